@@ -1,0 +1,1 @@
+"""Scenes that a renderer turns into images, one per module; nothing is downloaded."""

@@ -1,0 +1,102 @@
+"""Choice of the Mitsuba variant: a library that aborts must never take the caller with it."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from torch_zerohess.adapters import mitsuba as adapter
+
+ABORTING = [path for path in map(Path, ["/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1"]) if path.exists()]
+
+
+def test_llvm_version_comes_from_the_name_or_the_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-18.so", "libLLVM.dylib", "libLLVMCore.so.20"):
+        (tmp_path / name).touch()
+    (tmp_path / "libLLVM.so").symlink_to(tmp_path / "libLLVM.so.19.1")
+    monkeypatch.setattr(adapter, "_FOLDERS", (str(tmp_path),))
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    found = adapter.find_llvm()
+    assert found is not None
+    assert found.resolve().name == "libLLVM.so.19.1"
+    for asked, chosen in (("libLLVM-18.so", "libLLVM-18.so"), ("libLLVM-15.so.1", found.name), ("none", found.name)):
+        monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / asked))
+        again = adapter.find_llvm()
+        assert again is not None
+        assert again.name == chosen
+
+
+def test_old_and_unknown_llvm_are_not_candidates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM.dylib", "libLLVM.so"):
+        (tmp_path / name).touch()
+    monkeypatch.setattr(adapter, "_FOLDERS", (str(tmp_path),))
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "libLLVM.so"))
+    assert adapter.find_llvm() is None
+
+
+def test_without_mitsuba_the_reason_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    outcomes = adapter.variants()
+    assert set(outcomes) == {"scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"}
+    assert all(not outcome.works and "pip install mitsuba" in outcome.reason for outcome in outcomes.values())
+
+
+def test_bogus_llvm_does_not_work_and_the_caller_lives() -> None:
+    pytest.importorskip("mitsuba")
+    outcome = adapter.probe("llvm_ad_rgb", Path("/nonexistent/libLLVM.so.19"))
+    assert not outcome.works
+    assert "LLVM" in outcome.reason
+
+
+@pytest.mark.parametrize("library", ABORTING or [pytest.param(None, marks=pytest.mark.skip("no LLVM 15 here"))])
+def test_aborting_llvm_does_not_reach_the_caller(library: Path) -> None:
+    pytest.importorskip("mitsuba")
+    outcome = adapter.probe("llvm_ad_rgb", library)
+    assert not outcome.works
+    assert "SIGABRT" in outcome.reason
+
+
+def test_a_child_that_aborts_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(adapter, "_CHILD", "import os, sys; sys.stderr.write('LLVM ERROR: no\\nat 0x1\\n'); os.abort()")
+    outcome = adapter.probe("stand-in for an aborting variant")
+    assert not outcome.works
+    assert "LLVM ERROR: no" in outcome.reason
+
+
+def test_a_child_that_hangs_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(adapter, "_CHILD", "import time; time.sleep(60)")
+    outcome = adapter.probe("stand-in for a hanging variant", timeout=0.2)
+    assert outcome == adapter.Probe(False, "the test render did not end within 0.2 s")
+
+
+def test_scalar_always_works_and_a_probe_is_remembered() -> None:
+    pytest.importorskip("mitsuba")
+    outcomes = adapter.variants()
+    assert outcomes["scalar_rgb"] == adapter.Probe(True, "")
+    assert adapter.variants()["scalar_rgb"] is outcomes["scalar_rgb"]
+    assert all(outcome.works or outcome.reason for outcome in outcomes.values())
+
+
+def test_select_returns_the_module_with_the_variant_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba")
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", os.environ.get("DRJIT_LIBLLVM_PATH", ""))
+    assert adapter.select_variant("scalar_rgb", threads=1).variant() == "scalar_rgb"
+    expected = "llvm_ad_rgb" if adapter.variants()["llvm_ad_rgb"].works and adapter.find_llvm() else "scalar_rgb"
+    assert adapter.select_variant().variant() == expected
+
+
+def test_auto_falls_back_to_scalar(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(adapter, "find_llvm", lambda: None)
+    assert adapter.select_variant().variant() == "scalar_rgb"
+
+
+def test_explicit_variant_that_does_not_work_raises_with_the_reason() -> None:
+    pytest.importorskip("mitsuba")
+    with pytest.raises(RuntimeError, match=r"'no_such_variant' does not work here: .*scalar_rgb"):
+        adapter.select_variant("no_such_variant")
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        adapter.select_variant("scalar_rgb", threads=0)

@@ -1,0 +1,205 @@
+"""One batch of black-box evaluations: the points, the call, the checks, and the coefficients of the Stein sums."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.evaluators import Evaluator, Inline
+from torch_zerohess.perturbations import Perturbations, draws, perturb
+from torch_zerohess.smoothing import Smoothing
+
+ValueMode = Literal["center", "smoothed"]
+
+
+@dataclass(frozen=True)
+class BlackBoxCall:
+    """How to call a black box: the function, and what to do with what it returns.
+
+    fn: [K, n], *aux [K, ...] -> [K, *out], or of one point [n] -> [*out] where not `vectorized`.
+    on_nonfinite: "raise", "drop" (leave out the whole antithetic pair), or a number to put in its place.
+    """
+
+    fn: Callable[..., Any]
+    vectorized: bool = True
+    evaluator: Evaluator = field(default_factory=Inline)
+    value: ValueMode = "center"
+    on_nonfinite: str | float = "raise"
+
+    def __post_init__(self) -> None:
+        if not callable(self.fn):
+            raise TypeError(f"fn must be callable, got {self.fn!r}")
+        if self.value not in ("center", "smoothed"):
+            raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
+        number = isinstance(self.on_nonfinite, (int, float)) and not isinstance(self.on_nonfinite, bool)
+        if not number and self.on_nonfinite not in ("raise", "drop"):
+            raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a number, got {self.on_nonfinite!r}")
+
+    def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
+        """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
+        fn = self.fn if self.vectorized else self._each
+        values = _tensor(self.evaluator(fn, points, *aux))
+        if values.requires_grad:
+            raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")
+        if not values.is_floating_point():
+            raise TypeError(f"fn must return real floating-point values, got {values.dtype}: convert, e.g. .float()")
+        if values.dim() == 0 or len(values) != len(points):
+            raise ValueError(
+                f"fn must return one value per point, [{len(points)}, *out] for points "
+                f"{list(points.shape)}, got {list(values.shape)}"
+                + ("" if self.vectorized else " from single points")
+                + ("; for a function of one point pass vectorized=False" if self.vectorized else "")
+            )
+        return values.to(points.device)
+
+    def _each(self, points: Tensor, *aux: Tensor) -> Tensor:
+        return torch.stack([_tensor(self.fn(*one)) for one in zip(points, *aux, strict=True)])
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """Values at perturbed points, and everything that estimates are made of. B batch, K perturbations, n parameters."""
+
+    perturbations: Perturbations
+    values: Tensor
+    """[B, K, *out], as the black box returned them."""
+    center: Tensor | None
+    """f(x), [B, *out], where it was evaluated."""
+    base: Tensor
+    """What the estimate returns as value, float64 [B, *out]: f(x), or the smoothed value."""
+    coefficients: Tensor
+    """(f_k - baseline) / K, float64 [B, K, *out]."""
+    dropped: int
+    """Evaluations left out because they, or the other one of their pair, were not finite."""
+
+
+def checked_input(x: Any) -> Tensor:
+    """Return x, or raise if it is not a real floating tensor [*batch, n] with n > 0."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
+    if x.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
+    if x.dim() == 0 or x.numel() == 0:
+        raise ValueError(f"x must have shape [*batch, n] with at least one parameter, got {list(x.shape)}")
+    return x
+
+
+def evaluate(
+    call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Smoothing, keep: bool
+) -> Evaluations:
+    """Draw perturbations of x [B, n] and call the black box once, on all of them and on x itself where it is needed.
+
+    aux: [B, ...] each, repeated for every point of its batch element; keep: see `perturb`.
+    """
+    seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
+    perturbations = perturb(x, smoothing, seed, keep)
+    points = perturbations.points
+    B, K, n = points.shape
+    with_center = call.value == "center" or smoothing.baseline == "center"
+    if with_center:
+        points = torch.cat([points, x[:, None]], 1)
+    repeated = [one.repeat_interleave(points.shape[1], 0) for one in aux]
+    values = call(points.flatten(0, 1), repeated).unflatten(0, (B, -1))
+    values, kept = _finite(values, points, call.on_nonfinite, K, smoothing)
+    center = values[:, K] if with_center else None
+    values = values[:, :K]
+    base, coefficients = _coefficients(values.double(), center, kept, perturbations, smoothing)
+    if call.value == "center" and center is not None:
+        base = center.double()
+    return Evaluations(perturbations, values, center, base, coefficients, int((~kept).sum()))
+
+
+def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    """Return f(x), [B, *out], for x [B, n]: one evaluation per batch element and nothing else."""
+    values = call(x, aux)
+    bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
+    if bool(bad.any()):
+        values = _replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
+    return values
+
+
+def _coefficients(
+    values: Tensor, center: Tensor | None, kept: Tensor, perturbations: Perturbations, smoothing: Smoothing
+) -> tuple[Tensor, Tensor]:
+    """Smoothed value and (f - baseline) / K; dropped rows weigh nothing and the others more."""
+    shape = values.shape[2:]
+    keep = kept[..., None].double()
+    f = torch.where(kept[..., None], values.reshape(*kept.shape, -1), 0.0)
+    if smoothing.baseline == "center" and center is not None:
+        baseline = center.double().reshape(len(f), 1, -1).expand_as(f)
+    elif smoothing.baseline == "mean":
+        baseline = _mean_of_others(f, keep, draws(smoothing, perturbations.points.shape[2]))
+    else:
+        baseline = torch.zeros_like(f)
+    share = keep / keep.sum(1, keepdim=True)
+    coefficients = (f - baseline) * share
+    smoothed = (baseline * share).sum(1) + perturbations.stein.value(coefficients.mT)
+    return smoothed.reshape((len(f), *shape)), coefficients.reshape((*kept.shape, *shape))
+
+
+def _mean_of_others(f: Tensor, keep: Tensor, groups: list[Tensor]) -> Tensor:
+    """Mean over the rows of all other independent draws: a baseline that no row's own value enters."""
+    if len(groups) < 2:
+        raise ValueError(
+            "baseline 'mean' needs at least two independent draws to leave one out: use more samples (an even number "
+            "for sampler 'sobol'), or baseline 'center'"
+        )
+    # Sums of differences to one of the values keep the precision of a small variation on a large offset.
+    origin = f[:, :1]
+    label = torch.empty(f.shape[1], dtype=torch.int64, device=f.device)
+    for number, group in enumerate(groups):
+        label[group.to(f.device)] = number
+    shifted = (f - origin) * keep
+    sums = f.new_zeros(f.shape[0], len(groups), f.shape[2]).index_add_(1, label, shifted)
+    counts = f.new_zeros(f.shape[0], len(groups), 1).index_add_(1, label, keep)
+    others = (sums.sum(1, keepdim=True) - sums) / (counts.sum(1, keepdim=True) - counts).clamp_min(1.0)
+    return origin + others[:, label]
+
+
+def _finite(
+    values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing
+) -> tuple[Tensor, Tensor]:
+    """Treat values [B, E, *out] that are not finite; return them and which of the K perturbed rows are kept."""
+    kept = torch.ones(values.shape[0], K, dtype=torch.bool, device=values.device)
+    bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
+    if not bool(bad.any()):
+        return values, kept
+    if on_nonfinite != "drop" or bool(bad[:, K:].any()):
+        where = bad.nonzero()[0] if on_nonfinite != "drop" else torch.nonzero(bad[:, K:])[0] + torch.tensor([0, K])
+        rule = "raise" if on_nonfinite == "drop" else on_nonfinite
+        return _replaced(values, where, points, rule), kept
+    kept = ~bad[:, :K]
+    if smoothing.antithetic:
+        pair = kept[:, : K // 2] & kept[:, K // 2 :]
+        kept = torch.cat([pair, pair], 1)
+    fewest = 2 if smoothing.baseline == "mean" else 1
+    left = int(kept.sum(1).min()) // (2 if smoothing.antithetic else 1)
+    if left < fewest:
+        raise ValueError(
+            f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: fn is not finite "
+            "almost everywhere around x"
+        )
+    if smoothing.proposal == "optimal" and not bool(kept.all()):
+        raise ValueError("on_nonfinite='drop' cannot re-weight the element-wise sets of proposal 'optimal'")
+    return torch.where(bad.reshape(*bad.shape, *[1] * (values.dim() - 2)), 0.0, values), kept
+
+
+def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
+    if isinstance(rule, str):
+        point = points[tuple(where.tolist())]
+        text = ", ".join(f"{float(p):.6g}" for p in point[:8]) + (", ..." if len(point) > 8 else "")
+        value = values[tuple(where.tolist())]
+        wrong = float(value.flatten()[~torch.isfinite(value.flatten())][0])
+        raise ValueError(
+            f"fn returned {wrong} at the point [{text}]; choose on_nonfinite='drop' or a number to go on without it"
+        )
+    return torch.where(torch.isfinite(values), values, torch.as_tensor(float(rule), dtype=values.dtype))
+
+
+def _tensor(result: Any) -> Tensor:
+    try:
+        return torch.as_tensor(result)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

@@ -1,0 +1,27 @@
+"""The compiled extension, where there is one; pure torch, with the same results, where there is not."""
+
+import importlib
+import os
+import warnings
+
+HINT = "install a C++20 compiler (Debian: apt-get install g++) and reinstall: pip install --force-reinstall --no-deps ."
+
+
+def _load() -> tuple[bool, str]:
+    if os.environ.get("TORCH_ZEROHESS_PURE_TORCH", "0") not in ("", "0"):
+        return False, "switched off by TORCH_ZEROHESS_PURE_TORCH"
+    try:
+        importlib.import_module("torch_zerohess._C")
+    except ImportError as error:
+        reason = str(error)
+        warnings.warn(
+            f"torch_zerohess runs without its C++ extension, with the same results but slower ({reason}); {HINT}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return False, reason
+    return True, "built"
+
+
+available, status = _load()
+"""Whether the extension is used, and why or why not."""

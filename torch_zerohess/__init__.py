@@ -1,4 +1,36 @@
-"""torch_zerohess."""
-from torch_zerohess.estimate import Estimate, estimate
-from torch_zerohess.smoothing import Smoothing
+"""Any black-box function, differentiable to second order inside PyTorch.
+
+The function is convolved with a Gaussian, F(x) = E f(x + sigma u), u ~ N(0, I); value, gradient, Hessian and
+Hessian-vector products of F are estimated from one batch of evaluations of f (Stein's identities) and enter autograd:
+
+    import torch_zerohess as zh
+
+    layer = zh.BlackBox(render_loss, zh.Smoothing(sigma=0.1))   # [*batch, n] -> [*batch]
+    loss = layer(network(image)).mean()                         # white box, then black box
+    loss.backward()                                             # or torch.func, or zh.optim.NewtonCG
+"""
+
+from torch_zerohess import adapters, evaluators, optim
 from torch_zerohess.blackbox import BlackBox, smooth
+from torch_zerohess.curvature import CurvatureOperator, hvp
+from torch_zerohess.doctor import doctor
+from torch_zerohess.estimate import Estimate, estimate
+from torch_zerohess.finite_differences import finite_difference_hvp
+from torch_zerohess.schedules import LinearSigma
+from torch_zerohess.smoothing import Smoothing
+
+__all__ = [
+    "BlackBox",
+    "CurvatureOperator",
+    "Estimate",
+    "LinearSigma",
+    "Smoothing",
+    "adapters",
+    "doctor",
+    "estimate",
+    "evaluators",
+    "finite_difference_hvp",
+    "hvp",
+    "optim",
+    "smooth",
+]

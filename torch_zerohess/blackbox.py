@@ -67,6 +67,8 @@ class BlackBox(nn.Module):
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
         x = checked_input(x)
+        if x.requires_grad and not opaque.transformed(x) and forward_ad._current_level < 0:
+            x = Input.apply(x)
         batch = x.shape[:-1]
         flat, others = x.reshape(-1, x.shape[-1]), folded_aux(_without_grad(aux), batch)
         if self.call.value == "center" and not _differentiated(x):
@@ -125,6 +127,22 @@ class BlackBox(nn.Module):
 
     def extra_repr(self) -> str:
         return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"
+
+
+class Input(torch.autograd.Function):
+    """The identity, which marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
+
+    @staticmethod
+    def forward(x: Tensor) -> Tensor:
+        return x.view_as(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        return gradient
 
 
 def smooth(

@@ -35,7 +35,7 @@ class Estimate:
         return c.reshape(*c.shape[:2], -1).mT.contiguous()
 
     def _shaped(self, flat: Tensor, *tail: int) -> Tensor:
-        return flat.reshape(*self._batch, *self._out, *tail).to(self._x.dtype)
+        return flat.reshape((*self._batch, *self._out, *tail)).to(self._x.dtype)
 
     @property
     def value(self) -> Tensor:
@@ -97,7 +97,7 @@ class Estimate:
         points = self._evaluations.perturbations.points
         if self._evaluations.center is not None:
             points = torch.cat([points, self._x.reshape(-1, 1, points.shape[2])], 1)
-        return points.reshape(*self._batch, *points.shape[1:])
+        return points.reshape((*self._batch, *points.shape[1:]))
 
     @cached_property
     def values(self) -> Tensor:
@@ -105,7 +105,7 @@ class Estimate:
         values = self._evaluations.values
         if self._evaluations.center is not None:
             values = torch.cat([values, self._evaluations.center[:, None]], 1)
-        return values.reshape(*self._batch, *values.shape[1:])
+        return values.reshape((*self._batch, *values.shape[1:]))
 
     @property
     def dropped(self) -> int:

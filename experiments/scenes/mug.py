@@ -67,6 +67,7 @@ class MugScene:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
         self.film, self.spp, self.depth, self.seed = (int(sizes[0]), int(sizes[1])), spp, depth, seed
         self._mi: Any = select_variant(variant, threads)
+        self.variant: str = self._mi.variant()
         self._scene = self._mi.load_dict(self._description(), optimize=False)  # optimize=True drops parameter names
         self._params = self._mi.traverse(self._scene)
         self._params.keep(["handle.to_world"])

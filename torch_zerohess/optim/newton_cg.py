@@ -1,7 +1,7 @@
 """Newton's method with conjugate gradients in a trust region, for losses whose second derivatives are sampled."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -10,6 +10,10 @@ from torch.optim import Optimizer
 
 from torch_zerohess.curvature import CurvatureOperator
 from torch_zerohess.optim.steihaug import steihaug
+
+
+Closure = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
+"""What a closure returns: the loss, or the loss and where its white box ends."""
 
 
 class NewtonCG(Optimizer):
@@ -31,7 +35,8 @@ class NewtonCG(Optimizer):
         adapt: whether to test the step and adapt the radius.
         max_radius: the radius never grows beyond it.
 
-    The closure of `step` returns a loss with a graph and does not call backward.
+    The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
+    pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them.
 
     Example:
         >>> x = torch.tensor([3.0, -2.0], requires_grad=True)
@@ -75,7 +80,7 @@ class NewtonCG(Optimizer):
         if len(self.param_groups) != 1:
             raise ValueError(f"params must be one group, got {len(self.param_groups)}: the model has one Hessian")
 
-    def step(self, closure: Callable[[], Tensor]) -> Tensor:  # type: ignore[override]
+    def step(self, closure: Callable[[], Closure]) -> Tensor:  # type: ignore[override]
         """Take one step and return the loss before it, [] without a graph.
 
         Raises ValueError if the loss or its gradient is not finite; the parameters are then as they were.
@@ -83,8 +88,8 @@ class NewtonCG(Optimizer):
         group: dict[str, Any] = self.param_groups[0]
         parameters = [one for one in group["params"] if one.requires_grad]
         with torch.enable_grad():
-            loss = closure()
-            operator = CurvatureOperator(loss, parameters, mode=group["curvature"])
+            loss, through = _pair(closure())
+            operator = CurvatureOperator(loss, parameters, mode=group["curvature"], through=through)
         gradient = operator.gradient
         if not bool(torch.isfinite(loss)) or not bool(torch.isfinite(gradient).all()):
             raise ValueError(f"the loss ({float(loss)}) or its gradient is not finite; no step was taken")
@@ -99,11 +104,15 @@ class NewtonCG(Optimizer):
         _add(parameters, step.s, 1.0)
         if group["adapt"] and step.decrease > 0.0:
             with torch.no_grad():
-                actual = float(loss) - float(closure())
+                actual = float(loss) - float(_pair(closure())[0])
             group["radius"] = min(_next_radius(actual / step.decrease, float(step.s.norm()), radius), group["max_radius"])
             if not actual > 0.0:
                 _add(parameters, step.s, -1.0)
         return loss.detach()
+
+
+def _pair(result: Closure) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:
+    return result if isinstance(result, tuple) else (result, None)
 
 
 def _next_radius(ratio: float, length: float, radius: float) -> float:

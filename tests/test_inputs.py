@@ -1,0 +1,319 @@
+"""Bad inputs: the error names the argument, the value received and what would be right."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from truths import spread, vector
+
+from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+
+# torch's own forward mode compiles decompositions with its deprecated torch.jit.
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
+
+S = Smoothing(sigma=0.5, samples=3, seed=1)
+ONE = S.replace(samples=1)
+X = vector(0.1, 0.2)
+
+
+def f(z: Tensor) -> Tensor:
+    return z.square().sum(1)
+
+
+SETTINGS = [
+    ({"sigma": 0.0}, ValueError, r"sigma must be positive and finite, got 0\.0"),
+    ({"sigma": -0.3}, ValueError, r"sigma must be positive.*-0\.3"),
+    ({"sigma": math.nan}, ValueError, r"sigma must be positive and finite, got nan"),
+    ({"sigma": math.inf}, ValueError, r"sigma must be positive and finite, got inf"),
+    ({"sigma": torch.tensor([0.1, -2.0])}, ValueError, r"sigma must be positive.*-2\.0"),
+    ({"sigma": torch.tensor([0.1, math.inf])}, ValueError, "sigma must be positive and finite, got inf"),
+    ({"sigma": torch.ones(2, 2)}, TypeError, r"sigma must be a positive number or a tensor \[n\]"),
+    ({"sigma": torch.ones(0)}, TypeError, r"sigma must be a positive number or a tensor \[n\]"),
+    ({"sigma": torch.ones(2, dtype=torch.complex64)}, TypeError, "sigma must be a positive number"),
+    ({"sigma": torch.ones(2, requires_grad=True)}, ValueError, r"sigma must not require grad.*detach"),
+    ({"sigma": "wide"}, TypeError, r"sigma must be a positive number.*'wide'"),
+    ({"sigma": None}, TypeError, r"sigma must be a positive number.*None"),
+    ({"sigma": True}, TypeError, r"sigma must be a positive number.*True"),
+    ({"samples": 0}, ValueError, "samples must be at least 1, got 0"),
+    ({"samples": -5}, ValueError, "samples must be at least 1, got -5"),
+    ({"samples": 4.0}, TypeError, r"samples must be an integer, got 4\.0"),
+    ({"samples": True}, TypeError, "samples must be an integer, got True"),
+    ({"samples": None}, TypeError, "samples must be an integer, got None"),
+    ({"samples": 1, "baseline": "mean"}, ValueError, "samples must be at least 2, got 1"),
+    ({"proposal": "cauchy"}, ValueError, "proposal must be one of 'aggregate', 'gaussian', .*got 'cauchy'"),
+    ({"baseline": "median"}, ValueError, "baseline must be one of 'center', 'mean', 'none', got 'median'"),
+    ({"sampler": "halton"}, ValueError, "sampler must be one of 'random', 'sobol', 'orthogonal', got 'halton'"),
+    ({"antithetic": "yes"}, ValueError, "antithetic must be one of True, False, got 'yes'"),
+    ({"seed": -1}, ValueError, "seed must be at least 0, got -1"),
+    ({"seed": 2**63}, ValueError, r"seed must be below 2\*\*63, got 9223372036854775808"),
+    ({"seed": 1.5}, TypeError, r"seed must be an integer, got 1\.5"),
+    ({"order": 3}, ValueError, "order must be 1 or 2, got 3"),
+    ({"order": 0}, ValueError, "order must be at least 1, got 0"),
+    ({"sampler": "orthogonal", "proposal": "optimal"}, ValueError, "proposal must be .*got 'optimal'"),
+    ({"sampler": "orthogonal", "proposal": "uniform"}, ValueError, "proposal must be .*got 'uniform'"),
+    ({"sampler": "orthogonal", "proposal": "fr22"}, ValueError, "proposal must be .*got 'fr22'"),
+    ({"sampler": "sobol", "proposal": "optimal"}, ValueError, "sampler must be 'random', got 'sobol'"),
+    ({"width": 1.0}, TypeError, "width"),
+]
+
+
+@pytest.mark.parametrize(("changes", "error", "message"), SETTINGS)
+def test_settings(changes: dict, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        Smoothing(**{"sigma": 0.5, **changes})
+    with pytest.raises(error, match=message):
+        Smoothing(sigma=0.5).replace(**changes)
+
+
+def test_settings_are_frozen_keyword_only_and_own_their_sigma() -> None:
+    with pytest.raises(TypeError):
+        Smoothing(0.5)  # type: ignore[misc]
+    with pytest.raises(AttributeError):
+        S.samples = 3  # type: ignore[misc]
+    sigma = torch.tensor([0.1, 0.2])
+    smoothing = Smoothing(sigma=sigma)
+    sigma[0] = -1.0
+    assert float(smoothing.sigma_vector(2, sigma.device)[0]) == pytest.approx(0.1)
+    assert (S.replace(samples=9).samples, S.samples) == (9, 3)
+
+
+POINTS = [
+    (torch.tensor([1, 2]), TypeError, r"x must be float32 or float64, got torch\.int64: convert"),
+    (torch.ones(2, dtype=torch.complex128), TypeError, r"x must be float32 or float64, got torch\.complex128"),
+    (torch.ones(2, dtype=torch.float16), TypeError, r"x must be float32 or float64, got torch\.float16"),
+    (torch.ones(2, dtype=torch.bool), TypeError, r"x must be float32 or float64, got torch\.bool"),
+    (torch.ones(0), ValueError, r"x must have shape \[\*batch, n\] with at least one parameter, got \[0\]"),
+    (torch.ones(0, 3), ValueError, r"x must have shape \[\*batch, n\].*got \[0, 3\]"),
+    (torch.tensor(1.0), ValueError, r"x must have shape \[\*batch, n\].*got \[\]"),
+    ([0.1, 0.2], TypeError, r"x must be a torch tensor \[\*batch, n\], got list"),
+    (np.ones(2), TypeError, r"x must be a torch tensor \[\*batch, n\], got ndarray"),
+    (None, TypeError, r"x must be a torch tensor \[\*batch, n\], got NoneType"),
+]
+
+
+@pytest.mark.parametrize(("x", "error", "message"), POINTS)
+def test_points(x: object, error: type[Exception], message: str) -> None:
+    layer = BlackBox(f, S)
+    for call in (lambda: estimate(f, x, S), lambda: layer(x), lambda: layer.freeze(x), lambda: smooth(f, S)(x)):
+        with pytest.raises(error, match=message):
+            call()
+
+
+FUNCTIONS = [
+    (lambda z: z.sum(), ValueError, r"fn must return one value per point, \[K, \*out\].*got \[\].*vectorized=False"),
+    (lambda z: z.sum(0), ValueError, r"fn must return one value per point, \[K, \*out\].*got \[2\]"),
+    (lambda z: f(z)[:-1], ValueError, r"\[K, \*out\] for points \[K, 2\], got \[[06]\]"),
+    (lambda z: f(z).long(), TypeError, r"fn must return real floating-point values, got torch\.int64: convert"),
+    (lambda z: f(z) > 0, TypeError, r"fn must return real floating-point values, got torch\.bool"),
+    (lambda z: f(z) * 1j, TypeError, r"fn must return real floating-point values, got torch\.complex128"),
+    (lambda z: None, TypeError, "fn must return a tensor or a NumPy array, got NoneType"),
+    (lambda z: "f", TypeError, "fn must return a tensor or a NumPy array, got str"),
+    (lambda z: {"loss": f(z)}, TypeError, "fn must return a tensor or a NumPy array, got dict"),
+    (lambda z: f(z).requires_grad_(), ValueError, r"fn returned a tensor that requires grad.*detached"),
+    (lambda z: f(z) + math.nan, ValueError, r"fn returned nan at the point \[0?.*on_nonfinite='drop' or a number"),
+    (lambda z: f(z) / 0.0, ValueError, r"fn returned inf at the point \["),
+    (lambda z: f(z)[:, None] * vector(1.0, -math.inf), ValueError, r"fn returned -inf at the point \["),
+]
+
+
+@pytest.mark.parametrize(("fn", "error", "message"), FUNCTIONS)
+def test_what_the_function_returns(fn, error: type[Exception], message: str) -> None:
+    x = X.clone().requires_grad_()
+    for call in (lambda: estimate(fn, X, S), lambda: BlackBox(fn, S)(x), lambda: torch.func.grad(smooth(fn, S))(X)):
+        with pytest.raises(error, match=message.replace("K", "7")):
+            call()
+
+
+def test_what_the_function_returns_where_only_the_value_is_asked_for() -> None:
+    for fn, error, message in FUNCTIONS:
+        with torch.no_grad(), pytest.raises(error, match=message.replace("K", "1")):
+            BlackBox(fn, S)(X)
+
+
+def test_errors_of_the_function_itself_arrive_as_they_are() -> None:
+    def fails(z: Tensor) -> Tensor:
+        raise KeyError("my own")
+
+    for call in (lambda: estimate(fails, X, S), lambda: torch.func.hessian(smooth(fails, S))(X)):
+        with pytest.raises(KeyError, match="my own"):
+            call()
+
+
+def test_the_function_cannot_change_its_input() -> None:
+    x = X.clone()
+
+    def greedy(z: Tensor) -> Tensor:
+        result = f(z)
+        z.zero_()
+        return result
+
+    with torch.no_grad():
+        BlackBox(greedy, S)(x)
+    got, expected = estimate(greedy, x, S.replace(baseline="none"), value="smoothed"), estimate(f, X, S)
+    assert torch.equal(x, X)
+    assert torch.equal(got.points, expected.points[:-1])
+
+
+OTHERS = [
+    (lambda: estimate(f, X, S.replace(sigma=torch.ones(3))), ValueError, "sigma has 3 elements, but x has 2"),
+    (lambda: BlackBox(f, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
+    (lambda: estimate(f, X, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
+    (lambda: BlackBox("f", S), TypeError, "fn must be callable, got 'f'"),
+    (lambda: estimate(None, X, S), TypeError, "fn must be callable, got None"),
+    (lambda: BlackBox(f, S, value="mean"), ValueError, "value must be 'center' or 'smoothed', got 'mean'"),
+    (lambda: BlackBox(f, S, on_nonfinite="skip"), ValueError, "on_nonfinite must be 'raise', 'drop' or a number, got"),
+    (lambda: BlackBox(f, S, on_nonfinite=True), ValueError, "on_nonfinite must be .*got True"),
+    (lambda: estimate(f, X, S, 1.0), TypeError, r"aux\[0\] must be a tensor \[\*batch, \.\.\.\], got float"),
+    (
+        lambda: estimate(lambda z, a: f(z), X.expand(3, 2), S, torch.ones(2)),
+        ValueError,
+        r"aux\[0\] must have the batch dimensions \[3\] of x first, got \[2\]",
+    ),
+    (lambda: estimate(f, X, S).hvp(torch.ones(3)), ValueError, r"v must be a tensor of shape \[2\] .*got \[3\]"),
+    (lambda: estimate(f, X, S).hvp([1.0, 2.0]), ValueError, r"v must be a tensor of shape \[2\] .*got list"),
+    (lambda: estimate(f, X, S).standard_error("hessian"), ValueError, "quantity must be 'value', .*got 'hessian'"),
+    (lambda: estimate(f, X, S).standard_error("hvp"), ValueError, "v is the vector of quantity 'hvp'"),
+    (lambda: estimate(f, X, S).standard_error("value", X), ValueError, "v is the vector of quantity 'hvp'"),
+    (lambda: estimate(f, X, ONE).standard_error("value"), ValueError, "at least two independent draws"),
+    (
+        lambda: estimate(f, X, ONE.replace(proposal="optimal")).standard_error("value"),
+        ValueError,
+        "at least 2 samples per element, got 1",
+    ),
+    (
+        lambda: estimate(f, X, S.replace(samples=3, sampler="sobol", baseline="mean")),
+        ValueError,
+        "baseline 'mean' needs at least two independent draws",
+    ),
+    (
+        lambda: estimate(lambda z: f(z) * torch.where(z[:, 0] == X[0], 1.0, math.nan), X, S, on_nonfinite="drop"),
+        ValueError,
+        "on_nonfinite='drop' left 0 of 3 draws, 1 are needed",
+    ),
+    (
+        lambda: estimate(f, torch.zeros(30_000), S.replace(sampler="sobol")),
+        ValueError,
+        "sampler 'sobol' has .* dimensions at most, but x has 30000 parameters: use 'random'",
+    ),
+    # 1 + n + n (n + 1) / 2 sets of 3 pairs.
+    (
+        lambda: estimate(f, torch.zeros(1000), S.replace(proposal="optimal")),
+        ValueError,
+        "proposal 'optimal' would need 3009006 evaluations .* at most 1000000 .* use proposal 'aggregate'",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "message"), OTHERS)
+def test_other_arguments(call, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        call()
+
+
+FIRST_ORDER = "first derivatives only .*use Smoothing\\(proposal='aggregate', order=2\\)"
+
+
+@pytest.mark.parametrize("changes", [{"proposal": "fr22"}, {"proposal": "optimal", "order": 1}, {"order": 1}])
+def test_first_order_samples_have_no_hessian(changes: dict) -> None:
+    smoothing = S.replace(**changes)
+    e, layer, x = estimate(f, X, smoothing), smooth(f, smoothing), X.clone().requires_grad_()
+    if changes == {"order": 1}:
+        # The first-order mixture has no hole where the Hessian's kernel lives: it stays unbiased, only noisier.
+        assert torch.isfinite(e.hessian()).all()
+        return
+
+    def double_backward() -> None:
+        (gradient,) = torch.autograd.grad(layer(x), x, create_graph=True)
+        torch.autograd.grad(gradient.sum(), x)
+
+    asked = [
+        e.hessian,
+        e.hessian_diagonal,
+        lambda: e.hvp(X),
+        lambda: e.standard_error("hvp", X),
+        lambda: e.standard_error("hessian_diagonal"),
+        lambda: torch.func.hessian(layer)(X),
+        lambda: torch.func.jacrev(torch.func.jacrev(layer))(X),
+        lambda: torch.autograd.functional.hessian(layer, X),
+        lambda: torch.autograd.functional.hvp(layer, X, X),
+        double_backward,
+    ]
+    for ask in asked:
+        with pytest.raises(ValueError, match=FIRST_ORDER):
+            ask()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "sigma", "hint"), [(torch.float32, 1e-7, "float64"), (torch.float64, 1e-16, "shift")]
+)
+def test_sigma_below_the_rounding_of_x(dtype: torch.dtype, sigma: float, hint: str) -> None:
+    x = torch.tensor([0.0, 100.0], dtype=dtype)
+    message = rf"sigma is below the rounding of x: x \+ sigma\*u == x .*parameter 1, x = 100\.0, sigma = .*{hint}"
+    for call in (lambda: estimate(f, x, S.replace(sigma=sigma)), lambda: BlackBox(f, S.replace(sigma=sigma)).freeze(x)):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+@settings(deadline=None, derandomize=True, max_examples=150)
+@given(
+    sigma=st.floats(),
+    samples=st.integers(-2, 20),
+    seed=st.one_of(st.none(), st.integers(-(2**64), 2**64)),
+    order=st.integers(-1, 4),
+)
+def test_a_setting_is_accepted_or_refused_by_its_stated_range(
+    sigma: float, samples: int, seed: int | None, order: int
+) -> None:
+    right = sigma > 0 and math.isfinite(sigma) and samples >= 1 and order in (1, 2)
+    right = right and (seed is None or 0 <= seed < 2**63)
+    if right:
+        smoothing = Smoothing(sigma=sigma, samples=samples, seed=seed, order=order)
+        assert smoothing.sigma == sigma
+        assert smoothing.evaluations(3) == 2 * samples + 1
+    else:
+        with pytest.raises(ValueError, match=r"(sigma|samples|seed|order) must"):
+            Smoothing(sigma=sigma, samples=samples, seed=seed, order=order)
+
+
+@settings(deadline=None, derandomize=True, max_examples=150)
+@given(
+    batch=st.lists(st.integers(1, 3), max_size=2),
+    n=st.integers(1, 6),
+    out=st.lists(st.integers(1, 3), max_size=2),
+    samples=st.integers(2, 5),
+    proposal=st.sampled_from(["aggregate", "gaussian", "optimal", "uniform"]),
+    baseline=st.sampled_from(["center", "mean", "none"]),
+    antithetic=st.booleans(),
+    single=st.booleans(),
+    seed=st.integers(0, 2**63 - 1),
+)
+def test_shapes_symmetry_and_linearity(
+    batch: list[int], n: int, out: list[int], samples: int, proposal: str, baseline: str, antithetic: bool,
+    single: bool, seed: int,
+) -> None:  # fmt: skip
+    smoothing = Smoothing(
+        sigma=0.3, samples=samples, proposal=proposal, baseline=baseline, antithetic=antithetic, seed=seed
+    )
+    dtype = torch.float32 if single else torch.float64
+    x = spread(math.prod(batch) * n, -1.0, 1.0).to(dtype).reshape(*batch, n)
+    scale = spread(math.prod(out), 0.5, 2.0).reshape(out)
+
+    def fn(z: Tensor) -> Tensor:
+        return torch.cos(z.double().sum(1)).reshape(-1, *[1] * len(out)) * scale
+
+    one = estimate(lambda z: torch.cos(z.double().sum(1)), x, smoothing, value="smoothed")
+    e = estimate(fn, x, smoothing, value="smoothed")
+    shape = (*batch, *out)
+    assert e.value.shape == shape
+    assert e.gradient.shape == e.hessian_diagonal().shape == (*shape, n)
+    assert e.hessian().shape == (*shape, n, n)
+    assert torch.equal(e.hessian(), e.hessian().mT)
+    assert e.evaluations == math.prod(batch) * smoothing.evaluations(n, center=baseline == "center")
+    # The estimate is linear in f: each output is its scale times the one function.
+    expected = one.gradient.reshape(*batch, *[1] * len(out), n) * scale[..., None]
+    tolerance = 1e-5 if single else 1e-12
+    torch.testing.assert_close(e.gradient.double(), expected.double(), rtol=tolerance, atol=tolerance)

@@ -10,11 +10,11 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "torch_zerohess"
 # DESIGN section 4, left to right. A module may import only from those before it; a folder counts as one.
-LAYERS = """
-    smoothing philox quantiles proposals extension kernels linear_map stein samplers perturbations
-    evaluators evaluation standard_error estimate finite_differences opaque blackbox curvature schedules
-    optim adapters doctor
-""".split()
+LAYERS = [
+    *("smoothing", "philox", "quantiles", "proposals", "extension", "kernels", "linear_map", "stein", "samplers"),
+    *("perturbations", "evaluators", "evaluation", "standard_error", "estimate", "finite_differences", "opaque"),
+    *("blackbox", "curvature", "schedules", "optim", "adapters", "doctor"),
+]
 MOST_LINES = 320
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
@@ -51,19 +51,15 @@ def test_every_module_has_a_layer() -> None:
     assert layers - set(LAYERS) == set(), "add it to LAYERS, where it belongs"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: name(path) or "__init__")
+@pytest.mark.parametrize("path", [path for path in MODULES if name(path)], ids=name)
 def test_imports_go_one_way(path: Path) -> None:
     own = name(path)
-    if own == "":
-        return  # the top gathers everything; nothing may import it, see below
     layer = own.split(".")[0]
     for other in imported(path):
         assert other != "", f"{own} imports from the top of the package: import from the module itself"
         above = other.split(".")[0]
-        if above == layer:
-            assert own != other
-            continue
-        assert LAYERS.index(above) < LAYERS.index(layer), f"{own} imports {other}, which is to its right"
+        allowed = above == layer or LAYERS.index(above) < LAYERS.index(layer)  # within a folder: see the next test
+        assert allowed, f"{own} imports {other}, which is to its right"
 
 
 def test_modules_of_one_folder_have_no_cycle() -> None:
@@ -96,13 +92,6 @@ def test_import_loads_nothing_but_torch_and_the_standard_library() -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = {module.split(".")[0] for module in done.stdout.split()}
     assert "torch_zerohess" in loaded
-    foreign = loaded - {"torch_zerohess", "torch"} - set(sys.stdlib_module_names)
-    assert foreign == set()
-
-
-def test_import_loads_no_adapter_and_compiles_nothing() -> None:
-    command = [sys.executable, "-W", "error", "-c", LOADED]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    loaded = done.stdout.split()
-    assert not [module for module in loaded if module.startswith("torch_zerohess.adapters.")]
-    assert not [module for module in loaded if module.startswith(("torch.utils.cpp_extension", "torch._inductor"))]
+    assert loaded - {"torch_zerohess", "torch"} - set(sys.stdlib_module_names) == set()
+    # Nor the parts of torch that a plain `import torch` leaves alone because they are slow: import never compiles.
+    assert not [module for module in done.stdout.split() if module.startswith(("torch.utils.cpp", "torch._inductor"))]

@@ -9,11 +9,8 @@ import torch
 
 import torch_zerohess
 
-MODULES = ["torch_zerohess"] + sorted(
-    module.name
-    for module in pkgutil.walk_packages(torch_zerohess.__path__, "torch_zerohess.")
-    if not module.name.endswith("._C")
-)
+FOUND = [module.name for module in pkgutil.walk_packages(torch_zerohess.__path__, "torch_zerohess.")]
+MODULES = ["torch_zerohess", *sorted(name for name in FOUND if not name.endswith("._C"))]
 # Where the public names of the core live: each must show how it is used.
 WITH_EXAMPLES = ["smoothing", "estimate", "blackbox"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parent / "csrc" / "core_test.cpp"
-FLAGS = "-std=c++20 -O1 -g -Wall -Wextra -Werror -ffp-contract=off -DZH_NO_CLONES".split()
+FLAGS = ["-std=c++20", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-DZH_NO_CLONES"]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 

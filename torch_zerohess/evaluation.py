@@ -105,10 +105,13 @@ def evaluate(
     values, kept = _finite(values, points, call.on_nonfinite, K, smoothing)
     center = values[:, K] if with_center else None
     values = values[:, :K]
-    base, coefficients = _coefficients(values.double(), center, kept, perturbations, smoothing)
+    baseline, coefficients = _coefficients(values, center, kept, smoothing, n)
     if call.value == "center" and center is not None:
         base = center.double()
-    return Evaluations(perturbations, values, center, base, coefficients, int((~kept).sum()))
+    else:
+        base = baseline + perturbations.stein.value(coefficients.reshape(B, K, -1).mT).view_as(baseline)
+    dropped = 0 if kept is None else int((~kept).sum())
+    return Evaluations(perturbations, values, center, base, coefficients, dropped)
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -121,55 +124,59 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
 
 
 def _coefficients(
-    values: Tensor, center: Tensor | None, kept: Tensor, perturbations: Perturbations, smoothing: Smoothing
+    values: Tensor, center: Tensor | None, kept: Tensor | None, smoothing: Smoothing, n: int
 ) -> tuple[Tensor, Tensor]:
-    """Smoothed value and (f - baseline) / K; dropped rows weigh nothing and the others more."""
-    shape = values.shape[2:]
-    keep = kept[..., None].double()
-    f = torch.where(kept[..., None], values.reshape(*kept.shape, -1), 0.0)
-    if smoothing.baseline == "center" and center is not None:
-        baseline = center.double().reshape(len(f), 1, -1).expand_as(f)
-    elif smoothing.baseline == "mean":
-        baseline = _mean_of_others(f, keep, draws(smoothing, perturbations.points.shape[2]))
+    """Mean baseline [B, *out] and (f - baseline) / K [B, K, *out]; dropped rows weigh nothing, the others more."""
+    B, K = values.shape[:2]
+    f = values.double().reshape(B, K, -1)
+    share = torch.full((B, K, 1), 1.0 / K, dtype=torch.float64, device=f.device)
+    if kept is not None:
+        share = kept[..., None] / kept.sum(1).double()[:, None, None]
+        f = torch.where(kept[..., None], f, 0.0)
+    if smoothing.baseline == "none":
+        mean, coefficients = torch.zeros_like(f[:, 0]), f * share
+    elif smoothing.baseline == "center" and center is not None:
+        mean = center.double().reshape(B, -1)
+        coefficients = (f - mean[:, None]) * share
     else:
-        baseline = torch.zeros_like(f)
-    share = keep / keep.sum(1, keepdim=True)
-    coefficients = (f - baseline) * share
-    smoothed = (baseline * share).sum(1) + perturbations.stein.value(coefficients.mT)
-    return smoothed.reshape((len(f), *shape)), coefficients.reshape((*kept.shape, *shape))
+        baseline = _mean_of_others(f, share, draws(smoothing, n))
+        mean, coefficients = (baseline * share).sum(1), (f - baseline) * share
+    return mean.reshape((B, *values.shape[2:])), coefficients.reshape(values.shape)
 
 
-def _mean_of_others(f: Tensor, keep: Tensor, groups: list[Tensor]) -> Tensor:
-    """Mean over the rows of all other independent draws: a baseline that no row's own value enters."""
-    if len(groups) < 2:
+def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
+    """Mean over the rows of all other independent draws: a baseline that no row's own value enters.
+
+    f: [B, K, P]; share: [B, K, 1], zero for dropped rows; draws: rows [D, r] of the draws, by size.
+    """
+    if sum(len(part) for part in draws) < 2:
         raise ValueError(
             "baseline 'mean' needs at least two independent draws to leave one out: use more samples (an even number "
             "for sampler 'sobol'), or baseline 'center'"
         )
-    # Sums of differences to one of the values keep the precision of a small variation on a large offset.
+    # Differences to one of the values keep the precision of a small variation on a large offset.
     origin = f[:, :1]
-    label = torch.empty(f.shape[1], dtype=torch.int64, device=f.device)
-    for number, group in enumerate(groups):
-        label[group.to(f.device)] = number
-    shifted = (f - origin) * keep
-    sums = f.new_zeros(f.shape[0], len(groups), f.shape[2]).index_add_(1, label, shifted)
-    counts = f.new_zeros(f.shape[0], len(groups), 1).index_add_(1, label, keep)
-    others = (sums.sum(1, keepdim=True) - sums) / (counts.sum(1, keepdim=True) - counts).clamp_min(1.0)
-    return origin + others[:, label]
+    shifted = (f - origin) * share
+    total, result = shifted.sum(1, keepdim=True), torch.empty_like(f)
+    for part in draws:
+        index = part.to(f.device)
+        own, own_share = shifted[:, index].sum(2), share[:, index].sum(2)
+        others = (total - own) / (1.0 - own_share).clamp_min(1e-300)
+        result[:, index] = others[:, :, None].expand(-1, -1, part.shape[1], -1)
+    return origin + result
 
 
 def _finite(
     values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing
-) -> tuple[Tensor, Tensor]:
-    """Treat values [B, E, *out] that are not finite; return them and which of the K perturbed rows are kept."""
-    kept = torch.ones(values.shape[0], K, dtype=torch.bool, device=values.device)
+) -> tuple[Tensor, Tensor | None]:
+    """Treat values [B, E, *out] that are not finite; return them and which of the K perturbed rows are kept, if not all."""
     bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
     if not bool(bad.any()):
-        return values, kept
+        return values, None
     if on_nonfinite != "drop" or bool(bad[:, K:].any()):
         where = bad.nonzero()[0] if on_nonfinite != "drop" else torch.nonzero(bad[:, K:])[0] + torch.tensor([0, K])
         rule = "raise" if on_nonfinite == "drop" else on_nonfinite
-        return _replaced(values, where, points, rule), kept
+        return _replaced(values, where, points, rule), None
     kept = ~bad[:, :K]
     if smoothing.antithetic:
         pair = kept[:, : K // 2] & kept[:, K // 2 :]

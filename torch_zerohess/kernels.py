@@ -34,18 +34,17 @@ class Redrawn(NamedTuple):
     def count(self) -> int:
         return len(self.rows) // len(self.x) * (2 if self.antithetic else 1)
 
-    def chunks(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield perturbations [B, k, n] of a part of the rows, and which k of the K rows they are."""
+    def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Yield what `place` returns, for a part of the rows at a time, and which k of the K rows these are."""
         B, n = self.x.shape
         S = len(self.rows) // B
-        rows = self.rows.view(B, S, 5)
         step = max(1, _CHUNK // (B * n))
         for first in range(0, S, step):
-            part = rows[:, first : first + step]
+            part = self.rows.view(B, S, 5)[:, first : first + step]
             u = draw(part.reshape(-1, 5), n)
             index = torch.arange(first, first + part.shape[1], device=u.device)
             columns = torch.cat([index, index + S]) if self.antithetic else index
-            yield place(u, self.x, self.sigma, self.antithetic, self.single, proposals.GAUSSIAN)[1], columns
+            yield *place(u, self.x, self.sigma, self.antithetic, self.single, proposal), columns
 
 
 def _compiled(tensor: Tensor) -> bool:
@@ -82,7 +81,7 @@ def project(u: Tensor | Redrawn, t: Tensor) -> Tensor:
     if _compiled(u.x):
         return torch.ops.torch_zerohess.project_drawn(*u, t.contiguous())
     result = t.new_empty(*t.shape[:2], u.count)
-    for chunk, columns in u.chunks():
+    for _, chunk, _, columns in u.chunks():
         result[..., columns] = t @ chunk.mT
     return result
 
@@ -103,7 +102,7 @@ def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
         if _compiled(u) and a.shape[1] <= _MANY_VECTORS and u.shape[2] <= _WIDE:
             return torch.ops.torch_zerohess.hessian(u.contiguous(), a.contiguous())
         return (u.mT[:, None] * a[:, :, None]) @ u[:, None]
-    return _total(hessian(chunk, a[..., columns]) for chunk, columns in u.chunks())
+    return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
 
 
 def _sums(u: Tensor | Redrawn, a: Tensor, squares: bool) -> Tensor:
@@ -113,7 +112,7 @@ def _sums(u: Tensor | Redrawn, a: Tensor, squares: bool) -> Tensor:
         return a @ (u * u if squares else u)
     if _compiled(u.x):
         return torch.ops.torch_zerohess.accumulate_drawn(*u, a.contiguous(), squares)
-    return _total(_sums(chunk, a[..., columns], squares) for chunk, columns in u.chunks())
+    return _total(_sums(chunk, a[..., columns], squares) for _, chunk, _, columns in u.chunks())
 
 
 def _total(pieces: Iterator[Tensor]) -> Tensor:

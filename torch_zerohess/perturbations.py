@@ -39,7 +39,9 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
     """
     B, n = x.shape
     sigma = smoothing.sigma_vector(n, x.device)
-    proposal = _density(smoothing)
+    proposal, single, x64 = _density(smoothing), x.dtype == torch.float32, x.double().contiguous()
+    if not keep and smoothing.sampler == "random" and smoothing.proposal not in ("optimal", "fr22"):
+        return _perturb_in_pieces(x, x64, sigma, smoothing, seed)
     if smoothing.proposal == "optimal":
         total = B * smoothing.evaluations(n, center=False)
         if total > _MOST_OPTIMAL:
@@ -53,17 +55,37 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
         u = kernels.draw(rows, n)
     else:
         rows, u = _SAMPLERS[smoothing.sampler](seed, B, n, smoothing, proposal, x.device)
-    single, x64 = x.dtype == torch.float32, x.double().contiguous()
     points, u, weight = kernels.place(u, x64, sigma, smoothing.antithetic, single, proposal)
-    still = ~(u != 0).any(1)
-    if bool(still.any()):
-        b, d = (int(index) for index in still.nonzero()[0])
-        raise ValueError(
-            f"sigma is below the rounding of x: x + sigma*u == x in {x.dtype} for parameter {d}, x = {float(x[b, d])}, "
-            f"sigma = {float(sigma[d])}; "
-            + ("use float64 or a larger sigma" if single else "use a larger sigma or shift the origin of x")
-        )
-    return Perturbations(points, _stein(smoothing, keep, u, weight, rows, x64, sigma, single), sigma, rows)
+    _check_moved((u != 0).any(1), x, sigma)
+    return Perturbations(points, _stein(smoothing, u, weight, rows), sigma, rows)
+
+
+def _perturb_in_pieces(x: Tensor, x64: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int) -> Perturbations:
+    """As `perturb`, for many parameters: of the K rows only the points exist at once."""
+    B, n = x.shape
+    proposal = _density(smoothing)
+    rows = kernels.pick_rows(seed, 0, B * smoothing.samples, n, proposal, x.device)
+    recipe = Redrawn(rows, x64, sigma, smoothing.antithetic, x.dtype == torch.float32)
+    points = x.new_empty(B, recipe.count, n)
+    weight = x64.new_empty(B, recipe.count)
+    moved = torch.zeros(B, n, dtype=torch.bool, device=x.device)
+    for part, u, part_weight, columns in recipe.chunks(proposal):
+        points[:, columns], weight[:, columns] = part, part_weight
+        moved |= (u != 0).any(1)
+    _check_moved(moved, x, sigma)
+    return Perturbations(points, LikelihoodRatio(recipe, weight), sigma, rows)
+
+
+def _check_moved(moved: Tensor, x: Tensor, sigma: Tensor) -> None:
+    """Raise if no perturbation [B, n] of some parameter survived rounding."""
+    if bool(moved.all()):
+        return
+    b, d = (int(index) for index in (~moved).nonzero()[0])
+    advice = "use float64 or a larger sigma" if x.dtype == torch.float32 else "use a larger sigma or shift the origin"
+    raise ValueError(
+        f"sigma is below the rounding of x: x + sigma*u == x in {x.dtype} for parameter {d}, x = {float(x[b, d])}, "
+        f"sigma = {float(sigma[d])}; {advice}"
+    )
 
 
 def stored(smoothing: Smoothing, B: int, n: int) -> bool:
@@ -72,11 +94,12 @@ def stored(smoothing: Smoothing, B: int, n: int) -> bool:
 
 
 def draws(smoothing: Smoothing, n: int) -> list[Tensor]:
-    """Return which of the K rows belong to each independent draw, in order of the draws."""
-    S = smoothing.samples * smoothing.groups(n)
-    sizes = samplers.draw_sizes(smoothing, n)
-    parts = torch.arange(S).split(sizes)
-    return [torch.cat([part, part + S]) if smoothing.antithetic else part for part in parts]
+    """Return which of the K rows belong to each independent draw: int64 [D, r], draws of the same size together."""
+    index = torch.arange(smoothing.samples * smoothing.groups(n))
+    size = samplers.draw_size(smoothing, n)
+    whole = len(index) // size * size
+    parts = [index[:whole].view(-1, size)] + ([index[None, whole:]] if whole < len(index) else [])
+    return [torch.cat([part, part + len(index)], 1) for part in parts] if smoothing.antithetic else parts
 
 
 def _density(smoothing: Smoothing) -> int:
@@ -85,17 +108,11 @@ def _density(smoothing: Smoothing) -> int:
     return {"uniform": proposals.UNIFORM, "fr22": proposals.SIGNED_LOBES}.get(smoothing.proposal, proposals.GAUSSIAN)
 
 
-def _stein(
-    smoothing: Smoothing, keep: bool, u: Tensor, weight: Tensor, rows: Tensor, x: Tensor, sigma: Tensor, single: bool
-) -> Stein:
-    B, n = x.shape
+def _stein(smoothing: Smoothing, u: Tensor, weight: Tensor, rows: Tensor) -> Stein:
     if smoothing.proposal == "fr22":
         return SignedLobes(u.sign() * math.sqrt(2 / math.pi))
     if smoothing.proposal == "optimal":
-        elements = rows[: len(rows) // B].repeat(1 + smoothing.antithetic, 1)
-        return Elementwise(
-            proposals.element_weights(u, elements) * smoothing.groups(n), elements, n, smoothing.order
-        )
-    if keep:
-        return LikelihoodRatio(u, weight)
-    return LikelihoodRatio(Redrawn(rows, x, sigma, smoothing.antithetic, single), weight)
+        elements = rows[: len(rows) // len(u)].repeat(1 + smoothing.antithetic, 1)
+        n = u.shape[2]
+        return Elementwise(proposals.element_weights(u, elements) * smoothing.groups(n), elements, n, smoothing.order)
+    return LikelihoodRatio(u, weight)

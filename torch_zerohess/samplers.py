@@ -1,7 +1,7 @@
 """Perturbations u [R, n] of a batch of B estimates with S samples each, R = B * S: random, Sobol, orthogonal.
 
 All three have the same distribution row by row; they differ in how the rows of one estimate depend on each other.
-Rows that depend on each other form one independent draw: `draw_sizes` tells how many consecutive samples each has.
+Rows that depend on each other form one independent draw: `draw_size` tells how many consecutive samples it has.
 """
 
 import torch
@@ -14,19 +14,18 @@ from torch_zerohess.smoothing import Smoothing
 
 _SOBOL_BITS = 30
 _HALF_ULP = 2.0**-53
+_SHIFTS, _JITTER = 1 << 40, 1 << 41  # rows of noise that no perturbation uses
 
 
-def draw_sizes(smoothing: Smoothing, n: int) -> list[int]:
-    """Sizes, in consecutive samples, of the independent draws of one estimate; they add up to its samples."""
-    samples = smoothing.samples * smoothing.groups(n)
+def draw_size(smoothing: Smoothing, n: int) -> int:
+    """Return how many consecutive samples make one independent draw; the last draw of an estimate may have fewer."""
+    samples = smoothing.samples
     if smoothing.sampler == "random":
-        return [1] * samples
+        return 1
     if smoothing.sampler == "sobol":
         # Enough independent scrambles for a standard error, each long enough for its points to be even.
-        scrambles = next(r for r in (8, 4, 2, 1) if samples % r == 0 and (r <= 2 or samples >= 8 * r))
-        return [samples // scrambles] * scrambles
-    size = min(n, (samples + 1) // 2)
-    return [min(size, samples - first) for first in range(0, samples, size)]
+        return samples // next(r for r in (8, 4, 2, 1) if samples % r == 0 and (r <= 2 or samples >= 8 * r))
+    return min(n, (samples + 1) // 2)
 
 
 def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -38,22 +37,17 @@ def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, de
     if n + 3 > torch.quasirandom.SobolEngine.MAXDIM:
         most = torch.quasirandom.SobolEngine.MAXDIM - 3
         raise ValueError(f"sampler 'sobol' has {most} dimensions at most, but x has {n} parameters: use 'random'")
-    sizes = draw_sizes(smoothing, n)
-    # One seed per scramble: they may come close to each other, as each seeds a generator of its own.
-    seeds = uniforms(torch.full((len(sizes),), seed), torch.arange(len(sizes)), 0, 1, EXTRA)[:, 0]
-    engines = [
-        torch.quasirandom.SobolEngine(n + 3, scramble=True, seed=int(s * 2**62)).draw(size, dtype=torch.float64)
-        for s, size in zip(seeds, sizes, strict=True)
-    ]
-    points = (torch.cat(engines) * 2**_SOBOL_BITS).long().to(device)
-    scramble = torch.repeat_interleave(torch.arange(len(sizes), device=device), torch.tensor(sizes, device=device))
-    index = torch.arange(batch * len(points), device=device)
-    estimate = index // len(points)
-    shift_row = (1 << 40) + estimate * len(sizes) + scramble.repeat(batch)
-    first_rows, inverse = torch.unique(shift_row, return_inverse=True)
-    shifts = (uniforms(torch.full_like(first_rows, seed), first_rows, 0, n + 3, EXTRA) * 2**_SOBOL_BITS).long()
-    jitter = uniforms(torch.full_like(index, seed), (1 << 41) + index, 0, n + 3, EXTRA)
-    p = ((points.repeat(batch, 1) ^ shifts[inverse]) + jitter) * 2.0**-_SOBOL_BITS
+    size = draw_size(smoothing, n)
+    scrambles = smoothing.samples // size
+    seeds = uniforms(torch.full((scrambles,), seed), torch.arange(scrambles), 0, 1, EXTRA)[:, 0]
+    engines = [torch.quasirandom.SobolEngine(n + 3, scramble=True, seed=int(one * 2**62)) for one in seeds]
+    points = torch.stack([engine.draw(size, dtype=torch.float64) for engine in engines]).to(device)
+    index = torch.arange(batch * smoothing.samples, device=device)
+    shifted = _SHIFTS + torch.arange(batch * scrambles, device=device)
+    shifts = (uniforms(torch.full_like(shifted, seed), shifted, 0, n + 3, EXTRA) * 2**_SOBOL_BITS).long()
+    bits = (points * 2**_SOBOL_BITS).long() ^ shifts.view(batch, scrambles, 1, n + 3)
+    jitter = uniforms(torch.full_like(index, seed), _JITTER + index, 0, n + 3, EXTRA)
+    p = (bits.reshape(jitter.shape) + jitter) * 2.0**-_SOBOL_BITS
     p = p.clamp(_HALF_ULP, 1.0 - _HALF_ULP)
     rows = mixture_rows(torch.full_like(index, seed), index, p[:, n:], n, proposal)
     return rows, shape(rows, p[:, :n])
@@ -69,7 +63,11 @@ def orthogonal(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: in
     plain = rows.clone()
     plain[:, 2:] = torch.tensor([NORMAL, 0, 0])
     gaussian = kernels.draw(plain, n).view(batch, smoothing.samples, n)
-    blocks = [_orthogonalized(block) for block in gaussian.split(draw_sizes(smoothing, n), 1)]
+    size = draw_size(smoothing, n)
+    whole = smoothing.samples // size * size
+    blocks = [_orthogonalized(gaussian[:, :whole].reshape(-1, size, n)).view(batch, whole, n)]
+    if whole < smoothing.samples:
+        blocks.append(_orthogonalized(gaussian[:, whole:]))
     p = uniforms(rows[:, 0], rows[:, 1], 0, 2, EXTRA)
     return rows, with_lobes(rows, torch.cat(blocks, 1).flatten(0, 1), p[:, 0], p[:, 1])
 

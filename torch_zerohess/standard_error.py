@@ -12,27 +12,27 @@ _CHUNK = 1 << 22  # numbers held at a time
 def variance(stein: Stein, quantity: str, a: Tensor, draws: list[Tensor], v: Tensor | None) -> Tensor:
     """Return the variance of value [B, P], gradient, hessian_diagonal or hvp [B, P, n], in units of sigma.
 
-    a: coefficients [B, P, K]; draws: the rows of each independent draw; v: [B, P, n] for the hvp.
+    a: coefficients [B, P, K]; draws: rows [D, r] of the independent draws, by size; v: [B, P, n] for the hvp.
     With D draws y_d of expected share s_d of the sum Y, the variance is D/(D-1) sum_d (y_d - s_d Y)^2.
     """
     if isinstance(stein, Elementwise):
         return _elementwise(stein, quantity, a, draws, v)
-    if len(draws) < 2:
+    D = sum(len(part) for part in draws)
+    if D < 2:
         raise ValueError(
             "a standard error needs at least two independent draws: use more samples (an even number for 'sobol')"
         )
     total = _apply(stein, quantity, a, v)
-    K = sum(len(draw) for draw in draws)
     result = torch.zeros_like(total)
-    for size in sorted({len(draw) for draw in draws}):
-        same = torch.stack([draw for draw in draws if len(draw) == size]).to(a.device)
-        for part in same.split(max(1, _CHUNK // (size * max(1, total.numel())))):
-            B, P, D = a.shape[0], a.shape[1], len(part)
-            coefficients = a[:, :, part].movedim(2, 1).reshape(B * D, P, size)
-            vectors = None if v is None else v.repeat_interleave(D, 0)
-            y = _apply(stein.subset(part), quantity, coefficients, vectors).unflatten(0, (B, D))
-            result += ((y - (size / K) * total[:, None]) ** 2).sum(1)
-    return result * (len(draws) / (len(draws) - 1))
+    for same in draws:
+        size = same.shape[1]
+        for part in same.to(a.device).split(max(1, _CHUNK // (size * max(1, total.numel())))):
+            B, P, count = a.shape[0], a.shape[1], len(part)
+            coefficients = a[:, :, part].movedim(2, 1).reshape(B * count, P, size)
+            vectors = None if v is None else v.repeat_interleave(count, 0)
+            y = _apply(stein.subset(part), quantity, coefficients, vectors).unflatten(0, (B, count))
+            result += ((y - (size / a.shape[2]) * total[:, None]) ** 2).sum(1)
+    return result * (D / (D - 1))
 
 
 def _apply(stein: LikelihoodRatio | SignedLobes, quantity: str, a: Tensor, v: Tensor | None) -> Tensor:
@@ -44,7 +44,7 @@ def _apply(stein: LikelihoodRatio | SignedLobes, quantity: str, a: Tensor, v: Te
 
 def _elementwise(stein: Elementwise, quantity: str, a: Tensor, draws: list[Tensor], v: Tensor | None) -> Tensor:
     """Every draw has one element: its number is squared where the sums have it as it is, element by element."""
-    index = torch.stack(draws).to(a.device)
+    index = draws[0].to(a.device)
     S = int((stein.rows[index[:, 0], 2] == NORMAL).sum())
     if S < 2:
         raise ValueError("a standard error of proposal 'optimal' needs at least 2 samples per element, got 1")

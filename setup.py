@@ -70,7 +70,9 @@ def extension(torch: Path) -> Extension:
 torch = find_torch()
 building = any(command.startswith(("bdist", "build", "install", "develop", "editable")) for command in sys.argv[1:])
 if torch is None and building:
-    sys.exit(f"torch_zerohess needs torch to build. Run: pip install '{TORCH}'   and then install torch_zerohess again.")
+    sys.exit(
+        f"torch_zerohess needs torch to build. Run: pip install '{TORCH}'   and then install torch_zerohess again."
+    )
 
 setup(
     # Asked for by pip's isolated build only when the environment has no torch of its own.

@@ -31,7 +31,7 @@ def export(encoder: nn.Module, images: Tensor, path: Path) -> float:
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), torch.no_grad():
         # Deprecations inside the exporter are not ours to act on.
-        warnings.simplefilter("ignore", category=(DeprecationWarning, FutureWarning, UserWarning))  # type: ignore[arg-type]
+        warnings.simplefilter("ignore", category=(DeprecationWarning, FutureWarning, UserWarning))
         torch.onnx.export(
             encoder,
             (images[:2],),

@@ -14,7 +14,7 @@ from experiments.tasks.cnn import DEGREES, CnnTask
 from experiments.training import Result
 
 mpl.use("Agg")
-from matplotlib import pyplot as plt  # noqa: E402  (after the choice of a backend that needs no display)
+from matplotlib import pyplot as plt
 
 _POINTS = 120
 

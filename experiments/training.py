@@ -141,9 +141,7 @@ def _set_step(optimizer: torch.optim.Optimizer, method: Method, share: float) ->
     optimizer.param_groups[0][name] = method.step[0] + share * (method.step[1] - method.step[0])
 
 
-def _step(
-    optimizer: Any, method: Method, layer: zh.BlackBox, encoder: nn.Module, images: Tensor
-) -> float:
+def _step(optimizer: Any, method: Method, layer: zh.BlackBox, encoder: nn.Module, images: Tensor) -> float:
     """Take one step on a batch of images and return the mean loss before it."""
 
     def loss() -> Tensor:
@@ -156,9 +154,9 @@ def _step(
         return float(optimizer.step(loss))
     optimizer.zero_grad()
     value = loss()
-    value.backward()  # type: ignore[no-untyped-call]
+    value.backward()
     optimizer.step()
-    return float(value)
+    return float(value.detach())
 
 
 def _difference_model(layer: zh.BlackBox, encoder: nn.Module, images: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
-from truths import Image, spread, truths, vector
 
-from torch_zerohess import BlackBox, Smoothing, estimate, perturbations, smooth
+from torch_zerohess import BlackBox, Smoothing, estimate, kernels, perturbations, smooth
+from truths import Image, spread, truths, vector
 
 # torch's own forward mode compiles decompositions with its deprecated torch.jit.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
@@ -37,6 +37,7 @@ def memory(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
     """Perturbations kept, or drawn again for every sum."""
     if request.param == "redrawn":
         monkeypatch.setattr(perturbations, "STORED", 0)
+        monkeypatch.setattr(kernels, "_CHUNK", 2 * N)  # a row or two at a time
 
 
 BOTH = pytest.mark.usefixtures("memory")
@@ -184,9 +185,7 @@ def test_frozen_samples_pass_gradcheck_in_every_mode(smoothing: Smoothing) -> No
     close(frozen(at).detach(), e.value)
     close(torch.autograd.grad(frozen(at).sum(), at)[0], e.gradient.sum((1, 2)))
     near = leaf(BATCH[:2] + 0.05)  # away from where all terms of d vanish
-    assert gradcheck(
-        frozen, near, check_forward_ad=True, check_batched_grad=True, check_batched_forward_grad=True
-    )
+    assert gradcheck(frozen, near, check_forward_ad=True, check_batched_grad=True, check_batched_forward_grad=True)
     assert gradgradcheck(frozen, near, check_fwd_over_rev=True, check_batched_grad=True)
 
 

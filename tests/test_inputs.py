@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-from truths import spread, vector
 
 from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+from truths import spread, vector
 
 # torch's own forward mode compiles decompositions with its deprecated torch.jit.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")

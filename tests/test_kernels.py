@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from truths import spread
 
 from torch_zerohess import extension, kernels, proposals
 from torch_zerohess.kernels import Redrawn
+from truths import spread
 
 SIZES = [1, 2, 3, 7, 8, 9, 127, 128, 129, 300, 1024]
 DENSITIES = [
@@ -23,7 +23,7 @@ DENSITIES = [
 EPS = torch.finfo(torch.float64).eps
 ops = torch.ops.torch_zerohess
 CPU = torch.device("cpu")
-ROOT = Path(__file__).parent.parent
+FOLDER = Path(extension.__file__).parents[1]  # of the package under test: a checkout or an installation
 
 
 def test_extension_is_built() -> None:
@@ -124,7 +124,6 @@ def test_redrawn_equals_stored(n: int, single: bool, antithetic: bool, monkeypat
     x, sigma = spread(B * n, -3.0, 3.0).view(B, n).float().double(), spread(n, 1e-6, 1.0)
     u = kernels.place(kernels.draw(rows, n), x, sigma, antithetic, single, proposals.GAUSSIAN)[1]
     redrawn = Redrawn(rows, x, sigma, antithetic, single)
-    assert redrawn.count == K
     t, a = spread(B * M * n, -1.0, 1.0).view(B, M, n), spread(B * M * K, -1.0, 1.0).view(B, M, K)
     drawn = kernels.project(redrawn, t), kernels.accumulate(redrawn, a), kernels.accumulate_squares(redrawn, a)
     kept = kernels.project(u, t), kernels.accumulate(u, a), kernels.accumulate_squares(u, a)
@@ -174,6 +173,8 @@ def test_noncontiguous_inputs() -> None:
     for function, other in ((kernels.project, (t, s)), (kernels.accumulate, (a, b)), (kernels.hessian, (a, b))):
         assert torch.equal(function(v, other[1]), function(u, other[0]))
     assert torch.equal(kernels.accumulate_squares(v, b), kernels.accumulate_squares(u, a))
+    rows = every_kind(9)
+    assert torch.equal(kernels.draw(rows[::2], 9), kernels.draw(rows[::2].contiguous(), 9))
     with pytest.raises(RuntimeError, match="contiguous"):
         ops.project(v, t)
 
@@ -219,6 +220,21 @@ def test_wrong_shapes_raise(call) -> None:
         call()
 
 
+def test_no_batch_at_all_raises_and_does_not_end_the_process() -> None:
+    script = (
+        "import torch, torch_zerohess\n"
+        "rows, none = torch.zeros(4, 5, dtype=torch.int64), torch.zeros(0, 3, dtype=torch.float64)\n"
+        "t = none[:, None]\n"
+        "for name, last in (('project_drawn', (t,)), ('accumulate_drawn', (t, False))):\n"
+        "    try:\n"
+        "        getattr(torch.ops.torch_zerohess, name)(rows, none, torch.ones(3).double(), True, False, *last)\n"
+        "    except RuntimeError:\n"
+        "        print('raised')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=FOLDER, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, ["raised", "raised"]), done.stderr
+
+
 SAME_ESTIMATES = """
 import torch, torch_zerohess as zh
 from torch_zerohess import extension
@@ -234,7 +250,7 @@ def test_pure_torch_gives_the_same_estimates(capsys: pytest.CaptureFixture) -> N
     exec(SAME_ESTIMATES, {})
     environment = {**os.environ, "TORCH_ZEROHESS_PURE_TORCH": "1"}
     command = [sys.executable, "-W", "error", "-c", SAME_ESTIMATES]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, cwd=FOLDER, env=environment, capture_output=True, text=True, check=True)
     here, there = (text.splitlines() for text in (capsys.readouterr().out, done.stdout))
     assert [here.pop(), there.pop()] == ["True", "False"]
     for compiled, pure in zip(here, there, strict=True):

@@ -9,10 +9,10 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from truths import PlaneWave, Quadratic, Step, spread, vector
 
 from torch_zerohess import BlackBox, Smoothing, estimate
 from torch_zerohess.perturbations import stored
+from truths import PlaneWave, Quadratic, Step, spread, vector
 
 R = 400
 

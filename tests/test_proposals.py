@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
-from truths import spread
 
 from torch_zerohess import Smoothing, proposals, samplers
 from torch_zerohess.perturbations import perturb
+from truths import spread
 
 ROWS = 8000
 LEVEL = 1e-6

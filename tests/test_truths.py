@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import integrate, stats
+
 from truths import Step, spread, truths, vector
 
 SMOOTH = ["quadratic", "wave", "exponential", "bump", "image"]

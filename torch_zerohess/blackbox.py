@@ -122,7 +122,7 @@ class BlackBox(nn.Module):
         return {key: value for key, value in self.__dict__.items() if key != "_handle"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._handle = opaque.register(self)
 
     def extra_repr(self) -> str:
@@ -164,9 +164,7 @@ def smooth(
         >>> bool((slope - 0.7979).abs() < 0.05)
         True
     """
-    return BlackBox(
-        fn, smoothing, vectorized=vectorized, evaluator=evaluator, value=value, on_nonfinite=on_nonfinite
-    )
+    return BlackBox(fn, smoothing, vectorized=vectorized, evaluator=evaluator, value=value, on_nonfinite=on_nonfinite)
 
 
 def _value(reduction: Reduction, x: Tensor, center: Tensor, smoothing: Smoothing, *, zero: bool) -> Tensor:
@@ -200,5 +198,3 @@ def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
                 "pass it detached, or as part of x"
             )
     return aux
-
-

@@ -159,7 +159,7 @@ def _entries(node: Node | None) -> list[Tensor]:
         if current is None:
             continue
         if isinstance(current, Input._backward_cls):
-            found.append(current.saved_tensors[0])
+            found.append(current.saved_tensors[0])  # type: ignore[attr-defined]
         for following, _ in current.next_functions:
             if following not in seen:
                 seen.add(following)

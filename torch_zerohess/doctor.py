@@ -44,12 +44,15 @@ def doctor() -> Report:
         'cpu'
     """
     versions = {"python": platform.python_version()}
-    for name in ("torch_zerohess", "torch", *_OPTIONAL):
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
+    versions |= {name: version for name in ("torch_zerohess", "torch", *_OPTIONAL) if (version := _version(name))}
     devices = ["cpu"] + [f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in range(torch.cuda.device_count())]
     variants = {name: "works" if probe.works else probe.reason for name, probe in mitsuba.variants().items()}
     advice = [] if extension.available else [f"for the C++ extension, {extension.HINT}"]
     return Report(extension.available, extension.status, devices, variants, versions, advice)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

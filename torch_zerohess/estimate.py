@@ -74,9 +74,7 @@ class Estimate:
             ValueError: fewer than two independent draws, an unknown quantity, or an "hvp" without v.
         """
         if quantity not in ("value", "gradient", "hessian_diagonal", "hvp"):
-            raise ValueError(
-                f"quantity must be 'value', 'gradient', 'hessian_diagonal' or 'hvp', got {quantity!r}"
-            )
+            raise ValueError(f"quantity must be 'value', 'gradient', 'hessian_diagonal' or 'hvp', got {quantity!r}")
         if (quantity == "hvp") != (v is not None):
             raise ValueError("v is the vector of quantity 'hvp': give it there and only there")
         t = None if v is None else self._vector(v)

@@ -86,9 +86,7 @@ def checked_input(x: Any) -> Tensor:
     return x
 
 
-def evaluate(
-    call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Smoothing, keep: bool
-) -> Evaluations:
+def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Smoothing, keep: bool) -> Evaluations:
     """Draw perturbations of x [B, n] and call the black box once, on all of them and on x itself where it is needed.
 
     aux: [B, ...] each, repeated for every point of its batch element; keep: see `perturb`.
@@ -169,7 +167,7 @@ def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
 def _finite(
     values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing
 ) -> tuple[Tensor, Tensor | None]:
-    """Treat values [B, E, *out] that are not finite; return them and which of the K perturbed rows are kept, if not all."""
+    """Treat values [B, E, *out] that are not finite; return them, and which of the K perturbed rows stay if not all."""
     bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
     if not bool(bad.any()):
         return values, None

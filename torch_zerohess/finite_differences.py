@@ -27,11 +27,15 @@ def finite_difference_hvp(
     eps = sigma / 3 (Wang, Fischer and Ritschel 2025, OurHVP).
 
     Args:
-        fn, x, smoothing, *aux, vectorized: as for `estimate`; x is [*batch, n].
+        fn: [K, n], *aux [K, ...] -> [K, *out], or of one point where not `vectorized`, as for `estimate`.
+        x: [*batch, n], float32 or float64.
         v: [*batch, n] or [n]; a zero vector gives zero.
+        smoothing: how to sample each of the two gradients.
+        *aux: further inputs of fn, [*batch, ...] each.
         common: draw the same perturbations on both sides, so that most of the noise cancels in the difference; False
             draws independent ones, as the source does.
         step: length of the difference in units of sigma.
+        vectorized: False if fn takes one point [n] at a time.
 
     Returns:
         [*batch, *out, n], of the dtype of x.
@@ -51,7 +55,9 @@ def finite_difference_hvp(
     seed = int(torch.randint(2**62, ())) if smoothing.seed is None else smoothing.seed
     other = seed if common else seed ^ (1 << 61)
     forward, backward = (
-        estimate(fn, x + sign * offset, smoothing.replace(seed=s), *aux, vectorized=vectorized).gradient
+        estimate(
+            fn, x + sign * offset, smoothing.replace(seed=s), *aux, vectorized=vectorized, value="smoothed"
+        ).gradient
         for sign, s in ((1.0, seed), (-1.0, other))
     )
     scale = length.reshape(*length.shape[:-1], *[1] * (forward.dim() - length.dim()), 1)

@@ -31,7 +31,8 @@ class Redrawn(NamedTuple):
     single: bool
 
     @property
-    def count(self) -> int:
+    def K(self) -> int:
+        """Number of rows for each x."""
         return len(self.rows) // len(self.x) * (2 if self.antithetic else 1)
 
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
@@ -80,7 +81,7 @@ def project(u: Tensor | Redrawn, t: Tensor) -> Tensor:
         return t @ u.mT
     if _compiled(u.x):
         return torch.ops.torch_zerohess.project_drawn(*u, t.contiguous())
-    result = t.new_empty(*t.shape[:2], u.count)
+    result = t.new_empty(*t.shape[:2], u.K)
     for _, chunk, _, columns in u.chunks():
         result[..., columns] = t @ chunk.mT
     return result

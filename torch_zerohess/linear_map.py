@@ -39,7 +39,7 @@ class _LinearMap(torch.autograd.Function):
     def forward(vectors: Tensor, transposed: bool, zero: bool, *parts: Any) -> Tensor:
         u = _unflat(parts)
         if zero or vectors._is_zerotensor():  # a symbolic zero of forward mode has no memory to read
-            K, n = u.shape[1:] if isinstance(u, Tensor) else (u.count, u.x.shape[1])
+            K, n = u.shape[1:] if isinstance(u, Tensor) else (u.K, u.x.shape[1])
             return torch.zeros(*vectors.shape[:2], n if transposed else K, dtype=vectors.dtype, device=vectors.device)
         return kernels.accumulate(u, vectors) if transposed else kernels.project(u, vectors)
 

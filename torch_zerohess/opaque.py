@@ -1,10 +1,11 @@
 """The black box as one opaque operator: draw, call, reduce to coefficients. It has no derivative of its own.
 
-Under `torch.func` transforms and `torch.compile` the function must not be looked into, and a batch that `vmap` adds must
-reach it as more points of one call. A custom operator gives both: its vmap rule folds the new dimension into the batch.
-Plain eager code calls `evaluate_tensors` directly.
+Under `torch.func` transforms and `torch.compile` the function must not be looked into, and a batch that `vmap` adds
+must reach it as more points of one call. A custom operator gives both: its vmap rule folds the new dimension into the
+batch. Plain eager code calls `evaluate_tensors` directly.
 """
 
+import functools
 import itertools
 import weakref
 from collections.abc import Sequence
@@ -93,7 +94,7 @@ def _evaluate(
     handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     with torch.no_grad():
-        return tuple(evaluate_tensors(_owners[handle], keep, x, aux))
+        return evaluate_tensors(_owners[handle], keep, x, aux)
 
 
 @torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=())
@@ -109,14 +110,36 @@ def _(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> tuple[Te
     out = _output_shape(owner, x, aux)
     B, n = x.shape
     S = K // (1 + owner.smoothing.antithetic)
-    double = {"dtype": torch.float64, "device": x.device}
+    empty = functools.partial(x.new_empty, dtype=torch.float64)
     return (
-        torch.empty(B, *out, **double),
-        torch.empty(B, K, *out, **double),
-        torch.empty(B, K if keep else 0, n, **double),
-        torch.empty(B, K, **double),
-        torch.empty(B, S, 5, dtype=torch.int64, device=x.device),
-        torch.empty(n, **double),
+        empty(
+            (
+                B,
+                *out,
+            )
+        ),
+        empty(
+            (
+                B,
+                K,
+                *out,
+            )
+        ),
+        empty(
+            (
+                B,
+                K if keep else 0,
+                n,
+            )
+        ),
+        empty(
+            (
+                B,
+                K,
+            )
+        ),
+        x.new_empty((B, S, 5), dtype=torch.int64),
+        empty((n,)),
     )
 
 
@@ -174,5 +197,3 @@ def transformed(x: Tensor) -> bool:
         or torch._C._len_torch_dispatch_stack() > 0
         or type(x) not in (Tensor, torch.nn.Parameter)
     )
-
-

@@ -66,8 +66,8 @@ def _perturb_in_pieces(x: Tensor, x64: Tensor, sigma: Tensor, smoothing: Smoothi
     proposal = _density(smoothing)
     rows = kernels.pick_rows(seed, 0, B * smoothing.samples, n, proposal, x.device)
     recipe = Redrawn(rows, x64, sigma, smoothing.antithetic, x.dtype == torch.float32)
-    points = x.new_empty(B, recipe.count, n)
-    weight = x64.new_empty(B, recipe.count)
+    points = x.new_empty(B, recipe.K, n)
+    weight = x64.new_empty(B, recipe.K)
     moved = torch.zeros(B, n, dtype=torch.bool, device=x.device)
     for part, u, part_weight, columns in recipe.chunks(proposal):
         points[:, columns], weight[:, columns] = part, part_weight

@@ -24,11 +24,16 @@ _ROUNDS = 10
 def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> Tensor:
     """Return uniforms in (0, 1), [R, count] float64, for columns first to first + count of each row.
 
-    seed, row: int64 [R]. A value is (k + 1/2) / 2^52 with a 52-bit k: never 0 or 1, and exact under 1 - U, 4 U, 4 U - 2.
+    seed, row: int64 [R]. A value is (k + 1/2) / 2^52 with 52-bit k: never 0 or 1, and exact under 1 - U, 4 U, 4 U - 2.
     One Philox block of four words gives the two columns 2b and 2b + 1.
     """
     blocks = torch.arange(first // 2, (first + count + 1) // 2, device=row.device)
-    counter = (blocks & _MASK, row[:, None] & _MASK, (row[:, None] >> 32) & _MASK, torch.full_like(row[:, None], stream))
+    counter = (
+        blocks & _MASK,
+        row[:, None] & _MASK,
+        (row[:, None] >> 32) & _MASK,
+        torch.full_like(row[:, None], stream),
+    )
     words = _philox(counter, (seed[:, None] & _MASK, (seed[:, None] >> 32) & _MASK))
     pairs = torch.stack([_uniform(words[0], words[1]), _uniform(words[2], words[3])], -1).flatten(1)
     return pairs[:, first % 2 : first % 2 + count]

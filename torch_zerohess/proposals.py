@@ -123,7 +123,7 @@ def weights(u: Tensor, proposal: int) -> Tensor:
 
 
 def element_rows(seed: int, first: int, samples: int, n: int, order: int) -> Tensor:
-    """Rows of optimal sampling: `samples` for the value, for each gradient element i, for each Hessian element i <= j."""
+    """Rows of optimal sampling: `samples` for the value, for each gradient element and each Hessian element i <= j."""
     i, j = torch.triu_indices(n, n) if order == 2 else torch.empty(2, 0, dtype=torch.int64)
     each, value = torch.arange(n), torch.zeros(1, dtype=torch.int64)
     hessian = torch.where(i == j, DIAGONAL_LOBE, OFF_DIAGONAL_LOBE)

@@ -1,6 +1,6 @@
 """Inverse CDFs of the normal density and of the lobes of its first and second derivative.
 
-Written with additions, multiplications, divisions and square roots alone, each of which IEEE 754 rounds in one way only:
+Written with additions, multiplications, divisions and square roots alone, which IEEE 754 rounds in one way only:
 `csrc/quantiles.h` does the same operations in the same order and returns the same bits on every machine and device.
 All functions take and return float64 tensors of any shape.
 """
@@ -175,7 +175,7 @@ def _solve_from_zero(small: Tensor) -> Tensor:
 
 
 def _log_tail(f: Tensor, half_square: Tensor) -> Tensor:
-    """s (f^2/2 + R(s^2)): what log(1 + f) has beyond f - f^2/2."""
+    """S (f^2/2 + R(s^2)): what log(1 + f) has beyond f - f^2/2."""
     s = f / (2.0 + f)
     z = s * s
     r = torch.full_like(z, _LOG[6])

@@ -28,7 +28,9 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
     return min(n, (samples + 1) // 2)
 
 
-def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def sobol(
+    seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
     """Scrambled Sobol points: rows [R, 5] and u [R, n].
 
     Each independent scramble is a linear matrix scramble (Matousek 1998), shared by the batch, and a digital shift of
@@ -53,7 +55,9 @@ def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, de
     return rows, shape(rows, p[:, :n])
 
 
-def orthogonal(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def orthogonal(
+    seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
     """Blocks of orthogonal directions with independent chi-distributed lengths (Yu et al. 2016): rows and u [R, n].
 
     The orthonormal and the triangular factor of a Gaussian matrix are independent, so the lengths of its own rows
@@ -73,7 +77,7 @@ def orthogonal(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: in
 
 
 def _orthogonalized(block: Tensor) -> Tensor:
-    """Gram-Schmidt, twice, on the rows of [B, c, n]: sums in a fixed order, unlike a QR whose bits follow the threads."""
+    """Gram-Schmidt, twice, on the rows of [B, c, n]: sums in a fixed order, where a QR's follow the threads."""
     basis = torch.empty_like(block)
     for row in range(block.shape[1]):
         v = block[:, row : row + 1]
@@ -84,9 +88,9 @@ def _orthogonalized(block: Tensor) -> Tensor:
     return basis * torch.linalg.vector_norm(block, dim=2, keepdim=True)
 
 
-def random(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def random(
+    seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
     """Independent rows [R, 5] and their u [R, n]."""
     rows = kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device)
     return rows, kernels.draw(rows, n)
-
-

@@ -53,17 +53,16 @@ class Smoothing:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
-        for name, value, lowest in (("samples", self.samples, 1), ("order", self.order, 1), ("seed", self.seed, 0)):
-            if name == "seed" and value is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise TypeError(f"{name} must be an integer, got {value!r}")
-            if value < lowest:
-                raise ValueError(f"{name} must be at least {lowest}, got {value}")
+        seed = 0 if self.seed is None else self.seed
+        for name, number, lowest in (("samples", self.samples, 1), ("order", self.order, 1), ("seed", seed, 0)):
+            if isinstance(number, bool) or not isinstance(number, int):
+                raise TypeError(f"{name} must be an integer, got {number!r}")
+            if number < lowest:
+                raise ValueError(f"{name} must be at least {lowest}, got {number}")
         if self.order > 2:
             raise ValueError(f"order must be 1 or 2, got {self.order}")
-        if self.seed is not None and self.seed >= 2**63:
-            raise ValueError(f"seed must be below 2**63, got {self.seed}")
+        if seed >= 2**63:
+            raise ValueError(f"seed must be below 2**63, got {seed}")
         for name, value, allowed in (
             ("proposal", self.proposal, get_args(Proposal)),
             ("baseline", self.baseline, get_args(Baseline)),
@@ -78,7 +77,9 @@ class Smoothing:
                 f"got {self.proposal!r}"
             )
         if self.sampler == "sobol" and self.proposal == "optimal":
-            raise ValueError("proposal 'optimal' draws one small set per element: sampler must be 'random', got 'sobol'")
+            raise ValueError(
+                "proposal 'optimal' draws one small set per element: sampler must be 'random', got 'sobol'"
+            )
         if self.baseline == "mean" and self.samples * (self.antithetic or 1) < 2 and self.proposal != "optimal":
             raise ValueError("baseline 'mean' needs the mean of other draws: samples must be at least 2, got 1")
 

@@ -63,5 +63,3 @@ def _elementwise(stein: Elementwise, quantity: str, a: Tensor, draws: list[Tenso
     if quantity == "hvp" and v is not None:
         return (elements @ (v * v)[..., None])[..., 0]
     return elements.diagonal(dim1=2, dim2=3)
-
-

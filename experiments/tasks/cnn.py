@@ -67,7 +67,9 @@ class Encoder(nn.Module):
         )
 
     def forward(self, image: Tensor) -> Tensor:
-        rotation: Tensor = OUTPUT[0] + (OUTPUT[1] - OUTPUT[0]) * self.layers(2.0 * image - 0.7)  # linear radiance, centred
+        rotation: Tensor = OUTPUT[0] + (OUTPUT[1] - OUTPUT[0]) * self.layers(
+            2.0 * image - 0.7
+        )  # linear radiance, centred
         return rotation
 
 

@@ -11,7 +11,6 @@ from torch.optim import Optimizer
 from torch_zerohess.curvature import CurvatureOperator
 from torch_zerohess.optim.steihaug import steihaug
 
-
 Closure = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
 """What a closure returns: the loss, or the loss and where its white box ends."""
 
@@ -60,7 +59,11 @@ class NewtonCG(Optimizer):
     ) -> None:
         if curvature not in ("exact", "gauss_newton"):
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {curvature!r}")
-        for name, value, lowest in (("radius", radius, 0.0), ("tolerance", tolerance, 0.0), ("max_radius", max_radius, 0.0)):
+        for name, value, lowest in (
+            ("radius", radius, 0.0),
+            ("tolerance", tolerance, 0.0),
+            ("max_radius", max_radius, 0.0),
+        ):
             if not value > lowest:
                 raise ValueError(f"{name} must be positive, got {value}")
         if not 0.0 <= damping < math.inf:
@@ -90,7 +93,7 @@ class NewtonCG(Optimizer):
         with torch.enable_grad():
             loss, through = _pair(closure())
             operator = CurvatureOperator(loss, parameters, mode=group["curvature"], through=through)
-        gradient = operator.gradient
+        loss, gradient = loss.detach(), operator.gradient
         if not bool(torch.isfinite(loss)) or not bool(torch.isfinite(gradient).all()):
             raise ValueError(f"the loss ({float(loss)}) or its gradient is not finite; no step was taken")
         damping, radius = group["damping"], group["radius"]
@@ -105,10 +108,12 @@ class NewtonCG(Optimizer):
         if group["adapt"] and step.decrease > 0.0:
             with torch.no_grad():
                 actual = float(loss) - float(_pair(closure())[0])
-            group["radius"] = min(_next_radius(actual / step.decrease, float(step.s.norm()), radius), group["max_radius"])
+            group["radius"] = min(
+                _next_radius(actual / step.decrease, float(step.s.norm()), radius), group["max_radius"]
+            )
             if not actual > 0.0:
                 _add(parameters, step.s, -1.0)
-        return loss.detach()
+        return loss
 
 
 def _pair(result: Closure) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:

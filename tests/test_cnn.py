@@ -1,0 +1,129 @@
+"""The CNN task at a size for tests: the real scene, network, methods, logs and figures."""
+
+import itertools
+import json
+import math
+
+import matplotlib.image
+import pytest
+import torch
+
+from experiments import export
+from experiments.records import Log, Record, read
+from experiments.run import parse_methods, summary, train_all
+from experiments.tasks.cnn import ANGLES, PRESETS, CnnTask, Preset
+from experiments.training import METHODS, train
+
+TINY = Preset(16, 2, 2, (2, 2, 2), evaluations=84, images=12, held_out=4)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return TINY.scene(variant="scalar_rgb", threads=1)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_encoder_has_the_size_of_the_source(preset):
+    encoder = PRESETS[preset].encoder()
+    assert sum(p.numel() for p in encoder.parameters()) == 267_745
+    size = PRESETS[preset].film
+    assert encoder(torch.zeros(2, 3, size, size)).shape == (2, 1)
+
+
+def test_loss_is_zero_at_the_truth_and_counted(scene):
+    task = CnnTask(TINY, 0, scene)
+    images, rotation = task.training
+    assert float(rotation.min()) >= ANGLES[0]
+    assert float(rotation.max()) <= ANGLES[1]
+    assert float(task.loss(rotation, images).max()) < 1e-12
+    wrong = task.loss(rotation + 2.0, images)
+    assert float(wrong.min()) > 1e-5
+    assert task.evaluations == 2 * TINY.images
+
+
+def test_held_out_images_are_the_same_for_all_seeds_and_new(scene):
+    first, second = CnnTask(TINY, 0, scene), CnnTask(TINY, 1, scene)
+    assert torch.equal(first.held_out[1], second.held_out[1])
+    assert not torch.equal(first.training[1], second.training[1])
+    assert not set(first.training[1].flatten().tolist()) & set(first.held_out[1].flatten().tolist())
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_trains_within_its_budget(scene, name):
+    task, records = CnnTask(TINY, 0, scene), []
+    result = train(task, METHODS[name], 0, records.append)
+    method = METHODS[name]
+    per_step = method.batch * method.evaluations
+    assert [r.iteration for r in records] == list(range(TINY.evaluations // per_step))
+    assert records[-1].evaluations == result.evaluations == len(records) * per_step <= TINY.evaluations
+    assert all(a.seconds < b.seconds for a, b in itertools.pairwise(records))
+    changed = [
+        not torch.equal(a, b) for a, b in zip(result.encoder.parameters(), result.start.parameters(), strict=True)
+    ]
+    assert all(changed)
+    assert all(math.isfinite(r.parameter_error) and math.isfinite(r.image_error) for r in records)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_run_repeats_itself(scene, name):
+    task, runs = CnnTask(TINY, 0, scene), []
+    for _ in range(2):
+        records = []
+        train(task, METHODS[name], 3, records.append)
+        runs.append([(r.evaluations, r.loss, r.parameter_error) for r in records])
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("name", ["our_g", "our_hvpa"])
+def test_methods_learn(name):
+    """On a stand-in for the renderer, a smooth bowl in the angle, each divides the parameter error by ten."""
+
+    class Bowl(CnnTask):
+        def render(self, rotation):
+            x = torch.linspace(0, 1, 16)
+            position = (rotation.reshape(-1, 1, 1, 1) - 4.5) / 18
+            image = torch.exp(-0.5 * ((x - position) / 0.15) ** 2)
+            return image.expand(-1, 3, 16, 16).contiguous()
+
+    task = Bowl(Preset(16, 1, 2, (2, 2, 2), evaluations=1500, images=256, held_out=32), 0, None)
+    result = train(task, METHODS[name], 0, lambda record: None)
+    assert result.parameter_error[1] < 0.1 * result.parameter_error[0]
+    assert result.image_error[1] < 0.2 * result.image_error[0]
+
+
+def test_command_writes_logs_figures_encoder_and_table(tmp_path, capsys):
+    results = train_all(TINY, parse_methods("our_g, our_hvpa"), range(2), tmp_path, "scalar_rgb", 1)
+    printed = capsys.readouterr().out
+    for method in ("our_g", "our_hvpa"):
+        for seed in range(2):
+            rows = [json.loads(line) for line in (tmp_path / f"{method}-{seed}.jsonl").read_text().splitlines()]
+            assert {"task", "method", "run", "iteration", "seconds", "evaluations", "sigma"} <= rows[0].keys()
+            assert rows[0]["image_error"] > 0
+        assert method in printed
+    for name in ("errors.png", "predictions.png"):
+        assert matplotlib.image.imread(tmp_path / name).std() > 0.01
+    assert (tmp_path / "encoder-our_hvpa.onnx").exists()
+    assert summary(results) in printed
+
+
+def test_onnx_predicts_the_same(tmp_path):
+    torch.manual_seed(0)
+    encoder = PRESETS["fast"].encoder()
+    difference = export.export(encoder, torch.rand(5, 3, 64, 64), tmp_path / "encoder.onnx")
+    assert 0 <= difference < 1e-4
+
+
+def test_log_survives_a_cut_line(tmp_path):
+    path = tmp_path / "log.jsonl"
+    log = Log(path)
+    record = Record("cnn", "our_g", 0, 0, 0.1, 5, 1.0, 2.0, 2.0, 3.0)
+    log(record)
+    log.close()
+    path.write_text(path.read_text() + '{"task": "cn')
+    assert list(read(path)) == [record]
+
+
+@pytest.mark.parametrize("names", ["adam", "our_g,adam", ""])
+def test_unknown_methods_are_named(names):
+    with pytest.raises(SystemExit, match="fr22, our_g, our_h, our_hvp, our_hvpa"):
+        parse_methods(names)

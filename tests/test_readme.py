@@ -1,0 +1,38 @@
+"""The README's code runs, and its commands are those that exist."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+
+
+def test_python_blocks_run():
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), {})
+
+
+def test_setup_commands_are_one_line_each():
+    first, second = (block.strip() for block in re.findall(r"```bash\n(.*?)```", README, re.DOTALL))
+    for command in (first, second):
+        assert command.startswith("python3 -m venv .venv && .venv/bin/pip install")
+        assert "\n" not in command
+    assert first.endswith("python -m experiments run cnn --methods our_g,our_hvpa")
+    assert second.endswith("python -m pytest -q")
+
+
+def test_every_command_has_help():
+    names = re.findall(r"^\| `(\w+)", README, re.MULTILINE)
+    commands = [name for name in names if name in ("run", "error", "bench", "stability", "doctor")]
+    assert commands == ["run", "error", "bench", "stability", "doctor"]
+    shown = subprocess.run(
+        [sys.executable, "-m", "experiments", "--help"],
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert all(name in shown for name in commands)

@@ -147,6 +147,8 @@ auto stored(const Tensor& u) {
 auto drawn(const Tensor& rows, const Tensor& x, const Tensor& sigma, bool single) {
   check(x, "x", 2);
   check(sigma, "sigma", 1);
+  STD_TORCH_CHECK(
+      x.size(0) > 0 && rows.size(0) % x.size(0) == 0 && sigma.size(0) == x.size(1), "rows, x and sigma do not fit");
   const int64_t S = rows.size(0) / x.size(0);
   return [row = row_data(rows), px = x.const_data_ptr<double>(), ps = sigma.const_data_ptr<double>(), n = x.size(1), S,
           single](int64_t b) { return DrawnRows{row + b * S, px + b * n, ps, S, single}; };
@@ -165,16 +167,18 @@ Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
 Tensor project_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& t) {
   STD_TORCH_CHECK(x.size(0) == t.size(0) && x.size(1) == t.size(2), "x and t do not fit");
+  const auto rows_of = drawn(rows, x, sigma, single);  // checks what the next line divides by
   const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
-  return project_with(drawn(rows, x, sigma, single), K, t);
+  return project_with(rows_of, K, t);
 }
 
 Tensor accumulate_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& a,
     bool squares) {
+  const auto rows_of = drawn(rows, x, sigma, single);  // checks what the next line divides by
   const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
   STD_TORCH_CHECK(x.size(0) == a.size(0) && K == a.size(2), "rows and a do not fit");
-  return accumulate_with(drawn(rows, x, sigma, single), x.size(1), squares, a);
+  return accumulate_with(rows_of, x.size(1), squares, a);
 }
 
 Tensor hessian(const Tensor& u, const Tensor& a) {

@@ -165,7 +165,11 @@ OTHERS = [
     (lambda: BlackBox("f", S), TypeError, "fn must be callable, got 'f'"),
     (lambda: estimate(None, X, S), TypeError, "fn must be callable, got None"),
     (lambda: BlackBox(f, S, value="mean"), ValueError, "value must be 'center' or 'smoothed', got 'mean'"),
-    (lambda: BlackBox(f, S, on_nonfinite="skip"), ValueError, "on_nonfinite must be 'raise', 'drop' or a number, got"),
+    (
+        lambda: BlackBox(f, S, on_nonfinite="skip"),
+        ValueError,
+        "on_nonfinite must be 'raise', 'drop' or a finite number, got",
+    ),
     (lambda: BlackBox(f, S, on_nonfinite=True), ValueError, "on_nonfinite must be .*got True"),
     (lambda: estimate(f, X, S, 1.0), TypeError, r"aux\[0\] must be a tensor \[\*batch, \.\.\.\], got float"),
     (

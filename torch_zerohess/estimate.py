@@ -149,6 +149,8 @@ def estimate(
         >>> bool((e.gradient - torch.tensor([2.0, 4.0])).abs().max() < 0.5), e.evaluations
         (True, 1025)
     """
+    if not isinstance(smoothing, Smoothing):
+        raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
     call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite)
     x = checked_input(x).detach()
     batch, flat = x.shape[:-1], x.reshape(-1, x.shape[-1])

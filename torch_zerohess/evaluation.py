@@ -1,5 +1,6 @@
 """One batch of black-box evaluations: the points, the call, the checks, and the coefficients of the Stein sums."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch_zerohess.evaluators import Evaluator, Inline
 from torch_zerohess.perturbations import Perturbations, draws, perturb
 from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.stein import Elementwise, Stein
 
 ValueMode = Literal["center", "smoothed"]
 
@@ -33,9 +35,10 @@ class BlackBoxCall:
             raise TypeError(f"fn must be callable, got {self.fn!r}")
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
-        number = isinstance(self.on_nonfinite, (int, float)) and not isinstance(self.on_nonfinite, bool)
-        if not number and self.on_nonfinite not in ("raise", "drop"):
-            raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a number, got {self.on_nonfinite!r}")
+        rule = self.on_nonfinite
+        number = isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
+        if not number and rule not in ("raise", "drop"):
+            raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
@@ -64,7 +67,7 @@ class Evaluations:
 
     perturbations: Perturbations
     values: Tensor
-    """[B, K, *out], as the black box returned them."""
+    """[B, K, *out], as the black box returned them; zero where it was dropped."""
     center: Tensor | None
     """f(x), [B, *out], where it was evaluated."""
     base: Tensor
@@ -99,7 +102,9 @@ def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Sm
     if with_center:
         points = torch.cat([points, x[:, None]], 1)
     repeated = [one.repeat_interleave(points.shape[1], 0) for one in aux]
-    values = call(points.flatten(0, 1), repeated).unflatten(0, (B, -1))
+    # A copy where there is none yet: the black box may write to its input.
+    flat = points.flatten(0, 1) if with_center else points.flatten(0, 1).clone()
+    values = call(flat, repeated).unflatten(0, (B, -1))
     values, kept = _finite(values, points, call.on_nonfinite, K, smoothing)
     center = values[:, K] if with_center else None
     values = values[:, :K]
@@ -107,14 +112,21 @@ def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Sm
     if call.value == "center" and center is not None:
         base = center.double()
     else:
-        base = baseline + perturbations.stein.value(coefficients.reshape(B, K, -1).mT).view_as(baseline)
+        base = _smoothed_value(values, baseline, coefficients, perturbations.stein)
     dropped = 0 if kept is None else int((~kept).sum())
     return Evaluations(perturbations, values, center, base, coefficients, dropped)
 
 
+def _smoothed_value(values: Tensor, baseline: Tensor, coefficients: Tensor, stein: Stein) -> Tensor:
+    B, K = coefficients.shape[:2]
+    if isinstance(stein, Elementwise):  # only the value's own rows tell it: the others have another mean
+        return stein.value(values.double().reshape(B, K, -1).mT / K).view_as(baseline)
+    return baseline + stein.value(coefficients.reshape(B, K, -1).mT).view_as(baseline)
+
+
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
     """Return f(x), [B, *out], for x [B, n]: one evaluation per batch element and nothing else."""
-    values = call(x, aux)
+    values = call(x.clone(), [one.clone() for one in aux])
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):
         values = _replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
@@ -159,7 +171,9 @@ def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
     for part in draws:
         index = part.to(f.device)
         own, own_share = shifted[:, index].sum(2), share[:, index].sum(2)
-        others = (total - own) / (1.0 - own_share).clamp_min(1e-300)
+        if bool((own_share > 1.0 - 1e-12).any()):
+            raise ValueError("on_nonfinite='drop' left one independent draw, baseline 'mean' needs two: use 'center'")
+        others = (total - own) / (1.0 - own_share)
         result[:, index] = others[:, :, None].expand(-1, -1, part.shape[1], -1)
     return origin + result
 

@@ -61,7 +61,7 @@ def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: 
 
 def draw(rows: Tensor, n: int) -> Tensor:
     """See `proposals.draw`."""
-    return torch.ops.torch_zerohess.draw(rows, n) if _compiled(rows) else proposals.draw(rows, n)
+    return torch.ops.torch_zerohess.draw(rows.contiguous(), n) if _compiled(rows) else proposals.draw(rows, n)
 
 
 def place(
@@ -102,7 +102,8 @@ def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
     if isinstance(u, Tensor):
         if _compiled(u) and a.shape[1] <= _MANY_VECTORS and u.shape[2] <= _WIDE:
             return torch.ops.torch_zerohess.hessian(u.contiguous(), a.contiguous())
-        return (u.mT[:, None] * a[:, :, None]) @ u[:, None]
+        result = (u.mT[:, None] * a[:, :, None]) @ u[:, None]
+        return result.triu() + result.triu(1).mT
     return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
 
 

@@ -87,9 +87,13 @@ def _fold(part: Any, dim: int | None, V: int) -> Any:
     return part.flatten(0, 1)
 
 
-class FirstOrderOnly(torch.autograd.Function):
-    """The identity, whose first derivative is one and whose second raises instead of being silently zero."""
+def first_order_only(x: Tensor) -> Tensor:
+    """Return x with a second derivative that raises instead of being silently zero; compiled code has none anyway."""
+    result: Tensor = x if torch.compiler.is_compiling() else _FirstOrderOnly.apply(x)
+    return result
 
+
+class _FirstOrderOnly(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod

@@ -61,7 +61,9 @@ class Reduction(NamedTuple):
 
 def evaluate_tensors(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Reduction:
     """Evaluate once around x [B, n] and return the result as tensors; `keep` stores the perturbations."""
-    result = evaluate(owner.call, x, aux, owner.smoothing, keep)
+    # Forward mode of torch.autograd.functional maps over tangents only, but forbids random numbers in everything below.
+    with torch._C._ExcludeDispatchKeyGuard(_VMAP_MODE):
+        result = evaluate(owner.call, x, aux, owner.smoothing, keep)
     owner.output_shape = result.base.shape[1:]
     perturbations: Perturbations = result.perturbations
     B, K, n = perturbations.points.shape
@@ -69,7 +71,7 @@ def evaluate_tensors(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor])
     u = stein.u if isinstance(stein, (LikelihoodRatio, SignedLobes)) else None
     weight = stein.weight if isinstance(stein, (LikelihoodRatio, Elementwise)) else None
     return Reduction(
-        result.base,
+        result.base.contiguous(),
         result.coefficients,
         u if isinstance(u, Tensor) else result.base.new_empty(B, 0, n),
         result.base.new_empty(B, K) if weight is None else weight,
@@ -78,6 +80,7 @@ def evaluate_tensors(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor])
     )
 
 
+_VMAP_MODE = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("VmapMode"))  # type: ignore[arg-type]
 _owners: "weakref.WeakValueDictionary[int, Owner]" = weakref.WeakValueDictionary()
 _handles = itertools.count()
 

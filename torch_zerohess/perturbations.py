@@ -34,10 +34,13 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
 
     keep: store them, instead of drawing them again whenever they are needed (see `stored`).
 
-    Raises ValueError if sigma has the wrong length or is below the rounding of x, or if "optimal" sampling would need
-    more than a million evaluations.
+    Raises ValueError if x is not finite, if sigma has the wrong length or is below the rounding of x, or if "optimal"
+    sampling would need more than a million evaluations.
     """
     B, n = x.shape
+    if not bool(torch.isfinite(x).all()):
+        b, d = (int(index) for index in (~torch.isfinite(x)).nonzero()[0])
+        raise ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
     sigma = smoothing.sigma_vector(n, x.device)
     proposal, single, x64 = _density(smoothing), x.dtype == torch.float32, x.double().contiguous()
     if not keep and smoothing.sampler == "random" and smoothing.proposal not in ("optimal", "fr22"):

@@ -24,7 +24,8 @@ class Smoothing:
             share and divides by the density of that mixture; "gaussian" is the plain normal; "uniform" a box of +-5
             sigma, for comparison; "optimal" one sample set per element of gradient and Hessian, with constant weights
             (samples is then per element); "fr22" all dimensions from the signed first-derivative lobe, first order
-            only and biased for n > 1 (Fischer and Ritschel 2023), a baseline of the literature.
+            only and biased for n > 1, also in its smoothed value (Fischer and Ritschel 2023), a baseline of the
+            literature.
         antithetic: use every perturbation with both signs.
         baseline: what is subtracted from f. "center" is f(x); "mean" the mean of all other draws, which costs no
             evaluation; "none" nothing. It changes the variance, by orders of magnitude, and not the expectation.
@@ -114,7 +115,7 @@ def _checked_sigma(sigma: Any) -> float | Tensor:
     if isinstance(sigma, Tensor) and sigma.requires_grad:
         raise ValueError("sigma must not require grad: pass sigma.detach()")
     try:
-        values = torch.as_tensor(sigma)
+        values = torch.as_tensor(sigma, dtype=torch.float64 if isinstance(sigma, float) else None)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"sigma must be a positive number or a tensor [n], got {sigma!r}") from error
     if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torch_zerohess import kernels
 from torch_zerohess.kernels import Redrawn
-from torch_zerohess.linear_map import FIRST_ORDER_ERROR, FirstOrderOnly, Samples, project
+from torch_zerohess.linear_map import FIRST_ORDER_ERROR, Samples, first_order_only, project
 from torch_zerohess.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
 
 
@@ -110,7 +110,7 @@ class Elementwise:
     def ratio(self, d: Tensor, *, zero: bool = False) -> Tensor:
         """Return the quadratic in d [B, n] whose derivatives are the kernels, [B, K]."""
         if self.order == 1:
-            d = FirstOrderOnly.apply(d)
+            d = first_order_only(d)
         kind, i, j = self.rows[:, 2], self.rows[:, 3], self.rows[:, 4]
         d_i, d_j = (d.gather(1, index.expand(len(d), -1)) for index in (i, j))  # its backward has a vmap rule
         hessian = torch.where(kind == DIAGONAL_LOBE, 0.5, 1.0) * d_i * d_j
@@ -145,7 +145,7 @@ class SignedLobes:
 
     def ratio(self, d: Tensor, *, zero: bool = False) -> Tensor:
         """Return 1 + k.d, [B, K], differentiable once in d [B, n]."""
-        return 1.0 + project(self.u, FirstOrderOnly.apply(d)[:, None], zero=zero)[:, 0]
+        return 1.0 + project(self.u, first_order_only(d)[:, None], zero=zero)[:, 0]
 
     def subset(self, index: Tensor) -> "SignedLobes":
         """Return the draws index [D, r], r rows each, as a batch of B * D estimates."""

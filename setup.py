@@ -5,6 +5,7 @@ from inside pip's isolated build environment, which hides the packages of the en
 """
 
 import importlib.util
+import re
 import sys
 import sysconfig
 from pathlib import Path
@@ -33,7 +34,18 @@ def find_torch() -> Path | None:
     spec = importlib.util.find_spec("torch")
     if spec and spec.origin:
         installed.append(Path(spec.origin).parent)
-    return next((folder for folder in installed if (folder / "include/torch/csrc/stable/library.h").exists()), None)
+    return next((folder for folder in installed if recent(folder)), None)
+
+
+def recent(folder: Path) -> bool:
+    """Whether a folder has torch 2.10 or later with its headers."""
+    version = re.search(r"__version__ = '(\d+)\.(\d+)", _text(folder / "version.py"))
+    headers = (folder / "include/torch/csrc/stable/library.h").exists()
+    return headers and version is not None and tuple(map(int, version.groups())) >= (2, 10)
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
 
 
 class BuildIfPossible(build_ext):

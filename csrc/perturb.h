@@ -41,7 +41,7 @@ inline Row pick(int64_t seed, int64_t index, int64_t n, int64_t proposal) {
 }
 
 // u of columns first .. first + count of one row; first is even, count <= kBlock, out has room for kBlock numbers.
-ZH_CLONES inline void draw_columns(const Row& row, int64_t first, int64_t count, double* out) {
+ZH_CLONES static inline void draw_columns(const Row& row, int64_t first, int64_t count, double* out) {
   uniforms(uint64_t(row.seed), uint64_t(row.index), kDimensions, first, (count + 1) / 2, out);
   const int64_t i = row.i - first, j = row.j - first;
   const double p_i = i >= 0 && i < count ? out[i] : 0.5, p_j = j >= 0 && j < count ? out[j] : 0.5;
@@ -67,7 +67,7 @@ ZH_INLINE double place(double x, double sigma, double u, T* point) {
 }
 
 // Density ratio N(u) / p(u) of one row of n applied perturbations.
-ZH_CLONES inline double weight(const double* u, int64_t n, int64_t proposal) {
+ZH_CLONES static inline double weight(const double* u, int64_t n, int64_t proposal) {
   if (proposal == kGaussian || proposal == kSignedLobes) return 1.0;
   double first[8] = {}, second[8] = {}, hole[8] = {};
   for (int64_t d = 0; d < n; d += 8) {

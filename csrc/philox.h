@@ -4,7 +4,11 @@
 #include <cstdint>
 #include <cstring>
 
-#define ZH_INLINE static inline __attribute__((always_inline))
+#if defined(_MSC_VER)
+#define ZH_INLINE static __forceinline
+#else
+#define ZH_INLINE static inline __attribute__((always_inline))  // also into functions made for one instruction set
+#endif
 
 namespace zerohess {
 

@@ -35,7 +35,7 @@ struct DrawnRows {
   }
 };
 
-ZH_CLONES inline double dot(const double* a, const double* b, int64_t count) {
+ZH_CLONES static inline double dot(const double* a, const double* b, int64_t count) {
   double lanes[8] = {}, rest = 0.0;
   int64_t d = 0;
   for (; d + 8 <= count; d += 8)
@@ -44,11 +44,11 @@ ZH_CLONES inline double dot(const double* a, const double* b, int64_t count) {
   return ((lanes[0] + lanes[4]) + (lanes[2] + lanes[6])) + ((lanes[1] + lanes[5]) + (lanes[3] + lanes[7])) + rest;
 }
 
-ZH_CLONES inline void add_scaled(double scale, const double* u, int64_t count, double* out) {
+ZH_CLONES static inline void add_scaled(double scale, const double* u, int64_t count, double* out) {
   for (int64_t d = 0; d < count; ++d) out[d] += scale * u[d];
 }
 
-ZH_CLONES inline void add_scaled_squares(double scale, const double* u, int64_t count, double* out) {
+ZH_CLONES static inline void add_scaled_squares(double scale, const double* u, int64_t count, double* out) {
   for (int64_t d = 0; d < count; ++d) out[d] += scale * (u[d] * u[d]);
 }
 

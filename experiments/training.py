@@ -159,7 +159,7 @@ def _model(method: Method, layer: zh.BlackBox, encoder: nn.Module, images: Tenso
 
     The white box ends at the predictions y [B, 1]; Newton-CG goes through them with J^T (d2/dy2) J.
     """
-    y, fn, smoothing = encoder(images), layer.call.fn, layer.smoothing
+    y, fn, smoothing = encoder(images), layer.fn, layer.smoothing
     local = zh.estimate(fn, y, smoothing, images)
     if method.differences:
         # With one parameter, one product is the whole Hessian; a pair cancels every baseline of a gradient.

@@ -407,7 +407,7 @@ def test_state_dict_resumes_the_settings() -> None:
     buffer = io.BytesIO()
     torch.save(source.state_dict(), buffer)
     buffer.seek(0)
-    for state in (source.state_dict(), torch.load(buffer, weights_only=False)):
+    for state in (source.state_dict(), torch.load(buffer)):
         target = nn.Sequential(nn.Linear(2, N), BlackBox(module_level, AGGREGATE)).double()
         target.load_state_dict(state)
         assert (target[1].smoothing.sigma, target[1].smoothing.samples) == (0.0123, 4)

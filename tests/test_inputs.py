@@ -86,7 +86,7 @@ POINTS = [
     (torch.ones(2, dtype=torch.complex128), TypeError, r"x must be float32 or float64, got torch\.complex128"),
     (torch.ones(2, dtype=torch.float16), TypeError, r"x must be float32 or float64, got torch\.float16"),
     (torch.ones(2, dtype=torch.bool), TypeError, r"x must be float32 or float64, got torch\.bool"),
-    (torch.ones(0), ValueError, r"x must have shape \[\*batch, n\] with at least one parameter, got \[0\]"),
+    (torch.ones(0), ValueError, r"x must have shape \[\*batch, n\] with n and every batch dimension > 0, got \[0\]"),
     (torch.ones(0, 3), ValueError, r"x must have shape \[\*batch, n\].*got \[0, 3\]"),
     (torch.tensor(1.0), ValueError, r"x must have shape \[\*batch, n\].*got \[\]"),
     ([0.1, 0.2], TypeError, r"x must be a torch tensor \[\*batch, n\], got list"),

@@ -8,6 +8,10 @@ from pathlib import Path
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
 
+def test_nothing_is_left_to_fill_in():
+    assert "@@" not in README
+
+
 def test_python_blocks_run():
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert blocks

@@ -1,6 +1,7 @@
 """The drop-in layer: a function that can only be called, as a torch module with derivatives to second order."""
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -61,7 +62,7 @@ class BlackBox(nn.Module):
             raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
         self.smoothing = smoothing
         self.call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite)
-        self.output_shape: torch.Size | None = None
+        self.output_shapes: dict[tuple[int | torch.Size, ...], torch.Size] = {}
         self._handle = opaque.register(self)
 
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
@@ -88,8 +89,8 @@ class BlackBox(nn.Module):
         smoothed black box, with derivatives of every order and no further evaluation.
         """
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
-        center = x.detach().reshape(-1, n)
-        reduction = self._evaluate(center, folded_aux(aux, batch))
+        center = x.detach().reshape(-1, n).clone()
+        reduction = self._evaluate(center, folded_aux(_without_grad(aux), batch))
         smoothing = self.smoothing
 
         def frozen(z: Tensor) -> Tensor:
@@ -111,16 +112,19 @@ class BlackBox(nn.Module):
         if opaque.transformed(x):
             result: Tensor = torch.ops.torch_zerohess.evaluate_center(self._handle, x, aux)
             return result
-        values = evaluate_center(self.call, x, aux)
-        self.output_shape = values.shape[1:]
-        return values.to(x.dtype)
+        return evaluate_center(self.call, x, aux).to(x.dtype)
 
-    def get_extra_state(self) -> Smoothing:
+    @property
+    def fn(self) -> Callable[..., Any]:
+        """The black box itself."""
+        return self.call.fn
+
+    def get_extra_state(self) -> dict[str, Any]:
         """The settings travel with the state_dict, so that an annealed sigma is resumed."""
-        return self.smoothing
+        return {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
 
-    def set_extra_state(self, state: Smoothing) -> None:
-        self.smoothing = state
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self.smoothing = Smoothing(**state)
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key != "_handle"}
@@ -186,19 +190,31 @@ def _value(reduction: Reduction, x: Tensor, center: Tensor, smoothing: Smoothing
 
 def _differentiated(x: Tensor) -> bool:
     """Whether anybody may ask for a derivative with respect to x; where in doubt, yes."""
-    if not torch.compiler.is_compiling():
-        if torch._C._functorch.maybe_current_level() is not None:
-            return True
-        if forward_ad._current_level >= 0 and forward_ad.unpack_dual(x).tangent is not None:
-            return True
-    return torch.is_grad_enabled() and x.requires_grad
+    forward_mode = forward_ad._current_level >= 0
+    if torch.compiler.is_compiling():
+        return forward_mode or (torch.is_grad_enabled() and x.requires_grad)
+    return torch._C._functorch.maybe_current_level() is not None or _asked_for(x)
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     for number, one in enumerate(aux):
-        if isinstance(one, Tensor) and one.requires_grad and torch.is_grad_enabled():
+        if isinstance(one, Tensor) and _asked_for(one):
             raise ValueError(
                 f"aux[{number}] requires grad, but the black box is differentiated with respect to x alone: "
                 "pass it detached, or as part of x"
             )
     return aux
+
+
+def _asked_for(one: Tensor) -> bool:
+    """Whether a derivative with respect to a tensor is wanted at any level of nested transforms."""
+    if torch.compiler.is_compiling():
+        return torch.is_grad_enabled() and one.requires_grad
+    while True:
+        if one.requires_grad and torch.is_grad_enabled():
+            return True
+        if forward_ad._current_level >= 0 and forward_ad.unpack_dual(one).tangent is not None:
+            return True
+        if not torch._C._functorch.is_functorch_wrapped_tensor(one):
+            return False
+        one = torch._C._functorch.get_unwrapped(one)

@@ -141,13 +141,18 @@ def black_box_inputs(outputs: Tensor) -> list[Tensor]:
     found = {_edge(one): one for one in _entries(outputs.grad_fn)}
     if not found:
         raise ValueError(
-            "mode 'gauss_newton' found no BlackBox layer between inputs and outputs: name the tensors at which the "
-            "white box ends in `through`"
+            "mode 'gauss_newton' found no BlackBox layer between inputs and outputs (one that is compiled cannot be "
+            "found): name the tensors at which the white box ends in `through`"
         )
     for one in found.values():
         if _entries(one.grad_fn):
             raise ValueError(
                 "mode 'gauss_newton' needs black boxes side by side, but one stands behind another: use mode 'exact'"
+            )
+        if _edges_before(one.grad_fn) & found.keys():
+            raise ValueError(
+                "mode 'gauss_newton' found a black box whose input is computed from the input of another: name in "
+                "`through` the tensors that both come from"
             )
     return list(found.values())
 
@@ -165,6 +170,19 @@ def _entries(node: Node | None) -> list[Tensor]:
                 seen.add(following)
                 stack.append(following)
     return found
+
+
+def _edges_before(node: Node | None) -> set[tuple[object, int]]:
+    """Gradient edges that lead into a node, without its own."""
+    seen: set[tuple[object, int]] = set()
+    stack = [node]
+    while stack:
+        current = stack.pop()
+        for following, number in current.next_functions if current is not None else ():
+            if following is not None and (following, number) not in seen:
+                seen.add((following, number))
+                stack.append(following)
+    return seen
 
 
 def _edge(tensor: Tensor) -> tuple[object, int]:

@@ -9,7 +9,7 @@ import torch
 from torch_zerohess import extension
 from torch_zerohess.adapters import mitsuba
 
-_OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "kornia", "scikit-image", "numpy")
+_OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "numpy")
 
 
 @dataclass(frozen=True)

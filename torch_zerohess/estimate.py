@@ -78,7 +78,9 @@ class Estimate:
         if (quantity == "hvp") != (v is not None):
             raise ValueError("v is the vector of quantity 'hvp': give it there and only there")
         t = None if v is None else self._vector(v)
-        result = variance(self._stein, quantity, self._a, draws(self._smoothing, len(self._sigma)), t).sqrt()
+        result = variance(
+            self._stein, quantity, self._a, self._evaluations.share, draws(self._smoothing, len(self._sigma)), t
+        ).sqrt()
         if quantity == "value":
             return self._shaped(result)
         scale = self._sigma**2 if quantity == "hessian_diagonal" else self._sigma
@@ -152,7 +154,7 @@ def estimate(
     if not isinstance(smoothing, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
     call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite)
-    x = checked_input(x).detach()
+    x = checked_input(x).detach().clone()
     batch, flat = x.shape[:-1], x.reshape(-1, x.shape[-1])
     keep = stored(smoothing, *flat.shape)
     return Estimate(evaluate(call, flat, folded_aux(aux, batch), smoothing, keep), batch, x, smoothing)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_zerohess.evaluators import Evaluator, Inline
 from torch_zerohess.perturbations import Perturbations, draws, perturb
 from torch_zerohess.smoothing import Smoothing
-from torch_zerohess.stein import Elementwise, Stein
+from torch_zerohess.stein import Elementwise, Stein, total
 
 ValueMode = Literal["center", "smoothed"]
 
@@ -55,7 +55,7 @@ class BlackBoxCall:
                 + ("" if self.vectorized else " from single points")
                 + ("; for a function of one point pass vectorized=False" if self.vectorized else "")
             )
-        return values.to(points.device)
+        return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
 
     def _each(self, points: Tensor, *aux: Tensor) -> Tensor:
         return torch.stack([_tensor(self.fn(*one)) for one in zip(points, *aux, strict=True)])
@@ -74,8 +74,13 @@ class Evaluations:
     """What the estimate returns as value, float64 [B, *out]: f(x), or the smoothed value."""
     coefficients: Tensor
     """(f_k - baseline) / K, float64 [B, K, *out]."""
-    dropped: int
-    """Evaluations left out because they, or the other one of their pair, were not finite."""
+    share: Tensor
+    """Weight of each row in a mean, [B, K]: 1/K, or zero where it was dropped and more elsewhere."""
+
+    @property
+    def dropped(self) -> int:
+        """Evaluations left out because they, or the other one of their pair, were not finite."""
+        return int((self.share == 0).sum())
 
 
 def checked_input(x: Any) -> Tensor:
@@ -85,7 +90,7 @@ def checked_input(x: Any) -> Tensor:
     if x.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
     if x.dim() == 0 or x.numel() == 0:
-        raise ValueError(f"x must have shape [*batch, n] with at least one parameter, got {list(x.shape)}")
+        raise ValueError(f"x must have shape [*batch, n] with n and every batch dimension > 0, got {list(x.shape)}")
     return x
 
 
@@ -108,13 +113,15 @@ def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Sm
     values, kept = _finite(values, points, call.on_nonfinite, K, smoothing)
     center = values[:, K] if with_center else None
     values = values[:, :K]
-    baseline, coefficients = _coefficients(values, center, kept, smoothing, n)
+    share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
+    if kept is not None:
+        share = kept / kept.sum(1, keepdim=True).double()
+    baseline, coefficients = _coefficients(values, center, share[..., None], smoothing, n)
     if call.value == "center" and center is not None:
         base = center.double()
     else:
         base = _smoothed_value(values, baseline, coefficients, perturbations.stein)
-    dropped = 0 if kept is None else int((~kept).sum())
-    return Evaluations(perturbations, values, center, base, coefficients, dropped)
+    return Evaluations(perturbations, values, center, base, coefficients, share)
 
 
 def _smoothed_value(values: Tensor, baseline: Tensor, coefficients: Tensor, stein: Stein) -> Tensor:
@@ -134,15 +141,11 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
 
 
 def _coefficients(
-    values: Tensor, center: Tensor | None, kept: Tensor | None, smoothing: Smoothing, n: int
+    values: Tensor, center: Tensor | None, share: Tensor, smoothing: Smoothing, n: int
 ) -> tuple[Tensor, Tensor]:
     """Mean baseline [B, *out] and (f - baseline) / K [B, K, *out]; dropped rows weigh nothing, the others more."""
     B, K = values.shape[:2]
     f = values.double().reshape(B, K, -1)
-    share = torch.full((B, K, 1), 1.0 / K, dtype=torch.float64, device=f.device)
-    if kept is not None:
-        share = kept[..., None] / kept.sum(1).double()[:, None, None]
-        f = torch.where(kept[..., None], f, 0.0)
     if smoothing.baseline == "none":
         mean, coefficients = torch.zeros_like(f[:, 0]), f * share
     elif smoothing.baseline == "center" and center is not None:
@@ -150,7 +153,7 @@ def _coefficients(
         coefficients = (f - mean[:, None]) * share
     else:
         baseline = _mean_of_others(f, share, draws(smoothing, n))
-        mean, coefficients = (baseline * share).sum(1), (f - baseline) * share
+        mean, coefficients = total(baseline * share)[:, 0], (f - baseline) * share
     return mean.reshape((B, *values.shape[2:])), coefficients.reshape(values.shape)
 
 
@@ -167,13 +170,13 @@ def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
     # Differences to one of the values keep the precision of a small variation on a large offset.
     origin = f[:, :1]
     shifted = (f - origin) * share
-    total, result = shifted.sum(1, keepdim=True), torch.empty_like(f)
+    whole, result = total(shifted), torch.empty_like(f)
     for part in draws:
         index = part.to(f.device)
         own, own_share = shifted[:, index].sum(2), share[:, index].sum(2)
         if bool((own_share > 1.0 - 1e-12).any()):
             raise ValueError("on_nonfinite='drop' left one independent draw, baseline 'mean' needs two: use 'center'")
-        others = (total - own) / (1.0 - own_share)
+        others = (whole - own) / (1.0 - own_share)
         result[:, index] = others[:, :, None].expand(-1, -1, part.shape[1], -1)
     return origin + result
 
@@ -186,7 +189,9 @@ def _finite(
     if not bool(bad.any()):
         return values, None
     if on_nonfinite != "drop" or bool(bad[:, K:].any()):
-        where = bad.nonzero()[0] if on_nonfinite != "drop" else torch.nonzero(bad[:, K:])[0] + torch.tensor([0, K])
+        where = bad.nonzero()[0]
+        if on_nonfinite == "drop":  # the center cannot be dropped
+            where = torch.tensor([int(bad[:, K].nonzero()[0]), K])
         rule = "raise" if on_nonfinite == "drop" else on_nonfinite
         return _replaced(values, where, points, rule), None
     kept = ~bad[:, :K]
@@ -219,6 +224,7 @@ def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) 
 
 def _tensor(result: Any) -> Tensor:
     try:
-        return torch.as_tensor(result)
+        # Numbers of Python have the precision of float64, not that of torch's default.
+        return torch.as_tensor(result, dtype=torch.float64 if isinstance(result, float) else None)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

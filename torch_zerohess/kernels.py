@@ -102,7 +102,13 @@ def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
     if isinstance(u, Tensor):
         if _compiled(u) and a.shape[1] <= _MANY_VECTORS and u.shape[2] <= _WIDE:
             return torch.ops.torch_zerohess.hessian(u.contiguous(), a.contiguous())
-        result = (u.mT[:, None] * a[:, :, None]) @ u[:, None]
+        if a.shape[1] > u.shape[2]:  # many vectors, few parameters: outer products of the samples, in pieces
+            rows = max(1, _CHUNK // u.shape[2] ** 2)
+            pieces = zip(u.split(rows, 1), a.split(rows, 2), strict=True)
+            flat = _total(part @ (one[..., :, None] * one[..., None, :]).flatten(2) for one, part in pieces)
+            result = flat.unflatten(2, (u.shape[2], u.shape[2]))
+        else:
+            result = (u.mT[:, None] * a[:, :, None]) @ u[:, None]
         return result.triu() + result.triu(1).mT
     return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
 

@@ -137,6 +137,6 @@ class _NoDerivative(torch.autograd.Function):
 
 
 FIRST_ORDER_ERROR = (
-    "these samples serve first derivatives only (proposal 'fr22' or order=1): "
+    "these samples serve first derivatives only (proposal 'fr22', or 'optimal' with order=1): "
     "use Smoothing(proposal='aggregate', order=2) for Hessians and Hessian-vector products"
 )

@@ -26,7 +26,7 @@ class Owner(Protocol):
 
     call: BlackBoxCall
     smoothing: Smoothing
-    output_shape: torch.Size | None
+    output_shapes: dict[tuple[int | torch.Size, ...], torch.Size]
 
 
 class Reduction(NamedTuple):
@@ -64,19 +64,19 @@ def evaluate_tensors(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor])
     # Forward mode of torch.autograd.functional maps over tangents only, but forbids random numbers in everything below.
     with torch._C._ExcludeDispatchKeyGuard(_VMAP_MODE):
         result = evaluate(owner.call, x, aux, owner.smoothing, keep)
-    owner.output_shape = result.base.shape[1:]
+    owner.output_shapes[_signature(x, aux)] = result.base.shape[1:]
     perturbations: Perturbations = result.perturbations
     B, K, n = perturbations.points.shape
     stein = perturbations.stein
     u = stein.u if isinstance(stein, (LikelihoodRatio, SignedLobes)) else None
     weight = stein.weight if isinstance(stein, (LikelihoodRatio, Elementwise)) else None
     return Reduction(
-        result.base.contiguous(),
+        result.base.clone(),
         result.coefficients,
         u if isinstance(u, Tensor) else result.base.new_empty(B, 0, n),
         result.base.new_empty(B, K) if weight is None else weight,
         perturbations.rows.view(B, -1, 5),
-        perturbations.sigma,
+        perturbations.sigma.clone(),  # not the settings' own tensor: compiled code reuses the buffers it is given
     )
 
 
@@ -103,8 +103,8 @@ def _evaluate(
 @torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=())
 def _evaluate_center(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
     values = evaluate_center(_owners[handle].call, x, aux)
-    _owners[handle].output_shape = values.shape[1:]
-    return values.to(x.dtype, copy=True)
+    _owners[handle].output_shapes[_signature(x, aux)] = values.shape[1:]
+    return values.to(x.dtype)
 
 
 @_evaluate.register_fake
@@ -114,36 +114,12 @@ def _(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> tuple[Te
     B, n = x.shape
     S = K // (1 + owner.smoothing.antithetic)
     empty = functools.partial(x.new_empty, dtype=torch.float64)
-    return (
-        empty(
-            (
-                B,
-                *out,
-            )
-        ),
-        empty(
-            (
-                B,
-                K,
-                *out,
-            )
-        ),
-        empty(
-            (
-                B,
-                K if keep else 0,
-                n,
-            )
-        ),
-        empty(
-            (
-                B,
-                K,
-            )
-        ),
+    coefficients, u, rows = (
+        empty((B, K, *out)),
+        empty((B, K if keep else 0, n)),
         x.new_empty((B, S, 5), dtype=torch.int64),
-        empty((n,)),
     )
+    return empty((B, *out)), coefficients, u, empty((B, K)), rows, empty((n,))
 
 
 @_evaluate_center.register_fake
@@ -151,22 +127,28 @@ def _(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
     return x.new_empty(len(x), *_output_shape(_owners[handle], x, aux))
 
 
+def _signature(x: Tensor, aux: Sequence[Tensor]) -> tuple[int | torch.Size, ...]:
+    """What the shape of one value may depend on."""
+    return (int(x.shape[1]), *(torch.Size(map(int, one.shape[1:])) for one in aux))
+
+
 def _output_shape(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> torch.Size:
-    """Shape of one value: known from an earlier call, or from calling the black box once on zeros and ones."""
-    if owner.output_shape is None:
+    """Shape of one value: known from an earlier call, or from calling the black box once at zero."""
+    signature = _signature(x, aux)
+    if signature not in owner.output_shapes:
         from torch._subclasses.fake_tensor import unset_fake_temporarily
 
         with unset_fake_temporarily(), torch.no_grad():
             probe = torch.zeros(1, int(x.shape[1]), dtype=x.dtype, device=x.device)
             others = [torch.zeros(1, *map(int, one.shape[1:]), dtype=one.dtype, device=one.device) for one in aux]
             try:
-                owner.output_shape = owner.call(probe, others).shape[1:]
+                owner.output_shapes[signature] = owner.call(probe, others).shape[1:]
             except Exception as error:
                 raise RuntimeError(
                     "torch.compile needs the output shape of the black box, and calling it at zero failed: call the "
                     "layer once on real data before compiling it"
                 ) from error
-    return owner.output_shape
+    return owner.output_shapes[signature]
 
 
 def _mapped(info: Any, in_dims: Any, x: Tensor, aux: list[Tensor]) -> tuple[Tensor, list[Tensor]]:

@@ -60,6 +60,8 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
         rows, u = _SAMPLERS[smoothing.sampler](seed, B, n, smoothing, proposal, x.device)
     points, u, weight = kernels.place(u, x64, sigma, smoothing.antithetic, single, proposal)
     _check_moved((u != 0).any(1), x, sigma)
+    if bool((weight == 0).all(1).any()):
+        raise ValueError(f"proposal 'uniform' has no weight left at {n} parameters: use proposal 'aggregate'")
     return Perturbations(points, _stein(smoothing, u, weight, rows), sigma, rows)
 
 

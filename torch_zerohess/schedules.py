@@ -33,6 +33,12 @@ class LinearSigma:
         self._modules = [modules] if isinstance(modules, BlackBox) else list(modules)
         if not self._modules or not all(isinstance(one, BlackBox) for one in self._modules):
             raise TypeError(f"modules must be a BlackBox or several, got {modules!r}")
+        for one in self._modules:
+            if not isinstance(one.smoothing.sigma, float):
+                raise ValueError(
+                    f"modules must have one sigma for all parameters, got {one.smoothing.sigma}: scale the parameters "
+                    "of the black box instead"
+                )
         for name, value in (("start", start), ("end", end)):
             if not value > 0:
                 raise ValueError(f"{name} must be a positive sigma, got {value}")

@@ -1,5 +1,6 @@
 """Settings of the Gaussian smoothing: the one object that says how a black box is sampled."""
 
+import operator
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
@@ -33,7 +34,8 @@ class Smoothing:
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
             perturbations: every call uses the same ones, whatever the number of threads.
-        order: highest derivative that is wanted; 1 leaves out the lobes of the second.
+        order: highest derivative that is wanted; 1 leaves out the lobes made for the second. Second derivatives stay
+            available from "aggregate", with more variance, and not from "optimal".
 
     Raises:
         ValueError, TypeError: a setting is out of its range; the message names it.
@@ -56,10 +58,11 @@ class Smoothing:
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
         seed = 0 if self.seed is None else self.seed
         for name, number, lowest in (("samples", self.samples, 1), ("order", self.order, 1), ("seed", seed, 0)):
-            if isinstance(number, bool) or not isinstance(number, int):
+            if isinstance(number, bool) or not hasattr(number, "__index__"):
                 raise TypeError(f"{name} must be an integer, got {number!r}")
             if number < lowest:
                 raise ValueError(f"{name} must be at least {lowest}, got {number}")
+        object.__setattr__(self, "samples", operator.index(self.samples))
         if self.order > 2:
             raise ValueError(f"order must be 1 or 2, got {self.order}")
         if seed >= 2**63:
@@ -111,11 +114,15 @@ class Smoothing:
         return self.sigma.to(device=device, dtype=torch.float64)
 
 
+# Numbers of Python are float64, whatever the default of torch.
+_PRECISE = {float: torch.float64, list: torch.float64, tuple: torch.float64}
+
+
 def _checked_sigma(sigma: Any) -> float | Tensor:
     if isinstance(sigma, Tensor) and sigma.requires_grad:
         raise ValueError("sigma must not require grad: pass sigma.detach()")
     try:
-        values = torch.as_tensor(sigma, dtype=torch.float64 if isinstance(sigma, float) else None)
+        values = sigma if isinstance(sigma, Tensor) else torch.as_tensor(sigma, dtype=_PRECISE.get(type(sigma)))
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"sigma must be a positive number or a tensor [n], got {sigma!r}") from error
     if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:

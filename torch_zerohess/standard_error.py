@@ -9,30 +9,35 @@ from torch_zerohess.stein import Elementwise, LikelihoodRatio, SignedLobes, Stei
 _CHUNK = 1 << 22  # numbers held at a time
 
 
-def variance(stein: Stein, quantity: str, a: Tensor, draws: list[Tensor], v: Tensor | None) -> Tensor:
+def variance(stein: Stein, quantity: str, a: Tensor, share: Tensor, draws: list[Tensor], v: Tensor | None) -> Tensor:
     """Return the variance of value [B, P], gradient, hessian_diagonal or hvp [B, P, n], in units of sigma.
 
-    a: coefficients [B, P, K]; draws: rows [D, r] of the independent draws, by size; v: [B, P, n] for the hvp.
-    With D draws y_d of expected share s_d of the sum Y, the variance is D/(D-1) sum_d (y_d - s_d Y)^2.
+    a: coefficients [B, P, K]; share: of each row in a mean [B, K], zero where it was dropped; draws: rows [D, r] of the
+    independent draws, by size; v: [B, P, n] for the hvp. With D draws y_d of share s_d of the sum Y, the variance is
+    D/(D-1) sum_d (y_d - s_d Y)^2.
     """
     if isinstance(stein, Elementwise):
         return _elementwise(stein, quantity, a, draws, v)
-    D = sum(len(part) for part in draws)
-    if D < 2:
+    draws = [one.to(a.device) for one in draws]
+    shares = [share[:, one].sum(2) for one in draws]  # [B, D] each
+    D = torch.stack([(one > 0).sum(1) for one in shares]).sum(0).double()
+    if bool((D < 2).any()):
         raise ValueError(
             "a standard error needs at least two independent draws: use more samples (an even number for 'sobol')"
         )
-    total = _apply(stein, quantity, a, v)
-    result = torch.zeros_like(total)
-    for same in draws:
+    whole = _apply(stein, quantity, a, v)
+    tail = (1,) * (whole.dim() - 1)
+    result = torch.zeros_like(whole)
+    for same, their_share in zip(draws, shares, strict=True):
         size = same.shape[1]
-        for part in same.to(a.device).split(max(1, _CHUNK // (size * max(1, total.numel())))):
+        step = max(1, _CHUNK // (size * max(1, whole.numel())))
+        for part, s_d in zip(same.split(step), their_share.split(step, 1), strict=True):
             B, P, count = a.shape[0], a.shape[1], len(part)
             coefficients = a[:, :, part].movedim(2, 1).reshape(B * count, P, size)
             vectors = None if v is None else v.repeat_interleave(count, 0)
             y = _apply(stein.subset(part), quantity, coefficients, vectors).unflatten(0, (B, count))
-            result += ((y - (size / a.shape[2]) * total[:, None]) ** 2).sum(1)
-    return result * (D / (D - 1))
+            result += ((y - s_d.reshape(B, count, *tail) * whole[:, None]) ** 2).sum(1)
+    return result * (D / (D - 1)).reshape(-1, *tail)
 
 
 def _apply(stein: LikelihoodRatio | SignedLobes, quantity: str, a: Tensor, v: Tensor | None) -> Tensor:

@@ -26,6 +26,8 @@ from torch_zerohess.kernels import Redrawn
 from torch_zerohess.linear_map import FIRST_ORDER_ERROR, Samples, first_order_only, project
 from torch_zerohess.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
 
+_BLOCK = 4096
+
 
 @dataclass(frozen=True)
 class LikelihoodRatio:
@@ -37,23 +39,23 @@ class LikelihoodRatio:
     """N(u) / p(u), [B, K]."""
 
     def value(self, a: Tensor) -> Tensor:
-        return (self.weight[:, None] @ a.mT)[:, 0]
+        return total((a * self.weight[:, None]).mT)[:, 0]
 
     def gradient(self, a: Tensor) -> Tensor:
         return kernels.accumulate(self.u, a * self.weight[:, None])
 
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
         a = a * self.weight[:, None]
-        return kernels.accumulate(self.u, a * kernels.project(self.u, v)) - a.sum(2, keepdim=True) * v
+        return kernels.accumulate(self.u, a * kernels.project(self.u, v)) - total(a.mT).mT * v
 
     def hessian_diagonal(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]
-        return kernels.accumulate_squares(self.u, a) - a.sum(2, keepdim=True)
+        return kernels.accumulate_squares(self.u, a) - total(a.mT).mT
 
     def hessian(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]
         result = kernels.hessian(self.u, a)
-        result.diagonal(dim1=2, dim2=3).sub_(a.sum(2, keepdim=True))
+        result.diagonal(dim1=2, dim2=3).sub_(total(a.mT).mT)
         return result
 
     def ratio(self, d: Tensor, *, zero: bool = False) -> Tensor:
@@ -150,6 +152,13 @@ class SignedLobes:
     def subset(self, index: Tensor) -> "SignedLobes":
         """Return the draws index [D, r], r rows each, as a batch of B * D estimates."""
         return SignedLobes(self.u[:, index].flatten(0, 1))
+
+
+def total(a: Tensor) -> Tensor:
+    """Sum [B, K, P] over K to [B, 1, P] block by block: the order of one long sum follows the number of threads."""
+    whole = a.shape[1] // _BLOCK * _BLOCK
+    blocks = a[:, :whole].unflatten(1, (-1, _BLOCK)).sum(2).sum(1, keepdim=True)
+    return blocks + a[:, whole:].sum(1, keepdim=True)
 
 
 Stein = LikelihoodRatio | Elementwise | SignedLobes

@@ -80,13 +80,12 @@ class NewtonCG(Optimizer):
             "max_radius": max_radius,
         }
         super().__init__(params, defaults)
-        if len(self.param_groups) != 1:
-            raise ValueError(f"params must be one group, got {len(self.param_groups)}: the model has one Hessian")
 
     def step(self, closure: Callable[[], Closure]) -> Tensor:  # type: ignore[override]
         """Take one step and return the loss before it, [] without a graph.
 
-        Raises ValueError if the loss or its gradient is not finite; the parameters are then as they were.
+        Raises ValueError if the loss, its gradient or curvature is not finite, and what the closure raises; the
+        parameters are then as they were.
         """
         group: dict[str, Any] = self.param_groups[0]
         parameters = [one for one in group["params"] if one.requires_grad]
@@ -97,23 +96,42 @@ class NewtonCG(Optimizer):
         if not bool(torch.isfinite(loss)) or not bool(torch.isfinite(gradient).all()):
             raise ValueError(f"the loss ({float(loss)}) or its gradient is not finite; no step was taken")
         damping, radius = group["damping"], group["radius"]
+
+        def product(v: Tensor) -> Tensor:
+            length = v.norm()  # of a unit vector, so that float32 parameters neither over- nor underflow
+            return (operator @ (v / length)).double() * length + damping * v
+
         step = steihaug(
-            lambda v: operator @ v + damping * v,
-            gradient,
+            product,
+            gradient.double(),
             radius,
             iterations=group["iterations"],
             tolerance=group["tolerance"],
         )
-        _add(parameters, step.s, 1.0)
+        if not math.isfinite(step.decrease) or not bool(torch.isfinite(step.s).all()):
+            raise ValueError("the curvature of the loss is not finite; no step was taken")
+        before = [one.detach().clone() for one in parameters]
+        with torch.no_grad():
+            for one, part in zip(parameters, step.s.split([one.numel() for one in parameters]), strict=True):
+                one.add_(part.view_as(one).to(one.dtype))
         if group["adapt"] and step.decrease > 0.0:
-            with torch.no_grad():
-                actual = float(loss) - float(_pair(closure())[0])
-            group["radius"] = min(
-                _next_radius(actual / step.decrease, float(step.s.norm()), radius), group["max_radius"]
-            )
-            if not actual > 0.0:
-                _add(parameters, step.s, -1.0)
+            actual = -math.inf
+            try:
+                with torch.no_grad():
+                    actual = float(loss) - float(_pair(closure())[0])
+            finally:
+                if not actual > 0.0:
+                    with torch.no_grad():
+                        torch._foreach_copy_(parameters, before)
+            next_radius = _next_radius(actual / step.decrease, float(step.s.norm()), radius)
+            group["radius"] = min(next_radius, group["max_radius"])
         return loss
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Refuse a second group of parameters: the quadratic model has one Hessian."""
+        if self.param_groups:
+            raise ValueError("params must be one group: the quadratic model has one Hessian")
+        super().add_param_group(param_group)
 
 
 def _pair(result: Closure) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:
@@ -124,9 +142,3 @@ def _next_radius(ratio: float, length: float, radius: float) -> float:
     if not ratio >= 0.25:  # also where it is not a number
         return 0.25 * length
     return 2.0 * radius if ratio > 0.75 and length > 0.99 * radius else radius
-
-
-@torch.no_grad()
-def _add(parameters: list[Tensor], s: Tensor, scale: float) -> None:
-    for one, part in zip(parameters, s.split([one.numel() for one in parameters]), strict=True):
-        one.add_(part.view_as(one).to(one.dtype), alpha=scale)

@@ -43,7 +43,6 @@ def test_without_mitsuba_the_reason_says_what_to_install(monkeypatch: pytest.Mon
 
 
 def test_bogus_llvm_does_not_work_and_the_caller_lives() -> None:
-    pytest.importorskip("mitsuba")
     outcome = adapter.probe("llvm_ad_rgb", Path("/nonexistent/libLLVM.so.19"))
     assert not outcome.works
     assert "LLVM" in outcome.reason
@@ -51,14 +50,12 @@ def test_bogus_llvm_does_not_work_and_the_caller_lives() -> None:
 
 @pytest.mark.parametrize("library", ABORTING or [pytest.param(None, marks=pytest.mark.skip("no LLVM 15 here"))])
 def test_aborting_llvm_does_not_reach_the_caller(library: Path) -> None:
-    pytest.importorskip("mitsuba")
     outcome = adapter.probe("llvm_ad_rgb", library)
     assert not outcome.works
     assert "SIGABRT" in outcome.reason
 
 
 def test_a_child_that_aborts_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mitsuba")
     monkeypatch.setattr(adapter, "_CHILD", "import os, sys; sys.stderr.write('LLVM ERROR: no\\nat 0x1\\n'); os.abort()")
     outcome = adapter.probe("stand-in for an aborting variant")
     assert not outcome.works
@@ -66,14 +63,12 @@ def test_a_child_that_aborts_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_child_that_hangs_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mitsuba")
     monkeypatch.setattr(adapter, "_CHILD", "import time; time.sleep(60)")
     outcome = adapter.probe("stand-in for a hanging variant", timeout=0.2)
     assert outcome == adapter.Probe(False, "the test render did not end within 0.2 s")
 
 
 def test_scalar_always_works_and_a_probe_is_remembered() -> None:
-    pytest.importorskip("mitsuba")
     outcomes = adapter.variants()
     assert outcomes["scalar_rgb"] == adapter.Probe(True, "")
     assert adapter.variants()["scalar_rgb"] is outcomes["scalar_rgb"]
@@ -81,7 +76,6 @@ def test_scalar_always_works_and_a_probe_is_remembered() -> None:
 
 
 def test_select_returns_the_module_with_the_variant_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mitsuba")
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", os.environ.get("DRJIT_LIBLLVM_PATH", ""))
     assert adapter.select_variant("scalar_rgb", threads=1).variant() == "scalar_rgb"
     expected = "llvm_ad_rgb" if adapter.variants()["llvm_ad_rgb"].works and adapter.find_llvm() else "scalar_rgb"
@@ -89,13 +83,11 @@ def test_select_returns_the_module_with_the_variant_set(monkeypatch: pytest.Monk
 
 
 def test_auto_falls_back_to_scalar(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mitsuba")
     monkeypatch.setattr(adapter, "find_llvm", lambda: None)
     assert adapter.select_variant().variant() == "scalar_rgb"
 
 
 def test_explicit_variant_that_does_not_work_raises_with_the_reason() -> None:
-    pytest.importorskip("mitsuba")
     with pytest.raises(RuntimeError, match=r"'no_such_variant' does not work here: .*scalar_rgb"):
         adapter.select_variant("no_such_variant")
     with pytest.raises(ValueError, match="threads must be at least 1"):

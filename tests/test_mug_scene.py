@@ -1,12 +1,10 @@
-"""The mug: what its image may and may not depend on. Rendered small; Mitsuba is optional."""
+"""The mug: what its image may and may not depend on, rendered small."""
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mitsuba")
 
 from experiments.scenes.mug import RADIUS, MugScene, body, handle, to_srgb
 

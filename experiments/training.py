@@ -11,8 +11,8 @@
 The names are those of the source; its second-order steps are a nonlinear conjugate gradient on the weights. J is the
 Jacobian of the network, H the smoothed Hessian of the black box at one image, from one antithetic pair and therefore
 indefinite half of the time: abs takes the magnitude of its eigenvalues. Sigma and the step size (learning rate, trust
-radius) go down linearly over nine tenths of the evaluations. The settings were chosen on seeds 100 to 102, which no
-reported run uses.
+radius) go down linearly over nine tenths of the evaluations. Step sizes and batches were chosen on seeds 100 to 102,
+which no reported run uses, with renders looked up in a table of angles.
 """
 
 import time

@@ -1,0 +1,50 @@
+"""What a fitting task is: a black box, where its runs start, and how far a point is from the solution."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Task:
+    """A black box of n parameters and the truth about it. Tensors are float64; points come in batches [K, n].
+
+    The black box is there in two forms: `loss` returns one number per point, `image` what the loss is computed from,
+    for methods that can use it. One point costs one evaluation in either form.
+    """
+
+    name: str
+    title: str
+    """What is sought, in one line."""
+    parameters: str
+    """Names, units and ranges."""
+    needs: str
+    """What of the full setting the loss depends on, and what is therefore left out."""
+    n: int
+    loss: Callable[[Tensor], Tensor]
+    """[K, n] -> [K]."""
+    start: Callable[[torch.Generator], Tensor]
+    """Draw a start [n]."""
+    sigma: float
+    """Smoothing at the start, in units of the parameters: of the order of the distance to the solution."""
+    evaluations: int
+    """Evaluations that a run may use."""
+    image_error: Callable[[Tensor], float]
+    """Error of x [n] in the image; not counted as an evaluation."""
+    parameter_error: Callable[[Tensor], float]
+    """Mean squared error of x [n], up to symmetries of the task."""
+    bounds: tuple[Tensor, Tensor] | None = None
+    """Lower and upper [n]."""
+    image: Callable[[Tensor], Tensor] | None = None
+    """[K, n] -> [K, *out]."""
+    image_loss: Callable[[Tensor], Tensor] | None = None
+    """White box after `image`: [*out] -> []; differentiable, a mean of squares of `residuals`."""
+    residuals: Callable[[Tensor], Tensor] | None = None
+    """[*out] -> [m] with image_loss = mean(residuals^2), for least-squares methods."""
+    analytic: Callable[[Tensor, float], Tensor] | None = None
+    """Differentiable loss of x [n] convolved with a Gaussian of the given sigma (0: the loss itself), where known."""
+    picture: Callable[[Tensor], Tensor] | None = None
+    """What x [n] looks like: [h, w] or [h, w, 3] in [0, 1]."""
+    target_picture: Tensor | None = None

@@ -1,83 +1,84 @@
-"""Figures of training runs: errors against run time, and pictures of what was predicted."""
+"""Error curves of the methods on a task: both errors against run time and against evaluations, on log-log axes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, BinaryIO
 
 import matplotlib as mpl
 import numpy as np
-import torch
+import numpy.typing as npt
+import tyro
 
-from experiments.records import Record
-from experiments.scenes.mug import to_srgb
-from experiments.tasks.cnn import DEGREES, CnnTask
-from experiments.training import Result
+from experiments.results import METRICS, Run, load
+from experiments.trial import LEVELS
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 
-_POINTS = 120
+_POINTS = 200
+_FLOOR = 1e-8
+"""Relative errors below are drawn here."""
+_AXES = {"seconds": "run time [s]", "evaluations": "evaluations"}
+Array = npt.NDArray[np.float64]
 
 
-def curves(runs: Sequence[Sequence[Record]], path: Path) -> None:
-    """Plot image and parameter error against seconds, a median and a quartile band per method over its runs.
+def plot(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")], /) -> None:
+    """Draw both errors of every task against run time and evaluations into DIR, with quartile bands.
 
-    The image error of a batch is averaged over one twentieth of a run.
+    Args:
+        folder: written by `run`.
     """
-    methods = list(dict.fromkeys(run[0].method for run in runs))
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
-    for axis, quantity in zip(axes, ("image_error", "parameter_error"), strict=True):
-        for method in methods:
-            mine = [run for run in runs if run[0].method == method]
-            _band(axis, mine, quantity, method)
-        axis.set(xscale="log", yscale="log", xlabel="run time [s]")
-        axis.grid(which="major", alpha=0.3)
-    axes[0].set_ylabel("image error of new images (MSE)")
-    axes[1].set_ylabel("held-out parameter error (MSE, [20°]²)")
-    axes[1].legend(frameon=False)
-    figure.savefig(path, dpi=130)
+    for task, methods in load(folder).runs.items():
+        path = folder / f"{task}.png"
+        curves(task, methods, path)
+        print(path)
+
+
+def curves(task: str, methods: dict[str, list[Run]], path: Path | BinaryIO) -> None:
+    """Plot the median of the errors, relative to those at the start, and the band between the quartiles."""
+    figure, axes = plt.subplots(2, 2, figsize=(11, 7), layout="constrained", sharex="col", sharey=True)
+    for row, metric in zip(axes, METRICS, strict=True):
+        for axis, against in zip(row, _AXES, strict=True):
+            for (name, runs), style in zip(methods.items(), _styles(), strict=False):
+                _band(axis, runs, metric, against, f"{name} ({len(runs)})", style)
+            for level in LEVELS:
+                axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
+            axis.set(xscale="log", yscale="log")
+            axis.grid(which="major", alpha=0.3)
+        row[0].set_ylabel(f"{metric} error / error at the start")
+    for axis, label in zip(axes[1], _AXES.values(), strict=True):
+        axis.set_xlabel(label)
+    handles, labels = axes[0][1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", frameon=False, title="method (runs)")
+    figure.suptitle(f"{task}: median and quartiles")
+    figure.savefig(path, dpi=110, format="png")
     plt.close(figure)
 
 
-def _band(axis: Any, runs: Sequence[Sequence[Record]], quantity: str, label: str) -> None:
-    end = min(run[-1].seconds for run in runs)
-    start = max(run[0].seconds for run in runs)
-    grid = np.geomspace(max(start, end / 300), end, _POINTS)
-    lines = []
-    for run in runs:
-        seconds = np.array([record.seconds for record in run])
-        values = np.array([getattr(record, quantity) for record in run])
-        if quantity == "image_error":
-            width = max(1, len(run) // 20)
-            padded = np.concatenate([np.full(width - 1, values[0]), values])
-            values = np.convolve(padded, np.ones(width) / width, mode="valid")
-        lines.append(np.interp(grid, seconds, values))
-    low, middle, high = np.quantile(lines, (0.25, 0.5, 0.75), axis=0)
-    (line,) = axis.plot(grid, middle, label=f"{label} ({len(runs)} runs)" if len(runs) > 1 else label)
-    axis.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+def _styles() -> Iterator[dict[str, Any]]:
+    return ({"color": f"C{color}", "linestyle": line} for line in cycle(("-", "--", ":")) for color in range(10))
 
 
-def predictions(task: CnnTask, results: Sequence[Result], path: Path, count: int = 4) -> None:
-    """Show held-out inputs, the render of the untrained prediction and of that of every trained encoder."""
-    images, rotation = task.held_out
-    images, rotation = images[:count], rotation[:count]
-    columns = [("input", images, rotation)]
-    with torch.no_grad():
-        before = results[0].start(images)
-        columns.append(("before training", task.render(before), before))
-        for result in results:
-            after = result.encoder(images)
-            columns.append((f"{result.method}\n{result.seconds:.0f} s", task.render(after), after))
-    rows = len(images)
-    figure, axes = plt.subplots(
-        rows, len(columns), figsize=(1.7 * len(columns), 1.85 * rows + 0.5), layout="constrained", squeeze=False
-    )
-    for column, (title, pictures, angles) in enumerate(columns):
-        for row in range(rows):
-            axis = axes[row][column]
-            axis.imshow(to_srgb(pictures[row].permute(1, 2, 0).numpy()))
-            axis.set(xticks=[], yticks=[])
-            axis.set_xlabel(f"{DEGREES * float(angles[row]):.1f}°", fontsize=9)
-        axes[0][column].set_title(title, fontsize=10)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+def _band(axis: Any, runs: Sequence[Run], metric: str, against: str, label: str, style: dict[str, Any]) -> None:
+    lines = [line for run in runs if len((line := _line(run, metric, against))[0])]
+    if not lines:
+        axis.plot([], [], label=label, **style)
+        return
+    grid = np.geomspace(min(x[0] for x, _ in lines), max(x[-1] for x, _ in lines), _POINTS)
+    # An error holds until the next row; before the first row it is that of the start, after the last one the last.
+    values = [np.concatenate([[1.0], y])[np.searchsorted(x, grid, side="right")] for x, y in lines]
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
+    axis.plot(grid, middle, label=label, **style)
+    axis.fill_between(grid, low, high, color=style["color"], alpha=0.12, linewidth=0)
+
+
+def _line(run: Run, metric: str, against: str) -> tuple[Array, Array]:
+    """Return positions above 0 and relative errors there."""
+    pairs = [
+        (getattr(record, against), error)
+        for record, error in zip(run.records, run.error(metric), strict=True)
+        if error is not None and getattr(record, against) > 0
+    ]
+    x, y = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+    return x, np.maximum(y, _FLOOR)

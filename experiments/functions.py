@@ -12,7 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-_CHUNK = 1 << 19  # pixels rendered at a time: they stay in the cache
+_CHUNK = 1 << 16  # pixels rendered at a time: they stay in the cache
 
 
 class SoftSquares:

@@ -1,141 +1,92 @@
-"""`python -m experiments run TASK`: methods on a task, with a log row per iteration, plots, pictures and a table."""
+"""`python -m experiments run TASK...`: every method on every task, logged row by row, resumed after a kill."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-import torch
 import tyro
-from tqdm import tqdm
 
-from experiments import export, figures
-from experiments.records import Log, Record, read
-from experiments.tables import table
-from experiments.tasks.cnn import DEGREES, PRESETS, CnnTask, Preset
-from experiments.training import METHODS, Method, Result, train
+from experiments.catalogue import FITTING, TRAINING, Preset, chosen
+from experiments.ensemble import Ensemble
+from experiments.methods import METHODS
+from experiments.results import load
+from experiments.summary import as_text, summarize
+from experiments.training import METHODS as TRAINING_METHODS
+from experiments.trial import LIMIT
 
-REDUCTION = 100.0
-"""A run succeeds if it divides the held-out parameter error by this."""
+RUNS = {"fitting": 20, "training": 1}
+"""Runs of each method, if not given."""
 
 
 def run(
-    task: Annotated[Literal["cnn"], tyro.conf.Positional],
+    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="TASK...")],
     /,
-    preset: Literal["fast", "paper"] = "fast",
-    methods: str = ",".join(METHODS),
-    runs: int = 1,
+    methods: str = "all",
+    runs: int | None = None,
+    preset: Preset = "fast",
+    out: Path = Path("results"),
+    jobs: int = 1,
     seed: int = 0,
-    out: Path = Path("results/cnn"),
+    limit: float = LIMIT,
     variant: str = "auto",
     threads: int | None = None,
 ) -> None:
-    """Train with each method and compare them.
+    """Run methods on tasks, or go on with runs that were interrupted: the same command does both.
 
     Args:
-        task: cnn trains a network to predict the rotation of a mug from an image, through a path tracer.
-        preset: fast has 64x64 images and takes minutes; paper the source's sizes, hours.
-        methods: names separated by commas: fr22, our_g, our_h, our_hvp, our_hvpa.
-        runs: independent runs of each method, with seeds from `seed` upward.
-        seed: of the first run.
-        out: folder for logs, figures and the trained encoder; files of the same name are replaced.
-        variant: Mitsuba variant; auto takes a just-in-time one only where it is known to work.
-        threads: render threads; all cores if not given.
+        tasks: names, see `list`; cnn trains a network to predict the rotation of a mug, through a path tracer.
+        methods: names separated by commas, or all that apply.
+        runs: independent runs of each method, with other starts; 20, for cnn 1, if not given.
+        preset: fast takes minutes; paper has the source's sizes.
+        out: folder for logs and all that is made from them.
+        jobs: processes, one thread each (not for cnn); the results do not depend on it.
+        seed: number of the first run.
+        limit: seconds that a run may take (not for cnn).
+        variant: Mitsuba variant of cnn; auto takes a just-in-time one only where it is known to work.
+        threads: render threads of cnn; all cores if not given.
     """
-    chosen = parse_methods(methods)
-    if runs < 1:
+    names = chosen("TASK", tasks, [*FITTING, *TRAINING])
+    fitting, training = [name for name in names if name in FITTING], [name for name in names if name in TRAINING]
+    wanted = None
+    if methods.strip() != "all":
+        known = [*(METHODS if fitting else ()), *(TRAINING_METHODS if training else ())]
+        wanted = chosen("methods", methods.split(","), list(dict.fromkeys(known)))
+    if runs is not None and runs < 1:
         raise SystemExit(f"runs must be at least 1, got {runs}")
-    train_all(PRESETS[preset], chosen, range(seed, seed + runs), out, variant, threads)
+    try:
+        if fitting:
+            _fit(fitting, wanted, _range(seed, runs, "fitting"), preset, out, jobs, limit)
+        if training:
+            _train(wanted, _range(seed, runs, "training"), preset, out, variant, threads)
+    except KeyboardInterrupt:
+        raise SystemExit(f"\ninterrupted; the same command goes on where it was, logs are in {out}") from None
 
 
-def parse_methods(names: str) -> list[Method]:
-    """Return methods by their names separated by commas; SystemExit names those that do not exist."""
-    found = [name.strip() for name in names.split(",") if name.strip()]
-    unknown = [name for name in found if name not in METHODS]
-    if unknown or not found:
-        raise SystemExit(f"methods must be some of {', '.join(METHODS)}, got {', '.join(unknown) or 'none'}")
-    return [METHODS[name] for name in dict.fromkeys(found)]
+def _range(seed: int, runs: int | None, kind: str) -> range:
+    return range(seed, seed + (RUNS[kind] if runs is None else runs))
 
 
-def train_all(
-    preset: Preset, methods: Sequence[Method], seeds: Sequence[int], out: Path, variant: str, threads: int | None
-) -> list[Result]:
-    """Train every method from every seed; write logs, figures, encoder and table into `out`."""
-    torch.set_num_threads(1)  # small tensors: a second thread costs more than it gives
-    results: list[Result] = []
-    scene = preset.scene(variant, threads)
-    print(f"Mitsuba {scene.variant}, {preset.film}x{preset.film} pixels, {preset.spp} samples per pixel", flush=True)
-    for seed in seeds:
-        task = CnnTask(preset, seed, scene)
-        print(f"rendering {preset.images} training and {preset.held_out} held-out images, seed {seed}", flush=True)
-        _, _ = task.training, task.held_out
-        results += [_one(task, method, out, len(seeds)) for method in methods]
-    logs = [list(read(_log(out, result.method, result.run))) for result in results]
-    figures.curves(logs, out / "errors.png")
-    first = [result for result in results if result.run == seeds[0]]
-    figures.predictions(task, first, out / "predictions.png")
-    print("\n" + summary(results))
-    print(f"\nerrors against run time: {out / 'errors.png'}\npredictions: {out / 'predictions.png'}\nlogs: {out}")
-    if export.missing():
-        print(f"not exported to ONNX: pip install {' '.join(export.missing())}")
-    else:
-        path = out / f"encoder-{first[-1].method}.onnx"
-        difference = export.export(first[-1].encoder, task.held_out[0], path)
-        print(f"encoder: {path}, onnxruntime predicts the same to {DEGREES * difference:.1e} degrees")
-    return results
+def _fit(
+    tasks: list[str], methods: list[str] | None, runs: range, preset: Preset, out: Path, jobs: int, limit: float
+) -> None:
+    ensemble = Ensemble(out, runs, preset, jobs, limit)
+    names = None if methods is None else [name for name in methods if name in METHODS]
+    try:
+        planned = ensemble.plan(tasks, names)
+    except ImportError as error:
+        raise SystemExit(str(error)) from None
+    outcomes = ensemble.run(planned)
+    print("\n" + as_text(summarize(load(out, tasks))))
+    print(f"\n{len(outcomes)} of {len(planned)} runs have ended; logs are in {out}")
+    print(f"figures: python -m experiments plot {out}\npage: python -m experiments report {out}")
 
 
-def _one(task: CnnTask, method: Method, out: Path, runs: int) -> Result:
-    log = Log(_log(out, method.name, task.seed))
-    name = method.name if runs == 1 else f"{method.name} {task.seed}"
-    with tqdm(total=task.preset.evaluations, unit=" renders", desc=f"{name:>8}", dynamic_ncols=True) as bar:
+def _train(
+    methods: list[str] | None, runs: range, preset: Preset, out: Path, variant: str, threads: int | None
+) -> None:
+    from experiments.run_cnn import train_all  # needs Mitsuba
+    from experiments.tasks.cnn import PRESETS
 
-        def report(record: Record) -> None:
-            log(record)
-            error = DEGREES * (record.parameter_error or 0.0) ** 0.5
-            bar.set_postfix_str(f"error {error:.2f} degrees, sigma {record.sigma:.2f}", refresh=False)
-            bar.update(record.evaluations - bar.n)
-
-        try:
-            return train(task, method, task.seed, report)
-        finally:
-            log.close()
-
-
-def _log(out: Path, method: str, seed: int) -> Path:
-    return out / f"{method}-{seed}.jsonl"
-
-
-def summary(results: Sequence[Result]) -> str:
-    """Return a table with a row per method: medians over its runs, and how many succeeded."""
-    rows = []
-    for name in dict.fromkeys(result.method for result in results):
-        mine = [result for result in results if result.method == name]
-
-        def median(values: list[float]) -> float:
-            return float(torch.tensor(values, dtype=torch.float64).quantile(0.5))
-
-        before, after = (DEGREES * median([one.parameter_error[k] ** 0.5 for one in mine]) for k in (0, 1))
-        share = sum(one.parameter_error[0] >= REDUCTION * one.parameter_error[1] for one in mine)
-        rows.append(
-            [
-                name,
-                median([one.seconds for one in mine]),
-                median([float(one.evaluations) for one in mine]),
-                before,
-                after,
-                median([one.parameter_error[0] / one.parameter_error[1] for one in mine]),
-                median([one.image_error[0] / one.image_error[1] for one in mine]),
-                f"{share}/{len(mine)}",
-            ]
-        )
-    headers = [
-        "method",
-        "seconds",
-        "renders",
-        "rms error before [deg]",
-        "after [deg]",
-        "parameter MSE /",
-        "image MSE /",
-        f"runs beyond {REDUCTION:.0f}x",
-    ]
-    return table(headers, rows)
+    names = TRAINING_METHODS if methods is None else [name for name in methods if name in TRAINING_METHODS]
+    if not names:
+        raise SystemExit(f"methods for cnn must be some of {', '.join(TRAINING_METHODS)}")
+    train_all(PRESETS[preset], [TRAINING_METHODS[name] for name in names], runs, out, variant, threads)

@@ -25,8 +25,8 @@ class Task:
     n: int
     loss: Callable[[Tensor], Tensor]
     """[K, n] -> [K]."""
-    start: Callable[[torch.Generator], Tensor]
-    """Draw a start [n]."""
+    start: Callable[[int], Tensor]
+    """Number of the run -> start [n], the same for every method. Runs from 1000 upward are for tuning."""
     sigma: float
     """Smoothing at the start, in units of the parameters: of the order of the distance to the solution."""
     evaluations: int
@@ -48,3 +48,15 @@ class Task:
     picture: Callable[[Tensor], Tensor] | None = None
     """What x [n] looks like: [h, w] or [h, w, 3] in [0, 1]."""
     target_picture: Tensor | None = None
+    precision: float | None = None
+    """Parameter error that a run should reach beyond the usual levels, where the task is about reaching it."""
+
+
+def uniform(lower: Tensor, upper: Tensor) -> Callable[[int], Tensor]:
+    """Starts that are uniform between lower and upper [n], for `Task.start`."""
+
+    def start(run: int) -> Tensor:
+        generator = torch.Generator().manual_seed(run)
+        return lower + (upper - lower) * torch.rand(len(lower), generator=generator, dtype=torch.float64)
+
+    return start

@@ -15,16 +15,18 @@ radius) go down linearly over nine tenths of the evaluations. Step sizes and bat
 which no reported run uses, with renders looked up in a table of angles.
 """
 
-import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 import torch_zerohess as zh
-from experiments.records import Record
+from experiments.recorder import Recorder
+from experiments.records import Outcome
 from experiments.tasks.cnn import CnnTask
 
 SIGMA = (1.0, 0.1)
@@ -81,48 +83,58 @@ class Result:
     parameter_error: tuple[float, float]
 
 
-def train(task: CnnTask, method: Method, run: int, report: Callable[[Record], None]) -> Result:
-    """Train a new encoder until the evaluations of the preset are used; `report` gets a record per iteration.
+def train(task: CnnTask, method: Method, run: int, recorder: Recorder) -> Result:
+    """Train a new encoder until the evaluations of the preset are used; `recorder` gets a row per iteration.
 
-    The image error of a record is that of its own batch of training images, the parameter error that of the held-out
-    ones. Run r starts from the weights and draws the samples of seed r, the same for all methods.
+    Both errors of the first row are of the held-out images. After that the image error is the mean over the batches of
+    the last twentieth of the run, which costs no renders; the parameter error is that of the held-out images. Run r
+    starts from the weights and draws the samples of seed r, the same for all methods.
     """
-    torch.manual_seed(run)
-    encoder, start = task.preset.encoder(), task.preset.encoder()
-    start.load_state_dict(encoder.state_dict())
+    encoder, start = encoders(task, run)
     steps = max(1, task.preset.evaluations // (method.batch * method.evaluations))
-    layer = zh.BlackBox(task.loss, method.smoothing)
+
+    def black_box(rotation: Tensor, images: Tensor) -> Tensor:
+        return recorder.evaluate(task.loss, rotation, images)
+
+    layer = zh.BlackBox(black_box, method.smoothing)
     sigma = zh.LinearSigma(layer, *SIGMA, steps=max(1, int(_ANNEALED * steps)))
     optimizer = _optimizer(method, encoder)
     batches = _batches(task, method.batch)
-    first = task.image_error(encoder), task.parameter_error(encoder)
-    before, seconds = task.evaluations, 0.0
+    losses: deque[float] = deque(maxlen=max(1, steps // 20))
+    recorder.row(lambda: (task.image_error(encoder), task.parameter_error(encoder)))
     for iteration in range(steps):
-        clock = time.perf_counter()
         _set_step(optimizer, method, min(iteration / (_ANNEALED * steps), 1.0))
-        images = next(batches)
         current = layer.smoothing.sigma
-        loss = _step(optimizer, method, layer, encoder, images)
+        losses.append(_step(optimizer, method, layer, encoder, next(batches)))
         sigma.step()
-        seconds += time.perf_counter() - clock
-        report(
-            Record(
-                "cnn",
-                method.name,
-                run,
-                iteration,
-                seconds,
-                task.evaluations - before,
-                float(current),
-                loss,
-                loss,
-                task.parameter_error(encoder),
-            )
+        recorder.row(
+            lambda: (sum(losses) / len(losses), task.parameter_error(encoder)), sigma=float(current), loss=losses[-1]
         )
-    used = task.evaluations - before
-    last = task.image_error(encoder), task.parameter_error(encoder)
-    errors = (first[0], last[0]), (first[1], last[1])
-    return Result(method.name, run, encoder, start, seconds, used, *errors)
+    return Result(
+        method.name, run, encoder, start, recorder.seconds, recorder.evaluations, *_errors(task, start, encoder)
+    )
+
+
+def encoders(task: CnnTask, run: int) -> tuple[nn.Module, nn.Module]:
+    """Return two encoders with the weights that run r starts from, and seed the samples of its training."""
+    torch.manual_seed(run)
+    encoder, start = task.preset.encoder(), task.preset.encoder()
+    start.load_state_dict(encoder.state_dict())
+    return encoder, start
+
+
+def trained(task: CnnTask, outcome: Outcome, weights: Path) -> Result:
+    """Return the result of a run that has ended, from its outcome and the weights of its encoder."""
+    encoder, start = encoders(task, outcome.run)
+    encoder.load_state_dict(torch.load(weights, weights_only=True))
+    errors = _errors(task, start, encoder)
+    return Result(outcome.method, outcome.run, encoder, start, outcome.seconds, outcome.evaluations, *errors)
+
+
+def _errors(task: CnnTask, start: nn.Module, end: nn.Module) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Image and parameter errors of the held-out images, each before and after training."""
+    image, parameter = ((error(start), error(end)) for error in (task.image_error, task.parameter_error))
+    return image, parameter
 
 
 def _optimizer(method: Method, encoder: nn.Module) -> torch.optim.Optimizer:

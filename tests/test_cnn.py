@@ -3,14 +3,17 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import matplotlib.image
 import pytest
 import torch
 
 from experiments import export
-from experiments.records import Log, Record, read
-from experiments.run import parse_methods, summary, train_all
+from experiments.recorder import Recorder
+from experiments.records import Files, Log, Record, read
+from experiments.run import run
+from experiments.run_cnn import summary, train_all
 from experiments.tasks.cnn import ANGLES, PRESETS, CnnTask, Preset
 from experiments.training import METHODS, train
 
@@ -50,12 +53,14 @@ def test_held_out_images_are_the_same_for_all_seeds_and_new(scene):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_trains_within_its_budget(scene, name):
-    task, records = CnnTask(TINY, 0, scene), []
-    result = train(task, METHODS[name], 0, records.append)
-    method = METHODS[name]
+    task, recorder = CnnTask(TINY, 0, scene), Recorder("cnn", name, 0)
+    result = train(task, METHODS[name], 0, recorder)
+    method, records = METHODS[name], recorder.rows
     per_step = method.batch * method.evaluations
-    assert [r.iteration for r in records] == list(range(TINY.evaluations // per_step))
-    assert records[-1].evaluations == result.evaluations == len(records) * per_step <= TINY.evaluations
+    assert [r.evaluations for r in records] == list(range(0, TINY.evaluations + 1, per_step))
+    assert [r.iteration for r in records] == list(range(len(records)))
+    assert records[-1].evaluations == result.evaluations == task.evaluations
+    assert (records[0].image_error, records[0].parameter_error) == (result.image_error[0], result.parameter_error[0])
     assert all(a.seconds < b.seconds for a, b in itertools.pairwise(records))
     changed = [
         not torch.equal(a, b) for a, b in zip(result.encoder.parameters(), result.start.parameters(), strict=True)
@@ -68,9 +73,9 @@ def test_every_method_trains_within_its_budget(scene, name):
 def test_a_run_repeats_itself(scene, name):
     task, runs = CnnTask(TINY, 0, scene), []
     for _ in range(2):
-        records = []
-        train(task, METHODS[name], 3, records.append)
-        runs.append([(r.evaluations, r.loss, r.parameter_error) for r in records])
+        recorder = Recorder("cnn", name, 3)
+        train(task, METHODS[name], 3, recorder)
+        runs.append([(r.evaluations, r.loss, r.parameter_error) for r in recorder.rows])
     assert runs[0] == runs[1]
 
 
@@ -86,24 +91,56 @@ def test_methods_learn(name):
             return image.expand(-1, 3, 16, 16).contiguous()
 
     task = Bowl(Preset(16, 1, 2, (2, 2, 2), evaluations=1500, images=256, held_out=32), 0, None)
-    result = train(task, METHODS[name], 0, lambda record: None)
+    result = train(task, METHODS[name], 0, Recorder("cnn", name, 0))
     assert result.parameter_error[1] < 0.1 * result.parameter_error[0]
     assert result.image_error[1] < 0.2 * result.image_error[0]
 
 
 def test_command_writes_logs_figures_encoder_and_table(tmp_path, capsys):
-    results = train_all(TINY, parse_methods("our_g, our_hvpa"), range(2), tmp_path, "scalar_rgb", 1)
+    def command():
+        return train_all(TINY, [METHODS["our_g"], METHODS["our_hvpa"]], range(2), tmp_path, "scalar_rgb", 1)
+
+    results, folder = command(), tmp_path / "cnn"
     printed = capsys.readouterr().out
     for method in ("our_g", "our_hvpa"):
         for seed in range(2):
-            rows = [json.loads(line) for line in (tmp_path / f"{method}-{seed}.jsonl").read_text().splitlines()]
+            rows = [json.loads(line) for line in (folder / method / f"{seed}.jsonl").read_text().splitlines()]
             assert {"task", "method", "run", "iteration", "seconds", "evaluations", "sigma"} <= rows[0].keys()
             assert rows[0]["image_error"] > 0
         assert method in printed
     for name in ("errors.png", "predictions.png"):
-        assert matplotlib.image.imread(tmp_path / name).std() > 0.01
-    assert (tmp_path / "encoder-our_hvpa.onnx").exists()
+        assert matplotlib.image.imread(folder / name).std() > 0.01
+    assert (folder / "encoder-our_hvpa.onnx").exists()
     assert summary(results) in printed
+    logs = {path: path.read_bytes() for path in folder.glob("*/*.jsonl")}
+    assert summary(command()) == summary(results)  # nothing is trained twice
+    assert {path: path.read_bytes() for path in folder.glob("*/*.jsonl")} == logs
+
+
+@pytest.mark.parametrize("name", ["our_g", "our_hvpa"])
+@pytest.mark.parametrize("calls", [0, 1, 3])
+def test_an_interrupted_training_goes_on_with_the_same_rows(scene, tmp_path, name, calls):
+    class Interrupted(CnnTask):
+        def loss(self, rotation, image):
+            if calls * len(rotation) <= self.evaluations:
+                raise KeyboardInterrupt
+            return super().loss(rotation, image)
+
+    whole = Recorder("cnn", name, 0)
+    train(CnnTask(TINY, 0, scene), METHODS[name], 0, whole)
+    files = Files(tmp_path, 0)
+    recorder = Recorder("cnn", name, 0, files)
+    with pytest.raises(KeyboardInterrupt):
+        train(Interrupted(TINY, 0, scene), METHODS[name], 0, recorder)
+    recorder.close(ended=False)
+    before = list(read(files.log))
+    recorder, task = Recorder("cnn", name, 0, files), CnnTask(TINY, 0, scene)
+    train(task, METHODS[name], 0, recorder)
+    recorder.close(ended=True)
+    after = list(read(files.log))
+    assert after[: len(before)] == before
+    assert [replace(row, seconds=0.0) for row in after] == [replace(row, seconds=0.0) for row in whole.rows]
+    assert task.evaluations == whole.evaluations - calls * METHODS[name].batch * METHODS[name].evaluations
 
 
 def test_onnx_predicts_the_same(tmp_path):
@@ -126,4 +163,4 @@ def test_log_survives_a_cut_line(tmp_path):
 @pytest.mark.parametrize("names", ["adam", "our_g,adam", ""])
 def test_unknown_methods_are_named(names):
     with pytest.raises(SystemExit, match="fr22, our_g, our_h, our_hvp, our_hvpa"):
-        parse_methods(names)
+        run(("cnn",), methods=names)

@@ -1,19 +1,12 @@
-"""Conjugate gradients inside a trust region (Steihaug 1983; Nocedal and Wright, algorithm 7.2)."""
+"""Conjugate gradients inside a trust region (Steihaug 1983; Nocedal and Wright, algorithm 7.2), aware of noise."""
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-
-class Step(NamedTuple):
-    """A step s [N], the decrease -(g.s + s.Hs/2) that the model promises, and why the iteration ended."""
-
-    s: Tensor
-    decrease: float
-    exit: str
-    """ "converged", "boundary", "negative curvature" or "iterations"."""
+from torch_zerohess.optim.newton_step import Step
 
 
 def steihaug(
@@ -23,42 +16,78 @@ def steihaug(
     *,
     iterations: int,
     tolerance: float,
+    noise: float = 0.0,
 ) -> Step:
-    """Minimise g.s + s.Hs/2 over |s| <= radius, H v = product(v), g = gradient [N].
+    """Minimise g.s + s.Hs/2 over |s| <= radius, H v = product(v) [N], g = gradient [N].
 
-    Stops when the residual is `tolerance` times the gradient, on the boundary, along the first direction of negative
-    curvature (followed to the boundary), or after `iterations` products. The decrease never falls from one iterate to
-    the next, so that an early stop is a valid step.
+    Stops when the residual is `tolerance` times the gradient ("converged"), on the boundary ("boundary"), along the
+    first direction of negative curvature, followed to the boundary ("negative curvature"), or after `iterations`
+    products ("iterations"). The decrease never falls from one iterate to the next, so that an early stop is a valid
+    step.
+
+    Where g and H are means of R independent estimates, gradient [R, N] and product(v) [R, N] may give all of them.
+    Their spread tells the error of the residual g + H s and of the curvature d.Hd along a direction, and iterations
+    stop ("noise") when the residual, or the curvature, is of the size that errors alone would have (see `noise_level`):
+    what follows would be fitted to the noise, and grows without limit in flat directions. If the curvature of the very
+    first direction is that uncertain, it is taken at the upper end of its error.
     """
-    s, residual = torch.zeros_like(gradient), gradient.clone()
+    residuals = gradient.reshape(-1, gradient.shape[-1]).clone()
+    residual = residuals.mean(0)
+    g, s = residual, torch.zeros_like(residual)
     direction = -residual
     square = residual.dot(residual)
     goal = tolerance * square.sqrt()
-    curvature_s = torch.zeros_like(gradient)  # H s, kept for the decrease
+    images_s = torch.zeros_like(residual)  # H s, kept for the decrease
 
     def finish(step: Tensor, image: Tensor, reason: str) -> Step:
-        return Step(step, -float(gradient.dot(step) + 0.5 * step.dot(image)), reason)
+        return Step(step, -float(g.dot(step) + 0.5 * step.dot(image)), reason)
 
     if float(square) == 0.0:
-        return Step(s, 0.0, "converged")
-    for _ in range(iterations):
-        image = product(direction)
+        return finish(s, images_s, "converged")
+    for iteration in range(iterations):
+        if float(square.sqrt()) < noise_level(residuals, noise):
+            return finish(s, images_s, "noise")
+        images = product(direction).reshape(residuals.shape)
+        image = images.mean(0)
         bend = direction.dot(image)
+        error = noise_level((images @ direction)[:, None], noise)
+        uncertain = float(bend.abs()) < error
+        if uncertain and iteration:
+            return finish(s, images_s, "noise")
         # Rounding in a float32 product is not a direction of negative curvature.
-        if float(bend) <= float(direction.dot(direction)) * torch.finfo(direction.dtype).tiny:
+        if not uncertain and float(bend) <= float(direction.dot(direction)) * torch.finfo(direction.dtype).tiny:
             length = _to_boundary(s, direction, radius)
-            return finish(s + length * direction, curvature_s + length * image, "negative curvature")
-        length = square / bend
+            return finish(s + length * direction, images_s + length * image, "negative curvature")
+        length = square / (bend.clamp_min(0.0) + error if uncertain else bend)
         if float((s + length * direction).norm()) >= radius:
             length = _to_boundary(s, direction, radius)
-            return finish(s + length * direction, curvature_s + length * image, "boundary")
-        s, curvature_s = s + length * direction, curvature_s + length * image
-        residual = residual + length * image
+            return finish(s + length * direction, images_s + length * image, "boundary")
+        s, images_s = s + length * direction, images_s + length * image
+        if uncertain:
+            return finish(s, images_s, "noise")
+        residuals = residuals + length * images
+        residual = residuals.mean(0)
         previous, square = square, residual.dot(residual)
         if float(square.sqrt()) <= float(goal):
-            return finish(s, curvature_s, "converged")
+            return finish(s, images_s, "converged")
         direction = -residual + (square / previous) * direction
-    return finish(s, curvature_s, "iterations")
+    return finish(s, images_s, "iterations")
+
+
+def noise_level(estimates: Tensor, noise: float) -> float:
+    """Return the length below which the mean of independent estimates [R, N] does not differ from zero.
+
+    If there is nothing but errors, the squared length of the mean has the expectation tr C and the variance 2 tr C^2,
+    C the covariance of the mean [N, N], here from the spread of the R. The level is the root of that expectation plus
+    `noise` standard deviations: `noise` = 2 is 1.96 standard errors of a number, and tends to one of a long vector.
+    Zero where there is one estimate, or no `noise`.
+    """
+    R = len(estimates)
+    if R < 2 or noise == 0.0:
+        return 0.0
+    deviations = estimates - estimates.mean(0)
+    gram = deviations @ deviations.mT / (R * (R - 1))  # has the trace of C, and C^2 that of its square
+    return float((gram.trace() + noise * math.sqrt(2) * gram.norm()).sqrt())
 
 
 def _to_boundary(s: Tensor, direction: Tensor, radius: float) -> Tensor:

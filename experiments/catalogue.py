@@ -1,0 +1,38 @@
+"""Tasks by name, loaded when they are used, so that nothing is imported that a command does not need."""
+
+import difflib
+import importlib
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+from experiments.task import Task
+
+Preset = Literal["fast", "paper"]
+
+FITTING = {name: f"experiments.tasks.{name}" for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd")}
+"""Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
+TRAINING = {"cnn": "experiments.tasks.cnn"}
+"""Tasks whose unknowns are the weights of a network before the black box."""
+
+
+def load(name: str, preset: Preset = "fast") -> Task:
+    """Return a fitting task; ImportError says what to install."""
+    try:
+        task: Task = importlib.import_module(FITTING[name]).task(preset)
+    except ImportError as error:
+        raise ImportError(
+            f"task {name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'",
+            name=error.name,
+        ) from error
+    return task
+
+
+def chosen(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:
+    """Return names without repetition; SystemExit names those that do not exist, and what may have been meant."""
+    found = list(dict.fromkeys(name.strip() for name in names if name.strip()))
+    unknown = [name for name in found if name not in known]
+    if not found or unknown:
+        near = [match for name in unknown for match in difflib.get_close_matches(name, known, n=2)]
+        guess = f" (did you mean {' or '.join(near)}?)" if near else ""
+        raise SystemExit(f"{what} must be some of {', '.join(known)}, got {', '.join(unknown) or 'none'}{guess}")
+    return found

@@ -1,0 +1,44 @@
+"""Command line of the experiments: `python -m experiments --help`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import tyro
+
+import torch_zerohess as zh
+from experiments.bench import bench
+from experiments.error import error
+from experiments.figures import plot
+from experiments.listing import list_
+from experiments.nonpsd_error import nonpsd_error
+from experiments.report import report
+from experiments.run import run
+from experiments.stability import stability
+from experiments.summary import table
+from experiments.tune import tune
+
+
+def doctor() -> None:
+    """Print what this installation can do: extension, devices, Mitsuba variants, versions."""
+    print(zh.doctor())
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "list": list_,
+    "run": run,
+    "table": table,
+    "plot": plot,
+    "report": report,
+    "tune": tune,
+    "error": error,
+    "nonpsd": nonpsd_error,
+    "bench": bench,
+    "stability": stability,
+    "doctor": doctor,
+}
+
+
+def main() -> None:
+    tyro.extras.subcommand_cli_from_dict(
+        COMMANDS, prog="python -m experiments", description="Experiments of torch_zerohess."
+    )

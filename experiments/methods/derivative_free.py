@@ -1,0 +1,148 @@
+"""Derivative-free optimizers, what a user would pick instead of ours: CMA-ES, COBYQA and DFO-LS.
+
+Each is the implementation that its package ships, with the package's own settings but for the size of the first step,
+which is `Task.sigma` times `scale`. They report the best point that they have evaluated. Methods that choose their
+points one by one report after every evaluation, CMA-ES after every generation.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import Bounds, minimize
+
+from experiments.methods.keywords import with_settings
+from experiments.methods.method import Method
+from experiments.task import Task
+from experiments.trial import Trial
+
+Array = NDArray[np.float64]
+MOST = 100
+"""Parameters beyond which COBYQA, made for small problems, takes minutes between two evaluations."""
+
+
+class Best:
+    """The best point evaluated so far, which is what gets reported."""
+
+    def __init__(self, trial: Trial) -> None:
+        self._trial = trial
+        self.x, self.value = trial.start, math.inf
+
+    def __call__(self, points: Array, values: Array, *, sigma: float | None = None) -> None:
+        """Report after points [K, n] with values [K]."""
+        k = int(np.argmin(np.where(np.isnan(values), np.inf, values)))
+        if values[k] < self.value:
+            self.x, self.value = torch.tensor(points[k], dtype=torch.float64), float(values[k])
+        self._trial.report(self.x, sigma=sigma, loss=self.value)
+
+
+def cma_es(trial: Trial, *, scale: float = 1.0, bounded: bool = False) -> None:
+    """CMA-ES of pycma with its default population 4 + floor(3 ln n), and with bounds if `bounded`.
+
+    Where it stops by itself, as it does on a plateau, it starts again from the same point with twice the population
+    (Auger and Hansen 2005, "A restart CMA evolution strategy with increasing population size"), until the evaluations
+    are used up.
+    """
+    import cma
+
+    options: dict[str, Any] = {"verbose": -9, "seed": np.nan}
+    rng = np.random.default_rng(trial.seed)
+    options["randn"] = lambda *shape: rng.standard_normal(shape)
+    if bounded:
+        assert trial.task.bounds is not None
+        options["bounds"] = [one.tolist() for one in trial.task.bounds]
+    best, population = Best(trial), 4 + int(3 * math.log(trial.task.n))
+    while True:
+        strategy = cma.CMAEvolutionStrategy(
+            trial.start.tolist(), scale * trial.task.sigma, {**options, "popsize": population}
+        )
+        while not strategy.stop():
+            points = np.array(strategy.ask())
+            values = trial.loss(torch.from_numpy(points)).numpy()
+            strategy.tell(list(points), values.tolist())
+            best(points, values, sigma=float(strategy.sigma))
+        population *= 2
+
+
+def cobyqa(trial: Trial, *, scale: float = 1.0) -> None:
+    """COBYQA of SciPy: a trust region with quadratic models of least change (Ragonneau and Zhang 2022)."""
+    minimize(
+        _one_by_one(trial),
+        trial.start.numpy(),
+        method="COBYQA",
+        bounds=_bounds(trial.task),
+        options={
+            "maxfev": trial.task.evaluations,
+            "maxiter": trial.task.evaluations,
+            "initial_tr_radius": scale * trial.task.sigma,
+            "final_tr_radius": 1e-8 * scale * trial.task.sigma,
+        },
+    )
+
+
+def dfo_ls(trial: Trial, *, scale: float = 1.0) -> None:
+    """DFO-LS: Gauss-Newton on interpolated residuals (Cartis, Fiala, Marteau and Roberts 2019)."""
+    import dfols
+
+    residuals, best = trial.task.residuals, Best(trial)
+    assert residuals is not None
+
+    def evaluate(x: Array) -> Array:
+        values: Array = residuals(trial.image(torch.tensor(x[None], dtype=torch.float64))[0]).numpy()
+        best(x[None], np.array([np.mean(values**2)]))
+        return values
+
+    bounds = trial.task.bounds
+    dfols.solve(
+        evaluate,
+        trial.start.numpy(),
+        bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
+        rhobeg=scale * trial.task.sigma,
+        maxfun=trial.task.evaluations,
+        do_logging=False,
+    )
+
+
+def _one_by_one(trial: Trial) -> Callable[[Array], float]:
+    """The loss of one point, reported at once."""
+    best = Best(trial)
+
+    def evaluate(x: Array) -> float:
+        value = trial.loss(torch.tensor(x[None], dtype=torch.float64)).numpy()
+        best(x[None], value)
+        return float(value[0])
+
+    return evaluate
+
+
+def _bounds(task: Task) -> Bounds | None:
+    return None if task.bounds is None else Bounds(*(one.numpy() for one in task.bounds))
+
+
+def _is_bounded(task: Task) -> str | None:
+    return "the task has no bounds" if task.bounds is None else None
+
+
+def _is_small(task: Task) -> str | None:
+    return f"is for small problems, minutes between evaluations at n = {task.n}" if task.n > MOST else None
+
+
+def _has_residuals(task: Task) -> str | None:
+    return "the black box returns no residuals" if task.residuals is None else None
+
+
+METHODS = (
+    Method("cma_es", "CMA-ES (pycma) with restarts", with_settings(cma_es), packages=("cma",)),
+    Method(
+        "cma_es_bounded",
+        "CMA-ES (pycma) with restarts and bounds",
+        with_settings(cma_es, bounded=True),
+        _is_bounded,
+        ("cma",),
+    ),
+    Method("cobyqa", "COBYQA (SciPy), quadratic models", with_settings(cobyqa), _is_small, ("scipy",)),
+    Method("dfo_ls", "DFO-LS, Gauss-Newton on residuals", with_settings(dfo_ls), _has_residuals, ("DFO-LS",)),
+)

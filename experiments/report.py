@@ -1,0 +1,169 @@
+"""One self-contained HTML page about an ensemble: tables, curves, pictures, settings, machine and command."""
+
+import base64
+import html
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import matplotlib.image
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from experiments import catalogue, figures
+from experiments.catalogue import FITTING
+from experiments.command import flat, read_command
+from experiments.results import Run, load
+from experiments.summary import Summary, summarize, task_table
+from experiments.task import Task
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em; color: #222 }
+table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .15em .8em; border-bottom: 1px solid #ddd }
+th { text-align: left } td { font-variant-numeric: tabular-nums; white-space: nowrap } img.curves { max-width: 100% }
+.wide { overflow-x: auto } figure { display: inline-block; margin: .3em; text-align: center; font-size: 13px }
+figure img { width: 128px; height: auto; image-rendering: pixelated; border: 1px solid #ddd }
+pre { background: #f5f5f5; padding: .6em; overflow-x: auto } summary { cursor: pointer }
+"""
+
+
+def report(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
+    /,
+    out: Path | None = None,
+) -> None:
+    """Write one self-contained HTML page: tables, curves, pictures of start, result and target, settings and machine.
+
+    Args:
+        folder: written by `run`.
+        out: the page; DIR/report.html if not given.
+    """
+    path = out or folder / "report.html"
+    path.write_text(page(folder))
+    print(path)
+
+
+def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
+    """Return the page; `tasks` are those that have no name, for their pictures."""
+    results, known = load(folder), read_command(folder)
+    summary = summarize(results)
+    parts = [_commands(known["commands"])]
+    if summary.reference and summary.speed_ups:
+        parts.append(_speed_ups(summary))
+    for name, methods in results.runs.items():
+        settings = known["settings"].get(name, {})
+        preset = next((one.get("preset", "fast") for one in settings.values()), "fast")
+        task = (tasks or {}).get(name) or _load(name, preset)
+        parts += [f"<h2 id='{_text(name)}'>{_text(name)}</h2>", _about(task), _tables(summary, name)]
+        parts += [_curves(name, methods), _pictures(task, methods), _settings(settings)]
+    title = f"Results of {', '.join(results.runs)}"
+    if summary.unfinished:
+        parts.insert(0, f"<p>{summary.unfinished} runs have not ended; they are left out.</p>")
+    return (
+        f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>{_text(title)}</title>"
+        f"<style>{_STYLE}</style></head><body><h1>{_text(title)}</h1>{''.join(parts)}</body></html>\n"
+    )
+
+
+def _load(name: str, preset: Any) -> Task | None:
+    try:
+        return catalogue.load(name, preset) if name in FITTING else None
+    except ImportError:
+        return None
+
+
+def _commands(commands: Sequence[Mapping[str, Any]]) -> str:
+    if not commands:
+        return ""
+    lines = "\n".join(f"{one['command']}    # {one['started']}" for one in commands)
+    machine = ", ".join(f"{name} {value}" for name, value in commands[-1]["machine"].items())
+    return f"<h2>Command and machine</h2><pre>{_text(lines)}</pre><p>{_text(machine)}</p>"
+
+
+def _speed_ups(summary: Summary) -> str:
+    rows = [[s.method, s.seconds, s.evaluations, s.cases] for s in (*summary.speed_ups, summary.mean_speed_up)]
+    return (
+        f"<h2>Mean ratio to {_text(summary.reference)}</h2><p>Seconds and evaluations of a method divided by those of "
+        f"{_text(summary.reference)}, averaged over the tasks, errors and levels that both reach.</p>"
+        + _table(["method", "seconds", "evaluations", "cases"], rows)
+    )
+
+
+def _about(task: Task | None) -> str:
+    if task is None:
+        return ""
+    return f"<p>Sought: {_text(task.title)}. Parameters: {_text(task.parameters)}. Needs: {_text(task.needs)}.</p>"
+
+
+def _tables(summary: Summary, task: str) -> str:
+    headers, rows = task_table(summary, task)
+    found = "<p>Median evaluations and seconds, and share of the runs, until an error is reduced by:</p>"
+    found += _table(headers, rows)
+    failures = [one for one in summary.failures if one.task == task]
+    if failures:
+        found += "<p>Runs that ended before both errors were reduced by 99.9 %:</p>" + _table(
+            ["method", "runs", "", "reason"], [[one.method, one.runs, one.status, one.reason] for one in failures]
+        )
+    return found
+
+
+def _curves(name: str, methods: dict[str, list[Run]]) -> str:
+    image = io.BytesIO()
+    figures.curves(name, methods, image)
+    return f"<img class='curves' alt='error curves of {_text(name)}' src='{_embedded(image.getvalue())}'>"
+
+
+def _pictures(task: Task | None, methods: Mapping[str, Sequence[Run]]) -> str:
+    """Show the start, the results of the first run of every method, and the target."""
+    if task is None or task.picture is None:
+        return ""
+    run = min(one.outcome.run for runs in methods.values() for one in runs)
+    shown = [("start", task.picture(task.start(run)))]
+    for name, runs in methods.items():
+        shown += [
+            (name, task.picture(torch.tensor(one.outcome.x, dtype=torch.float64)))
+            for one in runs
+            if one.outcome.run == run and len(one.outcome.x) == task.n
+        ]
+    if task.target_picture is not None:
+        shown.append(("target", task.target_picture))
+    return f"<h3>Run {run}</h3>" + "".join(
+        f"<figure><img alt='{_text(name)}' src='{_embedded(_png(picture))}'>"
+        f"<figcaption>{_text(name)}</figcaption></figure>"
+        for name, picture in shown
+    )
+
+
+def _settings(settings: Mapping[str, dict[str, Any]]) -> str:
+    if not settings:
+        return ""
+    rows = [[name, ", ".join(f"{key} = {value}" for key, value in flat(one).items())] for name, one in settings.items()]
+    return f"<details><summary>Settings</summary>{_table(['method', 'settings'], rows)}</details>"
+
+
+def _table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    head = "".join(f"<th>{_text(name)}</th>" for name in headers)
+    body = "".join("<tr>" + "".join(f"<td>{_text(value)}</td>" for value in row) + "</tr>" for row in rows)
+    return f"<div class='wide'><table><tr>{head}</tr>{body}</table></div>"
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return "-"
+    return html.escape(f"{value:.3g}" if isinstance(value, float) else str(value), quote=True)
+
+
+def _png(picture: Tensor) -> bytes:
+    """PNG of [h, w] or [h, w, 3] in [0, 1]."""
+    pixels = (255 * picture.detach().double().clamp(0, 1)).round().to(torch.uint8)
+    rgb = pixels if pixels.ndim == 3 else pixels[..., None].expand(-1, -1, 3)
+    out = io.BytesIO()
+    matplotlib.image.imsave(out, np.ascontiguousarray(rgb.numpy()), format="png")
+    return out.getvalue()
+
+
+def _embedded(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()

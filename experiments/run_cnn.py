@@ -1,0 +1,161 @@
+"""Runs of the CNN task: logs that resume, errors and predictions as pictures, the encoder as ONNX, a table."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from experiments import export, figures, predictions
+from experiments.command import register
+from experiments.journal import DivergedError
+from experiments.recorder import Recorder
+from experiments.records import Files, Outcome, Record, read_outcome, write_outcome
+from experiments.results import load
+from experiments.tables import table
+from experiments.tasks.cnn import DEGREES, CnnTask, Preset
+from experiments.training import Method, Result, train, trained
+from experiments.trial import ending
+
+REDUCTION = 100.0
+"""A run succeeds if it divides the held-out parameter error by this."""
+
+
+def train_all(
+    preset: Preset, methods: Sequence[Method], seeds: Sequence[int], out: Path, variant: str, threads: int | None
+) -> list[Result]:
+    """Train every method from every seed, without those that `out` already has, and write what came of it to `out`/cnn.
+
+    Runs that fail are named, and left out of the results.
+    """
+    torch.set_num_threads(1)  # small tensors: a second thread costs more than it gives
+    folder = out / "cnn"
+    results: list[Result] = []
+    scene = preset.scene(variant, threads)
+    shared = {"preset": asdict(preset), "variant": scene.variant}
+    register(out, {"cnn": {method.name: {**shared, "method": asdict(method)} for method in methods}})
+    print(f"Mitsuba {scene.variant}, {preset.film}x{preset.film} pixels, {preset.spp} samples per pixel", flush=True)
+    for seed in seeds:
+        task = CnnTask(preset, seed, scene)
+        if not all(Files(folder / method.name, seed).outcome.exists() for method in methods):
+            print(f"rendering {preset.images} training and {preset.held_out} held-out images, seed {seed}", flush=True)
+            _, _ = task.training, task.held_out
+        for method in methods:
+            result = _one(task, method, Files(folder / method.name, seed), len(seeds))
+            results += [result] if result else []
+    if not results:
+        raise SystemExit("no run of cnn succeeded")
+    _conclude(task, results, out)
+    return results
+
+
+def _conclude(task: CnnTask, results: Sequence[Result], out: Path) -> None:
+    """Write figures and encoder, print the table."""
+    folder = out / "cnn"
+    shown = {result.method for result in results}
+    runs = {name: mine for name, mine in load(out).runs["cnn"].items() if name in shown}
+    figures.curves("cnn", runs, folder / "errors.png")
+    first = [result for result in results if result.run == results[0].run]
+    predictions.draw(task, first, folder / "predictions.png")
+    print("\n" + summary(results))
+    print(f"\nerrors: {folder / 'errors.png'}\npredictions: {folder / 'predictions.png'}\nlogs: {folder}")
+    if export.missing():
+        print(f"not exported to ONNX: pip install {' '.join(export.missing())}")
+    else:
+        path = folder / f"encoder-{first[-1].method}.onnx"
+        difference = export.export(first[-1].encoder, task.held_out[0], path)
+        print(f"encoder: {path}, onnxruntime predicts the same to {DEGREES * difference:.1e} degrees")
+
+
+def _one(task: CnnTask, method: Method, files: Files, runs: int) -> Result | None:
+    """Train once, or take the result that is there; None if the method failed."""
+    weights = files.folder / f"{files.run}.pt"
+    if not files.outcome.exists():
+        _train(task, method, files, weights, method.name if runs == 1 else f"{method.name} {files.run}")
+    outcome = read_outcome(files.outcome)
+    if outcome.status == "failed":
+        print(f"{method.name} {files.run} failed: {outcome.reason}")
+        return None
+    return trained(task, outcome, weights)
+
+
+def _train(task: CnnTask, method: Method, files: Files, weights: Path, name: str) -> None:
+    with tqdm(total=task.preset.evaluations, unit=" renders", desc=f"{name:>8}", dynamic_ncols=True) as bar:
+
+        def watch(record: Record) -> None:
+            error = DEGREES * (record.parameter_error or 0.0) ** 0.5
+            bar.set_postfix_str(f"error {error:.2f} degrees", refresh=False)
+            bar.update(record.evaluations - bar.n)
+
+        recorder = Recorder("cnn", method.name, files.run, files, watch)
+        diverged = None
+
+        def solve() -> None:
+            nonlocal diverged
+            try:
+                result = train(task, method, files.run, recorder)
+            except DivergedError as error:
+                diverged = error
+                raise
+            torch.save(result.encoder.state_dict(), weights)
+
+        try:
+            end = ending(solve)
+        finally:
+            recorder.close(ended=diverged is not None)
+    if diverged:
+        files.log.unlink()
+        return _train(task, method, files, weights, name)
+    outcome = Outcome(
+        "cnn",
+        method.name,
+        files.run,
+        end.status,
+        "all evaluations used" if end.status == "stopped" else end.reason,
+        recorder.seconds,
+        recorder.black_box_seconds,
+        recorder.evaluations,
+        len(recorder.rows) - 1,
+        [],
+        asdict(method),
+        end.traceback,
+    )
+    write_outcome(outcome, files)
+    return None
+
+
+def summary(results: Sequence[Result]) -> str:
+    """Return a table with a row per method: medians over its runs, and how many succeeded."""
+    rows = []
+    for name in dict.fromkeys(result.method for result in results):
+        mine = [result for result in results if result.method == name]
+
+        def median(values: list[float]) -> float:
+            return float(torch.tensor(values, dtype=torch.float64).quantile(0.5))
+
+        before, after = (DEGREES * median([one.parameter_error[k] ** 0.5 for one in mine]) for k in (0, 1))
+        share = sum(one.parameter_error[0] >= REDUCTION * one.parameter_error[1] for one in mine)
+        rows.append(
+            [
+                name,
+                median([one.seconds for one in mine]),
+                median([float(one.evaluations) for one in mine]),
+                before,
+                after,
+                median([one.parameter_error[0] / one.parameter_error[1] for one in mine]),
+                median([one.image_error[0] / one.image_error[1] for one in mine]),
+                f"{share}/{len(mine)}",
+            ]
+        )
+    headers = [
+        "method",
+        "seconds",
+        "renders",
+        "rms error before [deg]",
+        "after [deg]",
+        "parameter MSE /",
+        "image MSE /",
+        f"runs beyond {REDUCTION:.0f}x",
+    ]
+    return table(headers, rows)

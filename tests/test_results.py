@@ -1,0 +1,232 @@
+"""Tables, figures and pages of an ensemble, against numbers computed by hand."""
+
+import base64
+import csv
+import io
+import json
+import re
+from dataclasses import asdict
+
+import matplotlib.image
+import numpy as np
+import pytest
+from small import TARGET, TASK
+
+from experiments.catalogue import FITTING, load
+from experiments.figures import plot
+from experiments.listing import listing
+from experiments.methods import METHODS
+from experiments.records import Files, Log, Outcome, Record, write_outcome
+from experiments.report import page, report
+from experiments.results import load as load_results
+from experiments.run import run
+from experiments.summary import as_csv, as_json, as_text, summarize, table
+
+PER_ITERATION = 0.5
+"""Seconds of every iteration below, of which 0.4 are spent in the black box."""
+
+
+def write(folder, method, run, errors, *, each, status="finished", reason="both errors reduced by 99.9 %"):
+    """A run of `bowl` with these image errors, `each` evaluations per iteration; parameter errors are their squares."""
+    files = Files(folder / "bowl" / method, run)
+    log = Log(files.log)
+    for i, error in enumerate(errors):
+        square = None if error is None else error**2
+        log(Record("bowl", method, run, i, i * PER_ITERATION, i * each, None, None, error, square))
+    log.close()
+    n = len(errors) - 1
+    seconds = n * PER_ITERATION
+    x = TARGET.tolist()
+    outcome = Outcome("bowl", method, run, status, reason, seconds, 0.8 * seconds, n * each, n, x, {"preset": "fast"})
+    write_outcome(outcome, files)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Every row takes half a second, and 3 evaluations with trust_region, 30 with our_g."""
+    write(tmp_path, "trust_region", 0, [100.0, 10.0, 1.0, 0.1], each=3)
+    write(tmp_path, "trust_region", 1, [200.0, 200.0, 2.0, 0.2], each=3)
+    write(tmp_path, "our_g", 0, [100.0, 10.0, 5.0, 1.0], each=30, status="time limit", reason="more than 600 s")
+    write(tmp_path, "our_g", 1, [200.0, None, 20.0, 200.0], each=30, status="failed", reason="ValueError: no")
+    write(tmp_path, "our_g", 2, [300.0, 300.0, 300.0, 30.0], each=30, status="failed", reason="ValueError: no")
+    Files(tmp_path / "bowl" / "our_g", 3).journal.touch()
+    return tmp_path
+
+
+def cells(folder, method):
+    rows = [row for row in summarize(load_results(folder)).rows if row.method == method]
+    return {(row.metric, row.level): (row.evaluations, row.seconds, row.share) for row in rows}
+
+
+def test_medians_are_over_the_runs_that_got_there(folder):
+    assert cells(folder, "trust_region") == {
+        ("image", 0.9): (4.5, 0.75, 1.0),  # after rows 1 and 2
+        ("image", 0.99): (6.0, 1.0, 1.0),
+        ("image", 0.999): (9.0, 1.5, 1.0),
+        ("parameter", 0.9): (4.5, 0.75, 1.0),  # 1e4 to 1e2; 4e4 to 4
+        ("parameter", 0.99): (4.5, 0.75, 1.0),
+        ("parameter", 0.999): (6.0, 1.0, 1.0),
+    }
+    assert cells(folder, "our_g") == {
+        ("image", 0.9): (60.0, 1.0, 1.0),  # after rows 1, 2 and 3; reached is reached, whatever happens later
+        ("image", 0.99): (None, None, 1 / 3),
+        ("image", 0.999): (None, None, 0.0),
+        ("parameter", 0.9): (60.0, 1.0, 1.0),
+        ("parameter", 0.99): (60.0, 1.0, 1.0),
+        ("parameter", 0.999): (None, None, 1 / 3),
+    }
+
+
+def test_ratios_are_to_the_reference(folder):
+    summary = summarize(load_results(folder))
+    assert summary.reference == "trust_region"
+    ratios = {(r.metric, r.level): (r.ratio_evaluations, r.ratio_seconds) for r in summary.rows if r.method == "our_g"}
+    assert ratios == {
+        ("image", 0.9): (60 / 4.5, 1 / 0.75),
+        ("image", 0.99): (None, None),
+        ("image", 0.999): (None, None),
+        ("parameter", 0.9): (60 / 4.5, 1 / 0.75),
+        ("parameter", 0.99): (60 / 4.5, 1 / 0.75),
+        ("parameter", 0.999): (None, None),
+    }
+    (speed_up,) = summary.speed_ups
+    assert (speed_up.method, speed_up.cases) == ("our_g", 3)
+    assert speed_up.seconds == pytest.approx(4 / 3)
+    assert speed_up.evaluations == pytest.approx(40 / 3)
+    assert asdict(summary.mean_speed_up) == {**asdict(speed_up), "method": "all"}
+
+
+def test_overhead_failures_and_unfinished_runs(folder):
+    summary = summarize(load_results(folder))
+    overheads = {one.method: (one.overhead, one.black_box) for one in summary.overheads}
+    assert overheads["our_g"] == (pytest.approx(0.2 * PER_ITERATION), pytest.approx(0.8 * PER_ITERATION / 30))
+    failures = {(one.method, one.status, one.reason, one.runs) for one in summary.failures}
+    assert failures == {
+        ("our_g", "time limit", "more than 600 s", 1),
+        ("our_g", "failed", "ValueError: no", 2),
+    }
+    assert summary.unfinished == 1
+
+
+def test_the_reference_is_the_best_that_there_is(tmp_path):
+    write(tmp_path, "cma_es", 0, [1.0, 0.1], each=1)
+    assert summarize(load_results(tmp_path)).reference is None
+    write(tmp_path, "our_hvpa", 0, [1.0, 0.1], each=1)
+    write(tmp_path, "our_g", 0, [1.0, 0.1], each=1)
+    assert summarize(load_results(tmp_path)).reference == "our_hvpa"
+
+
+def test_a_run_that_died_before_its_first_row_counts(tmp_path):
+    write(tmp_path, "our_g", 0, [1.0, 0.0], each=1)
+    write_outcome(Outcome("bowl", "our_g", 1, "failed", "crash", 0, 0, 0, 0, []), Files(tmp_path / "bowl" / "our_g", 1))
+    assert cells(tmp_path, "our_g")["image", 0.999] == (1.0, 0.5, 0.5)
+
+
+def test_formats_agree(folder, capsys):
+    summary = summarize(load_results(folder))
+    parsed = json.loads(as_json(summary))
+    assert parsed["rows"][0].keys() >= {"task", "method", "metric", "level", "seconds", "evaluations", "share", "runs"}
+    flat = list(csv.DictReader(io.StringIO(as_csv(summary))))
+    assert [{k: "" if v is None else str(v) for k, v in row.items()} for row in parsed["rows"]] == flat
+    text = as_text(summary)
+    assert re.search(r"^our_g +60 1s 100% +- 33% +- 0%", text, re.MULTILINE)
+    assert "1 unfinished runs are left out" in text
+    for name, expected in (("text", text), ("csv", as_csv(summary)), ("json", as_json(summary))):
+        table(folder, format=name)
+        assert capsys.readouterr().out == expected + "\n"
+
+
+def test_plot_draws_every_task(folder, capsys):
+    plot(folder)
+    path = folder / "bowl.png"
+    assert capsys.readouterr().out.strip() == str(path)
+    assert matplotlib.image.imread(path).std() > 0.01
+
+
+def test_the_page_needs_nothing_else(folder):
+    text = page(folder, {"bowl": TASK})
+    assert "http" not in text
+    assert not re.findall(r"<(?:script|link|iframe)", text)
+    sources = re.findall(r"src='([^']*)'", text)
+    images = [
+        matplotlib.image.imread(io.BytesIO(base64.b64decode(source.removeprefix("data:image/png;base64,"))))
+        for source in sources
+    ]
+    # Curves, the start, the results of run 0 of both methods, the target.
+    assert len(images) == 1 + 1 + 2 + 1
+    start, result, target = images[1], images[2], images[-1]
+    assert np.array_equal(result, target)  # the runs above end at the solution
+    pixels = np.round(255 * TASK.picture(TASK.start(0)).numpy())
+    assert np.array_equal(np.round(255 * start[..., 0]), pixels)
+    for part in ("60 1s 100%", "ValueError: no", "trust_region", TASK.title, "1 runs have not ended"):
+        assert part in text
+
+
+def test_report_writes_the_page(folder, tmp_path, capsys):
+    report(folder)
+    assert (folder / "report.html").read_text() == page(folder)
+    report(folder, tmp_path / "other.html")
+    assert (tmp_path / "other.html").read_text() == page(folder)
+
+
+@pytest.mark.parametrize("command", [table, plot, report])
+def test_folders_without_runs_are_refused(command, tmp_path):
+    with pytest.raises(SystemExit, match=r"DIR must be a folder .* got .*nowhere"):
+        command(tmp_path / "nowhere")
+    with pytest.raises(SystemExit, match="has none"):
+        command(tmp_path)
+
+
+def test_list_names_everything():
+    text = listing()
+    for name in (*FITTING, *METHODS, "cnn"):
+        assert re.search(rf"^{name} ", text, re.MULTILINE), name
+
+
+def test_list_says_what_is_missing(monkeypatch):
+    def load_without(name, preset="fast"):
+        if name == "quad":
+            raise ImportError("task quad needs something", name="something")
+        return load(name, preset)
+
+    monkeypatch.setattr("experiments.catalogue.load", load_without)
+    assert re.search(r"^quad +task quad needs something$", listing(), re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tasks": ("quat",)}, r"TASK must be some of .* got quat \(did you mean quad\?\)"),
+        ({"tasks": ()}, "TASK must be some of .* got none"),
+        ({"tasks": ("quad",), "methods": "cma"}, r"methods must be some of .* got cma \(did you mean cma_es"),
+        ({"tasks": ("quad",), "runs": 0}, "runs must be at least 1, got 0"),
+        ({"tasks": ("quad",), "jobs": -1}, "jobs must be at least 1, got -1"),
+        ({"tasks": ("cnn",), "methods": "cma_es"}, "methods must be some of fr22, .* got cma_es"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message, tmp_path):
+    with pytest.raises(SystemExit, match=message):
+        run(arguments.pop("tasks"), out=tmp_path, **arguments)
+
+
+def test_run_runs_prints_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+    run(("quad",), methods="cobyqa, cma_es", runs=2, out=tmp_path, seed=3)
+    printed = capsys.readouterr().out
+    assert "4 of 4 runs have ended" in printed
+    assert as_text(summarize(load_results(tmp_path))) in printed
+    for method in ("cobyqa", "cma_es"):
+        assert sorted(path.name for path in (tmp_path / "quad" / method).iterdir()) == [
+            "3.json",
+            "3.jsonl",
+            "4.json",
+            "4.jsonl",
+        ]
+    page_of_quad = page(tmp_path)
+    assert load("quad").title in page_of_quad
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiments.ensemble.Ensemble.run", interrupt)
+    with pytest.raises(SystemExit, match="the same command goes on"):
+        run(("quad",), methods="cobyqa", runs=3, out=tmp_path, seed=3)

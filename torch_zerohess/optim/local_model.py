@@ -1,0 +1,194 @@
+"""Quadratic models of a black box around a point, by regression on evaluations in its neighbourhood.
+
+With u = (z - x)/sigma, gradient and Hessian of the smoothed function are the Hermite coefficients of degree 1 and 2 of
+u -> f(x + sigma u) under the normal density; a weighted least-squares fit estimates them, and can use evaluations that
+were made around other points (see `Pool`). Both models live in the span of the perturbations: with fewer evaluations
+than parameters they know nothing of the other directions, and a step does not go there.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_NOISE = (1e-7, 1e-4, 1e-2, 1e-1)
+"""Variance of what a quadratic leaves over, in units of the prior's; the evidence chooses."""
+_CONSTANT = 10.0
+"""Prior variance of the constant term."""
+_RIDGE = 0.2
+"""Prior precision of a slope, in evaluations."""
+_DAMPING = 1e-3
+"""Added to the curvature of an image model, in units of its mean eigenvalue."""
+
+
+@dataclass(frozen=True)
+class LocalModel:
+    """value + gradient.s + s.hessian s/2 of s = basis^T u [r], in units of sigma."""
+
+    value: float
+    gradient: Tensor
+    """[r]"""
+    hessian: Tensor
+    """[r, r]"""
+    basis: Tensor | None
+    """Orthonormal [n, r]; None for the identity."""
+    gradient_error: Tensor
+    """Standard error of the gradient [r]."""
+    curvature_error: Tensor
+    """Standard error of the diagonal of the Hessian [r]."""
+    significance: float = math.inf
+    """Log of the evidence of the model over that of a constant: below 0 the values may as well be noise."""
+    intercept: Tensor | None = None
+    """Output at u = 0, [m]."""
+    jacobian: Tensor | None = None
+    """Of the outputs, [r, m]."""
+
+    @property
+    def rank(self) -> int:
+        return len(self.gradient)
+
+    def reduce(self, u: Tensor) -> Tensor:
+        """Coordinates [r] of a perturbation u [n]."""
+        return u if self.basis is None else self.basis.mT @ u
+
+    def expand(self, s: Tensor) -> Tensor:
+        """Perturbation [n] of coordinates s [r]."""
+        return s if self.basis is None else self.basis @ s
+
+    def decrease(self, s: Tensor) -> float:
+        """How much the model falls from 0 to s [r]."""
+        return -float(self.gradient @ s + 0.5 * (s @ self.hessian @ s))
+
+    def misfit(self, s: Tensor, output: Tensor) -> float:
+        """Squared error of the predicted output [m] at s [r], over the squared change that was predicted."""
+        assert self.intercept is not None
+        assert self.jacobian is not None
+        change = s @ self.jacobian
+        error = float((output - self.intercept - change).square().sum())
+        return error / max(float(change.square().sum()), math.ulp(0.0))
+
+
+def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
+    """Fit a quadratic to values [P] at u [P, n] with weights [P], for any P >= 1 and n.
+
+    Kernel ridge regression with the kernel 10 + u.u'/n + (u.u')^2/2n^2 + (|u|^2-n)(|u'|^2-n)/4n^2: a Gaussian prior
+    over slopes, over all entries of the Hessian and over its trace, so that few evaluations in many dimensions still
+    tell the mean curvature. P numbers describe the Hessian, whatever n: a full one where P is large, one of low rank
+    plus a multiple of the identity else. The variance of what is left over is chosen by the evidence (marginal
+    likelihood), from exact interpolation to noise.
+    """
+    P, n = u.shape
+    basis, s = _reduced(u)
+    mean = (weights @ values) / weights.sum()
+    scale = (weights @ (values - mean).square() / weights.sum()).sqrt() + math.ulp(0.0)
+    root, inner, trace = weights.sqrt(), s @ s.mT, s.square().sum(1) - n
+    target = root * (values - mean) / scale
+    kernel = _CONSTANT + inner / n + (0.5 * inner.square() + 0.25 * trace[:, None] * trace) / n**2
+    fits = [_Evidence.of(kernel, noise, root, target) for noise in _NOISE]
+    best = max(fits, key=lambda fit: fit.log)
+    constant = _Evidence.of(torch.full_like(kernel, _CONSTANT), 1.0, root, target)
+    alpha, spread = root * best.solution, float(scale) * math.sqrt(best.variance)
+    gradient = s.mT @ alpha / n
+    identity = torch.eye(s.shape[1], dtype=s.dtype, device=s.device)
+    hessian = ((s.mT * alpha) @ s + 0.5 * (alpha @ trace) * identity) / n**2
+    # Posterior variances: the prior one less what the evaluations tell.
+    known = best.whiten(root[:, None] * s / n).square().sum(0)
+    bent = best.whiten(root[:, None] * (s.square() + 0.5 * trace[:, None]) / n**2).square().sum(0)
+    at_zero = _CONSTANT * alpha.sum() - 0.25 * (alpha @ trace) / n
+    return LocalModel(
+        float(mean + scale * at_zero),
+        scale * gradient,
+        scale * hessian,
+        basis,
+        spread * (1.0 / n - known).clamp_min(0.0).sqrt(),
+        spread * (3.0 / n**2 - bent).clamp_min(0.0).sqrt(),
+        best.log - constant.log,
+    )
+
+
+def fit_outputs(
+    u: Tensor, outputs: Tensor, weights: Tensor, loss: Callable[[Tensor], Tensor], shape: torch.Size
+) -> LocalModel:
+    """Fit outputs [P, m] linearly at u [P, n] and return the quadratic model of `loss` after it (generalized
+    Gauss-Newton).
+
+    The intercept is the smoothed output M = E f(x + sigma u), the slopes its Jacobian J [n, m]; the model of the loss
+    has gradient J grad(loss)(M) and Hessian J loss''(M) J^T. It smooths the output, loss(E f), not the loss, E loss(f).
+    `loss` takes an output of the given `shape`.
+    """
+    P, _ = u.shape
+    basis, s = _reduced(u)
+    r = s.shape[1]
+    design = torch.cat([s.new_ones(P, 1), s], 1)
+    gram = design.mT @ (weights[:, None] * design)
+    gram.diagonal()[0] += 1e-9
+    gram.diagonal()[1:] += _RIDGE
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
+    slopes = inverse @ (design.mT @ (weights[:, None] * outputs))
+    intercept, jacobian = slopes[0], slopes[1:]
+    value, downhill, bend = _loss_derivatives(loss, intercept.view(shape), jacobian.view(r, *shape))
+    gradient = jacobian @ downhill
+    hessian = jacobian @ bend.mT
+    hessian = 0.5 * (hessian + hessian.mT)
+    hessian.diagonal().add_(_DAMPING * hessian.diagonal().abs().mean())
+    spare = P - r - 1
+    left = (weights @ (outputs - design @ slopes).square()) / max(spare, 1)  # variance per output, [m]
+    own = inverse.diagonal()[1:] if spare > 0 else torch.full_like(gradient, math.inf)
+    return LocalModel(
+        value,
+        gradient,
+        hessian,
+        basis,
+        own.sqrt() * (left @ downhill.square()).sqrt().clamp_min(math.ulp(0.0)),
+        2.0 * own.sqrt() * (bend.square() @ left).sqrt().clamp_min(math.ulp(0.0)),
+        intercept=intercept,
+        jacobian=jacobian,
+    )
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """One kernel ridge regression: its solution and the log of its marginal likelihood."""
+
+    log: float
+    solution: Tensor
+    variance: float
+    factor: Tensor
+
+    @classmethod
+    def of(cls, kernel: Tensor, noise: float, root: Tensor, target: Tensor) -> "_Evidence":
+        matrix = root[:, None] * kernel * root
+        matrix.diagonal().add_(noise + 1e-13 * float(matrix.diagonal().mean()))
+        factor = torch.linalg.cholesky(matrix)
+        white = torch.linalg.solve_triangular(factor, target[:, None], upper=False)
+        variance = float(white.square().mean()) + math.ulp(0.0)
+        log = -0.5 * len(target) * math.log(variance) - float(factor.diagonal().log().sum())
+        solution = torch.linalg.solve_triangular(factor.mT, white, upper=True)[:, 0]
+        return cls(log, solution, variance, factor)
+
+    def whiten(self, columns: Tensor) -> Tensor:
+        return torch.linalg.solve_triangular(self.factor, columns, upper=False)
+
+
+def _reduced(u: Tensor) -> tuple[Tensor | None, Tensor]:
+    """Return a basis of the span of u [P, n] and the coordinates in it; the identity where P >= n."""
+    if len(u) >= u.shape[1]:
+        return None, u
+    basis, triangle = torch.linalg.qr(u.mT)
+    return basis, triangle.mT
+
+
+def _loss_derivatives(
+    loss: Callable[[Tensor], Tensor], output: Tensor, directions: Tensor
+) -> tuple[float, Tensor, Tensor]:
+    """Return loss, its gradient [m] and its Hessian times directions [r, *out], [r, m], at an output [*out]."""
+    with torch.enable_grad():
+        y = output.detach().requires_grad_(True)
+        value = loss(y)
+        (slope,) = torch.autograd.grad(value, y, create_graph=True)
+        if not slope.requires_grad:
+            return float(value.detach()), slope.detach().flatten(), torch.zeros_like(directions).flatten(1)
+        products = [torch.autograd.grad(slope, y, one, retain_graph=True)[0].flatten() for one in directions]
+    return float(value.detach()), slope.detach().flatten(), torch.stack(products)

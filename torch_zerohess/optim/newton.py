@@ -1,0 +1,107 @@
+"""Newton's method with the whole Hessian, for losses of few parameters."""
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.optim.newton_step import NewtonStep, Step
+from torch_zerohess.optim.second_order import Model, check_positive
+
+MOST = 10_000
+"""Parameters beyond which the Hessian is not formed."""
+MODIFICATIONS = ("shift", "abs")
+
+
+class Newton(NewtonStep):
+    """Newton steps with modified eigenvalues inside a trust region |s| <= radius.
+
+    The Hessian H = V diag(w) V^T is formed, one product per parameter, and decomposed. The step is
+    s = -V (m(w) + shift)^-1 V^T g with the smallest shift >= 0 that keeps it inside:
+
+    - "shift": m(w) = w, and shift + w >= 0: the minimum of the quadratic model in the ball (More and Sorensen 1983),
+      which leaves a saddle even where the gradient is zero.
+    - "abs": m(w) = abs(w), which turns steps towards a saddle around and does not rely on a negative eigenvalue
+      beyond its own magnitude (Dauphin et al. 2014): the safer choice for sampled Hessians.
+
+    What rounding leaves of a zero eigenvalue, and of the gradient along it, counts as zero. With `adapt` the closure is
+    called once more, without derivatives: a step that does not lower the loss is taken back, and the radius follows the
+    ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Without it every step is taken.
+
+    Args:
+        params: parameters, one group, 10 000 numbers at most.
+        radius: of the trust region, in units of the parameters; the initial one with `adapt`.
+        curvature: "exact", or "gauss_newton" for J^T H J of the black boxes behind a network.
+        modification: "shift" or "abs".
+        adapt: whether to test the step and adapt the radius.
+        max_radius: the radius never grows beyond it.
+
+    The closure of `step` returns a loss with a graph, as for `NewtonCG`; of several losses the mean is taken.
+
+    Example:
+        >>> x = torch.tensor([3.0, -2.0], requires_grad=True)
+        >>> loss = Newton([x], radius=10.0).step(lambda: (x**2 * torch.tensor([1.0, 5.0])).sum() + x.prod())
+        >>> bool(x.detach().abs().max() < 1e-5)
+        True
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Tensor],
+        *,
+        radius: float = 1.0,
+        curvature: str = "exact",
+        modification: str = "shift",
+        adapt: bool = True,
+        max_radius: float = math.inf,
+    ) -> None:
+        check_positive(radius=radius, max_radius=max_radius)
+        if modification not in MODIFICATIONS:
+            raise ValueError(f"modification must be 'shift' or 'abs', got {modification!r}")
+        defaults = {
+            "radius": radius,
+            "curvature": curvature,
+            "modification": modification,
+            "adapt": adapt,
+            "max_radius": max_radius,
+        }
+        super().__init__(params, defaults)
+        n = sum(one.numel() for one in self._parameters)
+        if n > MOST:
+            raise ValueError(f"params must have at most {MOST} numbers, whose Hessian is formed, got {n}: use NewtonCG")
+
+    def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
+        hessian = model.hessian()
+        if not bool(torch.isfinite(hessian).all()):
+            raise ValueError("the curvature of the loss is not finite; no step was taken")
+        w, vectors = torch.linalg.eigh(hessian)
+        g = model.gradient
+        a, rounding = vectors.mT @ g, len(w) * torch.finfo(self._parameters[0].dtype).eps
+        w = torch.where(w.abs() <= rounding * w.abs().max(), 0.0, w)
+        a = torch.where((w == 0.0) & (a.abs() <= rounding * g.norm()), 0.0, a)
+        y = in_ball(w.abs() if group["modification"] == "abs" else w, a, radius)
+        reason = "boundary" if float(y.norm()) > radius * (1 - 1e-9) else "converged"
+        return Step(vectors @ y, -float(a.dot(y) + 0.5 * (w * y).dot(y)), reason)
+
+
+def in_ball(w: Tensor, a: Tensor, radius: float) -> Tensor:
+    """Minimise a.y + y.(w y)/2 over |y| <= radius, for eigenvalues w [N] in any order and sign."""
+    least, index = w.min(0)
+    low = max(0.0, -float(least))
+
+    def solution(shift: float) -> Tensor:
+        return torch.where(a == 0.0, 0.0, -a / (w + shift))
+
+    if float(least) >= 0.0 and float((y := solution(0.0)).norm()) <= radius:
+        return y
+    high = low + float(a.norm()) / radius
+    while low < (middle := 0.5 * (low + high)) < high:
+        low, high = (middle, high) if float(solution(middle).norm()) > radius else (low, middle)
+    y = solution(high)
+    missing = radius**2 - float(y.dot(y))
+    if float(least) < 0.0 and missing > 0.0:
+        # The gradient has (almost) no share of the lowest eigenvector, which goes the rest of the way to the boundary.
+        y[index] = torch.copysign((y[index] ** 2 + missing).sqrt(), y[index])
+    return y

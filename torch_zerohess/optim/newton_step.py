@@ -1,0 +1,86 @@
+"""A step that minimises a quadratic model in a trust region, and its test: what `Newton` and `NewtonCG` share."""
+
+import math
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, pair
+
+
+class Step(NamedTuple):
+    """A step s [N], the decrease -(g.s + s.Hs/2) that the model promises, and why the search for it ended."""
+
+    s: Tensor
+    decrease: float
+    exit: str
+
+
+class NewtonStep(SecondOrder):
+    """Steps to the minimum of a quadratic model inside |s| <= radius, with or without a test.
+
+    With `adapt` the closure is called once more, without derivatives: a step that does not lower the loss is taken
+    back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1).
+    """
+
+    exit: str | None = None
+    """Why the search for the last step ended; not part of the state."""
+
+    @abstractmethod
+    def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
+        """Minimise the model in the ball of the radius."""
+
+    def step(self, closure: Closure) -> Tensor:  # type: ignore[override]
+        """Take one step and return the loss before it, [] without a graph.
+
+        Raises ValueError if the loss, its gradient or curvature is not finite, or if with `adapt` the loss is not
+        finite at the end of a step that was shortened ten times; and what the closure raises. The parameters are then
+        as they were.
+        """
+        group: dict[str, Any] = self.param_groups[0]
+        model = self._model(closure, separate=group.get("noise", 0.0) > 0.0)
+        if not model.finite:
+            raise ValueError(f"the loss ({float(model.loss)}) or its gradient is not finite; no step was taken")
+        radius = group["radius"]
+        s, decrease, self.exit = self._minimise(model, radius, group)
+        if not math.isfinite(decrease) or not bool(torch.isfinite(s).all()):
+            raise ValueError("the curvature of the loss is not finite; no step was taken")
+        if not group["adapt"]:
+            self._add(s)
+            return model.loss
+        slope = float(model.gradient.dot(s))
+        bend = -2.0 * (decrease + slope)  # s.Hs
+        for trial in range(TRIALS):
+            scale = 0.25**trial
+            predicted, length = -scale * (slope + 0.5 * scale * bend), scale * float(s.norm())
+            if not predicted > 0.0:
+                return model.loss
+            actual = self._try(scale * s, closure, model.loss)
+            if math.isfinite(actual):
+                group["radius"] = min(_next_radius(actual / predicted, length, radius), group["max_radius"])
+                return model.loss
+            radius = length
+        raise ValueError(
+            f"the loss is not finite at the end of a step, even after it was shortened to {length:.3g}; "
+            "no step was taken"
+        )
+
+    def _try(self, s: Tensor, closure: Closure, loss: Tensor) -> float:
+        """Move by s [N] and return by how much the loss fell; the move is taken back where it did not."""
+        before, actual = self._copy(), math.nan
+        self._add(s)
+        try:
+            with torch.no_grad():
+                actual = float(loss) - float(pair(closure())[0].mean())
+        finally:
+            if not 0.0 < actual < math.inf:
+                self._restore(before)
+        return actual
+
+
+def _next_radius(ratio: float, length: float, radius: float) -> float:
+    if ratio < 0.25:
+        return 0.25 * length
+    return 2.0 * radius if ratio > 0.75 and length > 0.99 * radius else radius

@@ -1,0 +1,135 @@
+"""What the second-order optimizers share: one group of parameters as a vector, and the quadratic model of a loss."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from torch_zerohess.curvature import CurvatureOperator
+
+Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
+"""What a closure returns: the loss, or the loss and where its white box ends."""
+Closure = Callable[[], Loss]
+CURVATURES = ("exact", "gauss_newton")
+TRIALS = 10
+"""How often a step to a point where the loss is not finite is shortened."""
+
+
+class Model:
+    """Loss, gradient and Hessian at one point, N parameters; R estimates of them where R losses were given.
+
+    The curvature is taken from the graph of the loss, so that all products use the samples of one forward pass.
+    """
+
+    def __init__(self, losses: Tensor, operators: Sequence[CurvatureOperator]) -> None:
+        self.loss = losses.detach().mean()
+        """[], the mean of the losses."""
+        self.gradients = torch.stack([one.gradient for one in operators]).double()
+        """[R, N], float64"""
+        self._operators = operators
+
+    @property
+    def gradient(self) -> Tensor:
+        """Their mean, [N]."""
+        return self.gradients.mean(0)
+
+    @property
+    def finite(self) -> bool:
+        """Whether loss and gradient are finite."""
+        return bool(torch.isfinite(self.loss)) and bool(torch.isfinite(self.gradients).all())
+
+    def products(self, v: Tensor) -> Tensor:
+        """Return the Hessians times v [N]: [R, N], float64."""
+        length = v.norm()  # of a unit vector, so that float32 parameters neither over- nor underflow
+        if not float(length) > 0.0:
+            return torch.zeros_like(self.gradients)
+        return torch.stack([one @ (v / length) for one in self._operators]).double() * length
+
+    def hessian(self) -> Tensor:
+        """Return the mean Hessian [N, N], float64 and symmetric."""
+        dense = torch.stack([one.to_dense() for one in self._operators]).double().mean(0)
+        return 0.5 * (dense + dense.mT)
+
+
+class SecondOrder(Optimizer):
+    """An optimizer with one Hessian, hence one group of parameters."""
+
+    def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any]) -> None:
+        if defaults["curvature"] not in CURVATURES:
+            raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
+        super().__init__(params, defaults)
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Refuse a second group of parameters: the quadratic model has one Hessian."""
+        if self.param_groups:
+            raise ValueError("params must be one group: the quadratic model has one Hessian")
+        super().add_param_group(param_group)
+
+    @property
+    def _parameters(self) -> list[Tensor]:
+        """Parameters that require grad."""
+        return [one for one in self.param_groups[0]["params"] if one.requires_grad]
+
+    def _model(self, closure: Closure, *, separate: bool = False) -> Model:
+        """Evaluate the closure where the parameters are; `separate` keeps the estimates of several losses apart."""
+        curvature = self.param_groups[0]["curvature"]
+        with torch.enable_grad():
+            losses, through = pair(closure())
+            parts = list(losses.reshape(-1).unbind()) if separate else [losses.mean()]
+            return Model(
+                losses, [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts]
+            )
+
+    def _add(self, step: Tensor) -> None:
+        """Add step [N] to the parameters."""
+        with torch.no_grad():
+            for one, part in zip(self._parameters, self._split(step), strict=True):
+                one.add_(part)
+
+    def _split(self, vector: Tensor) -> list[Tensor]:
+        """Return the parts of a vector [N] in the shapes and types of the parameters."""
+        parts = vector.split([one.numel() for one in self._parameters])
+        return [part.view_as(one).to(one.dtype) for part, one in zip(parts, self._parameters, strict=True)]
+
+    def _copy(self) -> list[Tensor]:
+        """Return a copy of the parameters, to `_restore`."""
+        return [one.detach().clone() for one in self._parameters]
+
+    def _restore(self, place: list[Tensor]) -> None:
+        """Put the parameters back, to the last bit."""
+        with torch.no_grad():
+            torch._foreach_copy_(self._parameters, place)
+
+
+def pair(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:
+    """Return loss and where the white box ends, if the closure says so."""
+    loss, through = result if isinstance(result, tuple) else (result, None)
+    if not isinstance(loss, Tensor) or loss.numel() == 0:
+        raise TypeError(f"closure must return the loss, a tensor with a graph, got {loss!r}")
+    return loss, through
+
+
+def check_positive(**settings: float) -> None:
+    """Raise ValueError for a setting that is not a positive number."""
+    for name, value in settings.items():
+        if not value > 0.0:
+            raise ValueError(f"{name} must be positive, got {value}")
+
+
+def check_not_negative(**settings: float) -> None:
+    """Raise ValueError for a setting that is negative or not finite."""
+    for name, value in settings.items():
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"{name} must be finite and not negative, got {value}")
+
+
+def check_count(**settings: int) -> None:
+    """Raise for a setting that is not an integer of at least one."""
+    for name, value in settings.items():
+        if isinstance(value, bool) or not hasattr(value, "__index__"):
+            raise TypeError(f"{name} must be an integer, got {value!r}")
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")

@@ -16,6 +16,7 @@ from torch_zerohess.curvature import CurvatureOperator, hvp
 from torch_zerohess.doctor import doctor
 from torch_zerohess.estimate import Estimate, estimate
 from torch_zerohess.finite_differences import finite_difference_hvp
+from torch_zerohess.minimize import Minimum, minimize
 from torch_zerohess.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing
 
@@ -24,6 +25,7 @@ __all__ = [
     "CurvatureOperator",
     "Estimate",
     "LinearSigma",
+    "Minimum",
     "Smoothing",
     "adapters",
     "doctor",
@@ -31,6 +33,7 @@ __all__ = [
     "evaluators",
     "finite_difference_hvp",
     "hvp",
+    "minimize",
     "optim",
     "smooth",
 ]

@@ -17,8 +17,8 @@ _NOISE = (1e-7, 1e-4, 1e-2, 1e-1)
 """Variance of what a quadratic leaves over, in units of the prior's; the evidence chooses."""
 _CONSTANT = 10.0
 """Prior variance of the constant term."""
-_RIDGE = 0.2
-"""Prior precision of a slope, in evaluations."""
+_RIDGES = (1e-6, 1e-3, 0.2)
+"""Prior precision of a slope, in evaluations; the evidence chooses."""
 _DAMPING = 1e-3
 """Added to the curvature of an image model, in units of its mean eigenvalue."""
 
@@ -48,6 +48,21 @@ class LocalModel:
     @property
     def rank(self) -> int:
         return len(self.gradient)
+
+    def full_gradient(self) -> Tensor:
+        """Gradient for u [n]; zero outside of the span."""
+        return self.expand(self.gradient)
+
+    def full_hessian(self) -> Tensor:
+        """Hessian for u [n, n]; zero outside of the span."""
+        return self.hessian if self.basis is None else self.basis @ self.hessian @ self.basis.mT
+
+    def full_errors(self) -> tuple[Tensor, Tensor]:
+        """Standard errors of gradient [n] and Hessian diagonal [n]; infinite if there are directions outside."""
+        if self.basis is None:
+            return self.gradient_error, self.curvature_error
+        unknown = torch.full_like(self.basis[:, 0], math.inf)
+        return unknown, unknown.clone()
 
     def reduce(self, u: Tensor) -> Tensor:
         """Coordinates [r] of a perturbation u [n]."""
@@ -79,7 +94,7 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
     plus a multiple of the identity else. The variance of what is left over is chosen by the evidence (marginal
     likelihood), from exact interpolation to noise.
     """
-    P, n = u.shape
+    n = u.shape[1]
     basis, s = _reduced(u)
     mean = (weights @ values) / weights.sum()
     scale = (weights @ (values - mean).square() / weights.sum()).sqrt() + math.ulp(0.0)
@@ -124,7 +139,7 @@ def fit_outputs(
     design = torch.cat([s.new_ones(P, 1), s], 1)
     gram = design.mT @ (weights[:, None] * design)
     gram.diagonal()[0] += 1e-9
-    gram.diagonal()[1:] += _RIDGE
+    gram.diagonal()[1:] += _ridge(s, outputs, weights)
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
     slopes = inverse @ (design.mT @ (weights[:, None] * outputs))
     intercept, jacobian = slopes[0], slopes[1:]
@@ -170,6 +185,22 @@ class _Evidence:
 
     def whiten(self, columns: Tensor) -> Tensor:
         return torch.linalg.solve_triangular(self.factor, columns, upper=False)
+
+
+def _ridge(s: Tensor, outputs: Tensor, weights: Tensor) -> float:
+    """Return the ridge under which outputs [P, m] at s [P, r] are most likely, all with one variance."""
+    P, m = outputs.shape
+    root = weights.sqrt()[:, None]
+    mean = (weights @ outputs) / weights.sum()
+    values, vectors = torch.linalg.eigh(root * (s @ s.mT + _CONSTANT) * root.mT)
+    power = (vectors.mT @ (root * (outputs - mean))).square().sum(1)
+
+    def log_evidence(ridge: float) -> float:
+        spectrum = values.clamp_min(0.0) + ridge
+        variance = float((power / spectrum).mean()) / m + math.ulp(0.0)
+        return -P * math.log(variance) - float(spectrum.log().sum())
+
+    return max(_RIDGES, key=log_evidence)
 
 
 def _reduced(u: Tensor) -> tuple[Tensor | None, Tensor]:

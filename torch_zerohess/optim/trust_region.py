@@ -21,8 +21,14 @@ _FLAT = 0.03
 """Relative change of the loss below which a step has stayed on a plateau."""
 _FAITHFUL = 0.25
 """Misfit of a predicted output up to which the model needs no new evaluations."""
+_TOLERABLE = 5.0
+"""Misfit up to which a step that lowers the loss is itself what the model needs to know."""
 _MISLED = 2.0
-"""Misfit beyond which it needs many."""
+"""Misfit beyond which other steps need more samples than the last time."""
+_RETRIES = 2
+"""Shorter steps tried in a row before samples are drawn."""
+_STALLED = 8
+"""Iterations after which the smoothed loss must have fallen by a twentieth, or sigma shrinks faster."""
 _REFUSED = 10
 """Batches in a row with values that are not finite, after which the search ends."""
 
@@ -106,6 +112,7 @@ class TrustRegion:
         self._first, self._best, self._x = start, start, start
         self._fx = self._lowest = self._local_value = math.inf
         self._local = start
+        self._best_sigma = 1.0
         self.sigma = 1.0
         """Current smoothing, in units of the first one."""
         self.evaluations = 0
@@ -124,6 +131,10 @@ class TrustRegion:
         self._need, self._paired = 0, False
         self._patience = self._refused = 0
         self._trust_output = False
+        self._faithful = False
+        self._reach = 1.0
+        self._retries = 0
+        self._misled = 0
         self._followed: list[float] = []
         self._shape = torch.Size()
 
@@ -145,9 +156,23 @@ class TrustRegion:
         return (self._x * self._unit).to(self.dtype)
 
     @property
-    def model(self) -> LocalModel | None:
-        """The latest model, around an earlier `center` and in units of its sigma."""
-        return self._model
+    def unit(self) -> Tensor:
+        """The first sigma per parameter [n]: what `sigma` and `LocalModel` are in units of."""
+        return self._unit
+
+    def model_at_best(self) -> tuple[LocalModel, float] | None:
+        """A model around `x` and its sigma, that of when x was found or wider if few evaluations are near.
+
+        None if the pool has lost touch with x, or before the first `tell`.
+        """
+        sigma = self._best_sigma
+        for _ in range(8):
+            weights = self._pool.weights(self._best, sigma)
+            near = weights > 1e-3
+            if int(near.sum()) > min(self.n, self._pool.capacity - 2):
+                return self._fit((self._pool.points[near] - self._best) / sigma, near, weights[near]), sigma
+            sigma *= 1.5
+        return None
 
     def ask(self, limit: int | None = None) -> Tensor:
         """Return the next points to evaluate [K, n], at most `limit` of them; the same ones until they are told."""
@@ -159,7 +184,7 @@ class TrustRegion:
             if self._phase == "trial":
                 points = self._trial()[None]
             elif self._phase == "start":
-                points = torch.cat([self._x[None], self._draw(*self._initial())])
+                points = torch.cat([self._x[None], self._draw(min(self.n, _BATCH), paired=False)])
             else:
                 points = self._draw(self._need, self._paired)
             self._asked = points
@@ -229,14 +254,6 @@ class TrustRegion:
 
     # Samples and steps.
 
-    def _initial(self) -> tuple[int, bool]:
-        """Samples of a first batch, and whether in pairs."""
-        n = self.n
-        if self.loss is not None and n > _FEW:
-            return min(n, _BATCH), False
-        full = (n + 1) * (n + 2) // 2 - 1  # a quadratic has this many coefficients beside the constant
-        return min(full, 2 * n + 1, _BATCH), n > 2
-
     def _draw(self, count: int, paired: bool) -> Tensor:
         """Draw about `count` points from N(x, sigma^2), orthogonal in blocks, and mirror them into the bounds."""
         rows = self._directions((count + 1) // 2 if paired else count)
@@ -248,11 +265,12 @@ class TrustRegion:
 
     def _directions(self, count: int) -> Tensor:
         """Normal vectors [count, n], orthogonal to each other and, in many dimensions, to what the pool spans."""
-        n, rows = self.n, []
+        n = self.n
+        rows: list[Tensor] = []
         known = None
         if n > _BATCH and 1 < len(self._pool) < n:
             known, _ = torch.linalg.qr(((self._pool.points - self._x) / self.sigma).mT)
-        while sum(map(len, rows)) < count:
+        while sum(len(one) for one in rows) < count:
             room = n if known is None else n - known.shape[1]
             block = self._normal(n, min(count, max(room, 1)))
             if known is not None:
@@ -269,14 +287,17 @@ class TrustRegion:
     def _plan(self) -> None:
         """Fit a model and find its step; where too few evaluations lie near, ask for more first."""
         weights = self._pool.weights(self._x, self.sigma)
+        if self._faithful:  # the model is about to interpolate: what is nearest counts most
+            distance = ((self._pool.points - self._x) / self.sigma).square().mean(1)
+            weights = weights / (0.1 + distance).square()
         near = weights > 1e-3
         if int(near.sum()) < min(self.n, 4) + 1 and self._need == 0:
-            self._sample(2 * ((self.n + 1) // 2))
+            self._sample(2)
             return
         self._need = 0
         u, weights = (self._pool.points[near] - self._x) / self.sigma, weights[near]
         self._model = self._fit(u, near, weights)
-        radius = math.sqrt(self.n)
+        radius = self._reach * math.sqrt(self.n)
         lower, upper = (self._lower - self._x) / self.sigma, (self._upper - self._x) / self.sigma
         if self._model.basis is None:
             self._step = box_step(self._model.gradient, self._model.hessian, radius, lower, upper)
@@ -340,28 +361,40 @@ class TrustRegion:
     def _follow(self, z: Tensor, fz: float, output: Tensor, length: float) -> None:
         """Move with the minimum of the smoothed output's loss; the worse it was predicted, the more samples."""
         assert self._model is not None
-        misfit = self._model.misfit(self._step, output)
-        before, self._x, self._fx = self._fx, z, fz
-        if misfit < _FAITHFUL and before - fz > 0.05 * abs(before):
-            if self._model.rank < self.n:
-                self._sample(min(self.n - self._model.rank, _BATCH), paired=False)
-            else:
-                self._phase = "trial"
+        misfit, before = self._model.misfit(self._step, output), self._fx
+        gain = before - fz
+        if self._faithful and gain <= 0.0 and self._retries < _RETRIES:
+            # The model was good so far: a shorter step, from a model that knows this point, is cheaper than samples.
+            self._retries += 1
+            self._reach = 0.4 * length
+            self.sigma *= 0.9
+            self._phase = "trial"
             return
-        narrow = min(max(0.85 + 0.3 * length, 0.8), 1.05)
+        self._x, self._fx, self._retries, self._reach = z, fz, 0, 1.0
+        if misfit < _TOLERABLE and gain > 0.02 * abs(before):
+            self._faithful, self._misled = True, 0
+            if misfit > _FAITHFUL:
+                self.sigma *= _narrowing(length)
+            self._phase = "trial"
+            if misfit < _FAITHFUL and self._model.rank < self.n:
+                self._sample(self.n - self._model.rank, paired=False)
+            return
+        self._faithful = misfit < _FAITHFUL and gain > 0.0
+        self._misled = 0 if misfit < _FAITHFUL else self._misled + (misfit > _MISLED)
+        narrow = _narrowing(length)
         self._followed.append(self._model.value)
-        recent, earlier = self._followed[-8:], self._followed[:-8]
+        recent, earlier = self._followed[-_STALLED:], self._followed[:-_STALLED]
         if earlier and min(recent) > 0.95 * min(earlier):
             narrow *= 0.8
-        if abs(before - fz) < _FLAT * abs(before) and misfit > _FAITHFUL and self._patience < 4:
+        if abs(gain) < _FLAT * abs(before) and misfit > _FAITHFUL and self._patience < 4:
             self._patience += 1
             if self._local_value < 0.9 * before:
                 self._x, self._fx = self._local, self._local_value
             else:
                 narrow = max(narrow, min(1.3, _WIDEST / self.sigma))
         self.sigma *= narrow
-        share = 2 if misfit > _MISLED else 8
-        self._sample(2 * math.ceil(self.n / share))
+        most = 2 * math.ceil(self.n / 2)
+        self._sample(min(2**self._misled, most) if misfit > _MISLED else 2 * math.ceil(self.n / 8))
 
     def _sample(self, count: int, *, paired: bool = True) -> None:
         self._phase, self._need = "sample", min(count, _BATCH)
@@ -395,7 +428,7 @@ class TrustRegion:
         if value < self._local_value:
             self._local, self._local_value = points[k], value
         if value < self._lowest:
-            self._best, self._lowest = points[k], value
+            self._best, self._lowest, self._best_sigma = points[k], value, self.sigma
 
     def _u(self, z: Tensor) -> Tensor:
         return (z - self._x) / self.sigma
@@ -416,6 +449,11 @@ class TrustRegion:
         if any(one.numel() != 1 for one in losses):
             raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
         return torch.stack([one.detach().double().reshape(()) for one in losses]), values.flatten(1)
+
+
+def _narrowing(length: float) -> float:
+    """Factor for sigma after a step of a length in units of the radius: short steps have found the minimum."""
+    return min(max(0.85 + 0.3 * length, 0.8), 1.05)
 
 
 def _units(sigma: float | Tensor, x0: Tensor) -> Tensor:

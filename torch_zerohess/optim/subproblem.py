@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 
 _BISECTIONS = 60
+_SMALLEST = 1e-300
+_HALVINGS = 24
+"""Lengths tried along the gradient where bounds are hit."""
 
 
 def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
@@ -17,32 +20,41 @@ def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
     """
     curvature, vectors = torch.linalg.eigh(hessian)
     a, lowest = vectors.mT @ gradient, float(curvature[0])
-    length, largest = float(gradient.norm()), float(curvature.abs().max())
-    if length == 0.0 and lowest >= 0.0:
-        return torch.zeros_like(gradient)
+    largest = float(curvature.abs().max())
     if lowest > 1e-14 * largest:
         s = -a / curvature
         if float(s.norm()) <= radius:
             return vectors @ s
-    low = max(0.0, -lowest) + 1e-12 * max(largest, math.ulp(0.0) * 1e12)
-    high = low + length / radius + largest
-    s = -a / (curvature + low)
-    if float(s.norm()) <= radius and lowest < 0.0:  # the hard case
-        s[0] += math.copysign(math.sqrt(max(radius**2 - float(s.square().sum()), 0.0)), float(s[0]) or 1.0)
-        return vectors @ (s * (radius / float(s.norm())))
+    scale = max(float(a.abs().max()) / radius, largest)
+    if scale == 0.0:
+        return torch.zeros_like(gradient)
+    # In units of the radius and the scale, where nothing over- or underflows: s = -a / (gap + rest), mu = rest - lowest.
+    a, curvature, largest = a / scale / radius, curvature / scale, largest / scale
+    negative = lowest < -1e-14 * largest * scale
+    gap = curvature - curvature[0] if negative else curvature.clamp_min(0.0)
+    low = _SMALLEST if negative else max(1e-12 * largest, _SMALLEST)
+    s = -a / (gap + low)
+    if float(s.norm()) <= 1.0:
+        if negative:  # the hard case
+            s[0] = math.copysign(math.sqrt(max(1.0 - float(s[1:].square().sum()), 0.0)), float(s[0]))
+        return radius * (vectors @ s)
+    high = float(a.abs().max()) * math.sqrt(len(a))
     for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        if float((a / (curvature + middle)).norm()) > radius:
+        middle = math.sqrt(low) * math.sqrt(high)
+        if float((a / (gap + middle)).norm()) > 1.0:
             low = middle
         else:
             high = middle
-        if high - low <= 1e-9 * high:
+        if high - low <= 1e-12 * high:
             break
-    return vectors @ (-a / (curvature + high))
+    return radius * (vectors @ (-a / (gap + high)))
 
 
 def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return a step as `ball_step`, with lower <= s <= upper [r]: parameters that hit a bound stay there."""
+    """Return a step as `ball_step`, with lower <= s <= upper [r]: parameters that hit a bound stay there.
+
+    Which ones hit is a guess; the best point along the projected gradient is returned if it is better.
+    """
     s, free = torch.zeros_like(gradient), torch.ones_like(gradient, dtype=torch.bool)
     while bool(free.any()):
         left = radius**2 - float(s[~free].square().sum())
@@ -56,4 +68,17 @@ def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, up
         if not bool(hit.any()):
             break
         free &= ~hit
-    return s
+    if bool(free.all()):
+        return s
+    s = s * min(1.0, radius / max(float(s.norm()), _SMALLEST))
+    path = _projected_gradient(gradient, radius, lower, upper)
+    every = torch.cat([s[None], path])
+    return every[int((every @ gradient + 0.5 * ((every @ hessian) * every).sum(1)).argmin())]
+
+
+def _projected_gradient(gradient: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:
+    """Return points down the gradient, [24, r], each moved to the nearest point of the box and into the ball."""
+    largest = gradient.abs().max().clamp_min(_SMALLEST)
+    lengths = radius * 2.0 ** torch.arange(8, 8 - _HALVINGS, -1, dtype=gradient.dtype, device=gradient.device)
+    path = (-lengths[:, None] * (gradient / largest)).clamp(lower, upper)
+    return path * (radius / path.norm(dim=1, keepdim=True).clamp_min(radius))

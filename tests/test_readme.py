@@ -15,8 +15,11 @@ def test_nothing_is_left_to_fill_in():
 def test_python_blocks_run():
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert blocks
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
+    names: dict = {}
+    for block in blocks:  # one after the other, as a reader would
+        exec(compile(block, "README.md", "exec"), names)
+    assert names["fit"].value == 0.0
+    assert names["search"].value < 0.05
 
 
 def test_setup_commands_are_one_line_each():
@@ -30,8 +33,9 @@ def test_setup_commands_are_one_line_each():
 
 def test_every_command_has_help():
     names = re.findall(r"^\| `(\w+)", README, re.MULTILINE)
-    commands = [name for name in names if name in ("run", "error", "bench", "stability", "doctor")]
-    assert commands == ["run", "error", "bench", "stability", "doctor"]
+    expected = ["list", "run", "table", "plot", "report", "tune", "nonpsd", "error", "bench", "stability", "doctor"]
+    commands = [name for name in names if name in expected]
+    assert commands == expected
     shown = subprocess.run(
         [sys.executable, "-m", "experiments", "--help"],
         cwd=Path(__file__).parent.parent,

@@ -19,6 +19,8 @@ _CONSTANT = 10.0
 """Prior variance of the constant term."""
 _RIDGES = (1e-6, 1e-3, 0.2)
 """Prior precision of a slope, in evaluations; the evidence chooses."""
+_ROUNDING = 1e-15
+"""Variation of values, relative to their size, that is none."""
 _DAMPING = 1e-3
 """Added to the curvature of an image model, in units of its mean eigenvalue."""
 
@@ -96,10 +98,13 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
     """
     n = u.shape[1]
     basis, s = _reduced(u)
-    mean = (weights @ values) / weights.sum()
-    scale = (weights @ (values - mean).square() / weights.sum()).sqrt() + math.ulp(0.0)
+    flat = float(values.max() - values.min()) <= _ROUNDING * float(values.abs().max())
+    mean = values[0] if flat else values[0] + weights @ (values - values[0]) / weights.sum()
+    change = torch.zeros_like(values) if flat else values - mean
+    largest = float(change.abs().max()) or 1.0
+    scale = largest * (weights @ (change / largest).square() / weights.sum()).sqrt() + math.ulp(0.0)
     root, inner, trace = weights.sqrt(), s @ s.mT, s.square().sum(1) - n
-    target = root * (values - mean) / scale
+    target = root * change / scale
     kernel = _CONSTANT + inner / n + (0.5 * inner.square() + 0.25 * trace[:, None] * trace) / n**2
     fits = [_Evidence.of(kernel, noise, root, target) for noise in _NOISE]
     best = max(fits, key=lambda fit: fit.log)
@@ -119,7 +124,7 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
         basis,
         spread * (1.0 / n - known).clamp_min(0.0).sqrt(),
         spread * (3.0 / n**2 - bent).clamp_min(0.0).sqrt(),
-        best.log - constant.log,
+        -math.inf if flat else best.log - constant.log,
     )
 
 
@@ -127,7 +132,7 @@ def fit_outputs(
     u: Tensor, outputs: Tensor, weights: Tensor, loss: Callable[[Tensor], Tensor], shape: torch.Size
 ) -> LocalModel:
     """Fit outputs [P, m] linearly at u [P, n] and return the quadratic model of `loss` after it (generalized
-    Gauss-Newton).
+    Gauss-Newton). Derivatives of the loss that are not finite, as those of a norm at zero, count as zero.
 
     The intercept is the smoothed output M = E f(x + sigma u), the slopes its Jacobian J [n, m]; the model of the loss
     has gradient J grad(loss)(M) and Hessian J loss''(M) J^T. It smooths the output, loss(E f), not the loss, E loss(f).
@@ -220,6 +225,11 @@ def _loss_derivatives(
         value = loss(y)
         (slope,) = torch.autograd.grad(value, y, create_graph=True)
         if not slope.requires_grad:
-            return float(value.detach()), slope.detach().flatten(), torch.zeros_like(directions).flatten(1)
+            return float(value.detach()), _finite(slope.detach().flatten()), torch.zeros_like(directions).flatten(1)
         products = [torch.autograd.grad(slope, y, one, retain_graph=True)[0].flatten() for one in directions]
-    return float(value.detach()), slope.detach().flatten(), torch.stack(products)
+    return float(value.detach()), _finite(slope.detach().flatten()), _finite(torch.stack(products))
+
+
+def _finite(derivatives: Tensor) -> Tensor:
+    """Zero in place of what is not finite: a norm at zero, a root, a logarithm outside of its domain."""
+    return torch.nan_to_num(derivatives, nan=0.0, posinf=0.0, neginf=0.0)

@@ -34,6 +34,14 @@ _REFUSED = 10
 
 Phase = Literal["start", "sample", "trial"]
 
+_STATE = (
+    *("sigma", "evaluations", "iterations", "rounds", "done", "message"),
+    *("_first", "_best", "_best_sigma", "_x", "_fx", "_lowest", "_local", "_local_value"),
+    *("_phase", "_step", "_asked", "_need", "_paired", "_patience", "_refused"),
+    *("_trust_output", "_faithful", "_reach", "_retries", "_misled"),
+)
+"""What changes as the search goes on, besides the models, the pool and the generator."""
+
 
 class TrustRegion:
     """Second-order descent on a smoothed black box that counts evaluations. The caller evaluates.
@@ -89,8 +97,8 @@ class TrustRegion:
         pool: int | None = None,
         seed: int | None = None,
     ) -> None:
-        if not isinstance(x0, Tensor) or not x0.is_floating_point() or x0.ndim != 1 or not len(x0):
-            raise ValueError(f"x0 must be a floating tensor [n], got {x0!r}")
+        if not isinstance(x0, Tensor) or x0.dtype not in (torch.float32, torch.float64) or x0.ndim != 1 or not len(x0):
+            raise ValueError(f"x0 must be a tensor [n], float32 or float64, got {x0!r}")
         if not bool(torch.isfinite(x0).all()):
             raise ValueError(f"x0 must be finite, got {x0}")
         for name, value, lowest in (("restarts", restarts, 0), ("noise", noise, 0.0)):
@@ -105,7 +113,8 @@ class TrustRegion:
         # Everything below is in units of sigma: one sigma per parameter is a change of units.
         self._unit = _units(sigma, x0)
         start = x0.detach().double() / self._unit
-        self._lower, self._upper = _box(bounds, x0, self._unit)
+        self._bounds = _box(bounds, x0)
+        self._lower, self._upper = (one.double() / self._unit for one in self._bounds)
         self._pool = Pool(self.n, pool or max(60, 6 * self.n), x0.device)
         self._generator = torch.Generator()
         self._generator.manual_seed(int(torch.randint(2**63 - 1, ())) if seed is None else seed)
@@ -143,7 +152,7 @@ class TrustRegion:
     @property
     def x(self) -> Tensor:
         """The best point so far [n]."""
-        return (self._best * self._unit).to(self.dtype)
+        return self._in_units(self._best)
 
     @property
     def value(self) -> float:
@@ -153,7 +162,7 @@ class TrustRegion:
     @property
     def center(self) -> Tensor:
         """Where the search is now [n], not always its best point."""
-        return (self._x * self._unit).to(self.dtype)
+        return self._in_units(self._x)
 
     @property
     def unit(self) -> Tensor:
@@ -188,29 +197,68 @@ class TrustRegion:
             else:
                 points = self._draw(self._need, self._paired)
             self._asked = points
+            if self.dtype != torch.float64:  # what is evaluated is the rounded point
+                self._asked = self._in_units(points).double() / self._unit
         self._asked = self._asked[:limit]
-        points = (self._asked * self._unit).to(self.dtype)
-        return points.clamp((self._lower * self._unit).to(self.dtype), (self._upper * self._unit).to(self.dtype))
+        return self._in_units(self._asked)
 
     def tell(self, values: Any) -> None:
         """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
 
         Values that are not finite are left out, and the step to such a point is refused and shortened. Raises
-        ValueError for a wrong shape, or if the start itself has no finite value.
+        ValueError for a wrong shape, or if the start itself has no finite value. The search is as before if this, or
+        the loss, raises.
         """
         if self._asked is None:
             raise RuntimeError("ask for points before telling their values")
-        points, self._asked = self._asked, None
+        before = self.state_dict()
         try:
-            losses, outputs = self._losses(values, points)
-        except Exception:
-            self._asked = points
+            self._take(values, self._asked)
+        except BaseException:
+            self.load_state_dict(before)
             raise
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a search with the same settings needs to go on exactly as this one would.
+
+        Tensors, numbers, strings, lists and dicts: `torch.save`, and `torch.load` with weights_only=True.
+        """
+        state = {name: getattr(self, name) for name in _STATE}
+        return {
+            **state,
+            "n": self.n,
+            "followed": list(self._followed),
+            "shape": list(self._shape),
+            "model": None if self._model is None else vars(self._model).copy(),
+            "output_model": None if self._output_model is None else vars(self._output_model).copy(),
+            "pool": self._pool.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a `state_dict`; the settings and the loss stay those given here."""
+        if state["n"] != self.n:
+            raise ValueError(f"state must be of a search with {self.n} parameters, got one with {state['n']}")
+        vars(self).update({name: state[name] for name in _STATE})
+        self._followed, self._shape = list(state["followed"]), torch.Size(state["shape"])
+        self._model, self._output_model = (
+            None if state[name] is None else LocalModel(**state[name]) for name in ("model", "output_model")
+        )
+        self._pool.load_state_dict(state["pool"])
+        self._generator.set_state(state["generator"].cpu())
+
+    def _in_units(self, z: Tensor) -> Tensor:
+        """Return z in the units and the type of x0; rounding does not leave the bounds."""
+        return (z * self._unit).to(self.dtype).clamp(*self._bounds)
+
+    def _take(self, values: Any, points: Tensor) -> None:
+        """`tell` of the values of points [K, n]; may raise half-way."""
+        self._asked = None
+        losses, outputs = self._losses(values, points)
         finite = torch.isfinite(losses)
         if outputs is not None:
             finite &= torch.isfinite(outputs).all(1)
         if self.evaluations == 0 and not bool(finite[0]):
-            self._asked = points
             raise ValueError(f"the black box is not finite at the start x0: {float(losses[0])}")
         self.evaluations += len(points)
         kept = None if outputs is None else outputs[finite]
@@ -235,22 +283,6 @@ class TrustRegion:
             self._arrive()
         if self._phase == "trial" and not self.done:
             self._plan()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that a search with the same settings needs to go on exactly as this one would."""
-        left_out = ("loss", "_pool", "_generator")
-        state = {name: value for name, value in vars(self).items() if name not in left_out}
-        state["_followed"] = list(self._followed)
-        return {**state, "pool": self._pool.state_dict(), "generator": self._generator.get_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a `state_dict`; the loss stays the one given here."""
-        state = dict(state)
-        if state["n"] != self.n:
-            raise ValueError(f"state must be of a search with {self.n} parameters, got one with {state['n']}")
-        self._pool.load_state_dict(state.pop("pool"))
-        self._generator.set_state(state.pop("generator"))
-        vars(self).update({**state, "_followed": list(state["_followed"])})
 
     # Samples and steps.
 
@@ -297,6 +329,9 @@ class TrustRegion:
         self._need = 0
         u, weights = (self._pool.points[near] - self._x) / self.sigma, weights[near]
         self._model = self._fit(u, near, weights)
+        outputs = self._pool.outputs
+        if self.loss is not None and outputs is not None and self.n <= _FEW and not self._trust_output:
+            self._output_model = fit_outputs(u, outputs[near], weights, self.loss, self._shape)
         radius = self._reach * math.sqrt(self.n)
         lower, upper = (self._lower - self._x) / self.sigma, (self._upper - self._x) / self.sigma
         if self._model.basis is None:
@@ -310,7 +345,6 @@ class TrustRegion:
         if self.loss is None or outputs is None:
             return fit_values(u, self._pool.values[near], weights)
         if self.n <= _FEW and not self._trust_output:
-            self._output_model = fit_outputs(u, outputs[near], weights, self.loss, self._shape)
             return fit_values(u, self._pool.values[near], weights)
         return fit_outputs(u, outputs[near], weights, self.loss, self._shape)
 
@@ -458,16 +492,19 @@ def _narrowing(length: float) -> float:
 
 def _units(sigma: float | Tensor, x0: Tensor) -> Tensor:
     """Return sigma as float64 [n]."""
-    unit = torch.as_tensor(sigma, dtype=torch.float64, device=x0.device)
+    unit = torch.as_tensor(sigma, dtype=torch.float64, device=x0.device).detach()
     if unit.shape not in ((), x0.shape) or not bool((torch.isfinite(unit) & (unit > 0)).all()):
         raise ValueError(f"sigma must be positive and finite, one value or one per parameter [{len(x0)}], got {sigma}")
+    start = x0.detach()
+    if bool((start + unit.to(x0.dtype) == start).any()):
+        raise ValueError(f"sigma must be large enough to change x0 in {x0.dtype}, got {sigma} for {start}")
     return unit.expand_as(x0).clone()
 
 
-def _box(bounds: tuple[float | Tensor, float | Tensor] | None, x0: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-    """Return lower and upper [n] in units of sigma."""
+def _box(bounds: tuple[float | Tensor, float | Tensor] | None, x0: Tensor) -> tuple[Tensor, Tensor]:
+    """Return lower and upper [n], the outermost numbers within the bounds that the type of x0 has."""
     if bounds is None:
-        infinite = torch.full_like(unit, math.inf)
+        infinite = torch.full_like(x0.detach(), math.inf)
         return -infinite, infinite
     if len(bounds) != 2:
         raise ValueError(f"bounds must be (lower, upper), got {len(bounds)} entries")
@@ -486,4 +523,9 @@ def _box(bounds: tuple[float | Tensor, float | Tensor] | None, x0: Tensor, unit:
             f"x0 must be within the bounds, got {float(start[k])} at index {k}, outside of "
             f"[{float(lower[k])}, {float(upper[k])}]"
         )
-    return lower / unit, upper / unit
+    inner = lower.to(x0.dtype), upper.to(x0.dtype)
+    infinite = torch.full_like(inner[0], math.inf)
+    return (
+        torch.where(inner[0].double() < lower, inner[0].nextafter(infinite), inner[0]),
+        torch.where(inner[1].double() > upper, inner[1].nextafter(-infinite), inner[1]),
+    )

@@ -80,6 +80,7 @@ def minimize(
     Ctrl-C ends the search and returns the best point so far, and so do `max_evaluations`. An exception of fn passes.
 
     Example:
+        >>> import torch
         >>> fit = minimize(lambda z: ((z - 3) ** 2).sum(1), torch.zeros(2), sigma=2.0, seed=0, restarts=0)
         >>> bool((fit.x - 3).abs().max() < 1e-3), fit.evaluations < 50
         (True, True)

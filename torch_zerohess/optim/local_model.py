@@ -223,6 +223,8 @@ def _loss_derivatives(
     with torch.enable_grad():
         y = output.detach().requires_grad_(True)
         value = loss(y)
+        if not value.requires_grad:
+            raise ValueError("loss must be differentiable by torch, got a value that does not depend on its output")
         (slope,) = torch.autograd.grad(value, y, create_graph=True)
         if not slope.requires_grad:
             return float(value.detach()), _finite(slope.detach().flatten()), torch.zeros_like(directions).flatten(1)

@@ -55,7 +55,7 @@ class Pool:
         here = ((self.points - x) / sigma).square().sum(1)
         target = -0.5 * here - self.n * math.log(sigma)
         distance = torch.cdist(self.points, self._centers, compute_mode="donot_use_mm_for_euclid_dist")
-        share = torch.bincount(self._origin, minlength=len(self._sigmas)) / len(self)
+        share = torch.bincount(self._origin, minlength=len(self._sigmas)).double() / len(self)
         each = share.log() - 0.5 * (distance / self._sigmas).square() - self.n * self._sigmas.log()
         ratio = (target - torch.logsumexp(each, 1)) * min(1.0, _FLAT / self.n)
         return torch.where(here == 0, 1.0, ratio.exp().clamp(max=_CAP))

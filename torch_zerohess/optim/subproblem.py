@@ -28,7 +28,7 @@ def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
     scale = max(float(a.abs().max()) / radius, largest)
     if scale == 0.0:
         return torch.zeros_like(gradient)
-    # In units of the radius and the scale, where nothing over- or underflows: s = -a / (gap + rest), mu = rest - lowest.
+    # In units of radius and scale, where nothing over- or underflows: s = -a / (gap + rest), mu = rest - lowest.
     a, curvature, largest = a / scale / radius, curvature / scale, largest / scale
     negative = lowest < -1e-14 * largest * scale
     gap = curvature - curvature[0] if negative else curvature.clamp_min(0.0)

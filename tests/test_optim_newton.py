@@ -7,7 +7,7 @@ import torch
 from test_optim import random_problem
 
 import torch_zerohess as zh
-from torch_zerohess.optim.newton import in_ball
+from torch_zerohess.optim.subproblem import diagonal_step
 from truths import Quadratic, vector
 
 
@@ -39,7 +39,7 @@ def best_on_a_grid(w, a, radius):
 )
 def test_step_is_the_minimum_of_the_model_in_the_ball(w, a, radius):
     w, a = vector(*w), vector(*a)
-    y = in_ball(w, a, radius)
+    y = diagonal_step(a, w, radius)
     assert float(y.norm()) <= radius * (1 + 1e-9)
     reached = float(a @ y + 0.5 * (w * y) @ y)
     best = best_on_a_grid(w, a, radius)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torch_zerohess.optim.newton_step import NewtonStep, Step
 from torch_zerohess.optim.second_order import Model, check_positive
+from torch_zerohess.optim.subproblem import diagonal_step
 
 MOST = 10_000
 """Parameters beyond which the Hessian is not formed."""
@@ -81,27 +82,6 @@ class Newton(NewtonStep):
         a, rounding = vectors.mT @ g, len(w) * torch.finfo(self._parameters[0].dtype).eps
         w = torch.where(w.abs() <= rounding * w.abs().max(), 0.0, w)
         a = torch.where((w == 0.0) & (a.abs() <= rounding * g.norm()), 0.0, a)
-        y = in_ball(w.abs() if group["modification"] == "abs" else w, a, radius)
+        y = diagonal_step(a, w.abs() if group["modification"] == "abs" else w, radius)
         reason = "boundary" if float(y.norm()) > radius * (1 - 1e-9) else "converged"
         return Step(vectors @ y, -float(a.dot(y) + 0.5 * (w * y).dot(y)), reason)
-
-
-def in_ball(w: Tensor, a: Tensor, radius: float) -> Tensor:
-    """Minimise a.y + y.(w y)/2 over |y| <= radius, for eigenvalues w [N] in any order and sign."""
-    least, index = w.min(0)
-    low = max(0.0, -float(least))
-
-    def solution(shift: float) -> Tensor:
-        return torch.where(a == 0.0, 0.0, -a / (w + shift))
-
-    if float(least) >= 0.0 and float((y := solution(0.0)).norm()) <= radius:
-        return y
-    high = low + float(a.norm()) / radius
-    while low < (middle := 0.5 * (low + high)) < high:
-        low, high = (middle, high) if float(solution(middle).norm()) > radius else (low, middle)
-    y = solution(high)
-    missing = radius**2 - float(y.dot(y))
-    if float(least) < 0.0 and missing > 0.0:
-        # The gradient has (almost) no share of the lowest eigenvector, which goes the rest of the way to the boundary.
-        y[index] = torch.copysign((y[index] ** 2 + missing).sqrt(), y[index])
-    return y

@@ -219,7 +219,7 @@ class Search:
         slack = 2.0 * self.noise
         promised = self.model.decrease(self.step)
         ratio = (self.fx - fz + slack) / (promised + slack) if promised + slack > 0.0 else -math.inf
-        least = 1e-3 * abs(self.fx) if math.isfinite(self.fx) else 0.0
+        least = 1e-3 * abs(self.fx)
         if self.rounds:  # not on a plateau, then: the loss may have a large offset
             least = min(least, 0.1 * self._spread)
         if min(fz, self.local_value) < self.fx - max(least, slack):

@@ -12,32 +12,37 @@ _HALVINGS = 24
 
 
 def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
-    """Return s [r] with |s| <= radius that minimises gradient.s + s.hessian s/2, hessian [r, r] of any signature.
-
-    By the eigenvectors of the Hessian and bisection for the shift mu of s = -(H + mu I)^-1 g (More and Sorensen 1983).
-    In the hard case, where the gradient has no component along the most negative curvature, the step is completed
-    along it to the boundary.
-    """
+    """Return s [r] with |s| <= radius that minimises gradient.s + s.hessian s/2, hessian [r, r] of any signature."""
     curvature, vectors = torch.linalg.eigh(hessian)
-    a, lowest = vectors.mT @ gradient, float(curvature[0])
-    largest = float(curvature.abs().max())
+    return vectors @ diagonal_step(vectors.mT @ gradient, curvature, radius)
+
+
+def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
+    """Return s [r] with |s| <= radius that minimises a.s + s.(curvature s)/2, in any order and of any sign.
+
+    By bisection for the shift mu of s = -a / (curvature + mu) (More and Sorensen 1983). In the hard case, where a has
+    no component along the most negative curvature, the step is completed along it to the boundary.
+    """
+    least, index = curvature.min(0)
+    lowest, largest = float(least), float(curvature.abs().max())
     if lowest > 1e-14 * largest:
         s = -a / curvature
         if float(s.norm()) <= radius:
-            return vectors @ s
+            return s
     scale = max(float(a.abs().max()) / radius, largest)
     if scale == 0.0:
-        return torch.zeros_like(gradient)
+        return torch.zeros_like(a)
     # In units of radius and scale, where nothing over- or underflows: s = -a / (gap + rest), mu = rest - lowest.
     a, curvature, largest = a / scale / radius, curvature / scale, largest / scale
     negative = lowest < -1e-14 * largest * scale
-    gap = curvature - curvature[0] if negative else curvature.clamp_min(0.0)
+    gap = curvature - curvature[index] if negative else curvature.clamp_min(0.0)
     low = _SMALLEST if negative else max(1e-12 * largest, _SMALLEST)
     s = -a / (gap + low)
     if float(s.norm()) <= 1.0:
         if negative:  # the hard case
-            s[0] = math.copysign(math.sqrt(max(1.0 - float(s[1:].square().sum()), 0.0)), float(s[0]))
-        return radius * (vectors @ s)
+            missing = 1.0 - float(s.square().sum()) + float(s[index] ** 2)
+            s[index] = math.copysign(math.sqrt(max(missing, 0.0)), float(s[index]))
+        return radius * s
     high = float(a.abs().max()) * math.sqrt(len(a))
     for _ in range(_BISECTIONS):
         middle = math.sqrt(low) * math.sqrt(high)
@@ -47,7 +52,7 @@ def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
             high = middle
         if high - low <= 1e-12 * high:
             break
-    return radius * (vectors @ (-a / (gap + high)))
+    return radius * -a / (gap + high)
 
 
 def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ class TrustRegion:
         restarts: how often to start again after arriving. 0 for a local search.
         tolerance: the search has arrived when sigma is below this times the first sigma.
         noise: standard deviation of repeated losses at one point, if it is known. Smaller decreases do not count.
-        pool: evaluations kept; max(60, 6 n) if not given.
+        pool: evaluations kept; by default 60 or 6 n, and enough for a full quadratic of a loss alone up to n = 20.
         seed: of the samples; from torch's global generator if None.
 
     Raises ValueError for settings out of range. Source: Wang, Fischer and Ritschel (2025) for the smoothed second
@@ -88,7 +88,7 @@ class TrustRegion:
             restarts=restarts,
             tolerance=tolerance,
             noise=float(noise),
-            pool=pool or max(60, 6 * self.n),
+            pool=pool or _capacity(self.n, loss is None),
             generator=generator,
         )
         self._asked: Tensor | None = None
@@ -221,6 +221,12 @@ class TrustRegion:
         if any(one.numel() != 1 for one in losses):
             raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
         return torch.stack([one.detach().double().reshape(()) for one in losses]), values.flatten(1)
+
+
+def _capacity(n: int, loss_alone: bool) -> int:
+    """Evaluations to keep: twice what determines the model, within reason."""
+    quadratic = min((n + 1) * (n + 2), 500) if loss_alone else 0
+    return max(60, 6 * n, quadratic)
 
 
 def _units(sigma: float | Tensor, x0: Tensor) -> Tensor:

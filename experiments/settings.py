@@ -159,7 +159,8 @@ RECOMMENDED: dict[str, dict[str, Settings]] = {
 """Trust region: everything at its default but sigma, where that of the task was not the best of those tried.
 
 The defaults themselves (batches, thresholds of misfit and gain, weights) were chosen on runs from 1000 upward of these
-six tasks; on BRDF again after a look at the reported ones. `tune brdf --method trust_region --runs 100 --over sigma=0.2,0.25,0.36,0.5` and the like give sigma."""
+six tasks; on BRDF again after a look at the reported ones.
+`tune brdf --method trust_region --runs 100 --over sigma=0.2,0.25,0.36,0.5` and the like give sigma."""
 
 
 def settings(method: str, task: str) -> Settings:

@@ -301,6 +301,7 @@ class Search:
             else:
                 self.x = (self.first + 2.0 * self._normal(self.n)).clamp(self.lower, self.upper)
         self.local_value, self._patience, self._followed, self.phase = math.inf, 0, [], "start"
+        self._faithful, self._reach, self._retries, self._misled = False, 1.0, 0, 0
 
     def _remember(self, points: Tensor, losses: Tensor) -> None:
         if not len(losses):

@@ -48,6 +48,13 @@ class Task:
     picture: Callable[[Tensor], Tensor] | None = None
     """What x [n] looks like: [h, w] or [h, w, 3] in [0, 1]."""
     target_picture: Tensor | None = None
+    adjoint: Callable[[Tensor, str], tuple[Tensor, Tensor]] | None = None
+    """The renderer's own derivative: x [n] and one of `adjoints` -> loss [], gradient [n]. Counts as two evaluations, a
+    render and its adjoint."""
+    adjoints: tuple[str, ...] = ()
+    """Integrators that `adjoint` knows."""
+    full: "Callable[[], Task] | None" = None
+    """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""
     precision: float | None = None
     """Parameter error that a run should reach beyond the usual levels, where the task is about reaching it."""
 

@@ -9,16 +9,20 @@ from experiments.task import Task
 
 Preset = Literal["fast", "paper"]
 
-FITTING = {name: f"experiments.tasks.{name}" for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd")}
+FITTING = {name: f"experiments.tasks.{name}" for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "caustic")}
 """Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
+RENDERED = {name: f"experiments.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror")}
+"""Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
+FITTING |= RENDERED
 TRAINING = {"cnn": "experiments.tasks.cnn"}
 """Tasks whose unknowns are the weights of a network before the black box."""
 
 
-def load(name: str, preset: Preset = "fast") -> Task:
-    """Return a fitting task; ImportError says what to install."""
+def load(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:
+    """Return a fitting task, with a Mitsuba variant if it is rendered; ImportError says what to install."""
+    more = (variant,) if name in RENDERED else ()
     try:
-        task: Task = importlib.import_module(FITTING[name]).task(preset)
+        task: Task = importlib.import_module(FITTING[name]).task(preset, *more)
     except ImportError as error:
         raise ImportError(
             f"task {name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'",

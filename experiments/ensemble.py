@@ -31,6 +31,8 @@ class Ensemble:
     preset: Preset = "fast"
     jobs: int = 1
     limit: float = LIMIT
+    variant: str = "auto"
+    """Of Mitsuba."""
 
     def __post_init__(self) -> None:
         if len(self.runs) < 1:
@@ -58,7 +60,7 @@ class Ensemble:
         return sorted(jobs, key=lambda job: job.run)
 
     def _jobs(self, task: str | Task, methods: Sequence[str | Method] | None) -> list[Job]:
-        loaded = catalogue.load(task, self.preset) if isinstance(task, str) else task
+        loaded = catalogue.load(task, self.preset, self.variant) if isinstance(task, str) else task
         jobs = []
         for name in METHODS if methods is None else methods:
             method = METHODS[name] if isinstance(name, str) else name
@@ -77,7 +79,18 @@ class Ensemble:
                 "method": own,
             }
             jobs += [
-                Job(task, name, run, self.folder, self.preset, self.limit, settings, own, loaded.evaluations)
+                Job(
+                    task,
+                    name,
+                    run,
+                    self.folder,
+                    self.preset,
+                    self.variant,
+                    self.limit,
+                    settings,
+                    own,
+                    loaded.evaluations,
+                )
                 for run in self.runs
             ]
         return jobs

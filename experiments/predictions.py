@@ -6,7 +6,7 @@ from pathlib import Path
 import matplotlib as mpl
 import torch
 
-from experiments.scenes.mug import to_srgb
+from experiments.scenes.meshes import to_srgb
 from experiments.tasks.cnn import DEGREES, CnnTask
 from experiments.training import Result
 

@@ -16,7 +16,9 @@ from torch import Tensor
 from experiments import catalogue, figures
 from experiments.catalogue import FITTING
 from experiments.command import flat, read_command
+from experiments.measures import described, measures
 from experiments.results import Run, load
+from experiments.saving import known_saving, line
 from experiments.summary import Summary, summarize, task_table
 from experiments.task import Task
 
@@ -58,7 +60,11 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
         preset = next((one.get("preset", "fast") for one in settings.values()), "fast")
         task = (tasks or {}).get(name) or _load(name, preset)
         parts += [f"<h2 id='{_text(name)}'>{_text(name)}</h2>", _about(task), _tables(summary, name)]
-        parts += [_curves(name, methods), _pictures(task, methods), _settings(settings)]
+        parts.append(_curves(name, methods))
+        if task is not None:
+            run, ends = _ends(task, methods)
+            parts += [_pictures(task, run, ends), _left_out(task, ends, folder / name)]
+        parts.append(_settings(settings))
     title = f"Results of {', '.join(results.runs)}"
     if summary.unfinished:
         parts.insert(0, f"<p>{summary.unfinished} runs have not ended; they are left out.</p>")
@@ -116,25 +122,49 @@ def _curves(name: str, methods: dict[str, list[Run]]) -> str:
     return f"<img class='curves' alt='error curves of {_text(name)}' src='{_embedded(image.getvalue())}'>"
 
 
-def _pictures(task: Task | None, methods: Mapping[str, Sequence[Run]]) -> str:
-    """Show the start, the results of the first run of every method, and the target."""
-    if task is None or task.picture is None:
-        return ""
+def _ends(task: Task, methods: Mapping[str, Sequence[Run]]) -> tuple[int, dict[str, Tensor]]:
+    """Return the number of the first run, its start, and where each method ended from there."""
     run = min(one.outcome.run for runs in methods.values() for one in runs)
-    shown = [("start", task.picture(task.start(run)))]
-    for name, runs in methods.items():
-        shown += [
-            (name, task.picture(torch.tensor(one.outcome.x, dtype=torch.float64)))
-            for one in runs
-            if one.outcome.run == run and len(one.outcome.x) == task.n
-        ]
+    ends = {
+        name: torch.tensor(one.outcome.x, dtype=torch.float64)
+        for name, runs in methods.items()
+        for one in runs
+        if one.outcome.run == run and len(one.outcome.x) == task.n
+    }
+    return run, {"start": task.start(run), **ends}
+
+
+def _pictures(task: Task, run: int, ends: Mapping[str, Tensor]) -> str:
+    """Show the start, the results of the first run of every method, and the target, with how they differ from it."""
+    shown = []
+    for name, x in ends.items():
+        picture, found = None if task.picture is None else task.picture(x), {}
+        if picture is not None and task.target_picture is not None:
+            found = measures(picture, task.target_picture)
+        more = getattr(task, "measures", None)
+        if more is not None:
+            found |= more(x)
+        if picture is not None or found:
+            shown.append(_figure(name, picture, described(found)))
+    if not shown:
+        return ""
     if task.target_picture is not None:
-        shown.append(("target", task.target_picture))
-    return f"<h3>Run {run}</h3>" + "".join(
-        f"<figure><img alt='{_text(name)}' src='{_embedded(_png(picture))}'>"
-        f"<figcaption>{_text(name)}</figcaption></figure>"
-        for name, picture in shown
-    )
+        shown.append(_figure("target", task.target_picture, ""))
+    return f"<h3>Run {run}</h3>{''.join(shown)}"
+
+
+def _figure(name: str, picture: Tensor | None, caption: str) -> str:
+    image = "" if picture is None else f"<img alt='{_text(name)}' src='{_embedded(_png(picture))}'>"
+    return f"<figure>{image}<figcaption><b>{_text(name)}</b><br>{_text(caption)}</figcaption></figure>"
+
+
+def _left_out(task: Task, ends: Mapping[str, Tensor], folder: Path) -> str:
+    """Say what the setting of the task saves over the source's, measured on the way to the best result."""
+    if task.full is None:
+        return ""
+    best = min(ends.values(), key=task.image_error)
+    found = known_saving(task, line(ends["start"], best), folder)
+    return f"<h3>Left out</h3><p>Used: {_text(task.needs)}; against the source's full setting, {_text(found)}.</p>"
 
 
 def _settings(settings: Mapping[str, dict[str, Any]]) -> str:

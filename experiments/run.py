@@ -41,8 +41,8 @@ def run(
         jobs: processes, one thread each (not for cnn); the results do not depend on it.
         seed: number of the first run.
         limit: seconds that a run may take (not for cnn).
-        variant: Mitsuba variant of cnn; auto takes a just-in-time one only where it is known to work.
-        threads: render threads of cnn; all cores if not given.
+        variant: of Mitsuba; auto takes a just-in-time one only where it is known to work.
+        threads: render threads of networks; all cores if not given. Other tasks have one per process.
     """
     names = chosen("TASK", tasks, [*FITTING, *TRAINING])
     fitting, training = [name for name in names if name in FITTING], [name for name in names if name in TRAINING]
@@ -54,7 +54,8 @@ def run(
         raise SystemExit(f"runs must be at least 1, got {runs}")
     try:
         if fitting:
-            _fit(fitting, wanted, _range(seed, runs, "fitting"), preset, out, jobs, limit)
+            ensemble = Ensemble(out, _range(seed, runs, "fitting"), preset, jobs, limit, variant)
+            _fit(ensemble, fitting, wanted)
         if training:
             _train(wanted, _range(seed, runs, "training"), preset, out, variant, threads)
     except KeyboardInterrupt:
@@ -65,10 +66,8 @@ def _range(seed: int, runs: int | None, kind: str) -> range:
     return range(seed, seed + (RUNS[kind] if runs is None else runs))
 
 
-def _fit(
-    tasks: list[str], methods: list[str] | None, runs: range, preset: Preset, out: Path, jobs: int, limit: float
-) -> None:
-    ensemble = Ensemble(out, runs, preset, jobs, limit)
+def _fit(ensemble: Ensemble, tasks: list[str], methods: list[str] | None) -> None:
+    out = ensemble.folder
     names = None if methods is None else [name for name in methods if name in METHODS]
     try:
         planned = ensemble.plan(tasks, names)

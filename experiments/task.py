@@ -67,3 +67,14 @@ def uniform(lower: Tensor, upper: Tensor) -> Callable[[int], Tensor]:
         return lower + (upper - lower) * torch.rand(len(lower), generator=generator, dtype=torch.float64)
 
     return start
+
+
+def around(n: int, distance: float, spread: float) -> Callable[[int], Tensor]:
+    """Starts whose n coordinates are uniform within `spread` of `distance` or of its negative, for `Task.start`."""
+
+    def start(run: int) -> Tensor:
+        generator = torch.Generator().manual_seed(run)
+        size = distance + spread * (2 * torch.rand(n, generator=generator, dtype=torch.float64) - 1)
+        return torch.where(torch.rand(n, generator=generator) < 0.5, -size, size)
+
+    return start

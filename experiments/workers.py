@@ -39,6 +39,7 @@ class Job:
     run: int
     folder: Path
     preset: Preset
+    variant: str
     limit: float
     settings: dict[str, Any]
     """Written to the outcome."""
@@ -171,7 +172,7 @@ def _execute(job: Job, connection: Connection) -> Message:
             last = now
 
     try:
-        task = _load(job.task, job.preset) if isinstance(job.task, str) else job.task
+        task = _load(job.task, job.preset, job.variant) if isinstance(job.task, str) else job.task
         method = METHODS[job.method] if isinstance(job.method, str) else job.method
         method.load()
         return attempt(
@@ -189,8 +190,8 @@ def _execute(job: Job, connection: Connection) -> Message:
 
 
 @lru_cache(maxsize=4)
-def _load(name: str, preset: Preset) -> Task:
-    return catalogue.load(name, preset)
+def _load(name: str, preset: Preset, variant: str) -> Task:
+    return catalogue.load(name, preset, variant)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "torch_zerohess"
 LAYERS = [
     *("smoothing", "philox", "quantiles", "proposals", "extension", "kernels", "linear_map", "stein", "samplers"),
     *("perturbations", "evaluators", "evaluation", "standard_error", "estimate", "finite_differences", "opaque"),
-    *("blackbox", "curvature", "schedules", "optim", "minimize", "adapters", "doctor"),
+    *("blackbox", "curvature", "schedules", "losses", "optim", "minimize", "adapters", "doctor"),
 ]
 MOST_LINES = 320
 MODULES = sorted(PACKAGE.rglob("*.py"))

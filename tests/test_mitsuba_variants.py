@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torch_zerohess.adapters import mitsuba as adapter
+from torch_zerohess.adapters import mitsuba_variants as adapter
 
 ABORTING = [path for path in map(Path, ["/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1"]) if path.exists()]
 

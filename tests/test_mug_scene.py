@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.scenes.mug import RADIUS, MugScene, body, handle, to_srgb
+from experiments.scenes.meshes import to_srgb
+from experiments.scenes.mug import RADIUS, MugScene, body, handle
 
 HIDDEN = [50.0, 60.0, 70.0, 80.0, 90.0]
 FACING = 257.0

@@ -4,22 +4,27 @@ import base64
 import csv
 import io
 import json
+import math
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import matplotlib.image
 import numpy as np
 import pytest
+import torch
 from small import TARGET, TASK
 
+import torch_zerohess as zh
 from experiments.catalogue import FITTING, load
 from experiments.figures import plot
 from experiments.listing import listing
+from experiments.measures import described, measures
 from experiments.methods import METHODS
 from experiments.records import Files, Log, Outcome, Record, write_outcome
 from experiments.report import page, report
 from experiments.results import load as load_results
 from experiments.run import run
+from experiments.saving import Saving, known_saving, line, saving
 from experiments.summary import as_csv, as_json, as_text, summarize, table
 
 PER_ITERATION = 0.5
@@ -160,6 +165,110 @@ def test_the_page_needs_nothing_else(folder):
     assert np.array_equal(np.round(255 * start[..., 0]), pixels)
     for part in ("60 1s 100%", "ValueError: no", "trust_region", TASK.title, "1 runs have not ended"):
         assert part in text
+    assert "Left out" not in text
+
+
+def test_pictures_say_how_far_they_are_from_the_target(folder):
+    text = page(folder, {"bowl": TASK})
+    captions = dict(re.findall(r"<figcaption><b>([^<]*)</b><br>([^<]*)</figcaption>", text))
+    start, target = TASK.picture(TASK.start(0)), TASK.picture(TARGET)
+    decibels = -10 * math.log10(float((start - target).square().mean()))
+    assert captions == {
+        "start": f"PSNR {decibels:.1f} dB",  # too small for a window of SSIM
+        "our_g": "PSNR inf dB",
+        "trust_region": "PSNR inf dB",
+        "target": "",
+    }
+    assert "PSNR" not in page(folder, {"bowl": replace(TASK, target_picture=None)})
+
+
+class Clock:
+    """Time that passes only when a loss says so."""
+
+    def __init__(self):
+        self.now, self.calls = 0.0, 0
+
+    def loss(self, seconds, factor):
+        def evaluate(x):
+            self.calls += 1
+            self.now += next(seconds)
+            return factor * TASK.loss(x)
+
+        return evaluate
+
+
+@pytest.fixture
+def halved(monkeypatch):
+    """`bowl` in 3 ms, its full setting in 36 ms with a loss that is larger by a quarter; both load for 100 s."""
+    clock = Clock()
+    monkeypatch.setattr("experiments.saving.time.perf_counter", lambda: clock.now)
+    whole = replace(TASK, loss=clock.loss(iter([100, 0.036, 0.7, 0.036, 0.036, 0.001, 0.036]), 1.25))
+    task = replace(TASK, loss=clock.loss(iter([100, 0.003, 0.003, 0.5, 0.003, 0.003, 0.002]), 1.0), full=lambda: whole)
+    return task, clock
+
+
+def test_saving_is_measured_at_the_same_points_without_the_loading(halved):
+    task, clock = halved
+    points = line(TARGET + 2, TARGET)
+    # The way is 2 sqrt(2) long; losses are its squared length.
+    assert torch.allclose(points, TARGET + torch.tensor([2, 1.6, 1.2, 0.8, 0.4, 0]).double()[:, None])
+    found = saving(task, points)
+    squares = [8 * t**2 for t in (1, 0.8, 0.6, 0.4, 0.2, 0)]
+    rms = math.sqrt(sum((0.25 * square) ** 2 for square in squares) / 6)
+    assert found == Saving(pytest.approx(0.003), pytest.approx(0.036), pytest.approx(rms / (1.25 * 8)))
+    assert clock.calls == 2 * 7
+    assert str(found) == ("time saved: 12x (3 ms against 36 ms per evaluation), loss differs by 10 % of its peak")
+
+
+def test_times_have_units():
+    assert "2x (1.5 s against 3 s" in str(Saving(1.5, 3.0, 0.0))
+    text = "time saved: 120x (12 us against 1.5 ms per evaluation), loss differs by 140 % of its peak"
+    assert str(Saving(1.2e-5, 1.4999e-3, 1.4)) == text
+
+
+def test_the_report_measures_the_saving_once(folder, halved):
+    task, clock = halved
+    first = page(folder, {"bowl": task})
+    assert "12x (3 ms against 36 ms per evaluation)" in first
+    assert json.loads((folder / "bowl" / "saving.json").read_text())["full_seconds"] == pytest.approx(0.036)
+    calls = clock.calls
+    assert page(folder, {"bowl": task}) == first
+    assert clock.calls == calls
+    assert known_saving(TASK, line(TARGET, TARGET), folder) is None
+    assert not (folder / "saving.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("task", "points", "message"),
+    [
+        (TASK, torch.zeros(1, 2), "task must have a full setting .* bowl has none"),
+        (replace(TASK, full=lambda: TASK), torch.zeros(2), r"points must be \[P, 2\], got \[2\]"),
+        (replace(TASK, full=lambda: TASK), torch.zeros(0, 2), r"points must be \[P, 2\], got \[0, 2\]"),
+    ],
+)
+def test_saving_names_what_is_wrong(task, points, message):
+    with pytest.raises(ValueError, match=message):
+        saving(task, points)
+
+
+@pytest.mark.parametrize("shape", [(20, 16), (20, 16, 3)])
+def test_measures_of_pictures(shape):
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(shape, generator=generator, dtype=torch.float64)
+    picture = (0.8 * target + 0.2 * torch.rand(shape, generator=generator)).clamp(0, 1)
+    found = measures(picture, target)
+    assert found["PSNR"] == pytest.approx(-10 * math.log10(float((picture - target).square().mean())))
+    assert found["SSIM"] == pytest.approx(1 - float(zh.losses.ssim(target)(picture)))
+    assert measures(target, target) == {"PSNR": math.inf, "SSIM": pytest.approx(1.0)}
+    # What cannot be shown does not count.
+    assert measures(picture + (picture == 1), target) == found
+    assert measures(picture[:10], target[:10]).keys() == {"PSNR"}
+    with pytest.raises(ValueError, match=r"picture must have the shape .*of the target, got \[19, 16"):
+        measures(picture[1:], target)
+
+
+def test_measures_as_text():
+    assert described({"PSNR": 31.25, "SSIM": 0.98765, "d": 0.00123}) == "PSNR 31.2 dB, SSIM 0.988, d 0.00123"
 
 
 def test_report_writes_the_page(folder, tmp_path, capsys):

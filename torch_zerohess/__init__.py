@@ -10,7 +10,7 @@ Hessian-vector products of F are estimated from one batch of evaluations of f (S
     loss.backward()                                             # or torch.func, or zh.optim.NewtonCG
 """
 
-from torch_zerohess import adapters, evaluators, optim
+from torch_zerohess import adapters, evaluators, losses, optim
 from torch_zerohess.blackbox import BlackBox, smooth
 from torch_zerohess.curvature import CurvatureOperator, hvp
 from torch_zerohess.doctor import doctor
@@ -33,6 +33,7 @@ __all__ = [
     "evaluators",
     "finite_difference_hvp",
     "hvp",
+    "losses",
     "minimize",
     "optim",
     "smooth",

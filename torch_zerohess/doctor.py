@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from torch_zerohess import extension
-from torch_zerohess.adapters import mitsuba
+from torch_zerohess.adapters import mitsuba_variants
 
 _OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "numpy")
 
@@ -46,7 +46,7 @@ def doctor() -> Report:
     versions = {"python": platform.python_version()}
     versions |= {name: version for name in ("torch_zerohess", "torch", *_OPTIONAL) if (version := _version(name))}
     devices = ["cpu"] + [f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in range(torch.cuda.device_count())]
-    variants = {name: "works" if probe.works else probe.reason for name, probe in mitsuba.variants().items()}
+    variants = {name: "works" if probe.works else probe.reason for name, probe in mitsuba_variants.variants().items()}
     advice = [] if extension.available else [f"for the C++ extension, {extension.HINT}"]
     return Report(extension.available, extension.status, devices, variants, versions, advice)
 

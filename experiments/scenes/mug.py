@@ -1,8 +1,8 @@
-"""A coffee mug on a curved backdrop whose handle turns about the vertical axis (tasks MUG and CNN).
+"""A coffee mug on a curved backdrop, whose handle turns about the vertical axis (tasks MUG and the CNN ones).
 
-One parameter, in degrees: the handle is seen in profile at 0, points at the camera near 257 and is hidden behind the
-body from 40 to 100, where the image does not change: a plateau of every image loss. The body is a solid of revolution,
-so only the handle moves. Lengths are metres and y is up; the meshes are computed here.
+At 0 degrees the handle is seen in profile; it points at the camera near 257 and is hidden behind the body from 40 to
+100, where the image does not change: a plateau of every image loss. The body is a solid of revolution, so where only
+the rotation is sought only the handle moves. Lengths are metres and y is up; the meshes are computed here.
 """
 
 import math
@@ -11,151 +11,96 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from torch_zerohess.adapters.mitsuba import select_variant
+from experiments.scenes.meshes import Array, Surface, grid, mi_mesh, rgb
+from torch_zerohess.adapters.mitsuba import MitsubaScene, Parameter, Transform, Value
 
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
-Surface = tuple[Array, Array, npt.NDArray[np.uint32]]  # vertices [m, 3], unit normals [m, 3], triangles [k, 3]
+DEGREES = 20.0
+"""Degrees per unit of a rotation."""
+ROTATION = Transform("handle.to_world", turn=((0.0, 1.0, 0.0),), unit=DEGREES)
+"""One column: the handle, in units of 20 degrees."""
+POSE = Transform(
+    ("body.to_world", "handle.to_world"), move=((0.0, 0.0, 1.0),), turn=((0.0, 1.0, 0.0),), unit=(0.01, DEGREES)
+)
+"""Two columns: position across the view in centimetres, and rotation in units of 20 degrees."""
+COLOR = Value(("mug.mesh.bsdf.diffuse_reflectance.value", "turned.mesh.bsdf.diffuse_reflectance.value"))
+"""Three columns: diffuse reflectance of the mug, 0 to 1."""
+LABEL = Value("sticker.mesh.bsdf.reflectance.data")
+"""1024 columns: reflectance of the 32x32 pixels of the label, row by row from below, 0 to 1; needs `label=True`."""
 
 RADIUS, HEIGHT, WALL = 0.040, 0.098, 0.0036
 HANDLE_REACH, HANDLE_LEVEL, HANDLE_SPAN, HANDLE_POWER = 0.032, 0.051, 0.030, 2.7
 HANDLE_TUBE = (0.0062, 0.0040)  # half widths across and along the plane of the handle
+LABEL_SIDE, LABEL_HEIGHTS, LABEL_ARC = 32, (0.016, 0.086), 1.9  # pixels, metres, radians about the camera's azimuth
 CAMERA, FIELD_OF_VIEW = (0.27507, 0.084647, 0.060803), 39.6  # the field of view is that of the film's width
 LIGHTS = (((0.0, 0.75, -0.35), 0.15, 7.0), ((0.55, 0.6, 0.35), 0.2, 12.0))  # centre, radius, radiance
 MUG_COLOR, BACKDROP_COLOR = (0.80, 0.20, 0.09), (0.83, 0.79, 0.73)
+DIRECT = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0, "block_size": 8}
+"""Direct light takes one shadow ray and no ray towards the lights, which are large and out of view."""
 
 
-class MugScene:
-    """Renders of the mug, one per angle of its handle; the scene is loaded once and reused.
-
-    Example: ``MugScene(film=64).render([200.0, 257.0])`` has shape [2, 64, 64, 3].
+# Depth 2, not 6: at 64x64 the MSE over all angles has the same minimum and plateau (correlation 0.997, at most 7 %
+# of its peak apart, where 8 spp alone moves it by 16 %), half the noise variance and a third of the time.
+def mug_scene(
+    parameters: Sequence[Parameter] = (ROTATION,),
+    film: tuple[int, int] = (64, 64),
+    spp: int = 8,
+    depth: int = 2,
+    label: bool = False,
+    **more: Any,
+) -> MitsubaScene:
+    """Return the scene as a black box.
 
     Args:
-        film: width and height in pixels, or one number for a square; (256, 192) in the paper.
+        parameters: some of `ROTATION` or `POSE`, `COLOR`, `LABEL`.
+        film: width and height in pixels; (256, 192) in the paper.
         spp: samples per pixel; 32 in the paper.
-        depth: longest path, at least 2 (direct light only, the default); 6 in the paper.
-        seed: of the renders, the same for every angle: fresh noise would be as large as the loss.
-        variant: Mitsuba variant, see :func:`torch_zerohess.adapters.mitsuba.select_variant`.
-        threads: render threads; None for all cores.
-
-    Raises:
-        TypeError, ValueError: an argument of the wrong type or out of range.
-        ModuleNotFoundError: Mitsuba is not installed.
-        RuntimeError: the variant does not work on this machine.
-
+        depth: longest path, at least 2 (direct light only); 6 in the paper.
+        label: whether a grey label is on the front of the mug.
+        more: of `MitsubaScene`.
     """
-
-    # Depth 2, not 6: at 64x64 the MSE over all angles has the same minimum and plateau (correlation 0.997, at most 7 %
-    # of its peak apart, where 8 spp alone moves it by 16 %), half the noise variance and a third of the time.
-    def __init__(
-        self,
-        film: int | tuple[int, int] = 64,
-        spp: int = 8,
-        depth: int = 2,
-        seed: int = 0,
-        variant: str = "auto",
-        threads: int | None = None,
-    ) -> None:
-        sizes = (film, film) if isinstance(film, int) else tuple(film)
-        if len(sizes) != 2 or min(sizes) < 1:
-            raise ValueError(f"film must be a size in pixels >= 1 or a pair (width, height) of them, got {film!r}")
-        for name, value, least in (("spp", spp, 1), ("depth", depth, 2), ("seed", seed, 0)):
-            if not isinstance(value, int):
-                raise TypeError(f"{name} must be an int, got {value!r}")
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
-        self.film, self.spp, self.depth, self.seed = (int(sizes[0]), int(sizes[1])), spp, depth, seed
-        self._mi: Any = select_variant(variant, threads)
-        self.variant: str = self._mi.variant()
-        self._scene = self._mi.load_dict(self._description(), optimize=False)  # optimize=True drops parameter names
-        self._params = self._mi.traverse(self._scene)
-        self._params.keep(["handle.to_world"])
-
-    def render(self, angles: Sequence[float]) -> Image:
-        """Linear RGB images [K, height, width, 3] of the handle turned by ``angles`` [K] in degrees, any finite value.
-
-        The same angle gives the same bits, whatever was rendered before.
-
-        Raises:
-            ValueError: ``angles`` is not a sequence of finite numbers.
-
-        """
-        degrees = np.asarray(angles, np.float64)
-        if degrees.ndim != 1:
-            raise ValueError(f"angles must be one-dimensional [K], got shape {list(degrees.shape)}")
-        if not np.isfinite(degrees).all():
-            first = int(np.flatnonzero(~np.isfinite(degrees))[0])
-            raise ValueError(f"angles must be finite (degrees), got angles[{first}] = {degrees[first]}")
-        width, height = self.film
-        images = np.empty((degrees.size, height, width, 3), np.float32)
-        for image, angle in zip(images, degrees % 360.0, strict=True):
-            self._params["handle.to_world"] = self._turn((0.0, 1.0, 0.0), float(angle))
-            self._params.update()
-            image[...] = np.asarray(self._mi.render(self._scene, spp=self.spp, seed=self.seed))
-        return images
-
-    def _turn(self, axis: tuple[float, float, float], degrees: float) -> Any:
-        return self._mi.ScalarTransform4f().rotate(list(axis), degrees)  # takes no NumPy scalars
-
-    def _description(self) -> dict[str, Any]:
-        width, height = self.film
-        view = self._mi.ScalarTransform4f().translate(list(CAMERA)) @ self._turn((0.0, 0.0, 1.0), -180.0)
-        view = view @ self._turn((0.0, 1.0, 0.0), -80.0) @ self._turn((1.0, 0.0, 0.0), -172.0)
-        # Direct light needs one shadow ray and no ray towards the lights, which are large and out of view.
-        integrator = (
-            {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
-            if self.depth == 2
-            else {"type": "path", "max_depth": self.depth, "rr_depth": self.depth}
-        )
-        matte = {"type": "diffuse", "reflectance": _rgb(BACKDROP_COLOR)}
-        glaze = {"type": "roughplastic", "alpha": 0.15, "nonlinear": True, "diffuse_reflectance": _rgb(MUG_COLOR)}
-        film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-        scene: dict[str, Any] = {
-            "type": "scene",
-            "integrator": integrator | {"block_size": 8},
-            "sensor": {
-                "type": "perspective",
-                "fov": FIELD_OF_VIEW,
-                "fov_axis": "x",
-                "to_world": view,
-                "near_clip": 0.01,
-                "film": film,
-            },
-            # The still shapes are one instance too: a turn then costs half of what it does with them at the top.
-            "still": {
-                "type": "shapegroup",
-                "backdrop": self._mesh("backdrop", backdrop(), matte),
-                "body": self._mesh("body", body(), glaze),
-            },
-            "turned": {"type": "shapegroup", "mesh": self._mesh("handle", handle(), glaze)},
-            "rest": {"type": "instance", "group": {"type": "ref", "id": "still"}},
-            "handle": {"type": "instance", "group": {"type": "ref", "id": "turned"}},
-        }
-        for i, (center, radius, radiance) in enumerate(LIGHTS):
-            light = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
-            scene[f"light{i}"] = {"type": "sphere", "center": list(center), "radius": radius, "emitter": light}
-        return scene
-
-    def _mesh(self, name: str, surface: Surface, bsdf: dict[str, Any]) -> Any:
-        """A ``mi.Mesh``, filled in the one way that scalar and just-in-time variants share."""
-        vertices, normals, faces = surface
-        properties = self._mi.Properties()
-        properties["bsdf"] = self._mi.load_dict(bsdf)
-        mesh = self._mi.Mesh(name, len(vertices), len(faces), properties, has_vertex_normals=True)
-        params = self._mi.traverse(mesh)
-        for key, values in (
-            ("vertex_positions", vertices.astype(np.float32)),
-            ("vertex_normals", normals.astype(np.float32)),
-            ("faces", faces),
-        ):
-            params[key] = type(params[key])(values.ravel())
-        params.update()
-        return mesh
+    if depth < 2:
+        raise ValueError(f"depth must be at least 2, direct light, got {depth}")
+    way = {"integrator": DIRECT} if depth == 2 else {"depth": depth}
+    return MitsubaScene(lambda mi: mug(mi, label), parameters, film=film, spp=spp, **way, **more)
 
 
-def _rgb(color: tuple[float, float, float]) -> dict[str, Any]:
-    return {"type": "rgb", "value": list(color)}
+def mug(mi: Any, label: bool = False) -> dict[str, Any]:
+    """Return the scene for `mitsuba.load_dict`, the handle at 0 degrees."""
+    turn = mi.ScalarTransform4f().translate(list(CAMERA)).rotate([0, 0, 1], -180.0)
+    matte = {"type": "diffuse", "reflectance": rgb(*BACKDROP_COLOR)}
+    glaze = {"type": "roughplastic", "alpha": 0.15, "nonlinear": True, "diffuse_reflectance": rgb(*MUG_COLOR)}
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 6, "rr_depth": 6},
+        "sensor": {
+            "type": "perspective",
+            "fov": FIELD_OF_VIEW,
+            "fov_axis": "x",
+            "to_world": turn.rotate([0, 1, 0], -80.0).rotate([1, 0, 0], -172.0),
+            "near_clip": 0.01,
+            "film": {"type": "hdrfilm", "width": 256, "height": 192, "pixel_format": "rgb", "rfilter": {"type": "box"}},
+        },
+        # Instances, also of what never moves: a turn then costs half of what it does with a mesh at the top.
+        "still": {"type": "shapegroup", "mesh": mi_mesh(mi, "backdrop", backdrop(), matte)},
+        "mug": {"type": "shapegroup", "mesh": mi_mesh(mi, "body", body(), glaze)},
+        "turned": {"type": "shapegroup", "mesh": mi_mesh(mi, "handle", handle(), glaze)},
+        "room": {"type": "instance", "group": {"type": "ref", "id": "still"}},
+        "body": {"type": "instance", "group": {"type": "ref", "id": "mug"}},
+        "handle": {"type": "instance", "group": {"type": "ref", "id": "turned"}},
+    }
+    if label:
+        grey = mi.Bitmap(np.full((LABEL_SIDE, LABEL_SIDE, 1), 0.5, np.float32))
+        picture = {"type": "bitmap", "bitmap": grey, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+        paper = {"type": "diffuse", "reflectance": picture}
+        surface, uv = sticker()
+        scene["sticker"] = {"type": "shapegroup", "mesh": mi_mesh(mi, "label", surface, paper, uv)}
+        scene["label"] = {"type": "instance", "group": {"type": "ref", "id": "sticker"}}
+    for i, (center, radius, radiance) in enumerate(LIGHTS):
+        light = {"type": "area", "radiance": rgb(radiance)}
+        scene[f"light{i}"] = {"type": "sphere", "center": list(center), "radius": radius, "emitter": light}
+    return scene
 
 
 def body(sides: int = 64) -> Surface:
@@ -169,7 +114,19 @@ def body(sides: int = 64) -> Surface:
         np.stack([axis * curve[:, k] for axis, k in zip(ring, (0, 1, 0), strict=True)], -1)
         for curve in (profile, normals)
     )
-    return _grid(vertices, directions)
+    return grid(vertices, directions)
+
+
+def sticker(columns: int = 32) -> tuple[Surface, Array]:
+    """The label, a part of a cylinder just off the body that faces the camera, and its texture coordinates."""
+    middle = math.atan2(CAMERA[2], CAMERA[0])
+    u, v = np.meshgrid(np.linspace(0.0, 1.0, columns + 1), np.array([0.0, 1.0]))
+    turn = middle - LABEL_ARC * (u - 0.5)
+    low, high = LABEL_HEIGHTS
+    normals = np.stack([np.cos(turn), np.zeros_like(turn), np.sin(turn)], -1)
+    vertices = (RADIUS + 0.0004) * normals
+    vertices[..., 1] = low + (high - low) * v
+    return grid(vertices, normals), np.stack([u, v], -1).reshape(-1, 2)
 
 
 def handle(rings: int = 32, sides: int = 12) -> Surface:
@@ -191,7 +148,7 @@ def handle(rings: int = 32, sides: int = 12) -> Surface:
         [across * flare * sin, level - along * flare * cos * run, -reach - along * flare * cos * rise], -1
     )
     normals = np.stack([sin / across, -cos * run / along, -cos * rise / along], -1)
-    return _grid(vertices, normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+    return grid(vertices, normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
 
 def backdrop() -> Surface:
@@ -200,7 +157,7 @@ def backdrop() -> Surface:
     across = np.array([[1.2], [-1.2]])
     vertices = np.stack(np.broadcast_arrays(profile[:, 0], profile[:, 1], across), -1)
     directions = np.stack(np.broadcast_arrays(normals[:, 0], normals[:, 1], 0.0 * across), -1)
-    return _grid(vertices, directions)
+    return grid(vertices, directions)
 
 
 def _rounded(corners: Sequence[tuple[float, float]], radii: Sequence[float], steps: int = 4) -> tuple[Array, Array]:
@@ -221,23 +178,20 @@ def _rounded(corners: Sequence[tuple[float, float]], radii: Sequence[float], ste
     return np.concatenate([*curve, points[-1:]]), np.concatenate([*normals, right[-1:]])
 
 
-def _grid(vertices: Array, normals: Array) -> Surface:
-    """Triangles of a grid [a, b, 3] of vertices, wound so that they face along the normals; degenerate ones left out.
+class MugScene:
+    """Renders of the mug, one per angle of its handle."""
 
-    Returns: vertices [a * b, 3], normals [a * b, 3], faces [m, 3].
-    """
-    index = np.arange(vertices.shape[0] * vertices.shape[1]).reshape(vertices.shape[:2])
-    a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
-    vertices, normals = vertices.reshape(-1, 3), normals.reshape(-1, 3)
-    corner = vertices[faces]
-    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    faces = np.where((area * normals[faces].sum(1)).sum(-1, keepdims=True) < 0.0, faces[:, ::-1], faces)
-    return vertices, normals, faces[np.linalg.norm(area, axis=-1) > 1e-12].astype(np.uint32)
+    def __init__(
+        self,
+        film: int = 64,
+        spp: int = 8,
+        depth: int = 2,
+        seed: int = 0,
+        variant: str = "auto",
+        threads: int | None = None,
+    ) -> None:
+        self.scene = mug_scene(film=(film, film), spp=spp, depth=depth, seed=seed, variant=variant, threads=threads)
+        self.variant = self.scene.variant
 
-
-def to_srgb(image: npt.ArrayLike) -> npt.NDArray[np.uint8]:
-    """8-bit sRGB of a linear RGB image, for pictures; values outside [0, 1] are clipped."""
-    linear = np.clip(np.asarray(image, np.float64), 0.0, 1.0)
-    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * curved).astype(np.uint8)
+    def render(self, angles: Sequence[float]) -> npt.NDArray[np.float32]:
+        return self.scene(torch.tensor(angles, dtype=torch.float64)[:, None] / DEGREES).numpy()

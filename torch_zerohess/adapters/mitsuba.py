@@ -1,212 +1,210 @@
-"""Which Mitsuba variant is safe here: an LLVM that is too old aborts the whole process, so every try runs in a child.
+"""A Mitsuba scene as a black box: parameters in, images or losses out.
 
-``llvm_ad_rgb`` is several times faster than ``scalar_rgb``, but Dr.Jit hands LLVM code that LLVM 14 and 15 do not
-compile ("Cannot select: fminimum", then ``abort()``). :func:`select_variant` therefore takes ``llvm_ad_rgb`` only with
-a library of a version known to be new enough that also passes a tiny render in a child process, and the embedded
-``scalar_rgb``, which needs nothing, in all other cases.
+Each parameter says which part of the scene it changes and in which unit; what is not named stays as it is. The scene is
+loaded once and rendered again for every point. Renders have the same noise unless asked otherwise: with fresh noise
+at few samples per pixel the loss varies as much from render to render as from start to solution.
+
+Example: where is the ball, and how bright is it? The points are [K, 3]: two lengths and a reflectance.
+
+    scene = MitsubaScene(
+        "room.xml",
+        [Transform("ball.to_world", move=((1, 0, 0), (0, 0, 1))), Value("ball.bsdf.reflectance.value", elements=1)],
+        film=(64, 48), spp=8,
+    )
+    target = torch.from_numpy(photograph)
+    fit = zh.minimize(scene, scene.x0, sigma=0.3, bounds=scene.bounds, loss=lambda image: (image - target).square().mean())
 """
 
-import importlib.util
+import difflib
 import os
-import re
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any, Literal
 
-MINIMUM_LLVM = 16
-CANDIDATES = ("scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
-INSTALL = "mitsuba is not installed; pip install mitsuba"
+import numpy as np
+import torch
+from torch import Tensor
 
-_FOLDERS = (
-    "/usr/lib",
-    "/usr/lib/*-linux-gnu*",
-    "/usr/lib/llvm-*/lib",
-    "/usr/lib64",
-    "/usr/local/lib",
-    "/opt/homebrew/opt/llvm*/lib",
-    "/usr/local/opt/llvm*/lib",
-)
-_NAME = re.compile(r"^libLLVM[-.](?:so\.|dylib\.)?(\d+)(?=[.\-]|$)")
+from torch_zerohess.adapters.mitsuba_parameters import Parameter, Transform, Value
+from torch_zerohess.adapters.mitsuba_variants import select_variant
 
-# What the child runs: the smallest scene with a shape, a light and a path, so that LLVM has to compile real kernels.
-_CHILD = """
-import sys
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-except ImportError:
-    pass
-import mitsuba as mi
-mi.set_variant(sys.argv[1])
-scene = mi.load_dict({
-    "type": "scene",
-    "integrator": {"type": "path", "max_depth": 2},
-    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}},
-    "ball": {"type": "sphere", "center": [0.0, 0.0, 4.0]},
-    "light": {"type": "constant"},
-})
-if not float(mi.TensorXf(mi.render(scene, spp=1)).array[0]) > 0.0:
-    sys.exit("the test image is black")
-"""
+__all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
+
+Description = Mapping[str, Any] | str | os.PathLike[str] | Callable[[ModuleType], Mapping[str, Any]]
 
 
-@dataclass(frozen=True)
-class Probe:
-    """Outcome of a try of one variant: whether it ``works``, and if not the ``reason`` (empty when it works)."""
-
-    works: bool
-    reason: str
-
-
-def find_llvm() -> Path | None:
-    """Newest libLLVM shared library with a known major version of at least ``MINIMUM_LLVM``.
-
-    The library that ``DRJIT_LIBLLVM_PATH`` names is preferred when it qualifies; then come the usual folders of Linux
-    and of Homebrew. The version is read from the file name or from the name of what a symbolic link points to; a
-    library of unknown version is never a candidate.
-
-    Returns: path of the library, or None when there is none.
-    """
-    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if asked and Path(asked).is_file() and _major(Path(asked)) >= MINIMUM_LLVM:
-        return Path(asked)
-    # Sorted by version, then by path, so that the choice does not depend on the order of the directory entries.
-    found = sorted((_major(path), str(path)) for path in _libraries())
-    if found and found[-1][0] >= MINIMUM_LLVM:
-        return Path(found[-1][1])
-    return None
-
-
-@cache
-def probe(variant: str, llvm: Path | None = None, timeout: float = 60.0) -> Probe:
-    """Try a variant on a 2x2 image in a child process, so that an abort there never reaches the caller.
+class MitsubaScene:
+    """Black box of n parameters: points [K, n] to linear images [K, height, width, channels], float32, or losses [K].
 
     Args:
-        variant: name of a Mitsuba variant, such as ``"llvm_ad_rgb"``.
-        llvm: library for the child's ``DRJIT_LIBLLVM_PATH``; None leaves the choice to Dr.Jit.
-        timeout: seconds after which the child is killed and the variant counts as not working.
-
-    Returns: the :class:`Probe`; remembered per arguments, since a try costs one to two seconds.
-
-    """
-    if importlib.util.find_spec("mitsuba") is None:
-        return Probe(False, INSTALL)
-    environment = dict(os.environ)
-    if llvm is not None:
-        environment["DRJIT_LIBLLVM_PATH"] = str(llvm)
-    try:
-        child = subprocess.run(
-            [sys.executable, "-c", _CHILD, variant],
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return Probe(False, f"the test render did not end within {timeout:g} s")
-    if child.returncode == 0:
-        return Probe(True, "")
-    return Probe(False, _reason(child.returncode, child.stderr))
-
-
-def variants() -> dict[str, Probe]:
-    """Probe of each variant of ``CANDIDATES`` that this Mitsuba was built with; never aborts, never raises.
-
-    Returns: name -> :class:`Probe`; all of ``CANDIDATES`` with the same reason when Mitsuba cannot be imported.
-    """
-    try:
-        import mitsuba
-    except ImportError as error:
-        reason = INSTALL if isinstance(error, ModuleNotFoundError) else f"mitsuba cannot be imported: {error}"
-        return {name: Probe(False, reason) for name in CANDIDATES}
-    built = set(mitsuba.variants())
-    return {name: _try(name) for name in CANDIDATES if name in built}
-
-
-def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleType:
-    """Set a variant that is known to work in this process, and return the ``mitsuba`` module.
-
-    Args:
-        variant: ``"auto"`` (``llvm_ad_rgb`` where that is safe, else ``scalar_rgb``) or the name of a variant.
-        threads: render threads of this process, at least 1; None keeps Dr.Jit's own choice (all cores). One thread in
-            each of several processes uses the cores best.
+        description: what `mitsuba.load_dict` takes, a function that returns it for the `mitsuba` module (for what needs
+            the variant, such as transforms and meshes), or the path of an XML file.
+        parameters: what the columns of x change, in this order.
+        film: width and height in pixels; None for those of the scene.
+        spp: samples per pixel, at least 1; None for that of the scene.
+        depth: longest path, for the integrator `path` instead of that of the scene: 2 is direct light.
+        integrator: of `load_dict`, instead of that of the scene.
+        seed: of the renders, at least 0.
+        noise: "fixed" has the same seed always; "call" a new one for every call, shared by its points; "point" a new
+            one for every point.
+        loss: of an image [height, width, channels] tensor, a scalar: the black box then returns losses.
+        nan: "raise" refuses pixels that are not finite; "keep" leaves them to what receives them, see `on_nonfinite`
+            of `BlackBox`.
+        variant: "auto" (`llvm_ad_rgb` where it is known to be safe, else `scalar_rgb`) or the name of a Mitsuba variant.
+        threads: render threads of this process; None for all cores.
 
     Raises:
+        ValueError: an argument out of its range, bounds outside what the scene accepts, or a name that the scene does
+            not have; the message has those that are near.
+        FileNotFoundError: the XML file or a texture does not exist.
+        RuntimeError: the variant does not work here, or Mitsuba refuses the scene.
         ModuleNotFoundError: Mitsuba is not installed.
-        ValueError: ``threads`` below 1.
-        RuntimeError: the variant asked for does not work here; the message has the reason and what to do.
-
     """
-    if threads is not None and threads < 1:
-        raise ValueError(f"threads must be at least 1 or None, got {threads}")
-    if importlib.util.find_spec("mitsuba") is None:
-        raise ModuleNotFoundError(INSTALL, name="mitsuba")
-    if variant == "auto":
-        variant = "llvm_ad_rgb" if find_llvm() is not None and _try("llvm_ad_rgb").works else "scalar_rgb"
-    elif variant != "scalar_rgb":
-        outcome = _try(variant)
-        if not outcome.works:
-            raise RuntimeError(f"variant {variant!r} does not work here: {outcome.reason}; {_advice(variant)}")
-    llvm = find_llvm()
-    if llvm is not None:  # read once, when Dr.Jit first needs LLVM
-        os.environ["DRJIT_LIBLLVM_PATH"] = str(llvm)
-    import drjit
-    import mitsuba
 
-    if mitsuba.variant() != variant:
-        mitsuba.set_variant(variant)
-    if threads is not None:
-        drjit.set_thread_count(threads)
-    return mitsuba
+    def __init__(
+        self,
+        description: Description,
+        parameters: Sequence[Parameter],
+        *,
+        film: tuple[int, int] | None = None,
+        spp: int | None = None,
+        depth: int | None = None,
+        integrator: Mapping[str, Any] | None = None,
+        seed: int = 0,
+        noise: Literal["fixed", "call", "point"] = "fixed",
+        loss: Callable[[Tensor], Tensor] | None = None,
+        nan: Literal["raise", "keep"] = "raise",
+        variant: str = "auto",
+        threads: int | None = None,
+    ) -> None:
+        _check(film, spp, depth, integrator, seed, noise, nan)
+        if not parameters:
+            raise ValueError("parameters must name at least one part of the scene, got none")
+        self.mi: Any = select_variant(variant, threads)
+        self.variant: str = self.mi.variant()
+        self.spp, self.seed, self.noise, self.loss, self.nan = spp, seed, noise, loss, nan
+        self.scene: Any = _load(self.mi, description)
+        self.values: Any = self.mi.traverse(self.scene)
+        """Of `mitsuba.traverse`."""
+        if film is not None:
+            self._resize(film)
+        if depth is not None:
+            integrator = {"type": "path", "max_depth": depth, "rr_depth": depth}
+        self.integrator: Any = None if integrator is None else self.mi.load_dict(dict(integrator))
+        """None for that of the scene."""
+        known = list(self.values.keys())
+        for parameter in parameters:
+            for name in parameter.names:
+                if name not in known:
+                    raise ValueError(_unknown(name, known))
+        names = [name for parameter in parameters for name in parameter.names]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"parameters must not change the same value twice, got {', '.join(twice)} more than once")
+        self.parameters = tuple(parameter.bind(self.mi, self.values) for parameter in parameters)
+        self.n = sum(one.n for one in self.parameters)
+        self.labels = [label for one in self.parameters for label in one.labels]
+        """Of the columns of x [n]."""
+        self.x0 = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64)
+        """[n], the scene as it was loaded."""
+        lower, upper = zip(*(pair for one in self.parameters for pair in one.limits), strict=True)
+        self.bounds = torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
+        """Lower and upper [n], infinite where there are none; renders are of points clamped to them."""
+        self.values.keep(names)
+        self._calls = seed
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Render points [K, n].
+
+        Raises:
+            ValueError: x has another shape, or is not finite.
+            FloatingPointError: a pixel is not finite.
+        """
+        if x.ndim != 2 or x.shape[1] != self.n:
+            raise ValueError(f"x must have shape [K, {self.n}] for {', '.join(self.labels)}, got {list(x.shape)}")
+        if not bool(torch.isfinite(x).all()):
+            k, i = (int(one) for one in (~torch.isfinite(x)).nonzero()[0])
+            raise ValueError(f"x must be finite, got {float(x[k, i])} for {self.labels[i]} in point {k}")
+        points = x.detach().cpu().double().clamp(*self.bounds)
+        self._calls += self.noise == "call"
+        images = [self._image(point) for point in points]
+        if self.loss is None:
+            out = torch.stack(images) if images else torch.empty(0)
+        else:
+            with torch.no_grad():
+                losses = [self.loss(image) for image in images]
+            if any(one.numel() != 1 for one in losses):
+                raise ValueError(f"loss must return one number per image, got shape {list(losses[0].shape)}")
+            out = torch.stack([one.reshape(()) for one in losses]).to(x.dtype)
+        return out.to(x.device)
+
+    def set(self, x: Tensor) -> None:
+        """Give the scene the parameters x [n], for renders of one's own."""
+        for parameter, part in zip(self.parameters, x.split([one.n for one in self.parameters]), strict=True):
+            parameter.write(self.values, part.tolist())
+        self.values.update()
+
+    def _image(self, x: Tensor) -> Tensor:
+        self.set(x)
+        self._calls += self.noise == "point"
+        more = {} if self.spp is None else {"spp": self.spp}
+        pixels = self.mi.render(self.scene, integrator=self.integrator, seed=self._calls, **more)
+        image = np.array(pixels, dtype=np.float32)
+        if self.nan == "raise" and not np.isfinite(image).all():
+            wrong = np.argwhere(~np.isfinite(image))
+            raise FloatingPointError(
+                f"{len(wrong)} values of the image at x = {x.tolist() if self.n < 20 else '[...]'} are not finite, the first "
+                f'at row {wrong[0][0]}, column {wrong[0][1]}; nan="keep" leaves them to on_nonfinite of BlackBox'
+            )
+        return torch.from_numpy(image)
+
+    def _resize(self, film: tuple[int, int]) -> None:
+        for name in [key for key in self.values.keys() if key.endswith((".film.size", ".film.crop_size"))]:  # noqa: SIM118
+            self.values[name] = list(film)
+        self.values.update()
 
 
-def _try(variant: str) -> Probe:
-    return probe(variant, find_llvm() if variant.startswith("llvm") else None)
-
-
-def _advice(variant: str) -> str:
-    if variant.startswith("llvm"):
-        return (
-            f"install LLVM {MINIMUM_LLVM} or newer (Debian: libllvm19, macOS: brew install llvm), point "
-            'DRJIT_LIBLLVM_PATH to its libLLVM, or use variant="scalar_rgb"'
-        )
-    return 'use variant="auto" or "scalar_rgb"'
-
-
-def _libraries() -> Iterator[Path]:
-    for folder in _FOLDERS:
-        for pattern in ("libLLVM*.so*", "libLLVM*.dylib"):
-            for path in Path("/").glob(f"{folder[1:]}/{pattern}"):
-                if path.is_file():
-                    yield path
-
-
-def _major(path: Path) -> int:
-    """Major version in the name of ``path`` or of the file it links to; 0 when neither says."""
-    for name in (path.resolve().name, path.name):
-        match = _NAME.match(name)
-        if match:
-            return int(match.group(1))
-    return 0
-
-
-def _reason(returncode: int, stderr: str) -> str:
-    """The telling line of a failed child: its first error line, else its last line, after the signal that ended it."""
-    lines = [line.strip() for line in stderr.splitlines() if line.strip()]
-    telling = [line for line in lines if re.match(r"(LLVM ERROR|\w*(Error|Exception)\b):", line)] or lines[-1:]
-    line = telling[0] if telling else "no message"
-    if returncode >= 0:
-        return line
+def _load(mi: Any, description: Description) -> Any:
+    """`optimize=False` keeps the names of the parameters."""
+    if isinstance(description, (str, os.PathLike)):
+        path = Path(description)
+        if not path.is_file():
+            raise FileNotFoundError(f"description: there is no file {path}")
+        load: Callable[[], Any] = lambda: mi.load_file(str(path), optimize=False)  # noqa: E731
+    else:
+        scene = dict(description(mi) if callable(description) else description)
+        load = lambda: mi.load_dict(scene, optimize=False)  # noqa: E731
     try:
-        name = signal.Signals(-returncode).name
-    except ValueError:
-        name = f"signal {-returncode}"
-    return f"killed by {name}: {line}"
+        return load()
+    except RuntimeError as error:
+        if "No such file" in str(error) or "does not exist" in str(error):
+            raise FileNotFoundError(f"description: {error}") from error
+        raise
+
+
+def _unknown(name: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    near += [key for key in known if key.split(".")[0] == name.split(".")[0] and key not in near][:3]
+    return f"the scene has no parameter {name!r}; near ones: {', '.join(near) or ', '.join(known[:8])}"
+
+
+def _check(
+    film: tuple[int, int] | None,
+    spp: int | None,
+    depth: int | None,
+    integrator: Mapping[str, Any] | None,
+    seed: int,
+    noise: str,
+    nan: str,
+) -> None:
+    if film is not None and (len(film) != 2 or not all(isinstance(side, int) and side >= 1 for side in film)):
+        raise ValueError(f"film must be a pair (width, height) of pixels >= 1, got {film!r}")
+    for name, value, least in (("spp", spp, 1), ("depth", depth, 1), ("seed", seed, 0)):
+        if value is not None and (not isinstance(value, int) or value < least):
+            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+    if depth is not None and integrator is not None:
+        raise ValueError("depth is that of the integrator `path`: give either depth or integrator, got both")
+    for name, text, choices in (("noise", noise, ("fixed", "call", "point")), ("nan", nan, ("raise", "keep"))):
+        if text not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {text!r}")

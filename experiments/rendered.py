@@ -1,0 +1,146 @@
+"""Fitting tasks through Mitsuba: the scene is loaded when it is first rendered, once per process."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from experiments.scenes.meshes import to_srgb
+from experiments.task import Task
+from torch_zerohess.adapters.mitsuba import MitsubaScene
+
+ADJOINTS = ("path", "prb", "prb_projective", "direct_projective")
+"""Integrators that can differentiate: plain automatic differentiation of a path tracer, path replay backpropagation,
+and both with samples on silhouettes."""
+_REMEMBERED = 256
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Film [pixels], samples per pixel and longest path of a render."""
+
+    film: tuple[int, int]
+    spp: int
+    depth: int
+
+    def __str__(self) -> str:
+        return f"{self.film[0]}x{self.film[1]} pixels, {self.spp} samples per pixel, depth {self.depth}"
+
+
+class Reference:
+    """A scene, the image of the solution, and the mean squared differences to it.
+
+    Args:
+        make: loads the scene.
+        solution: [n].
+    """
+
+    def __init__(self, make: Callable[[], MitsubaScene], solution: Tensor) -> None:
+        self._make, self.solution = make, solution
+        self._known: OrderedDict[bytes, float] = OrderedDict()
+
+    @cached_property
+    def scene(self) -> MitsubaScene:
+        return self._make()
+
+    @cached_property
+    def target(self) -> Tensor:
+        """[h, w, 3]."""
+        return self.scene(self.solution[None])[0].double()
+
+    def image(self, x: Tensor) -> Tensor:
+        images = self.scene(x).double()
+        for point, image in zip(x, images, strict=True):
+            self._known[_key(point)] = float(self.loss_of(image))
+        while len(self._known) > _REMEMBERED:
+            self._known.popitem(last=False)
+        return images
+
+    def loss(self, x: Tensor) -> Tensor:
+        return (self.image(x) - self.target).square().mean((1, 2, 3))
+
+    def loss_of(self, image: Tensor) -> Tensor:
+        return self.residuals(image).square().mean()
+
+    def residuals(self, image: Tensor) -> Tensor:
+        return (image - self.target).flatten()
+
+    def error(self, x: Tensor) -> float:
+        """Loss of x [n]; what was just rendered is not rendered again."""
+        known = self._known.get(_key(x))
+        return float(self.loss(x[None])[0]) if known is None else known
+
+    def picture(self, x: Tensor) -> Tensor:
+        return shown(self.scene(x[None])[0])
+
+    def adjoint(self, x: Tensor, integrator: str) -> tuple[Tensor, Tensor]:
+        """See `Task.adjoint`."""
+        from experiments.scenes.adjoint import value_and_gradient
+
+        return value_and_gradient(self.scene, x, integrator, self.loss_of)
+
+
+def rendered(
+    *,
+    scene: Callable[[Setting], MitsubaScene],
+    setting: Setting,
+    full: Setting,
+    solution: Tensor,
+    needs: str,
+    parameter_error: Callable[[Tensor], float] | None = None,
+    **facts: Any,
+) -> Task:
+    """Return the task of finding the parameters [n] of a scene from its render at the solution.
+
+    The loss is the mean squared difference of linear images; all renders share one seed, also that of the reference.
+
+    Args:
+        scene: loads the scene in a setting.
+        setting: of this task.
+        full: that of the source.
+        solution: [n].
+        needs: why the setting is enough.
+        parameter_error: of x [n]; the mean squared difference to the solution if None.
+        facts: `name`, `title`, `parameters`, `start`, `sigma`, `bounds` and `evaluations` of the task.
+    """
+    reference = Reference(lambda: scene(setting), solution)
+
+    def whole() -> Task:
+        return rendered(
+            scene=scene,
+            setting=full,
+            full=full,
+            solution=solution,
+            needs=needs,
+            parameter_error=parameter_error,
+            **facts,
+        )
+
+    return Task(
+        **facts,
+        needs=f"{setting}; {needs}",
+        n=len(solution),
+        loss=reference.loss,
+        image_error=reference.error,
+        parameter_error=parameter_error or (lambda x: float((x - solution).square().mean())),
+        image=reference.image,
+        image_loss=reference.loss_of,
+        residuals=reference.residuals,
+        picture=reference.picture,
+        adjoint=reference.adjoint,
+        adjoints=ADJOINTS,
+        full=None if setting == full else whole,
+    )
+
+
+def shown(image: Tensor) -> Tensor:
+    """Linear image as sRGB in [0, 1]."""
+    return torch.from_numpy(to_srgb(image)).double() / 255
+
+
+def _key(x: Tensor) -> bytes:
+    return x.detach().double().contiguous().numpy().tobytes()

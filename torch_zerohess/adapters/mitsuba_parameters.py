@@ -1,0 +1,217 @@
+"""What a column of x may change in a Mitsuba scene: the pose of objects (`Transform`), or values (`Value`)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+Vector = Sequence[float]
+Range = tuple[float, float]
+
+_ACCEPTED: tuple[tuple[tuple[str, ...], Range], ...] = (
+    (("reflectance", "transmittance", "albedo", "opacity", "weight"), (0.0, 1.0)),
+    (("alpha", "alpha_u", "alpha_v", "roughness"), (1e-4, 1.0)),
+    (("radiance", "intensity", "irradiance", "sigma_t", "scale"), (0.0, math.inf)),
+    (("x_fov",), (1e-3, 179.0)),
+)
+"""Ranges outside of which Mitsuba renders nonsense or stops, by what the name of a value ends with."""
+
+
+class Bound(Protocol):
+    """A parameter of a scene that is loaded."""
+
+    n: int
+    names: tuple[str, ...]
+    labels: list[str]
+    x0: list[float]
+    limits: list[Range]
+
+    def write(self, values: Any, x: list[Any]) -> None:
+        """Give x [n] to the entries `names` of what `mitsuba.traverse` returned; numbers or, for derivatives, Dr.Jit's."""
+
+
+class Parameter(Protocol):
+    """A part of x and of the scene."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    def bind(self, mi: Any, values: Any) -> Bound:
+        """Look the parameter up in a scene that has its names."""
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Pose of a shape, an instance, an emitter or a sensor, relative to that in the scene.
+
+    The pose is T(sum_i x_i unit_i move_i) P R(turn_1, x_j unit_j) ... P^-1 (pose in the scene), with P the translation
+    to the pivot. Moving an instance of a shape group is faster than moving a mesh, whose vertices are all written.
+
+    Args:
+        name: of a `to_world`, or several that move together.
+        move: directions [m][3].
+        turn: axes of rotations [r][3].
+        unit: length or degrees of x = 1, one for all or one for each of the m + r columns.
+        bounds: of x, a pair for all or one for each; None for none.
+        pivot: point that stays where it is when turned; None for the origin of the (first) object.
+    """
+
+    name: str | tuple[str, ...]
+    move: Sequence[Vector] = ()
+    turn: Sequence[Vector] = ()
+    unit: float | Sequence[float] = 1.0
+    bounds: Range | Sequence[Range] | None = None
+    pivot: Vector | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name,) if isinstance(self.name, str) else tuple(self.name)
+
+    def bind(self, mi: Any, values: Any) -> "Pose":
+        n = len(self.move) + len(self.turn)
+        if n == 0:
+            raise ValueError(f"{self.names[0]}: move and turn must have at least one vector, got none")
+        for what, vectors in (("move", self.move), ("turn", self.turn)):
+            for vector in vectors:
+                if len(vector) != 3 or not any(vector):
+                    raise ValueError(f"{self.names[0]}: {what} must be vectors of 3 numbers, not all 0, got {vector!r}")
+        for name in self.names:
+            if "Transform4f" not in type(values[name]).__name__:
+                kind = type(values[name]).__name__
+                raise ValueError(f"Transform is for a to_world, but {name} is a {kind}: take Value")
+        units = [float(one) for one in self.unit] if isinstance(self.unit, Sequence) else [float(self.unit)] * n
+        if len(units) != n or not all(math.isfinite(one) and one != 0.0 for one in units):
+            raise ValueError(f"{self.names[0]}: unit must be a number or {n} numbers, not 0, got {self.unit!r}")
+        return Pose(self, mi, values, units)
+
+
+class Pose:
+    """A `Transform` of a loaded scene."""
+
+    def __init__(self, transform: Transform, mi: Any, values: Any, units: list[float]) -> None:
+        self.names, self.n, self._mi = transform.names, len(units), mi
+        self._units, self._moves = units, [[float(c) for c in one] for one in transform.move]
+        self._turns = [[float(c) for c in one] for one in transform.turn]
+        matrices = [np.array(values[name].matrix, np.float64).reshape(4, 4) for name in self.names]
+        self._base = [mi.ScalarTransform4f(matrix) for matrix in matrices]
+        pivot = matrices[0][:3, 3] if transform.pivot is None else transform.pivot
+        self._pivot = [float(c) for c in pivot]
+        kinds = [f"move{i}" for i in range(len(self._moves))] + [f"turn{i}" for i in range(len(self._turns))]
+        self.labels = [f"{self.names[0]}.{kind}" for kind in kinds]
+        self.x0 = [0.0] * self.n
+        self.limits = ranges(self.names[0], transform.bounds, self.n)
+
+    def write(self, values: Any, x: list[Any]) -> None:
+        numbers = all(isinstance(one, float) for one in x)
+        kind = self._mi.ScalarTransform4f if numbers else self._mi.Transform4f  # the latter carries derivatives
+        pose = kind()
+        moved = len(self._moves)
+        if moved:
+            steps = [(u * value, move) for u, value, move in zip(self._units, x, self._moves, strict=False)]
+            pose = pose.translate([sum(length * move[c] for length, move in steps) for c in range(3)])
+        if self._turns:
+            pose = pose.translate(self._pivot)
+            for unit, value, axis in zip(self._units[moved:], x[moved:], self._turns, strict=True):
+                pose = pose.rotate(axis, unit * value)
+            pose = pose.translate([-c for c in self._pivot])
+        for name, base in zip(self.names, self._base, strict=True):
+            values[name] = type(values[name])(pose @ kind(base))
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number, a colour, a texture or vertices: anything `mitsuba.traverse` lists that is made of numbers.
+
+    Args:
+        name: of a value, or several that share it.
+        bounds: of x, a pair for all or one for each; None takes what the scene accepts, such as 0 to 1 for a reflectance.
+        unit: value of x = 1.
+        elements: 1 for one number that all elements share, such as a grey; None for all elements.
+    """
+
+    name: str | tuple[str, ...]
+    bounds: Range | Sequence[Range] | None = None
+    unit: float = 1.0
+    elements: int | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name,) if isinstance(self.name, str) else tuple(self.name)
+
+    def bind(self, mi: Any, values: Any) -> "Numbers":
+        if not (math.isfinite(self.unit) and self.unit != 0.0):
+            raise ValueError(f"{self.names[0]}: unit must be a number other than 0, got {self.unit!r}")
+        if self.elements not in (None, 1):
+            raise ValueError(f"{self.names[0]}: elements must be 1 or None, got {self.elements!r}")
+        for name in self.names:
+            if "Transform" in type(values[name]).__name__:
+                raise ValueError(f"Value is for numbers, but {name} is a transform: take Transform")
+        shapes = {name: np.array(values[name]).size for name in self.names}
+        if len(set(shapes.values())) > 1:
+            raise ValueError(f"names that share a value must have the same size, got {shapes}")
+        return Numbers(self, values)
+
+
+class Numbers:
+    """A `Value` of a loaded scene."""
+
+    def __init__(self, value: Value, values: Any) -> None:
+        first = value.names[0]
+        now = np.array(values[first], np.float64)
+        self.names, self._unit, self._shape = value.names, value.unit, now.shape
+        self._kinds = [type(values[name]) for name in self.names]
+        self._tensor = "Tensor" in self._kinds[0].__name__
+        self.n = 1 if value.elements == 1 else now.size
+        self.labels = [first] if self.n == 1 else [f"{first}[{i}]" for i in range(self.n)]
+        flat = now.reshape(-1) / value.unit
+        self.x0 = [float(flat.mean())] if self.n == 1 else flat.tolist()
+        low, high = (side / value.unit for side in accepted(first))
+        low, high = min(low, high), max(low, high)
+        self.limits = ranges(first, value.bounds or (low, high), self.n)
+        for least, most in self.limits:
+            if least < low or most > high:
+                raise ValueError(
+                    f"bounds of {first} must lie within {low:g} to {high:g}, which the scene accepts, got {least:g} to {most:g}"
+                )
+
+    def write(self, values: Any, x: list[Any]) -> None:
+        full = [self._unit * one for one in x]
+        size = math.prod(self._shape)
+        if len(full) == 1:
+            full = full * size
+        new: Any = full if size > 1 else full[0]
+        if self._tensor:
+            if not all(isinstance(one, float) for one in full):
+                raise NotImplementedError(
+                    f"{self.names[0]} is a tensor: derivatives for its elements are not passed on"
+                )
+            new = np.asarray(full, np.float32).reshape(self._shape)
+        elif size > 4:  # vertices
+            new = np.asarray(full, np.float32)
+        for name, kind in zip(self.names, self._kinds, strict=True):
+            values[name] = kind(new)
+
+
+def accepted(name: str) -> Range:
+    """Range of what Mitsuba takes for a value, from its name; infinite where nothing is known."""
+    words = [word for word in name.split(".") if word not in ("value", "data")]
+    for endings, limits in _ACCEPTED:
+        if words and any(words[-1] == ending or words[-1].endswith("_" + ending) for ending in endings):
+            return limits
+    return -math.inf, math.inf
+
+
+def ranges(name: str, bounds: Range | Sequence[Range] | None, n: int) -> list[Range]:
+    """Return n pairs of a lower and an upper bound."""
+    if bounds is None:
+        return [(-math.inf, math.inf)] * n
+    several = list(bounds) if isinstance(bounds[0], Sequence) else [bounds] * n
+    pairs = [(float(one[0]), float(one[1])) for one in several]  # type: ignore[index]
+    if len(pairs) != n:
+        raise ValueError(f"bounds of {name} must be a pair or {n} pairs (lower, upper), got {len(pairs)} pairs")
+    for low, high in pairs:
+        if not low < high:
+            raise ValueError(f"bounds of {name} must be lower < upper, got {low:g}, {high:g}")
+    return pairs

@@ -148,7 +148,7 @@ def fit_outputs(
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
     slopes = inverse @ (design.mT @ (weights[:, None] * outputs))
     intercept, jacobian = slopes[0], slopes[1:]
-    value, downhill, bend = _loss_derivatives(loss, intercept.view(shape), jacobian.view(r, *shape))
+    value, downhill, bend = loss_derivatives(loss, intercept.view(shape), jacobian.view(r, *shape))
     gradient = jacobian @ downhill
     hessian = jacobian @ bend.mT
     hessian = 0.5 * (hessian + hessian.mT)
@@ -216,7 +216,7 @@ def _reduced(u: Tensor) -> tuple[Tensor | None, Tensor]:
     return basis, triangle.mT
 
 
-def _loss_derivatives(
+def loss_derivatives(
     loss: Callable[[Tensor], Tensor], output: Tensor, directions: Tensor
 ) -> tuple[float, Tensor, Tensor]:
     """Return loss, its gradient [m] and its Hessian times directions [r, *out], [r, m], at an output [*out]."""

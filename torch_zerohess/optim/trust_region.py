@@ -7,8 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.optim import box_search
+from torch_zerohess.optim.box_search import BoxSearch
 from torch_zerohess.optim.local_model import LocalModel
 from torch_zerohess.optim.search import Search
+
+_BOX_POOL = 150
+"""Evaluations kept by a search in a box."""
 
 
 class TrustRegion:
@@ -81,16 +86,22 @@ class TrustRegion:
         self._bounds = _box(bounds, x0)
         generator = torch.Generator()
         generator.manual_seed(int(torch.randint(2**63 - 1, ())) if seed is None else seed)
-        self._search = Search(
-            x0.detach().double() / self._unit,
-            *(one.double() / self._unit for one in self._bounds),
-            loss=loss,
-            restarts=restarts,
-            tolerance=tolerance,
-            noise=float(noise),
-            pool=pool or _capacity(self.n, loss is None),
-            generator=generator,
-        )
+        place = (x0.detach().double() / self._unit, *(one.double() / self._unit for one in self._bounds))
+        self._search: Search | BoxSearch
+        if loss is not None and self.n <= box_search.MOST and bool(torch.isfinite(torch.stack(self._bounds)).all()):
+            self._search = BoxSearch(
+                *place, loss=loss, restarts=restarts, tolerance=tolerance, pool=pool or _BOX_POOL, generator=generator
+            )
+        else:
+            self._search = Search(
+                *place,
+                loss=loss,
+                restarts=restarts,
+                tolerance=tolerance,
+                noise=float(noise),
+                pool=pool or _capacity(self.n, loss is None),
+                generator=generator,
+            )
         self._asked: Tensor | None = None
 
     @property

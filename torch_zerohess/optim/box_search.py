@@ -1,0 +1,248 @@
+"""The search behind `TrustRegion` over few parameters in a finite box, where the black box returns an output.
+
+A Gaussian process (`GaussianProcess`) predicts the output anywhere in the box from all evaluations, and the white-box
+loss of the prediction says where to look next: at the point with the lowest loss among the outputs that lie within
+`_OPTIMISM` standard deviations of the prediction (a composite objective: Astudillo and Frazier 2019). One evaluation
+follows another; each is trial and sample at once. Where nothing lower is expected, the search looks where it knows
+least, so it leaves local minima and plateaus.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.optim.gaussian_process import GaussianProcess
+from torch_zerohess.optim.local_model import LocalModel, fit_outputs, loss_derivatives
+from torch_zerohess.optim.pool import Pool
+
+MOST = 4
+"""Parameters that the candidates cover a box of."""
+_OPTIMISM = 0.3
+"""Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
+_EXPLORING = 2.0
+"""The same in the steps after an arrival."""
+_SCALES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
+"""Distances of candidates from the best point."""
+_CANDIDATES = 24
+"""At each of these distances; four times as many all over the box."""
+_REFINEMENTS = 6
+_SAME = 1e-4
+"""Distance below which a point is known already."""
+_SETTLED = 3
+"""Steps in a row that stay within the tolerance of the best point: the search has arrived."""
+_REFUSED = 10
+"""Outputs in a row that are not finite, after which the search ends."""
+_EXPANSIONS = 3
+"""Of a loss that is not quadratic, around its predicted minimum."""
+
+_STATE = (
+    *("sigma", "evaluations", "iterations", "rounds", "done", "message", "phase"),
+    *("best", "lowest", "best_sigma", "x", "_settled", "_exploring", "_refused"),
+)
+
+
+class BoxSearch:
+    """State of a search over z [n], float64, within finite lower and upper [n]; the first sigma is 1.
+
+    One iteration is `points`, their evaluation, `take`, as in `Search`.
+    """
+
+    def __init__(
+        self,
+        start: Tensor,
+        lower: Tensor,
+        upper: Tensor,
+        *,
+        loss: Callable[[Tensor], Tensor],
+        restarts: int,
+        tolerance: float,
+        pool: int,
+        generator: torch.Generator,
+    ) -> None:
+        self.n, self.lower, self.upper, self.loss = len(start), lower, upper, loss
+        self.restarts, self.tolerance, self.generator = restarts, tolerance, generator
+        self.pool = Pool(self.n, pool, start.device)
+        self.best = self.x = start
+        self.lowest = math.inf
+        self.sigma = self.best_sigma = 1.0
+        self.evaluations = self.iterations = self.rounds = 0
+        self.done, self.message = False, ""
+        self.phase: Literal["start", "trial"] = "start"
+        self.shape = torch.Size()
+        """Of an output."""
+        self._settled = self._exploring = self._refused = 0
+
+    def points(self) -> Tensor:
+        """Draw the next points [K, n]."""
+        if self.phase == "start":
+            return torch.cat([self.best[None], self._around(self.best)])
+        if len(self.pool) < 2:
+            return self._around(self.best)
+        return self._next()[None]
+
+    def take(self, points: Tensor, losses: Tensor, outputs: Tensor | None) -> None:
+        """Go on with the losses [K] and outputs [K, m] of points [K, n]."""
+        assert outputs is not None
+        finite = torch.isfinite(losses) & torch.isfinite(outputs).all(1)
+        self.evaluations += len(points)
+        self.iterations += self.phase == "trial"
+        self._refused = 0 if bool(finite.all()) else self._refused + 1
+        if self._refused >= _REFUSED:
+            self.done, self.message = True, f"{_REFUSED} batches in a row had values that are not finite"
+            return
+        before = self.best
+        self._remember(points[finite], losses[finite], outputs[finite])
+        if not bool(finite.all()) and len(self.pool):  # as bad as the worst that is known
+            worst = self.pool.outputs[int(self.pool.values.argmax())]  # type: ignore[index]
+            bad = points[~finite]
+            self.pool.add(bad, self.pool.values.max().expand(len(bad)), worst.expand(len(bad), -1), self.best, 1.0)
+        if self.phase == "trial":
+            self._settle(float((points[-1] - before).norm()) / math.sqrt(self.n))
+        self.x = points[-1]
+        self.phase = "trial"
+
+    def model_at_best(self) -> tuple[LocalModel, float] | None:
+        """See `TrustRegion.model_at_best`."""
+        outputs, sigma = self.pool.outputs, self.best_sigma
+        while outputs is not None and sigma < 10.0:
+            weights = torch.exp(-0.5 * ((self.pool.points - self.best) / sigma).square().sum(1))
+            near = weights > 1e-3
+            if int(near.sum()) > self.n:
+                u = (self.pool.points[near] - self.best) / sigma
+                return fit_outputs(u, outputs[near], weights[near], self.loss, self.shape), sigma
+            sigma *= 1.5
+        return None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors, numbers, strings, lists and dicts."""
+        return {
+            **{name: getattr(self, name) for name in _STATE},
+            "shape": list(self.shape),
+            "pool": self.pool.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        vars(self).update({name: state[name] for name in _STATE})
+        self.shape = torch.Size(state["shape"])
+        self.pool.load_state_dict(state["pool"])
+        self.generator.set_state(state["generator"].cpu())
+
+    def _remember(self, points: Tensor, losses: Tensor, outputs: Tensor) -> None:
+        if not len(losses):
+            return
+        self.pool.add(points, losses, outputs, self.best, 1.0)
+        k = int(losses.argmin())
+        if float(losses[k]) < self.lowest:
+            self.best, self.lowest = points[k], float(losses[k])
+            self.best_sigma = max(self.sigma, self.tolerance)
+
+    def _settle(self, moved: float) -> None:
+        """Arrive where step after step stays at the best point."""
+        self.sigma = min(max(moved, 1e-2 * self.tolerance), 1.0)
+        self._exploring = max(self._exploring - 1, 0)
+        self._settled = self._settled + 1 if moved < self.tolerance else 0
+        if self._settled >= _SETTLED:
+            self._settled, self._exploring = 0, 2 * self.n
+            self.rounds += 1
+            if self.rounds > self.restarts:
+                self.done = True
+                self.message = f"{_SETTLED} steps in a row were below {self.tolerance} of sigma, {self.rounds} times"
+
+    def _around(self, x: Tensor) -> Tensor:
+        """Draw n orthogonal steps of length sqrt(n), mirrored into the box."""
+        directions, _ = torch.linalg.qr(self._normal(self.n, self.n))
+        z = x + math.sqrt(self.n) * directions.mT
+        z = torch.where(z < self.lower, 2 * self.lower - z, z)
+        z = torch.where(z > self.upper, 2 * self.upper - z, z)
+        return z.clamp(self.lower, self.upper)
+
+    def _next(self) -> Tensor:
+        """Return the point [n] with the lowest optimistic loss, or the least known one if that is known already."""
+        assert self.pool.outputs is not None
+        process = GaussianProcess.fit(self.pool.points, self.pool.outputs)
+        optimism = _EXPLORING if self._exploring else _OPTIMISM
+        output, x = self.pool.outputs[int(self.pool.values.argmin())], self.best
+        for _ in range(_EXPANSIONS):
+            model = _LossModel(process, output, self.loss, self.shape, optimism)
+            x = self._lowest(model)
+            output = process.mean + (process.covariance(x[None]) @ process.weights)[0]
+            if model.is_true(x, float(self.loss(output.view(self.shape)))):
+                break
+        if float((self.pool.points - x).norm(dim=1).min()) < _SAME:
+            spots = self._uniform(4 * _CANDIDATES)
+            x = spots[int(process.uncertainty(process.covariance(spots)).argmax())]
+        return x
+
+    def _lowest(self, model: "_LossModel") -> Tensor:
+        """Return the best of candidates around the best point and all over the box, improved by smaller and smaller steps."""
+        near = [self.best + scale * self._normal(_CANDIDATES, self.n) for scale in _SCALES]
+        candidates = torch.cat([*near, self._uniform(4 * _CANDIDATES)]).clamp(self.lower, self.upper)
+        scores = model(candidates)
+        k, width = int(scores.argmin()), 0.3
+        x, score = candidates[k], float(scores[k])
+        for _ in range(_REFINEMENTS):
+            candidates = (x + width * self._normal(2 * _CANDIDATES, self.n)).clamp(self.lower, self.upper)
+            scores = model(candidates)
+            k = int(scores.argmin())
+            if float(scores[k]) < score:
+                x, score = candidates[k], float(scores[k])
+            else:
+                width *= 0.4
+        return x
+
+    def _uniform(self, count: int) -> Tensor:
+        uniform = torch.rand(count, self.n, generator=self.generator, dtype=torch.float64).to(self.lower.device)
+        return self.lower + (self.upper - self.lower) * uniform
+
+    def _normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator, dtype=torch.float64).to(self.lower.device)
+
+
+class _LossModel:
+    """Optimistic loss of predicted outputs, from a quadratic expansion of the loss around one output [m].
+
+    An output that is off by s standard deviations v^1/2 in its worst direction has the loss
+    L - s |grad L| (m v)^1/2 + s^2 tr(L'') v / 2, for a mean square (L^1/2 - s v^1/2)^2.
+    """
+
+    def __init__(
+        self,
+        process: GaussianProcess,
+        output: Tensor,
+        loss: Callable[[Tensor], Tensor],
+        shape: torch.Size,
+        optimism: float,
+    ) -> None:
+        self.process, self.optimism, m = process, optimism, len(output)
+        directions = torch.cat([(process.mean - output)[None], process.weights])
+        self.value, slope, bend = loss_derivatives(loss, output.view(shape), directions.view(-1, *shape))
+        self.slope, self.bend = directions @ slope, directions @ bend.mT
+        self.steepness = float(slope.square().sum()), bend @ slope, bend @ bend.mT
+        self.elements = m
+        size = float(directions.square().sum())
+        self.trace = m * max(float(self.bend.diagonal().sum()), 0.0) / size if size > 0.0 else 0.0
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Optimistic losses [Q] of points [Q, n]."""
+        covariance = self.process.covariance(x)
+        c = torch.cat([covariance.new_ones(len(x), 1), covariance], 1)
+        variance = self.process.uncertainty(covariance)
+        constant, linear, square = self.steepness
+        steepness = (constant + 2.0 * c @ linear + ((c @ square) * c).sum(1)).clamp_min(0.0).sqrt()
+        # No prediction lies below the lowest value of the loss along the way: the parabola is cut at its vertex.
+        reach = self.optimism * variance.sqrt() * math.sqrt(self.elements)
+        if self.trace > 0.0:
+            reach = torch.minimum(reach, steepness * self.elements / self.trace)
+        return self._loss(c) - reach * steepness + 0.5 * self.trace / self.elements * reach.square()
+
+    def is_true(self, x: Tensor, loss: float) -> bool:
+        """Whether the expansion predicts the loss of the prediction at x [n]."""
+        c = torch.cat([x.new_ones(1, 1), self.process.covariance(x[None])], 1)
+        return abs(float(self._loss(c)[0]) - loss) <= 0.1 * abs(loss - self.value) + 1e-12 * abs(loss)
+
+    def _loss(self, c: Tensor) -> Tensor:
+        return self.value + c @ self.slope + 0.5 * ((c @ self.bend) * c).sum(1)

@@ -1,0 +1,91 @@
+"""Gaussian process over few parameters whose values are outputs: what is known between evaluations, and how well.
+
+All elements of an output share one kernel and one variance, so an output is predicted as a sum of known ones, whatever
+its size. The kernel is a constant plus one of `KERNELS`: smooth functions get the Gaussian one, whose smoothed
+derivatives exist in closed form, and renders with hard edges, whose loss has a cusp, the Matern one. Kernel, length and
+noise are those under which the outputs are most likely (Rasmussen and Williams 2006, section 5.4).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+LENGTHS = (0.3, 0.5, 1.0, 2.0, 4.0)
+"""Length scales, in units of the points."""
+NOISES = (1e-6, 1e-3, 1e-2)
+"""Variances of an output that the process does not explain, in units of its own."""
+_CONSTANT = 1.0
+_SPREAD = 1.5
+"""Standard deviation of the prior over the log of the length."""
+
+
+def matern(distance: Tensor) -> Tensor:
+    """Matern kernel of order 3/2: once differentiable."""
+    scaled = math.sqrt(3.0) * distance
+    return (1.0 + scaled) * torch.exp(-scaled)
+
+
+def gaussian(distance: Tensor) -> Tensor:
+    return torch.exp(-0.5 * distance.square())
+
+
+KERNELS: tuple[Callable[[Tensor], Tensor], ...] = (matern, gaussian)
+
+
+@dataclass(frozen=True)
+class GaussianProcess:
+    """Posterior given outputs [P, m] at points [P, n]; the prediction at x is mean + kernel(x) @ weights."""
+
+    points: Tensor
+    kernel: Callable[[Tensor], Tensor]
+    length: float
+    mean: Tensor
+    """[m]"""
+    weights: Tensor
+    """[P, m]"""
+    variance: float
+    """Of an element of the output, before anything is known."""
+    factor: Tensor
+    """Cholesky factor of the covariance of the points [P, P]."""
+
+    @classmethod
+    def fit(cls, points: Tensor, outputs: Tensor) -> "GaussianProcess":
+        """Choose kernel, length and noise by the evidence, and condition on P >= 2 outputs."""
+        P, m = outputs.shape
+        mean = outputs.mean(0)
+        change = outputs - mean
+        gram = change @ change.mT
+        distance = _distance(points, points)
+        best = (-math.inf, KERNELS[0], LENGTHS[0], NOISES[0], 0.0)
+        for kernel in KERNELS:
+            for length in LENGTHS:
+                values, vectors = torch.linalg.eigh(kernel(distance / length) + _CONSTANT)
+                power = (vectors * (gram @ vectors)).sum(0).clamp_min(0.0)
+                for noise in NOISES:
+                    spectrum = values.clamp_min(0.0) + noise
+                    variance = float((power / spectrum).sum()) / (P * m) + math.ulp(0.0)
+                    log = -P * math.log(variance) - float(spectrum.log().sum())
+                    log -= (math.log(length) / _SPREAD) ** 2
+                    if log > best[0]:
+                        best = (log, kernel, length, noise, variance)
+        _, kernel, length, noise, variance = best
+        covariance = kernel(distance / length) + _CONSTANT
+        covariance.diagonal().add_(noise)
+        factor = torch.linalg.cholesky(covariance)
+        return cls(points, kernel, length, mean, torch.cholesky_solve(change, factor), variance, factor)
+
+    def covariance(self, x: Tensor) -> Tensor:
+        """Covariance [Q, P] of points x [Q, n] with the known ones, in units of `variance`."""
+        return self.kernel(_distance(x, self.points) / self.length) + _CONSTANT
+
+    def uncertainty(self, covariance: Tensor) -> Tensor:
+        """Variance [Q] of an element of the output, given `covariance` [Q, P]."""
+        known = torch.linalg.solve_triangular(self.factor, covariance.mT, upper=False).square().sum(0)
+        return self.variance * (1.0 + _CONSTANT - known).clamp_min(0.0)
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")

@@ -10,6 +10,7 @@ from experiments.bench import bench
 from experiments.error import error
 from experiments.figures import plot
 from experiments.listing import list_
+from experiments.losses import losses
 from experiments.nonpsd_error import nonpsd_error
 from experiments.report import report
 from experiments.run import run
@@ -32,6 +33,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "tune": tune,
     "error": error,
     "nonpsd": nonpsd_error,
+    "losses": losses,
     "bench": bench,
     "stability": stability,
     "doctor": doctor,

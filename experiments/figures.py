@@ -1,7 +1,7 @@
 """Error curves of the methods on a task: both errors against run time and against evaluations, on log-log axes."""
 
-from collections.abc import Iterator, Sequence
-from itertools import cycle
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
@@ -10,17 +10,22 @@ import numpy as np
 import numpy.typing as npt
 import tyro
 
-from experiments.results import METRICS, Run, load
+from experiments.results import METRICS, Results, Run, load
 from experiments.trial import LEVELS
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-_POINTS = 200
+_POINTS = 1000
+"""Most corners that a curve is drawn with."""
+_LINES = ("-", "--", ":")
+_COLORS = 10
 _FLOOR = 1e-8
 """Relative errors below are drawn here."""
 _AXES = {"seconds": "run time [s]", "evaluations": "evaluations"}
 Array = npt.NDArray[np.float64]
+Style = Mapping[str, Any]
 
 
 def plot(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")], /) -> None:
@@ -29,26 +34,48 @@ def plot(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DI
     Args:
         folder: written by `run`.
     """
-    for task, methods in load(folder).runs.items():
+    results = load(folder)
+    chosen = styles_of(results)
+    for task, methods in results.runs.items():
         path = folder / f"{task}.png"
-        curves(task, methods, path)
+        curves(task, methods, path, chosen)
         print(path)
 
 
-def curves(task: str, methods: dict[str, list[Run]], path: Path | BinaryIO) -> None:
+def styles(names: Iterable[str]) -> dict[str, Style]:
+    """Return colour and dashes by method."""
+    return {
+        name: {"color": f"C{i % _COLORS}", "linestyle": _LINES[i // _COLORS % len(_LINES)]}
+        for i, name in enumerate(dict.fromkeys(names))
+    }
+
+
+def styles_of(results: Results) -> dict[str, Style]:
+    """Return colour and dashes by method, the same in the figures of all tasks."""
+    return styles(sorted(name for methods in results.runs.values() for name in methods))
+
+
+def curves(
+    task: str,
+    methods: Mapping[str, Sequence[Run]],
+    path: Path | BinaryIO,
+    chosen: Mapping[str, Style] | None = None,
+) -> None:
     """Plot the median of the errors, relative to those at the start, and the band between the quartiles."""
+    chosen = styles(methods) if chosen is None else chosen
     figure, axes = plt.subplots(2, 2, figsize=(11, 7), layout="constrained", sharex="col", sharey=True)
     for row, metric in zip(axes, METRICS, strict=True):
         for axis, against in zip(row, _AXES, strict=True):
-            for (name, runs), style in zip(methods.items(), _styles(), strict=False):
-                _band(axis, runs, metric, against, f"{name} ({len(runs)})", style)
+            axis.set(xscale="log", yscale="log")
+            for name, runs in methods.items():
+                _band(axis, runs, metric, against, f"{name} ({len(runs)})", chosen[name])
             for level in LEVELS:
                 axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
-            axis.set(xscale="log", yscale="log")
             axis.grid(which="major", alpha=0.3)
         row[0].set_ylabel(f"{metric} error / error at the start")
     for axis, label in zip(axes[1], _AXES.values(), strict=True):
         axis.set_xlabel(label)
+        _plain_ticks(axis)
     handles, labels = axes[0][1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", frameon=False, title="method (runs)")
     figure.suptitle(f"{task}: median and quartiles")
@@ -56,21 +83,37 @@ def curves(task: str, methods: dict[str, list[Run]], path: Path | BinaryIO) -> N
     plt.close(figure)
 
 
-def _styles() -> Iterator[dict[str, Any]]:
-    return ({"color": f"C{color}", "linestyle": line} for line in cycle(("-", "--", ":")) for color in range(10))
+def quartiles(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Return the positions [P] where any of the runs changes and the quartiles [3, P] of their errors from there on.
+
+    lines: positions and errors of every run. An error holds until the next row; before the first row it is that of the
+    start, after the last one the last. Between two runs quartiles are interpolated on the logarithmic axis they are
+    drawn on: on a linear one the larger error alone would count.
+    """
+    grid = np.unique(np.concatenate([x for x, _ in lines]))
+    if len(grid) > _POINTS:
+        grid = np.geomspace(grid[0], grid[-1], _POINTS)
+    errors = [np.concatenate([[1.0], y])[np.searchsorted(x, grid, side="right")] for x, y in lines]
+    return grid, np.exp(np.quantile(np.log(errors), (0.25, 0.5, 0.75), axis=0))
 
 
-def _band(axis: Any, runs: Sequence[Run], metric: str, against: str, label: str, style: dict[str, Any]) -> None:
+def _band(axis: Any, runs: Iterable[Run], metric: str, against: str, label: str, style: Style) -> None:
     lines = [line for run in runs if len((line := _line(run, metric, against))[0])]
     if not lines:
         axis.plot([], [], label=label, **style)
         return
-    grid = np.geomspace(min(x[0] for x, _ in lines), max(x[-1] for x, _ in lines), _POINTS)
-    # An error holds until the next row; before the first row it is that of the start, after the last one the last.
-    values = [np.concatenate([[1.0], y])[np.searchsorted(x, grid, side="right")] for x, y in lines]
-    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
-    axis.plot(grid, middle, label=label, **style)
-    axis.fill_between(grid, low, high, color=style["color"], alpha=0.12, linewidth=0)
+    grid, (low, middle, high) = quartiles(lines)
+    axis.step(grid, middle, where="post", label=label, **style)
+    axis.fill_between(grid, low, high, step="post", color=style["color"], alpha=0.12, linewidth=0)
+
+
+def _plain_ticks(axis: Any) -> None:
+    """Label a logarithmic axis with numbers, more of them where it is short, so that they do not overlap."""
+    first, last = axis.get_xlim()
+    steps = (1.0, 2.0, 5.0) if math.log10(last / first) < 2 else (1.0,)
+    axis.xaxis.set_major_locator(LogLocator(subs=steps, numticks=12))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _line(run: Run, metric: str, against: str) -> tuple[Array, Array]:

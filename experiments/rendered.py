@@ -9,13 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from experiments.scenes.adjoint import ADJOINTS, unavailable, value_and_gradient
 from experiments.scenes.meshes import to_srgb
 from experiments.task import Task
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
-ADJOINTS = ("path", "prb", "prb_projective", "direct_projective")
-"""Integrators that can differentiate: plain automatic differentiation of a path tracer, path replay backpropagation,
-and both with samples on silhouettes."""
 _REMEMBERED = 256
 
 
@@ -31,21 +29,43 @@ class Setting:
         return f"{self.film[0]}x{self.film[1]} pixels, {self.spp} samples per pixel, depth {self.depth}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class RenderedTask(Task):
+    """A task of `rendered`, with what it was made of."""
+
+    solution: Tensor
+    """[n]."""
+    setting: Setting
+    scene: Callable[[Setting], MitsubaScene]
+    """Loads the scene in a setting."""
+    moving: Callable[[Setting], MitsubaScene]
+    """The same for derivatives."""
+
+
 class Reference:
     """A scene, the image of the solution, and the mean squared differences to it.
 
     Args:
         make: loads the scene.
         solution: [n].
+        depth: longest path.
+        moving: loads the scene for derivatives, see `value_and_gradient`.
     """
 
-    def __init__(self, make: Callable[[], MitsubaScene], solution: Tensor) -> None:
+    def __init__(
+        self, make: Callable[[], MitsubaScene], solution: Tensor, depth: int, moving: Callable[[], MitsubaScene]
+    ) -> None:
         self._make, self.solution = make, solution
+        self._depth, self._make_moving = depth, moving
         self._known: OrderedDict[bytes, float] = OrderedDict()
 
     @cached_property
     def scene(self) -> MitsubaScene:
         return self._make()
+
+    @cached_property
+    def moving(self) -> MitsubaScene:
+        return self._make_moving()
 
     @cached_property
     def target(self) -> Tensor:
@@ -77,29 +97,33 @@ class Reference:
     def picture(self, x: Tensor) -> Tensor:
         return shown(self.scene(x[None])[0])
 
-    def adjoint(self, x: Tensor, integrator: str) -> tuple[Tensor, Tensor]:
+    def adjoint(self, x: Tensor, integrator: str, seed: int) -> tuple[Tensor, Tensor]:
         """See `Task.adjoint`."""
-        from experiments.scenes.adjoint import value_and_gradient
-
-        return value_and_gradient(self.scene, x, integrator, self.loss_of)
+        return value_and_gradient(
+            self.scene, x, integrator, self.loss_of, depth=self._depth, moving=self.moving, seed=seed
+        )
 
 
 def rendered(
     *,
     scene: Callable[[Setting], MitsubaScene],
+    moving: Callable[[Setting], MitsubaScene],
+    variant: str,
     setting: Setting,
     full: Setting,
     solution: Tensor,
     needs: str,
     parameter_error: Callable[[Tensor], float] | None = None,
     **facts: Any,
-) -> Task:
+) -> RenderedTask:
     """Return the task of finding the parameters [n] of a scene from its render at the solution.
 
     The loss is the mean squared difference of linear images; all renders share one seed, also that of the reference.
 
     Args:
         scene: loads the scene in a setting.
+        moving: the same with shapes in place of instances, for derivatives.
+        variant: of both.
         setting: of this task.
         full: that of the source.
         solution: [n].
@@ -107,11 +131,13 @@ def rendered(
         parameter_error: of x [n]; the mean squared difference to the solution if None.
         facts: `name`, `title`, `parameters`, `start`, `sigma`, `bounds` and `evaluations` of the task.
     """
-    reference = Reference(lambda: scene(setting), solution)
+    reference = Reference(lambda: scene(setting), solution, setting.depth, lambda: moving(setting))
 
-    def whole() -> Task:
+    def whole() -> RenderedTask:
         return rendered(
             scene=scene,
+            moving=moving,
+            variant=variant,
             setting=full,
             full=full,
             solution=solution,
@@ -120,8 +146,12 @@ def rendered(
             **facts,
         )
 
-    return Task(
+    return RenderedTask(
         **facts,
+        solution=solution,
+        setting=setting,
+        scene=scene,
+        moving=moving,
         needs=f"{setting}; {needs}",
         n=len(solution),
         loss=reference.loss,
@@ -131,8 +161,10 @@ def rendered(
         image_loss=reference.loss_of,
         residuals=reference.residuals,
         picture=reference.picture,
+        target_picture=lambda: shown(reference.target),
         adjoint=reference.adjoint,
-        adjoints=ADJOINTS,
+        adjoints=tuple(one for one in ADJOINTS if one != "direct_projective" or setting.depth == 2),
+        no_adjoint=lambda: unavailable(variant),
         full=None if setting == full else whole,
     )
 

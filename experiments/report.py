@@ -26,8 +26,9 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .15em .8em; border-bottom: 1px solid #ddd }
 th { text-align: left } td { font-variant-numeric: tabular-nums; white-space: nowrap } img.curves { max-width: 100% }
-.wide { overflow-x: auto } figure { display: inline-block; margin: .3em; text-align: center; font-size: 13px }
-figure img { width: 128px; height: auto; image-rendering: pixelated; border: 1px solid #ddd }
+.wide { overflow-x: auto } figure { display: inline-block; width: 170px; margin: .3em; vertical-align: top }
+figure img { width: 160px; height: auto; image-rendering: pixelated; border: 1px solid #ddd }
+figcaption { text-align: center; font-size: 13px; overflow-wrap: anywhere }
 pre { background: #f5f5f5; padding: .6em; overflow-x: auto } summary { cursor: pointer }
 """
 
@@ -51,7 +52,7 @@ def report(
 def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
     """Return the page; `tasks` are those that have no name, for their pictures."""
     results, known = load(folder), read_command(folder)
-    summary = summarize(results)
+    summary, chosen = summarize(results), figures.styles_of(results)
     parts = [_commands(known["commands"])]
     if summary.reference and summary.speed_ups:
         parts.append(_speed_ups(summary))
@@ -60,7 +61,7 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
         preset = next((one.get("preset", "fast") for one in settings.values()), "fast")
         task = (tasks or {}).get(name) or _load(name, preset)
         parts += [f"<h2 id='{_text(name)}'>{_text(name)}</h2>", _about(task), _tables(summary, name)]
-        parts.append(_curves(name, methods))
+        parts.append(_curves(name, methods, chosen))
         if task is not None:
             run, ends = _ends(task, methods)
             parts += [_pictures(task, run, ends), _left_out(task, ends, folder / name)]
@@ -116,9 +117,9 @@ def _tables(summary: Summary, task: str) -> str:
     return found
 
 
-def _curves(name: str, methods: dict[str, list[Run]]) -> str:
+def _curves(name: str, methods: dict[str, list[Run]], chosen: Mapping[str, figures.Style]) -> str:
     image = io.BytesIO()
-    figures.curves(name, methods, image)
+    figures.curves(name, methods, image, chosen)
     return f"<img class='curves' alt='error curves of {_text(name)}' src='{_embedded(image.getvalue())}'>"
 
 
@@ -140,16 +141,15 @@ def _pictures(task: Task, run: int, ends: Mapping[str, Tensor]) -> str:
     for name, x in ends.items():
         picture, found = None if task.picture is None else task.picture(x), {}
         if picture is not None and task.target_picture is not None:
-            found = measures(picture, task.target_picture)
-        more = getattr(task, "measures", None)
-        if more is not None:
-            found |= more(x)
+            found = measures(picture, task.target_picture())
+        if task.measures is not None:
+            found |= task.measures(x)
         if picture is not None or found:
             shown.append(_figure(name, picture, described(found)))
     if not shown:
         return ""
     if task.target_picture is not None:
-        shown.append(_figure("target", task.target_picture, ""))
+        shown.append(_figure("target", task.target_picture(), ""))
     return f"<h3>Run {run}</h3>{''.join(shown)}"
 
 
@@ -164,7 +164,7 @@ def _left_out(task: Task, ends: Mapping[str, Tensor], folder: Path) -> str:
         return ""
     best = min(ends.values(), key=task.image_error)
     found = known_saving(task, line(ends["start"], best), folder)
-    return f"<h3>Left out</h3><p>Used: {_text(task.needs)}; against the source's full setting, {_text(found)}.</p>"
+    return f"<h3>Left out</h3><p>Used: {_text(task.needs)}. Against the full setting of the source, {_text(found)}.</p>"
 
 
 def _settings(settings: Mapping[str, dict[str, Any]]) -> str:

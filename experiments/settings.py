@@ -95,6 +95,7 @@ CHOSEN: dict[str, dict[str, Settings]] = {
 
 _BOX2 = (0.2, 2e-5)
 _BOX10 = (1 / 6, 2e-4)
+_MESH: Settings = {"samples": 8, "learning_rate": 0.002, "sigma": (0.01, 0.003), "steps": 200}
 
 RETUNED: dict[str, dict[str, Settings]] = {
     # tune box2 --method our_h --runs 12 --evaluations 12000 --over trust_region=0.05,0.1,0.2 \
@@ -132,6 +133,31 @@ RETUNED: dict[str, dict[str, Settings]] = {
             "steps": 50,
         },
     },
+    # Table 3 lets sigma and the learning rate fall over far more steps than the distance to the solution needs.
+    # Single trials on runs 1000 and 1001; MIRROR, which Table 3 does not have, as BUNNY.
+    "mug": {"fr22": {"steps": 150}, "our_g": {"steps": 150}},
+    "shad": {
+        "fr22": {"learning_rate": 0.05, "sigma": (1.0, 0.01), "steps": 150},
+        "our_g": {"learning_rate": 0.05, "sigma": (1.0, 0.01), "steps": 150},
+        "our_hvpa": {"trust_region": 1.0, "sigma": (1.0, 0.01), "line_search": (1, 0.0), "samples": 2, "steps": 40},
+    },
+    "bunny": {
+        "fr22": {"learning_rate": 0.01, "sigma": (0.25, 0.0025), "steps": 100},
+        "our_g": {"learning_rate": 0.01, "sigma": (0.25, 0.0025), "steps": 100},
+        "our_hvpa": {"trust_region": 1.0, "sigma": (0.25, 0.0025), "line_search": (1, 0.0), "steps": 40},
+    },
+    "mirror": {
+        "fr22": {"samples": 2, "learning_rate": 0.01, "sigma": (0.25, 0.0025), "steps": 100},
+        "our_g": {"samples": 2, "learning_rate": 0.01, "sigma": (0.25, 0.0025), "steps": 100},
+        "our_hvpa": {
+            "samples": 2,
+            "trust_region": 1.0,
+            "sigma": (0.25, 0.0025),
+            "line_search": (1, 0.0),
+            "recompute": 2,
+            "steps": 40,
+        },
+    },
     # tune brdf --method our_hvpa --evaluations 12000 --over trust_region=0.5,1 modification=abs,radius
     "brdf": {
         "fr22": {"learning_rate": 0.01, "sigma": (0.2, 0.01), "steps": 600},
@@ -148,6 +174,23 @@ RETUNED: dict[str, dict[str, Settings]] = {
         "our_hvp": {"trust_region": 0.5, "sigma": (1.0, 0.01), "line_search": (3, 0.0), "recompute": 5, "steps": 50},
         "our_hvpa": {"trust_region": 0.5, "sigma": (1.0, 0.01), "line_search": (3, 0.0), "recompute": 5, "steps": 50},
     },
+    # Single trials on run 1000, twelve of our_g: learning rates 0.03 to 0.2, start sigma 0.2 to 1.5, 4 and 16 pairs.
+    # This one is the best at 50 000 evaluations; a rate of 0.1 is ahead until 10 000 and gets no further than 0.118.
+    "caustic": {
+        "fr22": {"learning_rate": 0.03, "sigma": (1.0, 0.3), "steps": 6000},
+        "our_g": {"learning_rate": 0.03, "sigma": (1.0, 0.3), "steps": 6000},
+        "our_hvpa": {
+            "samples": 256,
+            "sigma": (1.0, 0.3),
+            "line_search": (1, 0.0),
+            "recompute": 1,
+            "baseline": "mean",
+            "steps": 60,
+        },
+    },
+    # Single trials; the methods for meshes (`experiments.methods.meshes`) have their defaults.
+    "meshfit": dict.fromkeys(("fr22", "our_g"), _MESH),
+    "meshfit_color": dict.fromkeys(("fr22", "our_g"), _MESH),
 }
 """What replaces Table 3, or stands for it; `tune` is `python -m experiments tune`."""
 

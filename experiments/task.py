@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from experiments.scenes.fitted_mesh import FittedMesh
 
 
 @dataclass(frozen=True)
@@ -47,14 +51,20 @@ class Task:
     """Differentiable loss of x [n] convolved with a Gaussian of the given sigma (0: the loss itself), where known."""
     picture: Callable[[Tensor], Tensor] | None = None
     """What x [n] looks like: [h, w] or [h, w, 3] in [0, 1]."""
-    target_picture: Tensor | None = None
-    adjoint: Callable[[Tensor, str], tuple[Tensor, Tensor]] | None = None
-    """The renderer's own derivative: x [n] and one of `adjoints` -> loss [], gradient [n]. Counts as two evaluations, a
-    render and its adjoint."""
+    target_picture: Callable[[], Tensor] | None = None
+    adjoint: Callable[[Tensor, str, int], tuple[Tensor, Tensor]] | None = None
+    """The renderer's own derivative: x [n], one of `adjoints` and a seed of the adjoint pass -> loss [], gradient [n].
+    Counts as two evaluations, a render and its adjoint."""
     adjoints: tuple[str, ...] = ()
     """Integrators that `adjoint` knows."""
+    no_adjoint: Callable[[], str | None] = lambda: None
+    """Why `adjoint` cannot be called here, None if it can: derivatives need a variant of the renderer that has them."""
     full: "Callable[[], Task] | None" = None
     """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""
+    mesh: "FittedMesh | None" = None
+    """Where the parameters are the vertices of a mesh: its cameras and triangles, which are known without a render."""
+    measures: Callable[[Tensor], dict[str, float]] | None = None
+    """What else there is to know about x [n], by name."""
     precision: float | None = None
     """Parameter error that a run should reach beyond the usual levels, where the task is about reaching it."""
 

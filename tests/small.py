@@ -56,7 +56,7 @@ TASK = Task(
     parameter_error=parameter_error,
     image=image,
     picture=picture,
-    target_picture=picture(TARGET),
+    target_picture=lambda: picture(TARGET),
 )
 SLOW = replace(TASK, name="slow", loss=slow_loss)
 

@@ -183,3 +183,23 @@ def test_tuned_settings_are_of_methods_that_apply_and_from_their_space() -> None
             small = replace(task, evaluations=30)  # enough to see that these are arguments of the method
             outcome = attempt(small, method, 0, lambda trial, m=method, s=settings: METHODS[m].solve(trial, s))
             assert outcome.status != "failed", (name, method, outcome.reason)
+
+
+@pytest.mark.parametrize("name", ["cma_es", "cma_es_bounded"])
+def test_cma_es_takes_a_single_parameter(name):
+    solution = torch.tensor([0.3], dtype=torch.float64)
+    task = Task(
+        name="parabola",
+        title="a parabola",
+        parameters="one",
+        needs="nothing",
+        n=1,
+        loss=lambda x: (x - solution).square().sum(1),
+        start=uniform(-torch.ones(1).double(), torch.zeros(1).double()),
+        sigma=0.5,
+        evaluations=400,
+        image_error=lambda x: float((x - solution).square()),
+        parameter_error=lambda x: float((x - solution).square()),
+        bounds=(-torch.ones(1).double(), torch.ones(1).double()),
+    )
+    assert attempt(task, name, 0, lambda trial: METHODS[name].solve(trial, {})).status == "finished"

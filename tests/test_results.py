@@ -16,7 +16,7 @@ from small import TARGET, TASK
 
 import torch_zerohess as zh
 from experiments.catalogue import FITTING, load
-from experiments.figures import plot
+from experiments.figures import plot, quartiles, styles_of
 from experiments.listing import listing
 from experiments.measures import described, measures
 from experiments.methods import METHODS
@@ -148,6 +148,30 @@ def test_plot_draws_every_task(folder, capsys):
     assert matplotlib.image.imread(path).std() > 0.01
 
 
+def test_curves_are_steps_between_quartiles():
+    lines = [(np.array([1.0, 4.0]), np.array([1e-1, 1e-3])), (np.array([2.0]), np.array([1e-2]))]
+    positions, errors = quartiles(lines)
+    assert positions.tolist() == [1.0, 2.0, 4.0]
+    # (0.1, 1), (0.1, 0.01), (0.001, 0.01), a quarter, a half and three quarters of the way on a logarithmic axis.
+    assert np.allclose(np.log10(errors.T), [[-0.75, -0.5, -0.25], [-1.75, -1.5, -1.25], [-2.75, -2.5, -2.25]])
+
+
+def test_methods_have_one_style_in_all_figures(folder):
+    write(folder, "cobyqa", 0, [1.0, 0.1], each=1)
+    (folder / "bowl" / "cobyqa").rename(folder / "quad_cobyqa")
+    (folder / "quad").mkdir()
+    (folder / "quad_cobyqa").rename(folder / "quad" / "cobyqa")
+    chosen = styles_of(load_results(folder))
+    assert list(chosen) == ["cobyqa", "our_g", "trust_region"]
+    assert len({(style["color"], style["linestyle"]) for style in chosen.values()}) == 3
+
+
+@pytest.fixture
+def no_curves(monkeypatch):
+    """Curves take most of the time of a page."""
+    monkeypatch.setattr("experiments.figures.curves", lambda *_: None)
+
+
 def test_the_page_needs_nothing_else(folder):
     text = page(folder, {"bowl": TASK})
     assert "http" not in text
@@ -168,7 +192,7 @@ def test_the_page_needs_nothing_else(folder):
     assert "Left out" not in text
 
 
-def test_pictures_say_how_far_they_are_from_the_target(folder):
+def test_pictures_say_how_far_they_are_from_the_target(folder, no_curves):
     text = page(folder, {"bowl": TASK})
     captions = dict(re.findall(r"<figcaption><b>([^<]*)</b><br>([^<]*)</figcaption>", text))
     start, target = TASK.picture(TASK.start(0)), TASK.picture(TARGET)
@@ -179,7 +203,14 @@ def test_pictures_say_how_far_they_are_from_the_target(folder):
         "trust_region": "PSNR inf dB",
         "target": "",
     }
-    assert "PSNR" not in page(folder, {"bowl": replace(TASK, target_picture=None)})
+    without = replace(TASK, picture=None, target_picture=None, measures=lambda x: {"distance": float(x[0] - TARGET[0])})
+    text = page(folder, {"bowl": without})
+    assert "PSNR" not in text
+    assert re.findall(r"<b>([^<]*)</b><br>(distance [^<]*)<", text) == [
+        ("start", f"distance {float(TASK.start(0)[0] - TARGET[0]):.3g}"),
+        ("our_g", "distance 0"),
+        ("trust_region", "distance 0"),
+    ]
 
 
 class Clock:
@@ -226,7 +257,7 @@ def test_times_have_units():
     assert str(Saving(1.2e-5, 1.4999e-3, 1.4)) == text
 
 
-def test_the_report_measures_the_saving_once(folder, halved):
+def test_the_report_measures_the_saving_once(folder, halved, no_curves):
     task, clock = halved
     first = page(folder, {"bowl": task})
     assert "12x (3 ms against 36 ms per evaluation)" in first

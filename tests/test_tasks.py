@@ -105,7 +105,7 @@ def test_image_and_loss_are_one_black_box(name) -> None:
 @pytest.mark.parametrize("name", IMAGES)
 def test_pictures_can_be_shown(name) -> None:
     task = TASKS[name]
-    picture, target = task.picture(task.start(0)), task.target_picture
+    picture, target = task.picture(task.start(0)), task.target_picture()
     assert picture.shape == target.shape
     assert target.dim() == 2 or target.shape[2] == 3
     for one in (picture, target):
@@ -146,7 +146,7 @@ def test_box2_starts_on_a_plateau() -> None:
     assert len(far) > 50
     # Two squares that do not overlap: the sum of their energies, but for where pixels sample the soft edge.
     losses = task.loss(far)
-    energy = 2 * float(task.target_picture.square().mean())
+    energy = 2 * float(task.target_picture().square().mean())
     torch.testing.assert_close(losses, torch.full_like(losses, energy), rtol=0.02, atol=0)
     near = task.loss(vector([[0.3, 0.32], [0.3, 0.4]]))
     assert float(near[0]) < float(near[1]) < 0.9 * energy

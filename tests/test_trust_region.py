@@ -310,7 +310,8 @@ def test_a_sigma_per_parameter_is_a_change_of_units():
 def case(name):
     n = {"loss": 3, "small image": 2, "image": 5}[name]
     loss = None if name == "loss" else misfit(n)
-    return (lambda seed: TrustRegion(zeros(n), sigma=1.0, bounds=(-3.0, 4.0), loss=loss, seed=seed)), (
+    settings = {"sigma": 1.0, "bounds": (-3.0, 4.0), "loss": loss, "restarts": 1000}
+    return (lambda seed: TrustRegion(zeros(n), seed=seed, **settings)), (
         rays if loss else rosenbrock
     )
 

@@ -44,25 +44,29 @@ def cma_es(trial: Trial, *, scale: float = 1.0, bounded: bool = False) -> None:
 
     Where it stops by itself, as it does on a plateau, it starts again from the same point with twice the population
     (Auger and Hansen 2005, "A restart CMA evolution strategy with increasing population size"), until the evaluations
-    are used up.
+    are used up. pycma wants two parameters: a single one gets a second that changes nothing.
     """
     import cma
 
     options: dict[str, Any] = {"verbose": -9, "seed": np.nan}
     rng = np.random.default_rng(trial.seed)
     options["randn"] = lambda *shape: rng.standard_normal(shape)
+    n = trial.task.n
+    more = [0.0] if n == 1 else []
     if bounded:
         assert trial.task.bounds is not None
-        options["bounds"] = [one.tolist() for one in trial.task.bounds]
-    best, population = Best(trial), 4 + int(3 * math.log(trial.task.n))
+        lower, upper = (one.tolist() for one in trial.task.bounds)
+        options["bounds"] = [lower + [-1.0] * len(more), upper + [1.0] * len(more)]
+    best, population = Best(trial), 4 + int(3 * math.log(n))
     while True:
         strategy = cma.CMAEvolutionStrategy(
-            trial.start.tolist(), scale * trial.task.sigma, {**options, "popsize": population}
+            trial.start.tolist() + more, scale * trial.task.sigma, {**options, "popsize": population}
         )
         while not strategy.stop():
-            points = np.array(strategy.ask())
+            drawn = np.array(strategy.ask())
+            points = np.ascontiguousarray(drawn[:, :n])
             values = trial.loss(torch.from_numpy(points)).numpy()
-            strategy.tell(list(points), values.tolist())
+            strategy.tell(list(drawn), values.tolist())
             best(points, values, sigma=float(strategy.sigma))
         population *= 2
 

@@ -28,6 +28,15 @@ def mi_mesh(mi: Any, name: str, surface: Surface, bsdf: dict[str, Any], uv: Arra
     return mesh
 
 
+def instance(name: str, group: str, shape: Any, pose: Any = None) -> dict[str, Any]:
+    """Parts of a scene: the group `group` of one shape and its instance `name`, which moves fast.
+
+    Mitsuba differentiates through an instance, but does not sample its silhouette.
+    """
+    of: dict[str, Any] = {"type": "instance", "group": {"type": "ref", "id": group}}
+    return {group: {"type": "shapegroup", "mesh": shape}, name: of if pose is None else {**of, "to_world": pose}}
+
+
 def rgb(*color: float) -> dict[str, Any]:
     """Colour or grey as a dictionary of Mitsuba."""
     return {"type": "rgb", "value": list(color) if len(color) > 1 else color[0]}

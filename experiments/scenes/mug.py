@@ -7,19 +7,22 @@ the rotation is sought only the handle moves. Lengths are metres and y is up; th
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from experiments.scenes.meshes import Array, Surface, grid, mi_mesh, rgb
+from experiments.scenes.meshes import Array, Surface, grid, instance, mi_mesh, rgb
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Parameter, Transform, Value
 
 DEGREES = 20.0
 """Degrees per unit of a rotation."""
 ROTATION = Transform("handle.to_world", turn=((0.0, 1.0, 0.0),), unit=DEGREES)
 """One column: the handle, in units of 20 degrees."""
+MESH_ROTATION = replace(ROTATION, name="handle.vertex_positions", pivot=(0.0, 0.0, 0.0))
+"""The same without instances."""
 POSE = Transform(
     ("body.to_world", "handle.to_world"), move=((0.0, 0.0, 1.0),), turn=((0.0, 1.0, 0.0),), unit=(0.01, DEGREES)
 )
@@ -48,6 +51,7 @@ def mug_scene(
     spp: int = 8,
     depth: int = 2,
     label: bool = False,
+    instances: bool = True,
     **more: Any,
 ) -> MitsubaScene:
     """Return the scene as a black box.
@@ -58,16 +62,17 @@ def mug_scene(
         spp: samples per pixel; 32 in the paper.
         depth: longest path, at least 2 (direct light only); 6 in the paper.
         label: whether a grey label is on the front of the mug.
+        instances: of `mug`.
         more: of `MitsubaScene`.
     """
     if depth < 2:
         raise ValueError(f"depth must be at least 2, direct light, got {depth}")
     way = {"integrator": DIRECT} if depth == 2 else {"depth": depth}
-    return MitsubaScene(lambda mi: mug(mi, label), parameters, film=film, spp=spp, **way, **more)
+    return MitsubaScene(lambda mi: mug(mi, label, instances), parameters, film=film, spp=spp, **way, **more)
 
 
-def mug(mi: Any, label: bool = False) -> dict[str, Any]:
-    """Return the scene for `mitsuba.load_dict`, the handle at 0 degrees."""
+def mug(mi: Any, label: bool = False, instances: bool = True) -> dict[str, Any]:
+    """Return the scene for `mitsuba.load_dict`, the handle at 0 degrees; without instances `handle` is a mesh."""
     turn = mi.ScalarTransform4f().translate(list(CAMERA)).rotate([0, 0, 1], -180.0)
     matte = {"type": "diffuse", "reflectance": rgb(*BACKDROP_COLOR)}
     glaze = {"type": "roughplastic", "alpha": 0.15, "nonlinear": True, "diffuse_reflectance": rgb(*MUG_COLOR)}
@@ -82,21 +87,21 @@ def mug(mi: Any, label: bool = False) -> dict[str, Any]:
             "near_clip": 0.01,
             "film": {"type": "hdrfilm", "width": 256, "height": 192, "pixel_format": "rgb", "rfilter": {"type": "box"}},
         },
-        # Instances, also of what never moves: a turn then costs half of what it does with a mesh at the top.
-        "still": {"type": "shapegroup", "mesh": mi_mesh(mi, "backdrop", backdrop(), matte)},
-        "mug": {"type": "shapegroup", "mesh": mi_mesh(mi, "body", body(), glaze)},
-        "turned": {"type": "shapegroup", "mesh": mi_mesh(mi, "handle", handle(), glaze)},
-        "room": {"type": "instance", "group": {"type": "ref", "id": "still"}},
-        "body": {"type": "instance", "group": {"type": "ref", "id": "mug"}},
-        "handle": {"type": "instance", "group": {"type": "ref", "id": "turned"}},
     }
+    meshes = [
+        ("still", "room", mi_mesh(mi, "backdrop", backdrop(), matte)),
+        ("mug", "body", mi_mesh(mi, "body", body(), glaze)),
+        ("turned", "handle", mi_mesh(mi, "handle", handle(), glaze)),
+    ]
     if label:
         grey = mi.Bitmap(np.full((LABEL_SIDE, LABEL_SIDE, 1), 0.5, np.float32))
         picture = {"type": "bitmap", "bitmap": grey, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
         paper = {"type": "diffuse", "reflectance": picture}
         surface, uv = sticker()
-        scene["sticker"] = {"type": "shapegroup", "mesh": mi_mesh(mi, "label", surface, paper, uv)}
-        scene["label"] = {"type": "instance", "group": {"type": "ref", "id": "sticker"}}
+        meshes.append(("sticker", "label", mi_mesh(mi, "label", surface, paper, uv)))
+    for group, name, mesh in meshes:
+        # Instances, also of what never moves: a turn then costs half of what it does with a mesh at the top.
+        scene |= instance(name, group, mesh) if instances else {name: mesh}
     for i, (center, radius, radiance) in enumerate(LIGHTS):
         light = {"type": "area", "radiance": rgb(radiance)}
         scene[f"light{i}"] = {"type": "sphere", "center": list(center), "radius": radius, "emitter": light}

@@ -6,7 +6,7 @@ no derivative to a renderer that does not sample it.
 
 from typing import Any
 
-from experiments.scenes.meshes import rgb
+from experiments.scenes.meshes import instance, rgb
 from torch_zerohess.adapters.mitsuba import Transform
 
 POSITION = Transform("ball.to_world", move=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
@@ -16,8 +16,10 @@ BALL, LIGHT, POWER = (13.568, 8.049, -2.0), (25.975, 13.776, 0.0), 1715.0
 SKY = (0.6, 0.6, 0.99)
 
 
-def shadow(mi: Any) -> dict[str, Any]:
-    """Return the scene for `mitsuba.load_dict`."""
+def shadow(mi: Any, instances: bool = True) -> dict[str, Any]:
+    """Return the scene for `mitsuba.load_dict`, its ball an instance or, for derivatives, a shape of its own."""
+    pose = mi.ScalarTransform4f().translate(list(BALL))
+    sphere = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}}
     transform = mi.ScalarTransform4f
     view = transform().look_at(origin=[CAMERA, 0, 0], target=[0, 0, 0], up=[0, 0, 1])
     paper = {
@@ -41,12 +43,7 @@ def shadow(mi: Any) -> dict[str, Any]:
             "to_world": transform().look_at(origin=[0, 0, 0], target=[1, 0, 0], up=[0, 0, 1]).scale(20),
             "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": paper}},
         },
-        "group": {"type": "shapegroup", "sphere": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}}},
-        "ball": {
-            "type": "instance",
-            "group": {"type": "ref", "id": "group"},
-            "to_world": transform().translate(list(BALL)),
-        },
+        **(instance("ball", "group", sphere, pose) if instances else {"ball": {**sphere, "to_world": pose}}),
         "light": {"type": "point", "position": list(LIGHT), "intensity": rgb(POWER)},
         "sky": {"type": "constant", "radiance": rgb(*SKY)},
     }

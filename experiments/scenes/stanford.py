@@ -137,7 +137,7 @@ def _procedural() -> tuple[Array, npt.NDArray[np.int64]]:
     """A closed surface: how far the blended ellipsoids reach from a point inside, in the directions of an icosphere."""
     directions, faces = icosphere(5)
     origin = np.array([-0.10, -0.06, 0.0])
-    reach = np.linspace(0.0, 1.0, 401)[1:]
+    reach = np.linspace(0.0, 1.0, 201)[1:]
     field = np.zeros((len(directions), len(reach)))
     for centre, axes in _ELLIPSOIDS:
         ray, offset = directions / axes, (origin - centre) / axes

@@ -59,5 +59,5 @@ def fitting(
         image_loss=lambda image: residuals(image).square().mean(),
         residuals=residuals,
         picture=lambda x: squares.image(x[None])[0],
-        target_picture=reference,
+        target_picture=lambda: reference,
     )

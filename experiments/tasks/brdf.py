@@ -117,5 +117,5 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         residuals=residuals,
         analytic=analytic,
         picture=lambda x: sphere.picture(sphere(x[None])[0]),
-        target_picture=sphere.picture(reference),
+        target_picture=lambda: sphere.picture(reference),
     )

@@ -8,17 +8,31 @@ Direct light is enough: light that the bunny reflects to the wall changes the lo
 48x48 pixels, the `paper` preset the source's 64x64 with four times the samples.
 """
 
+from functools import partial
 from typing import Literal
 
 import torch
 
 from experiments.rendered import Setting, rendered
-from experiments.scenes.bunny import OVER_WALL, over_wall
+from experiments.scenes.bunny import OVER_WALL, as_mesh, over_wall
 from experiments.task import Task, around
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((64, 64), 32, 6)
 PRESETS = {"fast": Setting((48, 48), 8, 2), "paper": FULL}
+
+
+def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
+    """The scene in a setting; without instances its bunny is a mesh."""
+    return MitsubaScene(
+        partial(over_wall, instances=instances),
+        [OVER_WALL if instances else as_mesh(OVER_WALL, (0.0, 0.0, 0.0))],
+        film=setting.film,
+        spp=setting.spp,
+        depth=setting.depth,
+        variant=variant,
+        threads=1,
+    )
 
 
 def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
@@ -27,9 +41,9 @@ def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Ta
         title="position and rotation of the Stanford bunny over a wall",
         parameters="x, z in scene lengths, rotation in units of 100 degrees, all -1 to 1; "
         "starts +-.25 +- .1, solution 0",
-        scene=lambda one: MitsubaScene(
-            over_wall, [OVER_WALL], film=one.film, spp=one.spp, depth=one.depth, variant=variant, threads=1
-        ),
+        scene=lambda one: load(one, True, variant),
+        moving=lambda one: load(one, False, variant),
+        variant=variant,
         setting=PRESETS[preset],
         full=FULL,
         needs="direct light",

@@ -8,17 +8,31 @@ Paths need four segments (mirror, mirror, bunny, light); light that falls on the
 itself changes the loss little. The `fast` preset has 48x48 pixels, the `paper` preset 64x64 with four times the samples.
 """
 
+from functools import partial
 from typing import Literal
 
 import torch
 
 from experiments.rendered import Setting, rendered
-from experiments.scenes.bunny import IN_MIRRORS, in_mirrors
+from experiments.scenes.bunny import IN_MIRRORS, SEEN_AT, as_mesh, in_mirrors
 from experiments.task import Task, around
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((64, 64), 32, 6)
 PRESETS = {"fast": Setting((48, 48), 8, 4), "paper": FULL}
+
+
+def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
+    """The scene in a setting; without instances its bunny is a mesh."""
+    return MitsubaScene(
+        partial(in_mirrors, instances=instances),
+        [IN_MIRRORS if instances else as_mesh(IN_MIRRORS, SEEN_AT)],
+        film=setting.film,
+        spp=setting.spp,
+        depth=setting.depth,
+        variant=variant,
+        threads=1,
+    )
 
 
 def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
@@ -27,9 +41,9 @@ def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Ta
         title="position and rotation of the Stanford bunny in two mirrors",
         parameters="x, y in scene lengths, rotation in units of 100 degrees, all -1 to 1; "
         "starts +-.25 +- .1, solution 0",
-        scene=lambda one: MitsubaScene(
-            in_mirrors, [IN_MIRRORS], film=one.film, spp=one.spp, depth=one.depth, variant=variant, threads=1
-        ),
+        scene=lambda one: load(one, True, variant),
+        moving=lambda one: load(one, False, variant),
+        variant=variant,
         setting=PRESETS[preset],
         full=FULL,
         needs="two mirrors and direct light",

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from experiments.rendered import Setting, rendered
-from experiments.scenes.mug import DEGREES, mug_scene
+from experiments.scenes.mug import DEGREES, MESH_ROTATION, ROTATION, mug_scene
 from experiments.task import Task, uniform
+from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 TURN = 360.0 / DEGREES
 FULL = Setting((256, 192), 32, 6)
@@ -27,12 +28,27 @@ def parameter_error(x: Tensor) -> float:
     return float((torch.remainder(x + TURN / 2, TURN) - TURN / 2).square().mean())
 
 
+def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
+    """The scene in a setting; without instances its handle is a mesh."""
+    return mug_scene(
+        (ROTATION if instances else MESH_ROTATION,),
+        film=setting.film,
+        spp=setting.spp,
+        depth=setting.depth,
+        instances=instances,
+        variant=variant,
+        threads=1,
+    )
+
+
 def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
     return rendered(
         name="mug",
         title="the rotation of a mug whose handle is hidden on the way",
         parameters="rotation in units of 20 degrees, -4 to 14; starts U(9, 10), solution 0",
-        scene=lambda one: mug_scene(film=one.film, spp=one.spp, depth=one.depth, variant=variant, threads=1),
+        scene=lambda one: load(one, True, variant),
+        moving=lambda one: load(one, False, variant),
+        variant=variant,
         setting=PRESETS[preset],
         full=FULL,
         needs="direct light",

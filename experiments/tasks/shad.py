@@ -9,6 +9,7 @@ Direct light is enough: there is one wall, and the sphere is out of view. The `f
 source's film and samples, the `paper` preset all of it.
 """
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -22,6 +23,19 @@ FULL = Setting((256, 192), 32, 6)
 PRESETS = {"fast": Setting((64, 48), 8, 2), "paper": FULL}
 
 
+def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
+    """The scene in a setting; without instances its ball is a shape of its own."""
+    return MitsubaScene(
+        partial(shadow, instances=instances),
+        [POSITION],
+        film=setting.film,
+        spp=setting.spp,
+        depth=setting.depth,
+        variant=variant,
+        threads=1,
+    )
+
+
 def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
     start = torch.tensor([-0.5, 2.5]).double()
     return rendered(
@@ -29,9 +43,9 @@ def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Ta
         title="the position of a sphere out of view, from its shadow",
         parameters="y, z of the sphere in scene lengths, (-3.3, 1) and (.25, 3.75); starts (-.5, 2.5) +- .1, "
         "solution (-1.5, 1)",
-        scene=lambda one: MitsubaScene(
-            shadow, [POSITION], film=one.film, spp=one.spp, depth=one.depth, variant=variant, threads=1
-        ),
+        scene=lambda one: load(one, True, variant),
+        moving=lambda one: load(one, False, variant),
+        variant=variant,
         setting=PRESETS[preset],
         full=FULL,
         needs="direct light",

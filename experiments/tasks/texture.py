@@ -52,5 +52,5 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         residuals=residuals,
         analytic=lambda x, sigma: loss(x[None])[0] + sigma**2,
         picture=lambda x: x.view(SIDE, SIDE).clamp(0, 1),
-        target_picture=reference,
+        target_picture=lambda: reference,
     )

@@ -111,7 +111,7 @@ class MitsubaScene:
         lower, upper = zip(*(pair for one in self.parameters for pair in one.limits), strict=True)
         self.bounds = torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
         """Lower and upper [n], infinite where there are none; renders are of points clamped to them."""
-        self.values.keep(names)
+        self.values.keep([name for one in self.parameters for name in one.names])
         self._calls = seed
 
     def __call__(self, x: Tensor) -> Tensor:

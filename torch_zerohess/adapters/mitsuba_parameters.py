@@ -10,6 +10,8 @@ import numpy as np
 Vector = Sequence[float]
 Range = tuple[float, float]
 
+_POSITIONS, _NORMALS = ".vertex_positions", ".vertex_normals"
+
 _ACCEPTED: tuple[tuple[tuple[str, ...], Range], ...] = (
     (("reflectance", "transmittance", "albedo", "opacity", "weight"), (0.0, 1.0)),
     (("alpha", "alpha_u", "alpha_v", "roughness"), (1e-4, 1.0)),
@@ -28,8 +30,11 @@ class Bound(Protocol):
     x0: list[float]
     limits: list[Range]
 
-    def write(self, values: Any, x: list[Any]) -> None:
-        """Give x [n] to the entries `names` of what `mitsuba.traverse` returned; numbers or, for derivatives, Dr.Jit's."""
+    def write(self, values: Any, x: Any) -> None:
+        """Give x, a list of n numbers, to the entries `names` of what `mitsuba.traverse` returned.
+
+        A Dr.Jit array [n] instead of the list passes its derivatives on, in variants that have them.
+        """
 
 
 class Parameter(Protocol):
@@ -47,15 +52,17 @@ class Transform:
     """Pose of a shape, an instance, an emitter or a sensor, relative to that in the scene.
 
     The pose is T(sum_i x_i unit_i move_i) P R(turn_1, x_j unit_j) ... P^-1 (pose in the scene), with P the translation
-    to the pivot. Moving an instance of a shape group is faster than moving a mesh, whose vertices are all written.
+    to the pivot. A mesh has no `to_world`: name its `vertex_positions`, and its normals follow. Moving an instance of a
+    shape group is faster, since a mesh writes all vertices.
 
     Args:
-        name: of a `to_world`, or several that move together.
+        name: of a `to_world` or of `vertex_positions`, or several that move together.
         move: directions [m][3].
         turn: axes of rotations [r][3].
         unit: length or degrees of x = 1, one for all or one for each of the m + r columns.
         bounds: of x, a pair for all or one for each; None for none.
-        pivot: point that stays where it is when turned; None for the origin of the (first) object.
+        pivot: point that stays where it is when turned; None for the origin of the (first) object, or for the centre of
+            the box around it if it is a mesh.
     """
 
     name: str | tuple[str, ...]
@@ -78,9 +85,9 @@ class Transform:
                 if len(vector) != 3 or not any(vector):
                     raise ValueError(f"{self.names[0]}: {what} must be vectors of 3 numbers, not all 0, got {vector!r}")
         for name in self.names:
-            if "Transform4f" not in type(values[name]).__name__:
-                kind = type(values[name]).__name__
-                raise ValueError(f"Transform is for a to_world, but {name} is a {kind}: take Value")
+            kind = type(values[name]).__name__
+            if "Transform4f" not in kind and not name.endswith(_POSITIONS):
+                raise ValueError(f"Transform is for a to_world or vertex_positions, but {name} is a {kind}: take Value")
         units = [float(one) for one in self.unit] if isinstance(self.unit, Sequence) else [float(self.unit)] * n
         if len(units) != n or not all(math.isfinite(one) and one != 0.0 for one in units):
             raise ValueError(f"{self.names[0]}: unit must be a number or {n} numbers, not 0, got {self.unit!r}")
@@ -91,22 +98,22 @@ class Pose:
     """A `Transform` of a loaded scene."""
 
     def __init__(self, transform: Transform, mi: Any, values: Any, units: list[float]) -> None:
-        self.names, self.n, self._mi = transform.names, len(units), mi
-        self._units, self._moves = units, [[float(c) for c in one] for one in transform.move]
-        self._turns = [[float(c) for c in one] for one in transform.turn]
-        matrices = [np.array(values[name].matrix, np.float64).reshape(4, 4) for name in self.names]
-        self._base = [mi.ScalarTransform4f(matrix) for matrix in matrices]
-        pivot = matrices[0][:3, 3] if transform.pivot is None else transform.pivot
-        self._pivot = [float(c) for c in pivot]
+        first = transform.names[0]
+        self.n, self._mi, self._units = len(units), mi, units
+        self._moves = [[float(c) for c in one] for one in transform.move]
+        self._turns = [[float(c) / math.hypot(*one) for c in one] for one in transform.turn]  # Mitsuba's are of length 1
+        self._objects = [(_Mesh if one.endswith(_POSITIONS) else _Frame)(one, mi, values) for one in transform.names]
+        self.names = tuple(name for one in self._objects for name in one.names)
+        self._pivot = [float(c) for c in (self._objects[0].origin if transform.pivot is None else transform.pivot)]
         kinds = [f"move{i}" for i in range(len(self._moves))] + [f"turn{i}" for i in range(len(self._turns))]
-        self.labels = [f"{self.names[0]}.{kind}" for kind in kinds]
+        self.labels = [f"{first}.{kind}" for kind in kinds]
         self.x0 = [0.0] * self.n
-        self.limits = ranges(self.names[0], transform.bounds, self.n)
+        self.limits = ranges(first, transform.bounds, self.n)
 
-    def write(self, values: Any, x: list[Any]) -> None:
-        numbers = all(isinstance(one, float) for one in x)
-        kind = self._mi.ScalarTransform4f if numbers else self._mi.Transform4f  # the latter carries derivatives
-        pose = kind()
+    def write(self, values: Any, x: Any) -> None:
+        numbers = isinstance(x, list)
+        pose = self._mi.ScalarTransform4f() if numbers else self._mi.Transform4f()  # the latter carries derivatives
+        x = x if numbers else elements(self._mi, x, self.n)
         moved = len(self._moves)
         if moved:
             steps = [(u * value, move) for u, value, move in zip(self._units, x, self._moves, strict=False)]
@@ -116,8 +123,51 @@ class Pose:
             for unit, value, axis in zip(self._units[moved:], x[moved:], self._turns, strict=True):
                 pose = pose.rotate(axis, unit * value)
             pose = pose.translate([-c for c in self._pivot])
-        for name, base in zip(self.names, self._base, strict=True):
-            values[name] = type(values[name])(pose @ kind(base))
+        for one in self._objects:
+            one.place(values, pose, numbers)
+
+
+class _Frame:
+    """A `to_world`."""
+
+    def __init__(self, name: str, mi: Any, values: Any) -> None:
+        self.names = (name,)
+        matrix = np.array(values[name].matrix, np.float64).reshape(4, 4)
+        self.origin = matrix[:3, 3]
+        self._scalar = mi.ScalarTransform4f(matrix)
+
+    def place(self, values: Any, pose: Any, numbers: bool) -> None:
+        (name,) = self.names
+        values[name] = type(values[name])(pose @ (self._scalar if numbers else type(pose)(self._scalar)))
+
+
+class _Mesh:
+    """Vertices [m, 3] in the scene, and unit normals if the mesh has them."""
+
+    def __init__(self, name: str, mi: Any, values: Any) -> None:
+        normals = name.removesuffix(_POSITIONS) + _NORMALS
+        self._mi = mi
+        self._arrays = {
+            one: np.array(values[one], np.float64).reshape(-1, 3)
+            for one in (name, normals)
+            if one == name or (one in values and np.array(values[one]).size)
+        }
+        self.names = tuple(self._arrays)
+        vertices = self._arrays[name]
+        self.origin = 0.5 * (vertices.min(0) + vertices.max(0))
+
+    def place(self, values: Any, pose: Any, numbers: bool) -> None:
+        for name, array in self._arrays.items():
+            directions = name.endswith(_NORMALS)  # rotations and translations: normals turn as vectors do
+            if numbers:
+                matrix = np.array(pose.matrix, np.float64).reshape(4, 4)
+                moved = array @ matrix[:3, :3].T + (0.0 if directions else matrix[:3, 3])
+                values[name] = type(values[name])(moved.astype(np.float32).ravel())
+            else:
+                import drjit
+
+                kind = self._mi.Vector3f if directions else self._mi.Point3f
+                values[name] = drjit.ravel(pose @ kind(array.T.astype(np.float32)))
 
 
 @dataclass(frozen=True)
@@ -151,14 +201,14 @@ class Value:
         shapes = {name: np.array(values[name]).size for name in self.names}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"names that share a value must have the same size, got {shapes}")
-        return Numbers(self, values)
+        return Numbers(self, mi, values)
 
 
 class Numbers:
     """A `Value` of a loaded scene."""
 
-    def __init__(self, value: Value, values: Any) -> None:
-        first = value.names[0]
+    def __init__(self, value: Value, mi: Any, values: Any) -> None:
+        self._mi, first = mi, value.names[0]
         now = np.array(values[first], np.float64)
         self.names, self._unit, self._shape = value.names, value.unit, now.shape
         self._kinds = [type(values[name]) for name in self.names]
@@ -176,22 +226,33 @@ class Numbers:
                     f"bounds of {first} must lie within {low:g} to {high:g}, which the scene accepts, got {least:g} to {most:g}"
                 )
 
-    def write(self, values: Any, x: list[Any]) -> None:
-        full = [self._unit * one for one in x]
+    def write(self, values: Any, x: Any) -> None:
         size = math.prod(self._shape)
-        if len(full) == 1:
-            full = full * size
-        new: Any = full if size > 1 else full[0]
-        if self._tensor:
-            if not all(isinstance(one, float) for one in full):
-                raise NotImplementedError(
-                    f"{self.names[0]} is a tensor: derivatives for its elements are not passed on"
-                )
-            new = np.asarray(full, np.float32).reshape(self._shape)
-        elif size > 4:  # vertices
-            new = np.asarray(full, np.float32)
+        if not isinstance(x, list):
+            new = self._attached(x, size)
+        elif self._tensor or size > 4:  # textures, vertices
+            full = np.full(size, self._unit) * np.asarray(x, np.float64)
+            new = full.astype(np.float32).reshape(self._shape)
+        else:
+            new = [self._unit * one for one in x] * (size // len(x))
+            new = new if size > 1 else new[0]
         for name, kind in zip(self.names, self._kinds, strict=True):
             values[name] = kind(new)
+
+    def _attached(self, x: Any, size: int) -> Any:
+        """Elements from a Dr.Jit array x [n]."""
+        if self.n < size:
+            x = elements(self._mi, x, 1)[0] + self._mi.Float(np.zeros(size, np.float32))
+        if self._tensor:
+            return self._mi.TensorXf(self._unit * x, shape=self._shape)
+        return self._unit * x if size == 1 or size > 4 else [self._unit * one for one in elements(self._mi, x, size)]
+
+
+def elements(mi: Any, x: Any, n: int) -> list[Any]:
+    """Dr.Jit numbers of a Dr.Jit array x [n]."""
+    import drjit
+
+    return [drjit.gather(mi.Float, x, i) for i in range(n)]
 
 
 def accepted(name: str) -> Range:

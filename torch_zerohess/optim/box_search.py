@@ -23,7 +23,7 @@ MOST = 4
 _OPTIMISM = 0.3
 """Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
 _EXPLORING = 2.0
-"""The same in the steps after an arrival."""
+"""The same in the steps after an arrival, and where the loss itself is predicted."""
 _SCALES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
 """Distances of candidates from the best point."""
 _CANDIDATES = 24
@@ -36,11 +36,11 @@ _SETTLED = 3
 _REFUSED = 10
 """Outputs in a row that are not finite, after which the search ends."""
 _EXPANSIONS = 3
-"""Of a loss that is not quadratic, around its predicted minimum."""
+"""Around predicted minima, until one predicts the loss; a loss for which none does is itself predicted from then on."""
 
 _STATE = (
     *("sigma", "evaluations", "iterations", "rounds", "done", "message", "phase"),
-    *("best", "lowest", "best_sigma", "x", "_settled", "_exploring", "_refused"),
+    *("best", "lowest", "best_sigma", "x", "_moved", "_settled", "_exploring", "_refused", "_expands"),
 )
 
 
@@ -73,6 +73,7 @@ class BoxSearch:
         self.phase: Literal["start", "trial"] = "start"
         self.shape = torch.Size()
         """Of an output."""
+        self._moved, self._expands = math.inf, True
         self._settled = self._exploring = self._refused = 0
 
     def points(self) -> Tensor:
@@ -93,14 +94,13 @@ class BoxSearch:
         if self._refused >= _REFUSED:
             self.done, self.message = True, f"{_REFUSED} batches in a row had values that are not finite"
             return
-        before = self.best
         self._remember(points[finite], losses[finite], outputs[finite])
         if not bool(finite.all()) and len(self.pool):  # as bad as the worst that is known
             worst = self.pool.outputs[int(self.pool.values.argmax())]  # type: ignore[index]
             bad = points[~finite]
             self.pool.add(bad, self.pool.values.max().expand(len(bad)), worst.expand(len(bad), -1), self.best, 1.0)
         if self.phase == "trial":
-            self._settle(float((points[-1] - before).norm()) / math.sqrt(self.n))
+            self._settle(self._moved)
         self.x = points[-1]
         self.phase = "trial"
 
@@ -162,23 +162,37 @@ class BoxSearch:
 
     def _next(self) -> Tensor:
         """Return the point [n] with the lowest optimistic loss, or the least known one if that is known already."""
-        assert self.pool.outputs is not None
-        process = GaussianProcess.fit(self.pool.points, self.pool.outputs)
-        optimism = _EXPLORING if self._exploring else _OPTIMISM
-        output, x = self.pool.outputs[int(self.pool.values.argmin())], self.best
-        for _ in range(_EXPANSIONS):
-            model = _LossModel(process, output, self.loss, self.shape, optimism)
-            x = self._lowest(model)
-            output = process.mean + (process.covariance(x[None]) @ process.weights)[0]
-            if model.is_true(x, float(self.loss(output.view(self.shape)))):
-                break
+        process, x = self._through_output() if self._expands else self._from_losses()
+        self._moved = float((x - self.best).norm()) / math.sqrt(self.n)
         if float((self.pool.points - x).norm(dim=1).min()) < _SAME:
             spots = self._uniform(4 * _CANDIDATES)
             x = spots[int(process.uncertainty(process.covariance(spots)).argmax())]
         return x
 
+    def _through_output(self) -> tuple[GaussianProcess, Tensor]:
+        """Predict the output, expand the loss, and return the point [n] that is lowest."""
+        assert self.pool.outputs is not None
+        process = GaussianProcess.fit(self.pool.points, self.pool.outputs)
+        optimism = _EXPLORING if self._exploring else _OPTIMISM
+        output = self.pool.outputs[int(self.pool.values.argmin())]
+        for _ in range(_EXPANSIONS):
+            model = _LossModel(process, output, self.loss, self.shape, optimism)
+            x = self._lowest(model)
+            output = process.mean + (process.covariance(x[None]) @ process.weights)[0]
+            if model.is_true(x, float(self.loss(output.view(self.shape)))):
+                return process, x
+        self._expands = False
+        return self._from_losses()
+
+    def _from_losses(self) -> tuple[GaussianProcess, Tensor]:
+        """Predict the loss, and return the point [n] that is lowest."""
+        process = GaussianProcess.fit(self.pool.points, self.pool.values[:, None])
+        return process, self._lowest(
+            _LossModel(process, self.pool.values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
+        )
+
     def _lowest(self, model: "_LossModel") -> Tensor:
-        """Return the best of candidates around the best point and all over the box, improved by smaller and smaller steps."""
+        """Return the best of candidates around the best point and all over the box, improved by ever smaller steps."""
         near = [self.best + scale * self._normal(_CANDIDATES, self.n) for scale in _SCALES]
         candidates = torch.cat([*near, self._uniform(4 * _CANDIDATES)]).clamp(self.lower, self.upper)
         scores = model(candidates)

@@ -12,10 +12,12 @@ from typing import Any
 _SCALE = {"scale": (0.1, 0.25, 0.5, 1.0, 2.0)}
 _DIFFERENCE = {"difference": (1e-6, 1e-4, 1e-2, 0.1, 0.3)}
 _ADAPTIVE = {"samples": (1, 4, 16), "start": (0.1, 1.0), "end": (0.01, 0.1), "steps": (5, 20, 50)}
+_ADJOINT = {"rate": (0.03, 0.1, 0.3, 1.0), "steps": (50, 100, 300), "fresh": (True, False)}
 SPACES: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
     **dict.fromkeys(("cma_es", "cma_es_bounded", "cobyqa", "dfo_ls"), _SCALE),
     **dict.fromkeys(("bfgs_fd", "lbfgs_fd"), _DIFFERENCE),
     **dict.fromkeys(("bfgs_adaptive_fd", "bfgs_adaptive_fd_frozen"), _ADAPTIVE),
+    **dict.fromkeys(("mitsuba", "mitsuba_path", "mitsuba_projective"), _ADJOINT),
     "analytic_1": {"rate": (0.03, 0.1, 0.3), "steps": (50, 300)},
     "analytic_2": {"radius": (0.5, 1.0, 2.0, 5.0, 100.0), "steps": (3, 10)},
 }

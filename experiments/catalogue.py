@@ -9,13 +9,16 @@ from experiments.task import Task
 
 Preset = Literal["fast", "paper"]
 
-FITTING = {name: f"experiments.tasks.{name}" for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "caustic")}
+FITTING = {
+    name: f"experiments.tasks.{name}"
+    for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "caustic", "meshfit", "meshfit_color")
+}
 """Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
 RENDERED = {name: f"experiments.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror")}
 """Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
 FITTING |= RENDERED
-TRAINING = {"cnn": "experiments.tasks.cnn"}
-"""Tasks whose unknowns are the weights of a network before the black box."""
+TRAINING = {name: f"experiments.tasks.{name}" for name in ("cnn", "cnn_wide", "cnn5", "cnn_texture")}
+"""Tasks whose unknowns are the weights of a network before the black box: modules with `Task` and `PRESETS`."""
 
 
 def load(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:

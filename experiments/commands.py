@@ -7,12 +7,15 @@ import tyro
 
 import torch_zerohess as zh
 from experiments.bench import bench
+from experiments.check_caustic import check_caustic
 from experiments.error import error
 from experiments.figures import plot
+from experiments.gallery import gallery
 from experiments.listing import list_
 from experiments.losses import losses
 from experiments.nonpsd_error import nonpsd_error
 from experiments.report import report
+from experiments.robustness import robustness
 from experiments.run import run
 from experiments.stability import stability
 from experiments.summary import table
@@ -34,6 +37,9 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "error": error,
     "nonpsd": nonpsd_error,
     "losses": losses,
+    "caustic": check_caustic,
+    "robustness": robustness,
+    "gallery": gallery,
     "bench": bench,
     "stability": stability,
     "doctor": doctor,

@@ -68,14 +68,14 @@ def curves(
         for axis, against in zip(row, _AXES, strict=True):
             axis.set(xscale="log", yscale="log")
             for name, runs in methods.items():
-                _band(axis, runs, metric, against, f"{name} ({len(runs)})", chosen[name])
+                band(axis, runs, metric, against, f"{name} ({len(runs)})", chosen[name])
             for level in LEVELS:
                 axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
             axis.grid(which="major", alpha=0.3)
         row[0].set_ylabel(f"{metric} error / error at the start")
     for axis, label in zip(axes[1], _AXES.values(), strict=True):
         axis.set_xlabel(label)
-        _plain_ticks(axis)
+        plain_ticks(axis)
     handles, labels = axes[0][1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", frameon=False, title="method (runs)")
     figure.suptitle(f"{task}: median and quartiles")
@@ -97,7 +97,7 @@ def quartiles(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     return grid, np.exp(np.quantile(np.log(errors), (0.25, 0.5, 0.75), axis=0))
 
 
-def _band(axis: Any, runs: Iterable[Run], metric: str, against: str, label: str, style: Style) -> None:
+def band(axis: Any, runs: Iterable[Run], metric: str, against: str, label: str, style: Style) -> None:
     lines = [line for run in runs if len((line := _line(run, metric, against))[0])]
     if not lines:
         axis.plot([], [], label=label, **style)
@@ -107,7 +107,7 @@ def _band(axis: Any, runs: Iterable[Run], metric: str, against: str, label: str,
     axis.fill_between(grid, low, high, step="post", color=style["color"], alpha=0.12, linewidth=0)
 
 
-def _plain_ticks(axis: Any) -> None:
+def plain_ticks(axis: Any) -> None:
     """Label a logarithmic axis with numbers, more of them where it is short, so that they do not overlap."""
     first, last = axis.get_xlim()
     steps = (1.0, 2.0, 5.0) if math.log10(last / first) < 2 else (1.0,)

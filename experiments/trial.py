@@ -105,6 +105,20 @@ class Trial:
             raise ValueError(f"the black box of {self.task.name} returns a loss only")
         return self._evaluate(self.task.image, x)
 
+    def adjoint(self, x: Tensor, integrator: str, seed: int = 0) -> tuple[float, Tensor]:
+        """Return loss and gradient [n] at x [n] by the renderer itself, for 2 evaluations; see `Task.adjoint`."""
+        adjoint = self.task.adjoint
+        if adjoint is None or integrator not in self.task.adjoints:
+            known = ", ".join(self.task.adjoints) or "none"
+            raise ValueError(f"integrator must be one of {self.task.name}, {known}, got {integrator}")
+
+        def both(points: Tensor) -> Tensor:
+            value, gradient = adjoint(points[0], integrator, seed)
+            return torch.cat([value.reshape(1), gradient])
+
+        values = self._evaluate(both, x.detach().expand(2, -1))  # a render and its adjoint
+        return float(values[0]), values[1:].clone()
+
     def report(self, x: Tensor, *, sigma: float | Tensor | None = None, loss: float | Tensor | None = None) -> None:
         """End an iteration at x [n], the point the method would return if it were stopped now.
 
@@ -135,11 +149,12 @@ class Trial:
 
     def _solved(self, row: Record) -> bool:
         precise = self.task.precision is None or (row.parameter_error or 0.0) <= self.task.precision
-        return (
-            precise
-            and reduced(row.image_error, self._first.image_error, LEVELS[-1])
-            and reduced(row.parameter_error, self._first.parameter_error, LEVELS[-1])
+        errors = (
+            (row.image_error, self._first.image_error),
+            (row.parameter_error, self._first.parameter_error),
         )
+        # An error that is not defined for the task, as where there is no true solution, does not count.
+        return precise and all(reduced(now, first, LEVELS[-1]) for now, first in errors if first is not None)
 
     def _row(self, x: Tensor, sigma: float | None, loss: float | None) -> Record:
         def errors() -> tuple[float, float]:

@@ -311,9 +311,7 @@ def case(name):
     n = {"loss": 3, "small image": 2, "image": 5}[name]
     loss = None if name == "loss" else misfit(n)
     settings = {"sigma": 1.0, "bounds": (-3.0, 4.0), "loss": loss, "restarts": 1000}
-    return (lambda seed: TrustRegion(zeros(n), seed=seed, **settings)), (
-        rays if loss else rosenbrock
-    )
+    return (lambda seed: TrustRegion(zeros(n), seed=seed, **settings)), (rays if loss else rosenbrock)
 
 
 @pytest.mark.parametrize("name", ["loss", "small image", "image"])

@@ -1,11 +1,23 @@
 """Methods by name, one module per family."""
 
-from experiments.methods import analytic, derivative_free, paper, quasi_newton, trust_region
+from experiments.methods import (
+    analytic,
+    derivative_free,
+    gauss_newton,
+    meshes,
+    mitsuba,
+    paper,
+    quasi_newton,
+    trust_region,
+)
 from experiments.methods.method import Method
 
 METHODS: dict[str, Method] = {
     method.name: method
-    for family in (paper, trust_region, derivative_free, quasi_newton, analytic)
+    for family in (
+        *(paper, trust_region, gauss_newton, derivative_free, quasi_newton),
+        *(analytic, meshes, mitsuba),
+    )
     for method in family.METHODS
 }
 

@@ -51,5 +51,5 @@ def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Ta
         start=around(3, 0.25, 0.1),
         sigma=0.25,
         bounds=(-torch.ones(3).double(), torch.ones(3).double()),
-        evaluations=3000,
+        evaluations=400,
     )

@@ -56,6 +56,6 @@ def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Ta
         start=uniform(torch.tensor([9.0]).double(), torch.tensor([10.0]).double()),
         sigma=3.0,
         bounds=(torch.tensor([-4.0]).double(), torch.tensor([14.0]).double()),
-        evaluations=3000,
+        evaluations=400,
         parameter_error=parameter_error,
     )

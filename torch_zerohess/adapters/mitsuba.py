@@ -12,7 +12,7 @@ Example: where is the ball, and how bright is it? The points are [K, 3]: two len
         film=(64, 48), spp=8,
     )
     target = torch.from_numpy(photograph)
-    fit = zh.minimize(scene, scene.x0, sigma=0.3, bounds=scene.bounds, loss=lambda image: (image - target).square().mean())
+    fit = zh.minimize(scene, scene.x0, sigma=0.3, bounds=scene.bounds, loss=zh.losses.mse(target))
 """
 
 import difflib
@@ -51,7 +51,7 @@ class MitsubaScene:
         loss: of an image [height, width, channels] tensor, a scalar: the black box then returns losses.
         nan: "raise" refuses pixels that are not finite; "keep" leaves them to what receives them, see `on_nonfinite`
             of `BlackBox`.
-        variant: "auto" (`llvm_ad_rgb` where it is known to be safe, else `scalar_rgb`) or the name of a Mitsuba variant.
+        variant: "auto" (`llvm_ad_rgb` where it is known to be safe, else `scalar_rgb`) or the name of one.
         threads: render threads of this process; None for all cores.
 
     Raises:
@@ -153,8 +153,9 @@ class MitsubaScene:
         image = np.array(pixels, dtype=np.float32)
         if self.nan == "raise" and not np.isfinite(image).all():
             wrong = np.argwhere(~np.isfinite(image))
+            where = x.tolist() if self.n < 20 else "[...]"
             raise FloatingPointError(
-                f"{len(wrong)} values of the image at x = {x.tolist() if self.n < 20 else '[...]'} are not finite, the first "
+                f"{len(wrong)} values of the image at x = {where} are not finite, the first "
                 f'at row {wrong[0][0]}, column {wrong[0][1]}; nan="keep" leaves them to on_nonfinite of BlackBox'
             )
         return torch.from_numpy(image)

@@ -101,7 +101,7 @@ class Pose:
         first = transform.names[0]
         self.n, self._mi, self._units = len(units), mi, units
         self._moves = [[float(c) for c in one] for one in transform.move]
-        self._turns = [[float(c) / math.hypot(*one) for c in one] for one in transform.turn]  # Mitsuba's are of length 1
+        self._turns = [[float(c) / math.hypot(*one) for c in one] for one in transform.turn]  # of length 1
         self._objects = [(_Mesh if one.endswith(_POSITIONS) else _Frame)(one, mi, values) for one in transform.names]
         self.names = tuple(name for one in self._objects for name in one.names)
         self._pivot = [float(c) for c in (self._objects[0].origin if transform.pivot is None else transform.pivot)]
@@ -176,7 +176,8 @@ class Value:
 
     Args:
         name: of a value, or several that share it.
-        bounds: of x, a pair for all or one for each; None takes what the scene accepts, such as 0 to 1 for a reflectance.
+        bounds: of x, a pair for all or one for each; None takes what the scene accepts, such as 0 to 1 for a
+            reflectance.
         unit: value of x = 1.
         elements: 1 for one number that all elements share, such as a grey; None for all elements.
     """
@@ -223,7 +224,8 @@ class Numbers:
         for least, most in self.limits:
             if least < low or most > high:
                 raise ValueError(
-                    f"bounds of {first} must lie within {low:g} to {high:g}, which the scene accepts, got {least:g} to {most:g}"
+                    f"bounds of {first} must lie within {low:g} to {high:g}, which the scene accepts, "
+                    f"got {least:g} to {most:g}"
                 )
 
     def write(self, values: Any, x: Any) -> None:

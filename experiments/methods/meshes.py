@@ -1,0 +1,257 @@
+"""Methods for the vertices of a mesh: smoothed derivatives, with what is known about meshes and cameras around them.
+
+| method | perturbed | derivatives of | step |
+|---|---|---|---|
+| our_g_large_steps | vertices | the loss, with the white box (I + w L)^-1 before the black box | Adam |
+| our_g_levels | handles | the loss | Adam |
+| our_hvpa_levels | handles | the loss | Newton-CG |
+| our_g_local | handles | the losses of the handles | Adam |
+| our_h_local, **recommended** | handles | the losses of the handles | Newton, a Hessian per handle; then Adam |
+
+*Handles* are the vertices of a coarser mesh, whose displacements subdivision makes smooth: first few, then more. *The
+loss of a handle* is that of the pixels that it can change, a box in every view around the vertices it moves: this takes
+the cameras, which are known, and no render. All handles are perturbed in the same images, and each is a black box of
+its own few parameters, with a gradient and a Hessian that a few images determine. What the others do to the same pixels
+is noise; what they do elsewhere is not in it. The gradients together are that of the whole loss, but for the faint ends
+of the bumps, and for the smoothing over what others do, which is with the density of their samples; the Hessians are
+the diagonal blocks of that of the whole loss.
+
+Large steps: Nicolet, Jacobson and Jakob 2021, "Large steps in inverse rendering of geometry".
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+import torch_zerohess as zh
+from experiments.methods.keywords import with_settings
+from experiments.methods.method import Method
+from experiments.scenes.fitted_mesh import Control, FittedMesh
+from experiments.task import Task
+from experiments.trial import Trial
+
+LEVELS = (1, 2, 3, 3, 4)
+"""Of the icosphere, whose vertices are the handles in turn."""
+BEYOND = 2.0
+"""Margin of the box of a handle in units of sigma, for what its perturbations reach; 1 pixel comes on top."""
+DAMPING = 0.5
+"""Added to the eigenvalues of the blocks, in units of the mean size of all: what is hardly seen hardly moves."""
+
+
+def handles(
+    trial: Trial,
+    *,
+    credit: Literal["all", "local"],
+    newton: int = 0,
+    levels: tuple[int, ...] = LEVELS,
+    steps: int = 40,
+    samples: int = 8,
+    sigma: tuple[float, float] = (0.1, 0.05),
+    color: float = 0.5,
+    rate: float = 0.3,
+    size: float = 0.5,
+    momentum: tuple[float, float] = (0.5, 0.95),
+) -> None:
+    """Descend with the handles of one level after the other, and end.
+
+    Args:
+        trial: the run.
+        credit: whether a handle answers for all pixels or for those that it can change.
+        newton: on so many of the levels, from the first, steps are those of Newton with blocks of the Hessian, which
+            needs credit "local"; on the others those of Adam. The finer the level, the fewer pixels a handle has, and
+            the more of its sampled curvature is noise.
+        levels: of the handles; one may come again.
+        steps: on each level.
+        samples: antithetic pairs; a step costs twice as many evaluations.
+        sigma: at the first and the last step of a level, in units of the mean distance of its handles at the start of
+            the run.
+        color: change of a colour that counts as much as this distance.
+        rate: factor of a Newton step, which is then no longer than sigma: handles that overlap correct the same
+            pixels, each as if it were alone.
+        size: of a step of Adam, in units of sigma.
+        momentum: shares of what was before in the means of the gradient and of the curvature.
+    """
+    mesh, x = _mesh(trial.task), trial.start
+    first_order = zh.Smoothing(sigma=1.0, samples=samples, order=1, baseline="none")
+    second_order = zh.Smoothing(sigma=1.0, samples=samples, baseline="mean")
+    for visit, level in enumerate(levels):
+        smoothing = second_order if visit < newton else first_order
+        control, means = mesh.control(level), _Means(momentum)
+        unit = torch.full((mesh.channels,), mesh.spacing(trial.start, level), dtype=torch.float64)
+        unit[3:] = color
+        zero = torch.zeros(len(control), mesh.channels, dtype=torch.float64)
+        for number in range(steps):
+            width = sigma[0] + (sigma[1] - sigma[0]) * number / max(steps - 1, 1)
+            smoothing = smoothing.replace(sigma=width)
+            if credit == "local":
+                reach = BEYOND * width * float(unit[0]) * mesh.cameras.pixels + 1
+                local = _losses(trial, control, x, unit, reach)
+                estimate = zh.estimate(local, zero, smoothing, value="smoothed")
+            else:
+                estimate = zh.estimate(_loss(trial, control, x, unit), zero.flatten(), smoothing, value="smoothed")
+            gradient = estimate.gradient.view_as(zero)
+            if visit < newton:
+                move = _newton(*means(gradient, estimate.hessian()), rate, width)
+            else:
+                move = _adam(*means(gradient, gradient.square()), size * width)
+            x = control.displaced(x, (move * unit)[None])[0]
+            trial.report(x, sigma=width * float(unit[0]), loss=estimate.value.sum() if credit == "all" else None)
+
+
+def newton_cg(
+    trial: Trial,
+    *,
+    levels: tuple[int, ...] = LEVELS,
+    steps: int = 5,
+    samples: int = 64,
+    sigma: tuple[float, float] = (0.15, 0.075),
+    color: float = 0.5,
+    radius: float = 3.0,
+) -> None:
+    """Newton-CG on the smoothed loss as a function of all handles of a level; arguments as for `handles`.
+
+    radius: of the trust region, in units of sigma.
+    """
+    mesh, x = _mesh(trial.task), trial.start
+    for level in levels:
+        control = mesh.control(level)
+        unit = torch.full((mesh.channels,), mesh.spacing(trial.start, level), dtype=torch.float64)
+        unit[3:] = color
+        z = torch.zeros(len(control) * mesh.channels, dtype=torch.float64, requires_grad=True)
+        smoothing = zh.Smoothing(sigma=sigma[0], samples=samples, baseline="mean")
+        layer = zh.BlackBox(_loss(trial, control, x, unit), smoothing, value="smoothed")
+        optimizer = zh.optim.NewtonCG([z], radius=radius * sigma[0], adapt=False)
+        annealing = zh.LinearSigma(layer, *sigma, max(steps - 1, 1))
+        for _ in range(steps):
+            optimizer.param_groups[0]["radius"] = radius * annealing.sigma
+            loss = optimizer.step(partial(layer, z))
+            moved = z.detach().view(1, -1, mesh.channels) * unit
+            trial.report(control.displaced(x, moved)[0], sigma=annealing.sigma * float(unit[0]), loss=loss)
+            annealing.step()
+        x = trial.x
+
+
+def large_steps(
+    trial: Trial,
+    *,
+    samples: int = 8,
+    sigma: tuple[float, float] = (0.3, 0.1),
+    color: float = 0.5,
+    weight: float = 20.0,
+    rate: float = 0.05,
+    steps: int = 200,
+) -> None:
+    """Adam on z, vertices x = (I + weight L)^-1 z, with L the Laplacian of the triangles; arguments as for `handles`.
+
+    The step size is the same for all elements, by the greatest of Adam's second moments, as in the source.
+
+    rate: size of a step of z, in units of the mean length of edges.
+    """
+    mesh = _mesh(trial.task)
+    edge = mesh.spacing(trial.start, mesh.level)
+    unit = torch.full((mesh.channels,), edge, dtype=torch.float64)
+    unit[3:] = color
+    stiff = mesh.laplacian * weight
+    stiff.diagonal().add_(1.0)
+    smooth = torch.linalg.inv(stiff)
+    z = (stiff @ (mesh.rows(trial.start) / unit)).requires_grad_()
+    smoothing = zh.Smoothing(sigma=sigma[0], samples=samples, baseline="none", order=1)
+    layer = zh.BlackBox(lambda x: trial.loss((mesh.rows(x) * unit).flatten(1)), smoothing, value="smoothed")
+    annealing, means = zh.LinearSigma(layer, *sigma, max(steps - 1, 1)), _Means((0.9, 0.999))
+    for _ in range(steps):
+        loss = layer((smooth @ z).flatten())
+        (gradient,) = torch.autograd.grad(loss, z)
+        first, second = means(gradient, gradient.square().max())
+        with torch.no_grad():
+            z -= rate * first / second.sqrt().clamp(min=1e-300)
+            x = ((smooth @ z) * unit).flatten()
+        trial.report(x, sigma=annealing.sigma * edge, loss=loss.detach())
+        annealing.step()
+
+
+def _loss(trial: Trial, control: Control, x: Tensor, unit: Tensor) -> Callable[[Tensor], Tensor]:
+    """The loss [K] of displacements [K, handles * channels] in units of `unit`."""
+    return lambda z: trial.loss(control.displaced(x, z.unflatten(1, (-1, len(unit))) * unit))
+
+
+def _losses(trial: Trial, control: Control, x: Tensor, unit: Tensor, margin: float) -> Callable[[Tensor], Tensor]:
+    """The losses of all handles, as one black box of `channels` parameters that each handle evaluates as often.
+
+    A point of a handle goes into an image together with a point of every other one, in the order in which they come:
+    [handles * K, channels] -> [handles * K] for K evaluations.
+    """
+    sums, squared = control.sums(x, margin), _squared(trial.task)
+
+    def losses(points: Tensor) -> Tensor:
+        z = points.unflatten(0, (len(control), -1)).transpose(0, 1)
+        return sums(squared(trial.image(control.displaced(x, z * unit)))).T.flatten()
+
+    return losses
+
+
+def _squared(task: Task) -> Callable[[Tensor], Tensor]:
+    """Shares of the pixels in the loss: images [K, v, side, side, ...] -> [K, v, side, side]."""
+    residuals = task.residuals
+    assert residuals is not None
+    return lambda y: torch.vmap(residuals)(y).square().div(y[0].numel()).unflatten(1, (*y.shape[1:4], -1)).sum(4)
+
+
+class _Means:
+    """Exponential means of two series, without the bias of their first value."""
+
+    def __init__(self, shares: tuple[float, float]) -> None:
+        self._shares, self._sums, self._weights = shares, [torch.tensor(0.0), torch.tensor(0.0)], [0.0, 0.0]
+
+    def __call__(self, *values: Tensor) -> tuple[Tensor, Tensor]:
+        for i, (share, value) in enumerate(zip(self._shares, values, strict=True)):
+            self._sums[i] = share * self._sums[i] + (1 - share) * value
+            self._weights[i] = share * self._weights[i] + (1 - share)
+        first, second = (one / weight for one, weight in zip(self._sums, self._weights, strict=True))
+        return first, second
+
+
+def _newton(gradient: Tensor, blocks: Tensor, rate: float, longest: float) -> Tensor:
+    """Steps [handles, c] to the minima along the eigenvectors of blocks [handles, c, c], of absolute curvature."""
+    curvature, vectors = torch.linalg.eigh(blocks)
+    size = curvature.abs()
+    size = (size + DAMPING * size.mean()).clamp(min=1e-300)
+    move = -rate * (vectors @ ((vectors.mT @ gradient[..., None]) / size[..., None]))[..., 0]
+    return move * (longest / move.norm(dim=1, keepdim=True).clamp(min=longest))
+
+
+def _adam(gradient: Tensor, square: Tensor, size: float) -> Tensor:
+    """Steps [handles, c]."""
+    return -size * gradient / square.sqrt().clamp(min=1e-300)
+
+
+def _mesh(task: Task) -> FittedMesh:
+    assert task.mesh is not None
+    return task.mesh
+
+
+def _is_mesh(task: Task) -> str | None:
+    if task.mesh is None:
+        return "its parameters are not the vertices of a mesh that known cameras see"
+    return None if task.image and task.residuals else "the black box returns no residuals"
+
+
+def _method(name: str, title: str, solve: Callable[..., None], **fixed: Any) -> Method:
+    return Method(name, title, with_settings(solve, **fixed), _is_mesh, ("scipy",))
+
+
+METHODS = (
+    _method(
+        "our_h_local",
+        "ours for meshes: Newton, then Adam, a loss per handle",
+        handles,
+        credit="local",
+        newton=2,
+    ),
+    _method("our_g_local", "Adam, a loss per handle of a mesh", handles, credit="local"),
+    _method("our_g_levels", "Adam, handles of a mesh from coarse to fine", handles, credit="all"),
+    _method("our_hvpa_levels", "Newton-CG, handles of a mesh from coarse to fine", newton_cg),
+    _method("our_g_large_steps", "Adam behind the inverse Laplacian of a mesh", large_steps),
+)

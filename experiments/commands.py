@@ -11,6 +11,7 @@ from experiments.check_caustic import check_caustic
 from experiments.error import error
 from experiments.figures import plot
 from experiments.gallery import gallery
+from experiments.gradients import gradients
 from experiments.listing import list_
 from experiments.losses import losses
 from experiments.nonpsd_error import nonpsd_error
@@ -37,9 +38,10 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "error": error,
     "nonpsd": nonpsd_error,
     "losses": losses,
-    "caustic": check_caustic,
+    "gradients": gradients,
     "robustness": robustness,
     "gallery": gallery,
+    "caustic": check_caustic,
     "bench": bench,
     "stability": stability,
     "doctor": doctor,

@@ -1,4 +1,4 @@
-"""The trained encoder outside torch: ONNX, run by onnxruntime."""
+"""The trained network outside torch: ONNX, run by onnxruntime."""
 
 import importlib.util
 import logging
@@ -40,7 +40,7 @@ def export(encoder: nn.Module, images: Tensor, path: Path) -> float:
             external_data=False,
             verbose=False,
             input_names=["image"],
-            output_names=["rotation"],
+            output_names=["parameters"],
             dynamic_shapes={"image": {0: torch.export.Dim("batch")}},
         )
         expected = encoder(images)

@@ -59,7 +59,8 @@ def caustic(found: Trace, seen: Look, other: Trace | None, path: Path) -> None:
     columns = [("start", found.points[0], found.caption(0))]
     columns += [(one.method, one.points[-1], one.caption(-1)) for one in runs]
     figure = plt.figure(figsize=(2.2 * (len(columns) + 1) + 3.6, 4.9), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=[2.2 * (len(columns) + 1), 3.6])
+    parts: Any = figure.subfigures(1, 2, width_ratios=[2.2 * (len(columns) + 1), 3.6])
+    left, right = parts
     axes = left.subplots(2, len(columns) + 1)
     largest = max(float((_surface(x) - _surface(x).mean()).abs().max()) for _, x, _ in columns)
     for (top, below), (name, x, text) in zip(axes.T, columns, strict=False):

@@ -1,6 +1,7 @@
 """`python -m experiments list`: what there is, what goes with what, and what is missing."""
 
 import ast
+import importlib
 import importlib.util
 from pathlib import Path
 
@@ -51,7 +52,16 @@ def _loaded(name: str) -> Task | str:
 
 def _marks(name: str, tasks: dict[str, Task]) -> list[str]:
     fitting = ["+" if name in METHODS and not unusable(METHODS[name], task) else "." for task in tasks.values()]
-    return [*fitting, *("+" if name in TRAINING_METHODS else "." for _ in TRAINING)]
+    return [*fitting, *("+" if name in _training(module) else "." for module in TRAINING.values())]
+
+
+def _training(module: str) -> tuple[str, ...]:
+    """Return the methods of a training task; none if it cannot be used here."""
+    try:
+        methods: tuple[str, ...] = importlib.import_module(module).Task.methods
+    except ImportError:
+        return ()
+    return methods
 
 
 def _reasons(name: str, tasks: dict[str, Task]) -> dict[str, list[str]]:

@@ -1,5 +1,6 @@
 """`python -m experiments run TASK...`: every method on every task, logged row by row, resumed after a kill."""
 
+import importlib
 from pathlib import Path
 from typing import Annotated
 
@@ -33,14 +34,14 @@ def run(
     """Run methods on tasks, or go on with runs that were interrupted: the same command does both.
 
     Args:
-        tasks: names, see `list`; cnn trains a network to predict the rotation of a mug, through a path tracer.
+        tasks: names, see `list`; those named cnn train a network on images of a mug, through a path tracer.
         methods: names separated by commas, or all that apply.
-        runs: independent runs of each method, with other starts; 20, for cnn 1, if not given.
+        runs: independent runs of each method, with other starts; 20, for networks 1, if not given.
         preset: fast takes minutes; paper has the source's sizes.
         out: folder for logs and all that is made from them.
-        jobs: processes, one thread each (not for cnn); the results do not depend on it.
+        jobs: processes, one thread each (not for networks); the results do not depend on it.
         seed: number of the first run.
-        limit: seconds that a run may take (not for cnn).
+        limit: seconds that a run may take (not for networks).
         variant: of Mitsuba; auto takes a just-in-time one only where it is known to work.
         threads: render threads of networks; all cores if not given. Other tasks have one per process.
     """
@@ -57,7 +58,7 @@ def run(
             ensemble = Ensemble(out, _range(seed, runs, "fitting"), preset, jobs, limit, variant)
             _fit(ensemble, fitting, wanted)
         if training:
-            _train(wanted, _range(seed, runs, "training"), preset, out, variant, threads)
+            _train(training, wanted, _range(seed, runs, "training"), preset, out, variant, threads)
     except KeyboardInterrupt:
         raise SystemExit(f"\ninterrupted; the same command goes on where it was, logs are in {out}") from None
 
@@ -80,12 +81,21 @@ def _fit(ensemble: Ensemble, tasks: list[str], methods: list[str] | None) -> Non
 
 
 def _train(
-    methods: list[str] | None, runs: range, preset: Preset, out: Path, variant: str, threads: int | None
+    tasks: list[str],
+    methods: list[str] | None,
+    runs: range,
+    preset: Preset,
+    out: Path,
+    variant: str,
+    threads: int | None,
 ) -> None:
-    from experiments.run_cnn import train_all  # needs Mitsuba
-    from experiments.tasks.cnn import PRESETS
+    from experiments.run_training import train_all  # needs Mitsuba
 
-    names = TRAINING_METHODS if methods is None else [name for name in methods if name in TRAINING_METHODS]
-    if not names:
-        raise SystemExit(f"methods for cnn must be some of {', '.join(TRAINING_METHODS)}")
-    train_all(PRESETS[preset], [TRAINING_METHODS[name] for name in names], runs, out, variant, threads)
+    for name in tasks:
+        module = importlib.import_module(TRAINING[name])
+        known = [one for one in TRAINING_METHODS if one in module.Task.methods]
+        wanted = known if methods is None else [one for one in methods if one in known]
+        if not wanted:
+            raise SystemExit(f"methods for {name} must be some of {', '.join(known)}")
+        chosen_methods = [TRAINING_METHODS[one] for one in wanted]
+        train_all(module.Task, module.PRESETS[preset], chosen_methods, runs, out, variant, threads)

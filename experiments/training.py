@@ -1,4 +1,4 @@
-"""Training an encoder through a black box with first- and second-order methods, all on the same evaluation counter.
+"""Training a network through a black box with first- and second-order methods, all on the same evaluation counter.
 
 | method | smoothed derivative | step on the weights |
 |---|---|---|
@@ -7,6 +7,7 @@
 | our_h | Hessian, one sample set per element | Newton-CG with J^T abs(H) J |
 | our_hvp | Hessian by differences of independent gradients | Newton-CG with J^T abs(H) J |
 | our_hvpa | Hessian from shared aggregate samples | Newton-CG with J^T abs(H) J |
+| pooled | gradient of the local entropy, from a model of the image fitted to all renders | Adam (`pooled.py`) |
 
 The names are those of the source; its second-order steps are a nonlinear conjugate gradient on the weights. J is the
 Jacobian of the network, H the smoothed Hessian of the black box at one image, from one antithetic pair and therefore
@@ -15,6 +16,7 @@ radius) go down linearly over nine tenths of the evaluations. Step sizes and bat
 which no reported run uses, with renders looked up in a table of angles.
 """
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,13 +27,10 @@ import torch
 from torch import Tensor, nn
 
 import torch_zerohess as zh
+from experiments.pooled import ANNEALED, train_pooled
 from experiments.recorder import Recorder
 from experiments.records import Outcome
-from experiments.tasks.cnn import CnnTask
-
-SIGMA = (1.0, 0.1)
-"""First and last sigma, in units of 20 degrees."""
-_ANNEALED = 0.9
+from experiments.training_task import TrainingTask
 
 
 @dataclass(frozen=True)
@@ -39,22 +38,21 @@ class Method:
     """How one method samples and steps. `step` is its first and last learning rate or trust radius."""
 
     name: str
-    optimizer: Literal["adam", "newton"]
-    proposal: Literal["aggregate", "optimal", "fr22"]
-    batch: int
-    step: tuple[float, float]
+    optimizer: Literal["adam", "newton", "pooled"]
+    """`pooled` has its own settings, which come with the task; those that follow are for the others."""
+    proposal: Literal["aggregate", "optimal", "fr22"] = "aggregate"
+    batch: int = 1
+    step: tuple[float, float] = (0.0, 0.0)
     differences: bool = False
     """Hessian-vector products by finite differences of gradients."""
 
-    @property
-    def smoothing(self) -> zh.Smoothing:
+    def smoothing(self, sigma: float) -> zh.Smoothing:
         order = 2 if self.optimizer == "newton" and not self.differences else 1
-        return zh.Smoothing(sigma=SIGMA[0], samples=1, proposal=self.proposal, order=order)
+        return zh.Smoothing(sigma=sigma, samples=1, proposal=self.proposal, order=order)
 
-    @property
-    def evaluations(self) -> int:
+    def evaluations(self, n: int) -> int:
         """Renders per image: one antithetic pair per sample set and f(x); differences take two more pairs."""
-        return self.smoothing.evaluations(1) + (4 if self.differences else 0)
+        return self.smoothing(1.0).evaluations(n) + (4 if self.differences else 0)
 
 
 METHODS = {
@@ -65,6 +63,7 @@ METHODS = {
         Method("our_h", "newton", "optimal", 4, (0.07, 0.003)),
         Method("our_hvp", "newton", "aggregate", 4, (0.07, 0.003), differences=True),
         Method("our_hvpa", "newton", "aggregate", 4, (0.07, 0.003)),
+        Method("pooled", "pooled"),
     )
 }
 
@@ -83,47 +82,64 @@ class Result:
     parameter_error: tuple[float, float]
 
 
-def train(task: CnnTask, method: Method, run: int, recorder: Recorder) -> Result:
+def train(task: TrainingTask, method: Method, run: int, recorder: Recorder) -> Result:
     """Train a new encoder until the evaluations of the preset are used; `recorder` gets a row per iteration.
 
     Both errors of the first row are of the held-out images. After that the image error is the mean over the batches of
-    the last twentieth of the run, which costs no renders; the parameter error is that of the held-out images. Run r
+    the last twentieth of the run, which costs no renders; the parameter error is that of the held-out images. `pooled`
+    renders no predictions, so that its image error is that of the held-out images, in every tenth row. Run r
     starts from the weights and draws the samples of seed r, the same for all methods.
     """
     encoder, start = encoders(task, run)
-    steps = max(1, task.preset.evaluations // (method.batch * method.evaluations))
+    recorder.row(lambda: (task.image_error(encoder), task.parameter_error(encoder)))
+    if method.optimizer == "pooled":
 
-    def black_box(rotation: Tensor, images: Tensor) -> Tensor:
-        return recorder.evaluate(task.loss, rotation, images)
+        def report(sigma: float, loss: float, measure: bool) -> None:
+            recorder.row(
+                lambda: (task.image_error(encoder) if measure else math.nan, task.parameter_error(encoder)),
+                sigma=sigma,
+                loss=loss,
+            )
 
-    layer = zh.BlackBox(black_box, method.smoothing)
-    sigma = zh.LinearSigma(layer, *SIGMA, steps=max(1, int(_ANNEALED * steps)))
+        train_pooled(task, encoder, run, recorder, report)
+    else:
+        _train_sampled(task, method, encoder, recorder)
+    return Result(
+        method.name, run, encoder, start, recorder.seconds, recorder.evaluations, *_errors(task, start, encoder)
+    )
+
+
+def _train_sampled(task: TrainingTask, method: Method, encoder: nn.Module, recorder: Recorder) -> None:
+    """Train with derivatives sampled around the predictions of each batch."""
+    steps = max(1, task.preset.evaluations // (method.batch * method.evaluations(task.n)))
+
+    def black_box(x: Tensor, images: Tensor) -> Tensor:
+        return recorder.evaluate(task.loss, x, images)
+
+    layer = zh.BlackBox(black_box, method.smoothing(task.sigma[0]))
+    sigma = zh.LinearSigma(layer, *task.sigma, steps=max(1, int(ANNEALED * steps)))
     optimizer = _optimizer(method, encoder)
     batches = _batches(task, method.batch)
     losses: deque[float] = deque(maxlen=max(1, steps // 20))
-    recorder.row(lambda: (task.image_error(encoder), task.parameter_error(encoder)))
     for iteration in range(steps):
-        _set_step(optimizer, method, min(iteration / (_ANNEALED * steps), 1.0))
+        _set_step(optimizer, method, min(iteration / (ANNEALED * steps), 1.0))
         current = layer.smoothing.sigma
         losses.append(_step(optimizer, method, layer, encoder, next(batches)))
         sigma.step()
         recorder.row(
             lambda: (sum(losses) / len(losses), task.parameter_error(encoder)), sigma=float(current), loss=losses[-1]
         )
-    return Result(
-        method.name, run, encoder, start, recorder.seconds, recorder.evaluations, *_errors(task, start, encoder)
-    )
 
 
-def encoders(task: CnnTask, run: int) -> tuple[nn.Module, nn.Module]:
-    """Return two encoders with the weights that run r starts from, and seed the samples of its training."""
+def encoders(task: TrainingTask, run: int) -> tuple[nn.Module, nn.Module]:
+    """Return two networks with the weights that run r starts from, and seed the samples of its training."""
     torch.manual_seed(run)
     encoder, start = task.preset.encoder(), task.preset.encoder()
     start.load_state_dict(encoder.state_dict())
     return encoder, start
 
 
-def trained(task: CnnTask, outcome: Outcome, weights: Path) -> Result:
+def trained(task: TrainingTask, outcome: Outcome, weights: Path) -> Result:
     """Return the result of a run that has ended, from its outcome and the weights of its encoder."""
     encoder, start = encoders(task, outcome.run)
     encoder.load_state_dict(torch.load(weights, weights_only=True))
@@ -131,7 +147,7 @@ def trained(task: CnnTask, outcome: Outcome, weights: Path) -> Result:
     return Result(outcome.method, outcome.run, encoder, start, outcome.seconds, outcome.evaluations, *errors)
 
 
-def _errors(task: CnnTask, start: nn.Module, end: nn.Module) -> tuple[tuple[float, float], tuple[float, float]]:
+def _errors(task: TrainingTask, start: nn.Module, end: nn.Module) -> tuple[tuple[float, float], tuple[float, float]]:
     """Image and parameter errors of the held-out images, each before and after training."""
     image, parameter = ((error(start), error(end)) for error in (task.image_error, task.parameter_error))
     return image, parameter
@@ -186,7 +202,7 @@ def _model(method: Method, layer: zh.BlackBox, encoder: nn.Module, images: Tenso
     return model.mean(), y
 
 
-def _batches(task: CnnTask, size: int) -> Iterator[Tensor]:
+def _batches(task: TrainingTask, size: int) -> Iterator[Tensor]:
     images, _ = task.training
     position = 0
     while True:

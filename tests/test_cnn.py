@@ -1,4 +1,4 @@
-"""The CNN task at a size for tests: the real scene, network, methods, logs and figures."""
+"""The training tasks at a size for tests: the real scenes, networks, methods, logs and figures."""
 
 import itertools
 import json
@@ -10,14 +10,20 @@ import pytest
 import torch
 
 from experiments import export
+from experiments.pooled import Pooled
 from experiments.recorder import Recorder
 from experiments.records import Files, Log, Record, read
 from experiments.run import run
-from experiments.run_cnn import summary, train_all
-from experiments.tasks.cnn import ANGLES, PRESETS, CnnTask, Preset
+from experiments.run_training import summary, train_all
+from experiments.tasks.cnn import ANGLES, PRESETS, CnnPreset, CnnTask
 from experiments.training import METHODS, train
 
-TINY = Preset(16, 2, 2, (2, 2, 2), evaluations=84, images=12, held_out=4)
+SAMPLED = [name for name in METHODS if name != "pooled"]
+TINY = CnnPreset(16, 2, 2, (2, 2, 2), evaluations=84, images=12, held_out=4)
+
+
+class Quick(CnnTask):
+    pooled = Pooled(lengths=(0.5,), temperature=0.1, steps=20, batch=4, draws=4, rank=8, first=8, rows=10)
 
 
 @pytest.fixture(scope="module")
@@ -53,25 +59,33 @@ def test_held_out_images_are_the_same_for_all_seeds_and_new(scene):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_trains_within_its_budget(scene, name):
-    task, recorder = CnnTask(TINY, 0, scene), Recorder("cnn", name, 0)
+    task, recorder = Quick(TINY, 0, scene), Recorder("cnn", name, 0)
     result = train(task, METHODS[name], 0, recorder)
     method, records = METHODS[name], recorder.rows
-    per_step = method.batch * method.evaluations
-    assert [r.evaluations for r in records] == list(range(0, TINY.evaluations + 1, per_step))
+    if name in SAMPLED:
+        per_step = method.batch * method.evaluations(1)
+        assert [r.evaluations for r in records] == list(range(0, TINY.evaluations + 1, per_step))
+    else:
+        assert records[1].evaluations == Quick.pooled.first
+        assert len(records) == 1 + 10 + 1  # every second step, and the last one
     assert [r.iteration for r in records] == list(range(len(records)))
-    assert records[-1].evaluations == result.evaluations == task.evaluations
+    assert records[-1].evaluations == result.evaluations == task.evaluations <= TINY.evaluations
+    assert TINY.evaluations - task.evaluations < 28
     assert (records[0].image_error, records[0].parameter_error) == (result.image_error[0], result.parameter_error[0])
     assert all(a.seconds < b.seconds for a, b in itertools.pairwise(records))
     changed = [
         not torch.equal(a, b) for a, b in zip(result.encoder.parameters(), result.start.parameters(), strict=True)
     ]
     assert all(changed)
-    assert all(math.isfinite(r.parameter_error) and math.isfinite(r.image_error) for r in records)
+    assert all(math.isfinite(r.parameter_error) for r in records)
+    images = [r.image_error for r in records if r.image_error is not None]
+    assert all(map(math.isfinite, images))
+    assert len(images) == (len(records) if name in SAMPLED else 3)
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_run_repeats_itself(scene, name):
-    task, runs = CnnTask(TINY, 0, scene), []
+    task, runs = Quick(TINY, 0, scene), []
     for _ in range(2):
         recorder = Recorder("cnn", name, 3)
         train(task, METHODS[name], 3, recorder)
@@ -79,30 +93,34 @@ def test_a_run_repeats_itself(scene, name):
     assert runs[0] == runs[1]
 
 
-@pytest.mark.parametrize("name", ["our_g", "our_hvpa"])
+@pytest.mark.parametrize("name", ["our_g", "our_hvpa", "pooled"])
 def test_methods_learn(name):
     """On a stand-in for the renderer, a smooth bowl in the angle, each divides the parameter error by ten."""
 
     class Bowl(CnnTask):
+        pooled = Pooled(lengths=(1.0,), temperature=0.1, steps=300, rank=64)
+
         def render(self, rotation):
             x = torch.linspace(0, 1, 16)
             position = (rotation.reshape(-1, 1, 1, 1) - 4.5) / 18
             image = torch.exp(-0.5 * ((x - position) / 0.15) ** 2)
             return image.expand(-1, 3, 16, 16).contiguous()
 
-    task = Bowl(Preset(16, 1, 2, (2, 2, 2), evaluations=1500, images=256, held_out=32), 0, None)
+    task = Bowl(CnnPreset(16, 1, 2, (2, 2, 2), evaluations=1500, images=256, held_out=32), 0, None)
     result = train(task, METHODS[name], 0, Recorder("cnn", name, 0))
     assert result.parameter_error[1] < 0.1 * result.parameter_error[0]
     assert result.image_error[1] < 0.2 * result.image_error[0]
 
 
 def test_command_writes_logs_figures_encoder_and_table(tmp_path, capsys):
+    names = ("our_g", "our_hvpa", "pooled")
+
     def command():
-        return train_all(TINY, [METHODS["our_g"], METHODS["our_hvpa"]], range(2), tmp_path, "scalar_rgb", 1)
+        return train_all(Quick, TINY, [METHODS[name] for name in names], range(2), tmp_path, "scalar_rgb", 1)
 
     results, folder = command(), tmp_path / "cnn"
     printed = capsys.readouterr().out
-    for method in ("our_g", "our_hvpa"):
+    for method in names:
         for seed in range(2):
             rows = [json.loads(line) for line in (folder / method / f"{seed}.jsonl").read_text().splitlines()]
             assert {"task", "method", "run", "iteration", "seconds", "evaluations", "sigma"} <= rows[0].keys()
@@ -110,37 +128,40 @@ def test_command_writes_logs_figures_encoder_and_table(tmp_path, capsys):
         assert method in printed
     for name in ("errors.png", "predictions.png"):
         assert matplotlib.image.imread(folder / name).std() > 0.01
-    assert (folder / "encoder-our_hvpa.onnx").exists()
-    assert summary(results) in printed
+    assert (folder / "encoder-pooled.onnx").exists()
+    assert summary(Quick, results) in printed
     logs = {path: path.read_bytes() for path in folder.glob("*/*.jsonl")}
-    assert summary(command()) == summary(results)  # nothing is trained twice
+    assert summary(Quick, command()) == summary(Quick, results)  # nothing is trained twice
     assert {path: path.read_bytes() for path in folder.glob("*/*.jsonl")} == logs
 
 
-@pytest.mark.parametrize("name", ["our_g", "our_hvpa"])
+@pytest.mark.parametrize("name", ["our_g", "our_hvpa", "pooled"])
 @pytest.mark.parametrize("calls", [0, 1, 3])
 def test_an_interrupted_training_goes_on_with_the_same_rows(scene, tmp_path, name, calls):
-    class Interrupted(CnnTask):
-        def loss(self, rotation, image):
-            if calls * len(rotation) <= self.evaluations:
+    class Interrupted(Quick):
+        def image(self, rotation):
+            if self.calls == calls:
                 raise KeyboardInterrupt
-            return super().loss(rotation, image)
+            self.calls += 1
+            return super().image(rotation)
+
+        calls = 0
 
     whole = Recorder("cnn", name, 0)
-    train(CnnTask(TINY, 0, scene), METHODS[name], 0, whole)
+    train(Quick(TINY, 0, scene), METHODS[name], 0, whole)
     files = Files(tmp_path, 0)
-    recorder = Recorder("cnn", name, 0, files)
+    recorder, interrupted = Recorder("cnn", name, 0, files), Interrupted(TINY, 0, scene)
     with pytest.raises(KeyboardInterrupt):
-        train(Interrupted(TINY, 0, scene), METHODS[name], 0, recorder)
+        train(interrupted, METHODS[name], 0, recorder)
     recorder.close(ended=False)
     before = list(read(files.log))
-    recorder, task = Recorder("cnn", name, 0, files), CnnTask(TINY, 0, scene)
+    recorder, task = Recorder("cnn", name, 0, files), Quick(TINY, 0, scene)
     train(task, METHODS[name], 0, recorder)
     recorder.close(ended=True)
     after = list(read(files.log))
     assert after[: len(before)] == before
     assert [replace(row, seconds=0.0) for row in after] == [replace(row, seconds=0.0) for row in whole.rows]
-    assert task.evaluations == whole.evaluations - calls * METHODS[name].batch * METHODS[name].evaluations
+    assert task.evaluations == whole.evaluations - interrupted.evaluations > 0
 
 
 def test_onnx_predicts_the_same(tmp_path):
@@ -162,5 +183,5 @@ def test_log_survives_a_cut_line(tmp_path):
 
 @pytest.mark.parametrize("names", ["adam", "our_g,adam", ""])
 def test_unknown_methods_are_named(names):
-    with pytest.raises(SystemExit, match="fr22, our_g, our_h, our_hvp, our_hvpa"):
+    with pytest.raises(SystemExit, match="fr22, our_g, our_h, our_hvp, our_hvpa, pooled"):
         run(("cnn",), methods=names)

@@ -20,6 +20,8 @@ def test_python_blocks_run():
         exec(compile(block, "README.md", "exec"), names)
     assert names["fit"].value == 0.0
     assert names["search"].value < 0.05
+    assert names["found"].value <= 1e-6
+    assert names["found"].evaluations < 100
 
 
 def test_setup_commands_are_one_line_each():
@@ -33,7 +35,10 @@ def test_setup_commands_are_one_line_each():
 
 def test_every_command_has_help():
     names = re.findall(r"^\| `(\w+)", README, re.MULTILINE)
-    expected = ["list", "run", "table", "plot", "report", "tune", "nonpsd", "error", "bench", "stability", "doctor"]
+    expected = [
+        *("list", "run", "table", "plot", "report", "tune", "nonpsd", "losses", "gradients", "robustness", "gallery"),
+        *("caustic", "error", "bench", "stability", "doctor"),
+    ]
     commands = [name for name in names if name in expected]
     assert commands == expected
     shown = subprocess.run(

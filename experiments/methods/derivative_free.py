@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 MOST = 100
 """Parameters beyond which COBYQA, made for small problems, takes minutes between two evaluations."""
 
+MOST_RESIDUALS = 2000
+"""The same for DFO-LS, which keeps the residuals of n points."""
+
 
 class Best:
     """The best point evaluated so far, which is what gets reported."""
@@ -135,6 +138,8 @@ def _is_small(task: Task) -> str | None:
 
 
 def _has_residuals(task: Task) -> str | None:
+    if task.n > MOST_RESIDUALS:
+        return f"its interpolation takes gigabytes at n = {task.n}"
     return "the black box returns no residuals" if task.residuals is None else None
 
 

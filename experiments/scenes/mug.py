@@ -11,8 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-import torch
 
 from experiments.scenes.meshes import Array, Surface, grid, instance, mi_mesh, rgb
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Parameter, Transform, Value
@@ -181,22 +179,3 @@ def _rounded(corners: Sequence[tuple[float, float]], radii: Sequence[float], ste
         curve.append(center + side * arc)
         normals.append(arc)
     return np.concatenate([*curve, points[-1:]]), np.concatenate([*normals, right[-1:]])
-
-
-class MugScene:
-    """Renders of the mug, one per angle of its handle."""
-
-    def __init__(
-        self,
-        film: int = 64,
-        spp: int = 8,
-        depth: int = 2,
-        seed: int = 0,
-        variant: str = "auto",
-        threads: int | None = None,
-    ) -> None:
-        self.scene = mug_scene(film=(film, film), spp=spp, depth=depth, seed=seed, variant=variant, threads=threads)
-        self.variant = self.scene.variant
-
-    def render(self, angles: Sequence[float]) -> npt.NDArray[np.float32]:
-        return self.scene(torch.tensor(angles, dtype=torch.float64)[:, None] / DEGREES).numpy()

@@ -12,7 +12,7 @@ from torch_zerohess.optim.box_search import BoxSearch
 from torch_zerohess.optim.local_model import LocalModel
 from torch_zerohess.optim.search import Search
 
-_BOX_POOL = 150
+_BOX_POOL = 60
 """Evaluations kept by a search in a box."""
 
 

@@ -1,8 +1,9 @@
-"""Runs of the CNN task: logs that resume, errors and predictions as pictures, the encoder as ONNX, a table."""
+"""Runs of training tasks: logs that resume, errors and predictions as pictures, the network as ONNX, a table."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -14,8 +15,8 @@ from experiments.recorder import Recorder
 from experiments.records import Files, Outcome, Record, read_outcome, write_outcome
 from experiments.results import load
 from experiments.tables import table
-from experiments.tasks.cnn import DEGREES, CnnTask, Preset
 from experiments.training import Method, Result, train, trained
+from experiments.training_task import Preset, TrainingTask
 from experiments.trial import ending
 
 REDUCTION = 100.0
@@ -23,21 +24,28 @@ REDUCTION = 100.0
 
 
 def train_all(
-    preset: Preset, methods: Sequence[Method], seeds: Sequence[int], out: Path, variant: str, threads: int | None
+    kind: type[TrainingTask],
+    preset: Preset,
+    methods: Sequence[Method],
+    seeds: Sequence[int],
+    out: Path,
+    variant: str,
+    threads: int | None,
 ) -> list[Result]:
-    """Train every method from every seed, without those that `out` already has, and write what came of it to `out`/cnn.
+    """Train every method from every seed, without those that `out` already has, and write what came of it to `out`.
 
     Runs that fail are named, and left out of the results.
     """
     torch.set_num_threads(1)  # small tensors: a second thread costs more than it gives
-    folder = out / "cnn"
+    folder = out / kind.name
     results: list[Result] = []
     scene = preset.scene(variant, threads)
     shared = {"preset": asdict(preset), "variant": scene.variant}
-    register(out, {"cnn": {method.name: {**shared, "method": asdict(method)} for method in methods}})
-    print(f"Mitsuba {scene.variant}, {preset.film}x{preset.film} pixels, {preset.spp} samples per pixel", flush=True)
+    register(out, {kind.name: {method.name: {**shared, "method": _settings(kind, method)} for method in methods}})
+    size = f"{preset.film}x{preset.film} pixels, {preset.spp} samples per pixel"
+    print(f"{kind.name}: Mitsuba {scene.variant}, {size}", flush=True)
     for seed in seeds:
-        task = CnnTask(preset, seed, scene)
+        task = kind(preset, seed, scene)
         if not all(Files(folder / method.name, seed).outcome.exists() for method in methods):
             print(f"rendering {preset.images} training and {preset.held_out} held-out images, seed {seed}", flush=True)
             _, _ = task.training, task.held_out
@@ -45,30 +53,34 @@ def train_all(
             result = _one(task, method, Files(folder / method.name, seed), len(seeds))
             results += [result] if result else []
     if not results:
-        raise SystemExit("no run of cnn succeeded")
+        raise SystemExit(f"no run of {kind.name} succeeded")
     _conclude(task, results, out)
     return results
 
 
-def _conclude(task: CnnTask, results: Sequence[Result], out: Path) -> None:
+def _settings(kind: type[TrainingTask], method: Method) -> dict[str, Any]:
+    return asdict(kind.pooled if method.optimizer == "pooled" else method) | {"sigma": kind.sigma}
+
+
+def _conclude(task: TrainingTask, results: Sequence[Result], out: Path) -> None:
     """Write figures and encoder, print the table."""
-    folder = out / "cnn"
+    folder = out / task.name
     shown = {result.method for result in results}
-    runs = {name: mine for name, mine in load(out).runs["cnn"].items() if name in shown}
-    figures.curves("cnn", runs, folder / "errors.png")
+    runs = {name: mine for name, mine in load(out).runs[task.name].items() if name in shown}
+    figures.curves(task.name, runs, folder / "errors.png")
     first = [result for result in results if result.run == results[0].run]
     predictions.draw(task, first, folder / "predictions.png")
-    print("\n" + summary(results))
+    print("\n" + summary(type(task), results))
     print(f"\nerrors: {folder / 'errors.png'}\npredictions: {folder / 'predictions.png'}\nlogs: {folder}")
     if export.missing():
         print(f"not exported to ONNX: pip install {' '.join(export.missing())}")
     else:
         path = folder / f"encoder-{first[-1].method}.onnx"
         difference = export.export(first[-1].encoder, task.held_out[0], path)
-        print(f"encoder: {path}, onnxruntime predicts the same to {DEGREES * difference:.1e} degrees")
+        print(f"encoder: {path}, onnxruntime predicts the same parameters to {difference:.1e}")
 
 
-def _one(task: CnnTask, method: Method, files: Files, runs: int) -> Result | None:
+def _one(task: TrainingTask, method: Method, files: Files, runs: int) -> Result | None:
     """Train once, or take the result that is there; None if the method failed."""
     weights = files.folder / f"{files.run}.pt"
     if not files.outcome.exists():
@@ -80,15 +92,15 @@ def _one(task: CnnTask, method: Method, files: Files, runs: int) -> Result | Non
     return trained(task, outcome, weights)
 
 
-def _train(task: CnnTask, method: Method, files: Files, weights: Path, name: str) -> None:
+def _train(task: TrainingTask, method: Method, files: Files, weights: Path, name: str) -> None:
     with tqdm(total=task.preset.evaluations, unit=" renders", desc=f"{name:>8}", dynamic_ncols=True) as bar:
 
         def watch(record: Record) -> None:
-            error = DEGREES * (record.parameter_error or 0.0) ** 0.5
-            bar.set_postfix_str(f"error {error:.2f} degrees", refresh=False)
+            if record.parameter_error:
+                bar.set_postfix_str(f"{task.measure} {task.measured(record.parameter_error):.2f}", refresh=False)
             bar.update(record.evaluations - bar.n)
 
-        recorder = Recorder("cnn", method.name, files.run, files, watch)
+        recorder = Recorder(task.name, method.name, files.run, files, watch)
         diverged = None
 
         def solve() -> None:
@@ -108,7 +120,7 @@ def _train(task: CnnTask, method: Method, files: Files, weights: Path, name: str
         files.log.unlink()
         return _train(task, method, files, weights, name)
     outcome = Outcome(
-        "cnn",
+        task.name,
         method.name,
         files.run,
         end.status,
@@ -118,14 +130,14 @@ def _train(task: CnnTask, method: Method, files: Files, weights: Path, name: str
         recorder.evaluations,
         len(recorder.rows) - 1,
         [],
-        asdict(method),
+        _settings(type(task), method),
         end.traceback,
     )
     write_outcome(outcome, files)
     return None
 
 
-def summary(results: Sequence[Result]) -> str:
+def summary(kind: type[TrainingTask], results: Sequence[Result]) -> str:
     """Return a table with a row per method: medians over its runs, and how many succeeded."""
     rows = []
     for name in dict.fromkeys(result.method for result in results):
@@ -134,7 +146,7 @@ def summary(results: Sequence[Result]) -> str:
         def median(values: list[float]) -> float:
             return float(torch.tensor(values, dtype=torch.float64).quantile(0.5))
 
-        before, after = (DEGREES * median([one.parameter_error[k] ** 0.5 for one in mine]) for k in (0, 1))
+        before, after = (median([kind.measured(one.parameter_error[k]) for one in mine]) for k in (0, 1))
         share = sum(one.parameter_error[0] >= REDUCTION * one.parameter_error[1] for one in mine)
         rows.append(
             [
@@ -146,16 +158,18 @@ def summary(results: Sequence[Result]) -> str:
                 median([one.parameter_error[0] / one.parameter_error[1] for one in mine]),
                 median([one.image_error[0] / one.image_error[1] for one in mine]),
                 f"{share}/{len(mine)}",
+                f"{sum(one.image_error[0] >= 10.0 * one.image_error[1] for one in mine)}/{len(mine)}",
             ]
         )
     headers = [
         "method",
         "seconds",
         "renders",
-        "rms error before [deg]",
-        "after [deg]",
+        f"{kind.measure} before",
+        "after",
         "parameter MSE /",
         "image MSE /",
         f"runs beyond {REDUCTION:.0f}x",
+        "image error -90 %",
     ]
     return table(headers, rows)

@@ -177,7 +177,10 @@ def test_tuned_settings_are_of_methods_that_apply_and_from_their_space() -> None
     for name, methods in TUNED.items():
         task = catalogue.load(name)
         for method, settings in methods.items():
-            assert METHODS[method].applies(task) is None
+            reason = METHODS[method].applies(task)
+            assert reason in (None, task.no_adjoint())
+            if reason:  # Mitsuba has no variant with derivatives here
+                continue
             for key, value in settings.items():
                 assert value in SPACES.get(method, {}).get(key, (value,))
             small = replace(task, evaluations=30)  # enough to see that these are arguments of the method

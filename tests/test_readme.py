@@ -29,7 +29,7 @@ def test_setup_commands_are_one_line_each():
     for command in (first, second):
         assert command.startswith("python3 -m venv .venv && .venv/bin/pip install")
         assert "\n" not in command
-    assert first.endswith("python -m experiments run cnn --methods our_g,our_hvpa")
+    assert first.endswith("python -m experiments run cnn --methods our_g,pooled")
     assert second.endswith("python -m pytest -q")
 
 

@@ -25,12 +25,15 @@ class TrustRegion:
     predicted badly. Sigma, and with it the region, grows after a long good step and on a plateau, and shrinks after a
     short or refused one.
 
-    - Loss alone, or n <= 2: the search descends, and moves to whatever evaluated point is best.
+    - An output and a `loss`, up to four parameters, finite bounds: a Gaussian process predicts the output everywhere in
+      the box, and the search looks where the loss may be lowest (`BoxSearch`); it leaves plateaus and local minima.
+    - Loss alone, or n <= 2 without bounds: the search descends, and moves to whatever evaluated point is best.
     - An output [K, *out] and a white-box `loss`: every evaluation is many equations. The search follows the minimum of
       loss(E f) while sigma goes to zero, also where the loss itself rises for a while.
 
     Where sigma has become small the search has arrived at a minimum, possibly a local one. It then starts again, in
-    turn from a random point and around the best one, with more samples per iteration, up to `restarts` times.
+    turn from a random point and around the best one, with more samples per iteration, up to `restarts` times; in a box
+    it looks for some steps where it knows least.
 
     Args:
         x0: start [n], float32 or float64, within the bounds.
@@ -41,11 +44,14 @@ class TrustRegion:
         restarts: how often to start again after arriving. 0 for a local search.
         tolerance: the search has arrived when sigma is below this times the first sigma.
         noise: standard deviation of repeated losses at one point, if it is known. Smaller decreases do not count.
-        pool: evaluations kept; by default 60 or 6 n, and enough for a full quadratic of a loss alone up to n = 20.
+        pool: evaluations kept; by default 60 or 6 n, and enough for a full quadratic of a loss alone up to n = 20. In a
+            box the time of an iteration grows with its third power.
         seed: of the samples; from torch's global generator if None.
 
     Raises ValueError for settings out of range. Source: Wang, Fischer and Ritschel (2025) for the smoothed second
-    order; evaluations are re-used as in derivative-free least squares (Cartis et al. 2019) and COBYQA.
+    order; evaluations are re-used as in derivative-free least squares (Cartis et al. 2019) and COBYQA; a model of the
+    output instead of the loss, with optimism, as in Bayesian optimization of composite functions (Astudillo and Frazier
+    2019).
 
     Example:
         >>> search = TrustRegion(torch.tensor([900.0, 850.0]), sigma=500.0, seed=0, restarts=0)

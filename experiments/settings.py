@@ -16,8 +16,9 @@ search on BOX2 was seen on the reported runs.
   as in the authors' logs. The first-order methods keep their learning rates, which work; they are slow: on BOX2
   our_g at 0.01 instead of 0.0006 takes a tenth of the evaluations, fewer than any of the second-order methods.
 - BOX10: of 13 settings for each method (`tune box10 --method M --runs 2 --trials 12 --evaluations 30000`) one of
-  our_hvpa gets there, from one of two starts. Descent on the smoothed loss moves all five squares onto the central place, a local
-  minimum at 58 % of the first error, from a start sigma of 0.001 as from one of 0.17; only noisy steps lead elsewhere.
+  our_hvpa gets there, from one of two starts. Descent on the smoothed loss moves all five squares onto the central
+  place, a local minimum at 58 % of the first error, from a start sigma of 0.001 as from one of 0.17; only noisy steps
+  lead elsewhere.
 - TEXTURE: with 4 pairs a gradient of 1024 elements is nearly all noise, and so is a curvature. Adam needs a smaller
   learning rate. The line search needs more pairs, the mean as baseline, and no conjugate directions.
 - BRDF and NONPSD are not in Table 3.

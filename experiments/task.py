@@ -57,7 +57,7 @@ class Task:
     Counts as two evaluations, a render and its adjoint."""
     adjoints: tuple[str, ...] = ()
     """Integrators that `adjoint` knows."""
-    no_adjoint: Callable[[], str | None] = lambda: None
+    no_adjoint: Callable[[], str | None] | None = None
     """Why `adjoint` cannot be called here, None if it can: derivatives need a variant of the renderer that has them."""
     full: "Callable[[], Task] | None" = None
     """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""

@@ -42,6 +42,10 @@ def picture(x):
     return (x / 10).abs().clamp(0, 1).expand(2, 2)
 
 
+def target_picture():
+    return picture(TARGET)
+
+
 TASK = Task(
     name="bowl",
     title="the bottom of a bowl",
@@ -56,7 +60,7 @@ TASK = Task(
     parameter_error=parameter_error,
     image=image,
     picture=picture,
-    target_picture=lambda: picture(TARGET),
+    target_picture=target_picture,
 )
 SLOW = replace(TASK, name="slow", loss=slow_loss)
 

@@ -121,8 +121,9 @@ class MitsubaScene:
             ValueError: x has another shape, or is not finite.
             FloatingPointError: a pixel is not finite.
         """
-        if x.ndim != 2 or x.shape[1] != self.n:
-            raise ValueError(f"x must have shape [K, {self.n}] for {', '.join(self.labels)}, got {list(x.shape)}")
+        if x.ndim != 2 or x.shape[1] != self.n or not len(x):
+            columns = ", ".join(self.labels)
+            raise ValueError(f"x must have shape [K, {self.n}], K >= 1, for {columns}, got {list(x.shape)}")
         if not bool(torch.isfinite(x).all()):
             k, i = (int(one) for one in (~torch.isfinite(x)).nonzero()[0])
             raise ValueError(f"x must be finite, got {float(x[k, i])} for {self.labels[i]} in point {k}")
@@ -130,7 +131,7 @@ class MitsubaScene:
         self._calls += self.noise == "call"
         images = [self._image(point) for point in points]
         if self.loss is None:
-            out = torch.stack(images) if images else torch.empty(0)
+            out = torch.stack(images)
         else:
             with torch.no_grad():
                 losses = [self.loss(image) for image in images]

@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from experiments.scenes.fitted_mesh import FittedMesh
 
 
+def _nothing() -> None:
+    """For `Task.no_adjoint`; a function with a name can be pickled."""
+
+
 @dataclass(frozen=True)
 class Task:
     """A black box of n parameters and the truth about it. Tensors are float64; points come in batches [K, n].
@@ -57,7 +61,7 @@ class Task:
     Counts as two evaluations, a render and its adjoint."""
     adjoints: tuple[str, ...] = ()
     """Integrators that `adjoint` knows."""
-    no_adjoint: Callable[[], str | None] | None = None
+    no_adjoint: Callable[[], str | None] = _nothing
     """Why `adjoint` cannot be called here, None if it can: derivatives need a variant of the renderer that has them."""
     full: "Callable[[], Task] | None" = None
     """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""

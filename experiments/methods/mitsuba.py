@@ -57,9 +57,7 @@ def adjoint_adam(
 
 
 def _differentiable(task: Task) -> str | None:
-    if task.adjoint is None:
-        return "the black box has no derivative of its own"
-    return task.no_adjoint() if task.no_adjoint else None
+    return "the black box has no derivative of its own" if task.adjoint is None else task.no_adjoint()
 
 
 METHODS = (

@@ -18,7 +18,7 @@ def loss(x):
 
 
 def slow_loss(x):
-    time.sleep(0.1)
+    time.sleep(0.2)  # long enough to be killed on a busy machine
     return loss(x)
 
 

@@ -121,9 +121,9 @@ class MitsubaScene:
             ValueError: x has another shape, or is not finite.
             FloatingPointError: a pixel is not finite.
         """
-        if x.ndim != 2 or x.shape[1] != self.n or not len(x):
+        if x.ndim != 2 or x.shape[1] != self.n:
             columns = ", ".join(self.labels)
-            raise ValueError(f"x must have shape [K, {self.n}], K >= 1, for {columns}, got {list(x.shape)}")
+            raise ValueError(f"x must have shape [K, {self.n}] for {columns}, got {list(x.shape)}")
         if not bool(torch.isfinite(x).all()):
             k, i = (int(one) for one in (~torch.isfinite(x)).nonzero()[0])
             raise ValueError(f"x must be finite, got {float(x[k, i])} for {self.labels[i]} in point {k}")
@@ -131,13 +131,14 @@ class MitsubaScene:
         self._calls += self.noise == "call"
         images = [self._image(point) for point in points]
         if self.loss is None:
-            out = torch.stack(images)
+            out = torch.stack(images) if images else torch.empty(0, dtype=torch.float32)
         else:
             with torch.no_grad():
                 losses = [self.loss(image) for image in images]
             if any(one.numel() != 1 for one in losses):
                 raise ValueError(f"loss must return one number per image, got shape {list(losses[0].shape)}")
-            out = torch.stack([one.reshape(()) for one in losses]).to(x.dtype)
+            out = torch.stack([one.reshape(()) for one in losses]) if losses else torch.empty(0)
+            out = out.to(x.dtype)
         return out.to(x.device)
 
     def set(self, x: Tensor) -> None:

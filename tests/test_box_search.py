@@ -230,6 +230,49 @@ def test_it_arrives_and_says_so():
     assert abs(float(search.x[0]) - 1.0) < 0.02
 
 
+def bump(x):
+    """A smooth picture [K, 40]: a bump that is where x [K, 1] says."""
+    return torch.exp(-0.5 * ((torch.linspace(-6, 6, 40, dtype=torch.float64) - x[:, :1]) / 0.7).square())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_of_noisy_outputs_it_returns_the_best_on_average(noise):
+    """The standard deviation of every element is 0.3: the loss of a picture is 0.09 more than that of its mean."""
+    solution = vector(1.3)
+    generator, errors = torch.Generator().manual_seed(0), []
+    for seed in range(8):
+        search = TrustRegion(
+            vector(-3.0),
+            sigma=1.5,
+            bounds=(-5.0, 5.0),
+            loss=misfit(bump, solution),
+            restarts=99,
+            noise=noise,
+            seed=seed,
+        )
+        while search.evaluations < 60:
+            clean = bump(search.ask())
+            search.tell(clean + 0.3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64))
+        assert search.value < 0.02
+        errors.append(float(search.x - solution))
+    # What 40 of these pictures would tell at the solution: 1 / (bump' . bump' / 0.09) of variance each.
+    slope = (bump(solution[None] + 1e-4) - bump(solution[None] - 1e-4)) / 2e-4
+    least = 0.3 / float(slope.norm()) / math.sqrt(40)
+    assert math.sqrt(sum(one**2 for one in errors) / 8) < 2.0 * least
+
+
+def test_outputs_that_vary_fast_are_not_taken_for_noise():
+    search = TrustRegion(
+        vector(-3.0), sigma=1.5, bounds=(-5.0, 5.0), loss=misfit(bump, vector(1.3)), restarts=99, seed=0
+    )
+    lowest = math.inf
+    while search.evaluations < 60:
+        outputs = bump(search.ask())
+        lowest = min(lowest, *(float(misfit(bump, vector(1.3))(one)) for one in outputs))
+        search.tell(outputs)
+        assert search.value == lowest
+
+
 def test_without_bounds_or_with_more_parameters_it_is_not_used():
     for n, bounds in ((1, None), (5, (-2.0, 2.0))):
         zeros = torch.zeros(n, dtype=torch.float64)

@@ -4,7 +4,8 @@ A Gaussian process (`GaussianProcess`) predicts the output anywhere in the box f
 loss of the prediction says where to look next: at the point with the lowest loss among the outputs that lie within
 `_OPTIMISM` standard deviations of the prediction (a composite objective: Astudillo and Frazier 2019). One evaluation
 follows another; each is trial and sample at once. Where nothing lower is expected, the search looks where it knows
-least, so it leaves local minima and plateaus.
+least, so it leaves local minima and plateaus. Where outputs differ from call to call (the evidence tells) the best
+point is the one with the lowest loss of the prediction, which is an average of what was evaluated around it.
 """
 
 import math
@@ -14,7 +15,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.optim.gaussian_process import GaussianProcess
+from torch_zerohess.optim.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.optim.local_model import LocalModel, fit_outputs, loss_derivatives
 from torch_zerohess.optim.pool import Pool
 
@@ -35,12 +36,14 @@ _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
 _REFUSED = 10
 """Outputs in a row that are not finite, after which the search ends."""
+_TELLING = 10
+"""Evaluations over n + 1 from which high noise is told from fast variation."""
 _EXPANSIONS = 3
 """Around predicted minima, until one predicts the loss; a loss for which none does is itself predicted from then on."""
 
 _STATE = (
     *("sigma", "evaluations", "iterations", "rounds", "done", "message", "phase"),
-    *("best", "lowest", "best_sigma", "x", "_moved", "_settled", "_exploring", "_refused", "_expands"),
+    *("best", "lowest", "best_sigma", "x", "_moved", "_settled", "_exploring", "_refused", "_expands", "_noisy"),
 )
 
 
@@ -59,11 +62,12 @@ class BoxSearch:
         loss: Callable[[Tensor], Tensor],
         restarts: int,
         tolerance: float,
+        noise: float,
         pool: int,
         generator: torch.Generator,
     ) -> None:
         self.n, self.lower, self.upper, self.loss = len(start), lower, upper, loss
-        self.restarts, self.tolerance, self.generator = restarts, tolerance, generator
+        self.restarts, self.tolerance, self.noise, self.generator = restarts, tolerance, noise, generator
         self.pool = Pool(self.n, pool, start.device)
         self.best = self.x = start
         self.lowest = math.inf
@@ -73,7 +77,7 @@ class BoxSearch:
         self.phase: Literal["start", "trial"] = "start"
         self.shape = torch.Size()
         """Of an output."""
-        self._moved, self._expands = math.inf, True
+        self._moved, self._expands, self._noisy = math.inf, True, False
         self._settled = self._exploring = self._refused = 0
 
     def points(self) -> Tensor:
@@ -172,13 +176,18 @@ class BoxSearch:
     def _through_output(self) -> tuple[GaussianProcess, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
         assert self.pool.outputs is not None
-        process = GaussianProcess.fit(self.pool.points, self.pool.outputs)
+        process = self._fit(self.pool.outputs)
         optimism = _EXPLORING if self._exploring else _OPTIMISM
-        output = self.pool.outputs[int(self.pool.values.argmin())]
+        outputs, values = self.pool.outputs, self.pool.values
+        if self._noisy:
+            outputs = process.predict(self.pool.points)
+            values = torch.stack([self.loss(one.view(self.shape)).detach().double().reshape(()) for one in outputs])
+            self._judge(values)
+        output = outputs[int(values.argmin())]
         for _ in range(_EXPANSIONS):
             model = _LossModel(process, output, self.loss, self.shape, optimism)
             x = self._lowest(model)
-            output = process.mean + (process.covariance(x[None]) @ process.weights)[0]
+            output = process.predict(x[None])[0]
             if model.is_true(x, float(self.loss(output.view(self.shape)))):
                 return process, x
         self._expands = False
@@ -186,10 +195,26 @@ class BoxSearch:
 
     def _from_losses(self) -> tuple[GaussianProcess, Tensor]:
         """Predict the loss, and return the point [n] that is lowest."""
-        process = GaussianProcess.fit(self.pool.points, self.pool.values[:, None])
-        return process, self._lowest(
-            _LossModel(process, self.pool.values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
-        )
+        process, values = self._fit(self.pool.values[:, None]), self.pool.values
+        if self._noisy:
+            values = process.predict(self.pool.points)[:, 0]
+            self._judge(values)
+        return process, self._lowest(_LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING))
+
+    def _fit(self, outputs: Tensor) -> GaussianProcess:
+        """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again."""
+        tells = self.noise > 0.0 or len(self.pool) >= _TELLING * (self.n + 1)
+        process = GaussianProcess.fit(self.pool.points, outputs, NOISES + HIGH_NOISES if tells else NOISES)
+        before, self._noisy = self._noisy, process.noise >= HIGH_NOISES[0]
+        if before and not self._noisy:
+            self._judge(self.pool.values)
+        return process
+
+    def _judge(self, values: Tensor) -> None:
+        """Make the point of the pool with the lowest of values [P] the best one."""
+        k = int(values.argmin())
+        self.best, self.lowest = self.pool.points[k], float(values[k])
+        self.best_sigma = max(self.sigma, self.tolerance)
 
     def _lowest(self, model: "_LossModel") -> Tensor:
         """Return the best of candidates around the best point and all over the box, improved by ever smaller steps."""

@@ -7,7 +7,7 @@ noise are those under which the outputs are most likely (Rasmussen and Williams 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +17,8 @@ LENGTHS = (0.3, 0.5, 1.0, 2.0, 4.0)
 """Length scales, in units of the points."""
 NOISES = (1e-6, 1e-3, 1e-2)
 """Variances of an output that the process does not explain, in units of its own."""
+HIGH_NOISES = (0.1, 1.0, 10.0)
+"""The same of outputs that differ from call to call. A few exact ones that vary fast look like that, too."""
 _CONSTANT = 1.0
 _SPREAD = 1.5
 """Standard deviation of the prior over the log of the length."""
@@ -48,11 +50,13 @@ class GaussianProcess:
     """[P, m]"""
     variance: float
     """Of an element of the output, before anything is known."""
+    noise: float
+    """Variance that the process does not explain, in units of `variance`."""
     factor: Tensor
     """Cholesky factor of the covariance of the points [P, P]."""
 
     @classmethod
-    def fit(cls, points: Tensor, outputs: Tensor) -> "GaussianProcess":
+    def fit(cls, points: Tensor, outputs: Tensor, noises: Sequence[float] = NOISES) -> "GaussianProcess":
         """Choose kernel, length and noise by the evidence, and condition on P >= 2 outputs."""
         P, m = outputs.shape
         mean = outputs.mean(0)
@@ -64,7 +68,7 @@ class GaussianProcess:
             for length in LENGTHS:
                 values, vectors = torch.linalg.eigh(kernel(distance / length) + _CONSTANT)
                 power = (vectors * (gram @ vectors)).sum(0).clamp_min(0.0)
-                for noise in NOISES:
+                for noise in noises:
                     spectrum = values.clamp_min(0.0) + noise
                     variance = float((power / spectrum).sum()) / (P * m) + math.ulp(0.0)
                     log = -P * math.log(variance) - float(spectrum.log().sum())
@@ -75,7 +79,11 @@ class GaussianProcess:
         covariance = kernel(distance / length) + _CONSTANT
         covariance.diagonal().add_(noise)
         factor = torch.linalg.cholesky(covariance)
-        return cls(points, kernel, length, mean, torch.cholesky_solve(change, factor), variance, factor)
+        return cls(points, kernel, length, mean, torch.cholesky_solve(change, factor), variance, noise, factor)
+
+    def predict(self, x: Tensor) -> Tensor:
+        """Expected outputs [Q, m] at points x [Q, n]."""
+        return self.mean + self.covariance(x) @ self.weights
 
     def covariance(self, x: Tensor) -> Tensor:
         """Covariance [Q, P] of points x [Q, n] with the known ones, in units of `variance`."""

@@ -43,7 +43,9 @@ class TrustRegion:
         loss: from one output [*out] to a scalar, differentiable by torch; None if the black box returns the loss.
         restarts: how often to start again after arriving. 0 for a local search.
         tolerance: the search has arrived when sigma is below this times the first sigma.
-        noise: standard deviation of repeated losses at one point, if it is known. Smaller decreases do not count.
+        noise: standard deviation of repeated losses at one point, if it is known. Smaller decreases do not count. In a
+            box it is told from the outputs, after some 10 (n + 1) of them, or at once if this is positive; `x` is then
+            the point with the lowest loss of the predicted output, and `value` is that loss.
         pool: evaluations kept; by default 60 or 6 n, and enough for a full quadratic of a loss alone up to n = 20. In a
             box the time of an iteration grows with its third power.
         seed: of the samples; from torch's global generator if None.
@@ -96,7 +98,13 @@ class TrustRegion:
         self._search: Search | BoxSearch
         if loss is not None and self.n <= box_search.MOST and bool(torch.isfinite(torch.stack(self._bounds)).all()):
             self._search = BoxSearch(
-                *place, loss=loss, restarts=restarts, tolerance=tolerance, pool=pool or _BOX_POOL, generator=generator
+                *place,
+                loss=loss,
+                restarts=restarts,
+                tolerance=tolerance,
+                noise=float(noise),
+                pool=pool or _BOX_POOL,
+                generator=generator,
             )
         else:
             self._search = Search(

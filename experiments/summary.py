@@ -15,13 +15,14 @@ import io
 import json
 import statistics
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from experiments.catalogue import chosen
 from experiments.results import METRICS, Results, Run, load
 from experiments.tables import table as text_table
 from experiments.trial import LEVELS
@@ -94,9 +95,13 @@ class Summary:
     """Runs that have not ended, which no number includes."""
 
 
-def summarize(results: Results) -> Summary:
-    methods = {method for runs in results.runs.values() for method in runs}
-    reference = next((name for name in REFERENCES if name in methods), None)
+def summarize(results: Results, reference: str | None = None, methods: Collection[str] | None = None) -> Summary:
+    """Return the tables, with ratios to a method, by default the first of `REFERENCES`; of some methods, or of all."""
+    if methods is not None:
+        runs = {task: {m: r for m, r in mine.items() if m in methods} for task, mine in results.runs.items()}
+        results = replace(results, runs={task: mine for task, mine in runs.items() if mine})
+    found = {method for runs in results.runs.values() for method in runs}
+    reference = reference or next((name for name in REFERENCES if name in found), None)
     rows = [row for task in results.runs for row in _rows(task, results, reference)]
     others = list(dict.fromkeys(row.method for row in rows if row.method != reference))
     cells = [(task, name, runs) for task, methods in results.runs.items() for name, runs in methods.items()]
@@ -240,12 +245,21 @@ def table(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
     /,
     format: Literal["text", "csv", "json"] = "text",
+    reference: str | None = None,
+    methods: str | None = None,
 ) -> None:
     """Print how many evaluations and seconds every method took, with ratios to the reference and failed runs.
 
     Args:
         folder: written by `run`.
         format: text prints a table per task; csv and json a row per task, method, error and level.
+        reference: method that ratios are to; the recommended one, or the best of the source's, if not given.
+        methods: names separated by commas, or all.
     """
-    summary = summarize(load(folder))
+    results = load(folder)
+    there = sorted({method for runs in results.runs.values() for method in runs})
+    wanted = chosen("methods", methods.split(","), there) if methods is not None else there
+    if reference is not None:
+        (reference,) = chosen("reference", [reference], wanted)
+    summary = summarize(results, reference, wanted)
     print({"text": as_text, "csv": as_csv, "json": as_json}[format](summary))

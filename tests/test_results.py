@@ -121,6 +121,28 @@ def test_the_reference_is_the_best_that_there_is(tmp_path):
     assert summarize(load_results(tmp_path)).reference == "our_hvpa"
 
 
+def test_the_reference_and_the_methods_can_be_chosen(folder, capsys):
+    write(folder, "cma_es", 0, [100.0, 1.0], each=12)
+    table(folder, format="json", reference="our_g", methods="our_g,cma_es")
+    found = json.loads(capsys.readouterr().out)
+    assert found["reference"] == "our_g"
+    assert {row["method"] for row in found["rows"]} == {"our_g", "cma_es"}
+    (ratio,) = [r for r in found["rows"] if (r["method"], r["metric"], r["level"]) == ("cma_es", "image", 0.9)]
+    assert (ratio["ratio_evaluations"], ratio["ratio_seconds"]) == (12 / 60, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"reference": "ours"}, "reference must be some of our_g, trust_region, got ours"),
+        ({"methods": "our_h"}, "our_g"),
+    ],
+)
+def test_a_reference_or_a_method_that_is_not_there_is_named(folder, given, message):
+    with pytest.raises(SystemExit, match=message):
+        table(folder, **given)
+
+
 def test_a_run_that_died_before_its_first_row_counts(tmp_path):
     write(tmp_path, "our_g", 0, [1.0, 0.0], each=1)
     write_outcome(Outcome("bowl", "our_g", 1, "failed", "crash", 0, 0, 0, 0, []), Files(tmp_path / "bowl" / "our_g", 1))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from experiments.animation import Look, Trace, pixels
+from experiments.figures import plain_ticks
 from experiments.trial import LEVELS
 
 mpl.use("Agg")
@@ -150,6 +151,7 @@ def _errors(axis: Any, runs: Sequence[Trace]) -> None:
     axis.set(xscale="log", yscale="log", xlabel="evaluations", ylabel="image error / at the start")
     axis.grid(which="major", alpha=0.3)
     axis.legend(fontsize=8, frameon=False)
+    plain_ticks(axis)
 
 
 def _surface(x: Tensor) -> Tensor:

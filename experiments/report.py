@@ -29,7 +29,7 @@ th { text-align: left } td { font-variant-numeric: tabular-nums; white-space: no
 .wide { overflow-x: auto } figure { display: inline-block; width: 170px; margin: .3em; vertical-align: top }
 figure img { width: 160px; height: auto; image-rendering: pixelated; border: 1px solid #ddd }
 figcaption { text-align: center; font-size: 13px; overflow-wrap: anywhere }
-pre { background: #f5f5f5; padding: .6em; overflow-x: auto } summary { cursor: pointer }
+pre { background: #f5f5f5; padding: .6em; white-space: pre-wrap } summary { cursor: pointer }
 """
 
 
@@ -68,7 +68,7 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
         parts.append(_settings(settings))
     title = f"Results of {', '.join(results.runs)}"
     if summary.unfinished:
-        parts.insert(0, f"<p>{summary.unfinished} runs have not ended; they are left out.</p>")
+        parts.insert(0, f"<p>Unfinished runs that are not shown: {summary.unfinished}.</p>")
     return (
         f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>{_text(title)}</title>"
         f"<style>{_STYLE}</style></head><body><h1>{_text(title)}</h1>{''.join(parts)}</body></html>\n"

@@ -8,6 +8,7 @@ import torch
 from torch_zerohess.optim import TrustRegion
 from torch_zerohess.optim.box_search import BoxSearch, _LossModel
 from torch_zerohess.optim.gaussian_process import GaussianProcess, gaussian, matern
+from torch_zerohess.optim.pool import Pool
 from truths import vector
 
 
@@ -275,9 +276,9 @@ def test_outputs_that_vary_fast_are_not_taken_for_noise():
 
 def test_without_bounds_or_with_more_parameters_it_is_not_used():
     for n, bounds in ((1, None), (5, (-2.0, 2.0))):
-        zeros = torch.zeros(n, dtype=torch.float64)
-        assert not isinstance(TrustRegion(zeros, sigma=1.0, bounds=bounds, loss=torch.sum)._search, BoxSearch)
-    assert not isinstance(TrustRegion(vector(0.0), sigma=1.0, bounds=(-2.0, 2.0))._search, BoxSearch)
+        for loss in (None, torch.sum):
+            zeros = torch.zeros(n, dtype=torch.float64)
+            assert not isinstance(TrustRegion(zeros, sigma=1.0, bounds=bounds, loss=loss)._search, BoxSearch)
 
 
 def test_the_model_at_the_best_point_is_that_of_the_output_there():
@@ -291,3 +292,21 @@ def test_the_model_at_the_best_point_is_that_of_the_output_there():
     jacobian = torch.func.jacfwd(lambda x: waves(x[None])[0])(vector(1.0, 0.3))
     truth = 2 / 5 * jacobian.mT @ jacobian
     assert torch.allclose(model.full_hessian() / sigma**2, truth, rtol=0.5, atol=0.3 * float(truth.abs().max()))
+
+
+def test_a_full_pool_forgets_the_worse_of_two_that_are_alike():
+    pool = Pool(1, 5)
+    points = vector(0.0, 0.3, 1.0, 1.1, 4.0)[:, None]
+    losses = vector(0.0, 1.0, 2.0, 3.0, 4.0)
+    for k in range(5):
+        pool.thin(points[0])
+        assert len(pool) == k  # not before it is full
+        pool.add(points[k : k + 1], losses[k : k + 1], losses[k : k + 1, None], points[0], 1.0)
+    pool.thin(points[0])
+    assert torch.equal(pool.values, vector(0.0, 1.0, 2.0, 4.0))  # 1.0 and 1.1 are alike, 0.0 and 0.3 are not
+    assert torch.equal(pool.points[:, 0], vector(0.0, 0.3, 1.0, 4.0))
+    assert torch.equal(pool.outputs[:, 0], pool.values)
+    pool.add(vector(0.31)[:, None], vector(-1.0), vector(-1.0)[:, None], vector(0.31), 1.0)
+    pool.thin(points[0])
+    assert torch.equal(pool.values, vector(0.0, 2.0, 4.0, -1.0))
+    assert torch.isfinite(pool.weights(vector(0.0), 1.0)).all()

@@ -1,4 +1,4 @@
-"""The search behind `TrustRegion` over few parameters in a finite box, where the black box returns an output.
+"""The search behind `TrustRegion` over few parameters in a finite box.
 
 A Gaussian process (`GaussianProcess`) predicts the output anywhere in the box from all evaluations, and the white-box
 loss of the prediction says where to look next: at the point with the lowest loss among the outputs that lie within
@@ -15,8 +15,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.optim.draws import normal, reflect, uniform
 from torch_zerohess.optim.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
-from torch_zerohess.optim.local_model import LocalModel, fit_outputs, loss_derivatives
+from torch_zerohess.optim.local_model import LocalModel, fit_outputs, fit_values, loss_derivatives
 from torch_zerohess.optim.pool import Pool
 
 MOST = 4
@@ -59,7 +60,7 @@ class BoxSearch:
         lower: Tensor,
         upper: Tensor,
         *,
-        loss: Callable[[Tensor], Tensor],
+        loss: Callable[[Tensor], Tensor] | None,
         restarts: int,
         tolerance: float,
         noise: float,
@@ -77,7 +78,7 @@ class BoxSearch:
         self.phase: Literal["start", "trial"] = "start"
         self.shape = torch.Size()
         """Of an output."""
-        self._moved, self._expands, self._noisy = math.inf, True, False
+        self._moved, self._expands, self._noisy = math.inf, loss is not None, False
         self._settled = self._exploring = self._refused = 0
 
     def points(self) -> Tensor:
@@ -90,7 +91,7 @@ class BoxSearch:
 
     def take(self, points: Tensor, losses: Tensor, outputs: Tensor | None) -> None:
         """Go on with the losses [K] and outputs [K, m] of points [K, n]."""
-        assert outputs is not None
+        outputs = losses[:, None] if outputs is None else outputs
         finite = torch.isfinite(losses) & torch.isfinite(outputs).all(1)
         self.evaluations += len(points)
         self.iterations += self.phase == "trial"
@@ -116,6 +117,8 @@ class BoxSearch:
             near = weights > 1e-3
             if int(near.sum()) > self.n:
                 u = (self.pool.points[near] - self.best) / sigma
+                if self.loss is None:
+                    return fit_values(u, self.pool.values[near], weights[near]), sigma
                 return fit_outputs(u, outputs[near], weights[near], self.loss, self.shape), sigma
             sigma *= 1.5
         return None
@@ -138,6 +141,8 @@ class BoxSearch:
     def _remember(self, points: Tensor, losses: Tensor, outputs: Tensor) -> None:
         if not len(losses):
             return
+        if not self._noisy:
+            self.pool.thin(self.best)
         self.pool.add(points, losses, outputs, self.best, 1.0)
         k = int(losses.argmin())
         if float(losses[k]) < self.lowest:
@@ -150,25 +155,26 @@ class BoxSearch:
         self._exploring = max(self._exploring - 1, 0)
         self._settled = self._settled + 1 if moved < self.tolerance else 0
         if self._settled >= _SETTLED:
-            self._settled, self._exploring = 0, 2 * self.n
-            self.rounds += 1
-            if self.rounds > self.restarts:
-                self.done = True
-                self.message = f"{_SETTLED} steps in a row were below {self.tolerance} of sigma, {self.rounds} times"
+            self._arrive(f"{_SETTLED} steps in a row were below {self.tolerance} of sigma")
+
+    def _arrive(self, reason: str) -> None:
+        """End, or explore."""
+        self._settled, self._exploring = 0, 2 * self.n
+        self.rounds += 1
+        if self.rounds > self.restarts:
+            self.done, self.message = True, f"{reason}, {self.rounds} times"
 
     def _around(self, x: Tensor) -> Tensor:
         """Draw n orthogonal steps of length sqrt(n), mirrored into the box."""
         directions, _ = torch.linalg.qr(self._normal(self.n, self.n))
-        z = x + math.sqrt(self.n) * directions.mT
-        z = torch.where(z < self.lower, 2 * self.lower - z, z)
-        z = torch.where(z > self.upper, 2 * self.upper - z, z)
-        return z.clamp(self.lower, self.upper)
+        return reflect(x + math.sqrt(self.n) * directions.mT, self.lower, self.upper)
 
     def _next(self) -> Tensor:
         """Return the point [n] with the lowest optimistic loss, or the least known one if that is known already."""
         process, x = self._through_output() if self._expands else self._from_losses()
+        known = float((self.pool.points - x).norm(dim=1).min()) < _SAME
         self._moved = float((x - self.best).norm()) / math.sqrt(self.n)
-        if float((self.pool.points - x).norm(dim=1).min()) < _SAME:
+        if known or (self._exploring and not self._expands):
             spots = self._uniform(4 * _CANDIDATES)
             x = spots[int(process.uncertainty(process.covariance(spots)).argmax())]
         return x
@@ -176,6 +182,7 @@ class BoxSearch:
     def _through_output(self) -> tuple[GaussianProcess, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
         assert self.pool.outputs is not None
+        assert self.loss is not None
         process = self._fit(self.pool.outputs)
         optimism = _EXPLORING if self._exploring else _OPTIMISM
         outputs, values = self.pool.outputs, self.pool.values
@@ -234,11 +241,10 @@ class BoxSearch:
         return x
 
     def _uniform(self, count: int) -> Tensor:
-        uniform = torch.rand(count, self.n, generator=self.generator, dtype=torch.float64).to(self.lower.device)
-        return self.lower + (self.upper - self.lower) * uniform
+        return uniform(self.generator, self.lower, self.upper, count)
 
     def _normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self.generator, dtype=torch.float64).to(self.lower.device)
+        return normal(self.generator, self.lower, *shape)
 
 
 class _LossModel:

@@ -48,6 +48,23 @@ class Pool:
         first = int(self._origin.min()) if len(self._origin) else 0
         self._origin, self._centers, self._sigmas = self._origin - first, self._centers[first:], self._sigmas[first:]
 
+    def thin(self, keep: Tensor) -> None:
+        """Where the pool is full, forget the worse of the two evaluations that are most alike, not that at keep [n].
+
+        Alike are those that are near each other for their distance from there: what is left covers the space, and more
+        densely around keep, where the latest evaluations would not.
+        """
+        if len(self) < self.capacity:
+            return
+        distance = torch.cdist(self.points, self.points, compute_mode="donot_use_mm_for_euclid_dist")
+        away = (self.points - keep).norm(dim=1) + 1e-3
+        alike = (distance / (away[:, None] + away)).fill_diagonal_(math.inf)
+        pair = divmod(int(alike.argmin()), len(self))
+        k = max(pair, key=lambda i: (not torch.equal(self.points[i], keep), float(self.values[i])))
+        rest = torch.arange(len(self), device=self.points.device) != k
+        self.points, self.values, self._origin = self.points[rest], self.values[rest], self._origin[rest]
+        self.outputs = None if self.outputs is None else self.outputs[rest]
+
     def weights(self, x: Tensor, sigma: float) -> Tensor:
         """Weights [P] at most 7.4 for a fit around x [n]; 1 for an evaluation at x itself."""
         if not len(self):

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.optim.draws import normal, reflect, uniform
 from torch_zerohess.optim.local_model import LocalModel, fit_outputs, fit_values
 from torch_zerohess.optim.pool import Pool
 from torch_zerohess.optim.subproblem import ball_step, box_step
@@ -82,6 +83,13 @@ class Search:
     def _follows(self) -> bool:
         return self.loss is not None and self.n > _FEW
 
+    def go_on(self, pool: Pool, lowest: float, sigma: float) -> None:
+        """Begin with the evaluations of another search, of which the start is the best, with this loss there."""
+        self.pool.add(pool.points, pool.values, None, self.x, 1.0)
+        self.fx = self.lowest = self.local_value = lowest
+        self.sigma, self.phase = sigma, "trial"
+        self._plan()
+
     def points(self) -> Tensor:
         """Draw the next points [K, n]."""
         if self.phase == "trial":
@@ -156,10 +164,7 @@ class Search:
         """Draw about `count` points from N(x, sigma^2), orthogonal in blocks, and mirror them into the bounds."""
         rows = self._directions((count + 1) // 2 if paired else count)
         u = torch.cat([rows, -rows]) if paired else rows
-        z = self.x + self.sigma * u
-        z = torch.where(z < self.lower, 2 * self.lower - z, z)
-        z = torch.where(z > self.upper, 2 * self.upper - z, z)
-        return z.clamp(self.lower, self.upper)
+        return reflect(self.x + self.sigma * u, self.lower, self.upper)
 
     def _directions(self, count: int) -> Tensor:
         """Normal vectors [count, n], orthogonal to each other and, in many dimensions, to what the pool spans."""
@@ -170,17 +175,15 @@ class Search:
             known, _ = torch.linalg.qr(((self.pool.points - self.x) / self.sigma).mT)
         while sum(len(one) for one in rows) < count:
             room = n if known is None else n - known.shape[1]
-            block = self._normal(n, min(count, max(room, 1)))
+            block = normal(self.generator, self.x, n, min(count, max(room, 1)))
             if known is not None:
                 for _ in range(2):  # twice is enough (Kahan)
                     block = block - known @ (known.mT @ block)
             known = None
             directions, _ = torch.linalg.qr(block)
-            rows.append(directions.mT * self._normal(directions.shape[1], n).norm(dim=1, keepdim=True))
+            lengths = normal(self.generator, self.x, directions.shape[1], n).norm(dim=1, keepdim=True)
+            rows.append(directions.mT * lengths)
         return torch.cat(rows)[:count]
-
-    def _normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self.generator, dtype=torch.float64).to(self.x.device)
 
     def _plan(self) -> None:
         """Fit a model and find its step; where too few evaluations lie near, ask for more first."""
@@ -294,12 +297,10 @@ class Search:
         self.sigma = 1.5
         self.x = self.best
         if self.rounds % 2:
-            bounded = bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())
-            if bounded:
-                uniform = torch.rand(self.n, generator=self.generator, dtype=torch.float64).to(self.x.device)
-                self.x = self.lower + (self.upper - self.lower) * uniform
+            if bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all()):
+                self.x = uniform(self.generator, self.lower, self.upper, 1)[0]
             else:
-                self.x = (self.first + 2.0 * self._normal(self.n)).clamp(self.lower, self.upper)
+                self.x = (self.first + 2.0 * normal(self.generator, self.x, self.n)).clamp(self.lower, self.upper)
         self.local_value, self._patience, self._followed, self.phase = math.inf, 0, [], "start"
         self._faithful, self._reach, self._retries, self._misled = False, 1.0, 0, 0
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_zerohess.optim import box_search
 from torch_zerohess.optim.box_search import BoxSearch
 from torch_zerohess.optim.local_model import LocalModel
+from torch_zerohess.optim.loss_search import LossSearch
 from torch_zerohess.optim.search import Search
 
 _BOX_POOL = 60
@@ -25,9 +26,10 @@ class TrustRegion:
     predicted badly. Sigma, and with it the region, grows after a long good step and on a plateau, and shrinks after a
     short or refused one.
 
-    - An output and a `loss`, up to four parameters, finite bounds: a Gaussian process predicts the output everywhere in
-      the box, and the search looks where the loss may be lowest (`BoxSearch`); it leaves plateaus and local minima.
-    - Loss alone, or n <= 2 without bounds: the search descends, and moves to whatever evaluated point is best.
+    - Up to four parameters, finite bounds: a Gaussian process predicts the output everywhere in the box, and the search
+      looks where the `loss` may be lowest (`BoxSearch`); it leaves plateaus and local minima. So it does with the loss
+      alone, and finishes with quadratics (`LossSearch`).
+    - Loss alone, or n <= 2, else: the search descends, and moves to whatever evaluated point is best.
     - An output [K, *out] and a white-box `loss`: every evaluation is many equations. The search follows the minimum of
       loss(E f) while sigma goes to zero, also where the loss itself rises for a while.
 
@@ -95,27 +97,20 @@ class TrustRegion:
         generator = torch.Generator()
         generator.manual_seed(int(torch.randint(2**63 - 1, ())) if seed is None else seed)
         place = (x0.detach().double() / self._unit, *(one.double() / self._unit for one in self._bounds))
+        boxed = self.n <= box_search.MOST and bool(torch.isfinite(torch.stack(self._bounds)).all())
+        capacity = _BOX_POOL if boxed else _capacity(self.n, loss is None)
+        settings: dict[str, Any] = {
+            "restarts": restarts,
+            "tolerance": tolerance,
+            "noise": float(noise),
+            "pool": pool or capacity,
+            "generator": generator,
+        }
         self._search: Search | BoxSearch
-        if loss is not None and self.n <= box_search.MOST and bool(torch.isfinite(torch.stack(self._bounds)).all()):
-            self._search = BoxSearch(
-                *place,
-                loss=loss,
-                restarts=restarts,
-                tolerance=tolerance,
-                noise=float(noise),
-                pool=pool or _BOX_POOL,
-                generator=generator,
-            )
+        if boxed:
+            self._search = LossSearch(*place, **settings) if loss is None else BoxSearch(*place, loss=loss, **settings)
         else:
-            self._search = Search(
-                *place,
-                loss=loss,
-                restarts=restarts,
-                tolerance=tolerance,
-                noise=float(noise),
-                pool=pool or _capacity(self.n, loss is None),
-                generator=generator,
-            )
+            self._search = Search(*place, loss=loss, **settings)
         self._asked: Tensor | None = None
 
     @property

@@ -31,7 +31,8 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
 TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     # tune bunny --method mitsuba_path --runs 3 --evaluations 120 --over rate=0.3,0.5,1.0; --method mitsuba_projective
     # --evaluations 100 --over rate=0.1,0.2; --method mitsuba --evaluations 120 --over rate=0.3,0.5: default is best.
-    # On mug and mirror no rate of mitsuba_path gets there (--runs 2 --evaluations 200 --over rate=0.03,0.3).
+    # On mug and mirror no rate of mitsuba_path gets there (--runs 2 --evaluations 200 --over rate=0.03,0.3), nor one of
+    # mitsuba_projective (--runs 2 --evaluations 100 --over rate=0.1,0.3,1.0 steps=50; on shad the default is best).
     "bunny": {"mitsuba_path": {"rate": 0.3}, "mitsuba_projective": {"rate": 0.2}},
     "quad": {
         "cma_es": {"scale": 0.5},

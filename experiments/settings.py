@@ -161,7 +161,8 @@ RETUNED: dict[str, dict[str, Settings]] = {
     #     "sigma=(1.0,0.1),(0.7,0.05),(1.0,0.01),(0.5,0.01)" recompute=1,5 modification=abs,radius \
     #     baseline=mean,center "line_search=(1,0.0)" steps=20,40,60
     # tune shad --method our_hvp --runs 3 --trials 10 --seed 1 --over samples=1,2 trust_region=0.2,0.4,0.7 \
-    #     "sigma=(1.0,0.1),(0.7,0.05),(0.5,0.01)" recompute=1,5 modification=abs,radius "line_search=(1,0.0)" steps=20,40
+    #     "sigma=(1.0,0.1),(0.7,0.05),(0.5,0.01)" recompute=1,5 modification=abs,radius "line_search=(1,0.0)" \
+    #     steps=20,40
     # tune shad --method our_h --runs 3 --trials 8 --seed 1 --over samples=1,2 trust_region=0.1,0.2,0.4 recompute=1,5 \
     #     "sigma=(1.0,0.1),(0.7,0.05),(0.5,0.01)" modification=abs,radius "line_search=(1,0.0)" steps=20,30
     "shad": {

@@ -117,10 +117,10 @@ class LossSearch(BoxSearch):
 
     def _finish(self, search: Search, points: Tensor, losses: Tensor) -> None:
         """Let quadratics go on, and return to the process where they find nothing better."""
-        before = search.lowest
+        before, tried = search.lowest, search.iterations
         search.take(points, losses, None)
         self.evaluations += len(points)
-        self.iterations += len(points) == 1
+        self.iterations += search.iterations - tried
         finite = torch.isfinite(losses)
         for point, loss in zip(points[finite], losses[finite], strict=True):
             if float((self.pool.points - point).norm(dim=1).min()) > _APART:
@@ -131,4 +131,4 @@ class LossSearch(BoxSearch):
         self._waited = 0 if search.lowest < before else self._waited + len(points)
         if search.done or self._waited >= _PATIENCE * (self.n + 1):
             self._close, self._finished, self._waited = None, self.best, 0
-            self._arrive(f"sigma fell below {search.tolerance} of the first one, or nothing better was found")
+            self._arrive(f"quadratics ended at {_FINEST * self.tolerance} of sigma, or found nothing better for a while")

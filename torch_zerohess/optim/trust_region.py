@@ -29,9 +29,9 @@ class TrustRegion:
     - Up to four parameters, finite bounds: a Gaussian process predicts the output everywhere in the box, and the search
       looks where the `loss` may be lowest (`BoxSearch`); it leaves plateaus and local minima. So it does with the loss
       alone, and finishes with quadratics (`LossSearch`).
-    - Loss alone, or n <= 2, else: the search descends, and moves to whatever evaluated point is best.
-    - An output [K, *out] and a white-box `loss`: every evaluation is many equations. The search follows the minimum of
-      loss(E f) while sigma goes to zero, also where the loss itself rises for a while.
+    - Otherwise, with the loss alone or n <= 2, it descends, and moves to whatever evaluated point is best.
+    - Otherwise, with an output [K, *out] and a white-box `loss`, every evaluation is many equations: it follows the
+      minimum of loss(E f) while sigma goes to zero, also where the loss itself rises for a while.
 
     Where sigma has become small the search has arrived at a minimum, possibly a local one. It then starts again, in
     turn from a random point and around the best one, with more samples per iteration, up to `restarts` times; in a box
@@ -43,7 +43,7 @@ class TrustRegion:
             One value, or one per parameter [n] where they have different units.
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         loss: from one output [*out] to a scalar, differentiable by torch; None if the black box returns the loss.
-        restarts: how often to start again after arriving. 0 for a local search.
+        restarts: how often to go on after arriving. 0 for a local search.
         tolerance: the search has arrived when sigma is below this times the first sigma.
         noise: standard deviation of repeated losses at one point, if it is known. Smaller decreases do not count. In a
             box it is told from the outputs, after some 10 (n + 1) of them, or at once if this is positive; `x` is then

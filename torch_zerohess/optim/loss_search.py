@@ -124,11 +124,11 @@ class LossSearch(BoxSearch):
         finite = torch.isfinite(losses)
         for point, loss in zip(points[finite], losses[finite], strict=True):
             if float((self.pool.points - point).norm(dim=1).min()) > _APART:
-                self.pool.add(point[None], loss[None], loss[None, None], self.best, 1.0)
+                self._remember(point[None], loss[None], loss[None, None])
         if search.lowest < self.lowest:
             self.best, self.lowest, self.best_sigma = search.best, search.lowest, search.best_sigma
         self.x, self.sigma = search.x, search.sigma
         self._waited = 0 if search.lowest < before else self._waited + len(points)
         if search.done or self._waited >= _PATIENCE * (self.n + 1):
             self._close, self._finished, self._waited = None, self.best, 0
-            self._arrive(f"quadratics ended at {_FINEST * self.tolerance} of sigma, or found nothing better for a while")
+            self._arrive(f"quadratics reached {search.tolerance} of sigma or found nothing better for a while")

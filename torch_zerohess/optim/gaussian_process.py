@@ -61,21 +61,18 @@ class GaussianProcess:
         P, m = outputs.shape
         mean = outputs.mean(0)
         change = outputs - mean
-        gram = change @ change.mT
         distance = _distance(points, points)
-        best = (-math.inf, KERNELS[0], LENGTHS[0], NOISES[0], 0.0)
-        for kernel in KERNELS:
-            for length in LENGTHS:
-                values, vectors = torch.linalg.eigh(kernel(distance / length) + _CONSTANT)
-                power = (vectors * (gram @ vectors)).sum(0).clamp_min(0.0)
-                for noise in noises:
-                    spectrum = values.clamp_min(0.0) + noise
-                    variance = float((power / spectrum).sum()) / (P * m) + math.ulp(0.0)
-                    log = -P * math.log(variance) - float(spectrum.log().sum())
-                    log -= (math.log(length) / _SPREAD) ** 2
-                    if log > best[0]:
-                        best = (log, kernel, length, noise, variance)
-        _, kernel, length, noise, variance = best
+        lengths, levels = distance.new_tensor(LENGTHS), distance.new_tensor(noises)
+        scaled = distance / lengths[:, None, None]
+        values, vectors = torch.linalg.eigh(torch.cat([kernel(scaled) for kernel in KERNELS]) + _CONSTANT)
+        power = (vectors * (change @ change.mT @ vectors)).sum(1).clamp_min(0.0)
+        spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [kernels x lengths, noises, P]
+        variances = (power[:, None] / spectrum).sum(2) / (P * m) + math.ulp(0.0)
+        evidence = -P * variances.log() - spectrum.log().sum(2)
+        evidence -= (lengths.log() / _SPREAD).square().repeat(len(KERNELS))[:, None]
+        shape, level = divmod(int(evidence.argmax()), len(noises))
+        kernel, length = KERNELS[shape // len(LENGTHS)], LENGTHS[shape % len(LENGTHS)]
+        noise, variance = noises[level], float(variances[shape, level])
         covariance = kernel(distance / length) + _CONSTANT
         covariance.diagonal().add_(noise)
         factor = torch.linalg.cholesky(covariance)

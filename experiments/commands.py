@@ -1,5 +1,7 @@
 """Command line of the experiments: `python -m experiments --help`."""
 
+import os
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -49,6 +51,11 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 
 
 def main() -> None:
-    tyro.extras.subcommand_cli_from_dict(
-        COMMANDS, prog="python -m experiments", description="Experiments of torch_zerohess."
-    )
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, prog="python -m experiments", description="Experiments of torch_zerohess."
+        )
+        sys.stdout.flush()
+    except BrokenPipeError:  # `| head` has read enough; what is left to flush goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None

@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -223,3 +225,15 @@ def test_box2_is_a_plateau_that_smoothing_gives_a_slope() -> None:
 def test_table_aligns_numbers() -> None:
     text = table(["case", "n"], [["a", 1.23456], ["bb", None], ["c", 12345.6]])
     assert text.splitlines() == ["case      n", "----  -----", "a      1.23", "bb        -", "c     12346"]
+
+
+def test_a_reader_that_has_enough_ends_a_command_without_a_traceback() -> None:
+    command = [sys.executable, "-m", "experiments", "list"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        running.stdout.close()
+        said = running.stderr.read()
+    assert running.returncode == 1
+    assert "Traceback" not in said
+    assert "BrokenPipe" not in said

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ class Ensemble:
             raise SystemExit(f"limit must be a positive number of seconds, got {self.limit:g}")
 
     def plan(self, tasks: Sequence[str | Task], methods: Sequence[str | Method] | None = None) -> list[Job]:
-        """Return all jobs, run by run, so that an ensemble that is stopped has about as many runs of each method.
+        """Return all jobs in the order of `ordered`.
 
         methods: None takes all that apply. One that does not apply to a task, or lacks a package, is left out with a
         line that says so. Settings that differ from those of earlier runs in the folder are refused.
@@ -57,7 +57,7 @@ class Ensemble:
         for job in jobs:
             table.setdefault(job.task_name, {})[job.method_name] = job.settings
         register(self.folder, table)
-        return sorted(jobs, key=lambda job: job.run)
+        return ordered(jobs)
 
     def _jobs(self, task: str | Task, methods: Sequence[str | Method] | None) -> list[Job]:
         loaded = catalogue.load(task, self.preset, self.variant) if isinstance(task, str) else task
@@ -137,6 +137,21 @@ class _Progress:
         if time.monotonic() - self._drawn > self._interval:
             self._bar.refresh()
             self._drawn = time.monotonic()
+
+
+def ordered(jobs: Iterable[Job]) -> list[Job]:
+    """Return jobs task by task, since every scene that a process has loaded slows down all of them.
+
+    Those of a task are run by run, so that an ensemble that is stopped has about as many of each method; methods that
+    load another scene come last.
+    """
+    position: dict[str, int] = {}
+
+    def key(job: Job) -> tuple[int, bool, int]:
+        method = METHODS[job.method] if isinstance(job.method, str) else job.method
+        return position.setdefault(job.task_name, len(position)), method.another_scene, job.run
+
+    return sorted(jobs, key=key)
 
 
 def unusable(method: Method, task: Task) -> str | None:

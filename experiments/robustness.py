@@ -17,7 +17,7 @@ import tyro
 from experiments import robustness_figure
 from experiments.catalogue import FITTING, Preset, chosen
 from experiments.command import register
-from experiments.ensemble import Ensemble, unusable
+from experiments.ensemble import Ensemble, ordered, unusable
 from experiments.methods import METHODS
 from experiments.results import Results, Run, load
 from experiments.settings import settings as settings_of
@@ -146,7 +146,7 @@ def robustness(
             raise SystemExit("no sweep of this command applies to these tasks and methods")
         todo = {(one.varied, one.method, job.run): job for one, many in planned for job in many}
         register(out, _settings(list(todo.values())))
-        ensemble.run(sorted(todo.values(), key=lambda job: job.run))
+        ensemble.run(ordered(todo.values()))
     except ImportError as error:
         raise SystemExit(str(error)) from None
     except KeyboardInterrupt:

@@ -96,10 +96,10 @@ def _load(name: str, preset: Preset, variant: str, evaluations: int | None, chan
     return Varied(**facts, made=(name, preset, variant, evaluations, change))
 
 
-_kept = lru_cache(maxsize=64)(_load)
+_kept = lru_cache(maxsize=1)(_load)  # scenes that stay loaded slow down the next
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=1)
 def _base(name: str, preset: Preset, variant: str) -> Task:
     return catalogue.load(name, preset, variant)
 

@@ -189,7 +189,7 @@ def _execute(job: Job, connection: Connection) -> Message:
         return Trouble(f"{type(error).__name__}: {error}")
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=1)  # a scene that stays loaded slows down the next
 def _load(name: str, preset: Preset, variant: str) -> Task:
     return catalogue.load(name, preset, variant)
 

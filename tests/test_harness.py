@@ -257,6 +257,15 @@ def test_finished_runs_are_not_run_twice(results, capsys):
     assert {path: path.stat().st_mtime_ns for path in results[0].glob("*/*/*.json*")} == before
 
 
+def test_jobs_are_task_by_task_and_what_loads_another_scene_comes_last(tmp_path):
+    other, derivative = replace(TASK, name="other"), replace(HALVE, name="derivative", another_scene=True)
+    jobs = ensemble(tmp_path).plan([TASK, other], [derivative, SEARCH, HALVE])
+    one = [("search", 0), ("halve", 0), ("search", 1), ("halve", 1), ("derivative", 0), ("derivative", 1)]
+    assert [(job.task_name, job.method_name, job.run) for job in jobs] == [
+        (task, *rest) for task in (TASK.name, "other") for rest in one
+    ]
+
+
 def test_other_settings_are_refused(results):
     with pytest.raises(SystemExit, match=r"halve was made with preset = fast \(now paper\), limit = 600.0 \(now 5\)"):
         ensemble(results[0], preset="paper", limit=5).plan([TASK], [HALVE])

@@ -67,6 +67,7 @@ METHODS = (
         with_settings(adjoint_adam, integrator="prb"),
         _differentiable,
         ("mitsuba",),
+        another_scene=True,
     ),
     Method(
         "mitsuba_path",
@@ -74,6 +75,7 @@ METHODS = (
         with_settings(adjoint_adam, integrator="path"),
         _differentiable,
         ("mitsuba",),
+        another_scene=True,
     ),
     Method(
         "mitsuba_projective",
@@ -81,5 +83,6 @@ METHODS = (
         with_settings(adjoint_adam, integrator="projective"),
         _differentiable,
         ("mitsuba",),
+        another_scene=True,
     ),
 )

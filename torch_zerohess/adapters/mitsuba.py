@@ -37,6 +37,9 @@ Description = Mapping[str, Any] | str | os.PathLike[str] | Callable[[ModuleType]
 class MitsubaScene:
     """Black box of n parameters: points [K, n] to linear images [K, height, width, channels], float32, or losses [K].
 
+    Just-in-time variants render slower the more scenes a process has loaded (half as slow again with three small ones):
+    delete those that are not needed.
+
     Args:
         description: what `mitsuba.load_dict` takes, a function that returns it for the `mitsuba` module (for what needs
             the variant, such as transforms and meshes), or the path of an XML file.

@@ -1,5 +1,6 @@
 """Fitting tasks through Mitsuba: the scene is loaded when it is first rendered, once per process."""
 
+import gc
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -71,6 +72,12 @@ class Reference:
     def target(self) -> Tensor:
         """[h, w, 3]."""
         return self.scene(self.solution[None])[0].double()
+
+    def release(self) -> None:
+        """Free the scenes."""
+        for name in ("scene", "moving"):
+            vars(self).pop(name, None)
+        gc.collect()
 
     def image(self, x: Tensor) -> Tensor:
         images = self.scene(x).double()
@@ -165,6 +172,7 @@ def rendered(
         adjoint=reference.adjoint,
         adjoints=tuple(one for one in ADJOINTS if one != "direct_projective" or setting.depth == 2),
         no_adjoint=lambda: unavailable(variant),
+        release=reference.release,
         full=None if setting == full else whole,
     )
 

@@ -43,18 +43,14 @@ class Saving:
 def saving(task: Task, points: Tensor) -> Saving:
     """Measure a task against its full setting at points [P, n], one evaluation at a time.
 
-    Both take turns, so that whatever else the machine does falls on both alike; the first evaluation of each, which
-    loads and compiles, is not timed. Raises ValueError if the task has no other setting.
+    One is released before the other is loaded; the first evaluation of each, which loads and compiles, is not timed.
+    Raises ValueError if the task has no other setting.
     """
     if task.full is None:
         raise ValueError(f"task must have a full setting to be measured against, {task.name} has none")
     if points.ndim != 2 or points.shape[1] != task.n or not len(points):
         raise ValueError(f"points must be [P, {task.n}], got {list(points.shape)}")
-    full = task.full()
-    for one in (task, full):
-        one.loss(points[:1])
-    pairs = [[_timed(one.loss, point[None]) for one in (task, full)] for point in points]
-    used, whole = zip(*pairs, strict=True)
+    used, whole = (_measured(one, points) for one in (task, task.full()))
     return Saving(
         statistics.median(seconds for seconds, _ in used),
         statistics.median(seconds for seconds, _ in whole),
@@ -77,6 +73,14 @@ def known_saving(task: Task, points: Tensor, folder: Path) -> Saving | None:
 def line(start: Tensor, end: Tensor) -> Tensor:
     """Points [POINTS, n] from start to end [n]."""
     return torch.stack([torch.lerp(start, end, t) for t in torch.linspace(0, 1, POINTS).tolist()])
+
+
+def _measured(task: Task, points: Tensor) -> list[tuple[float, float]]:
+    """Return seconds and loss of every point."""
+    task.loss(points[:1])
+    found = [_timed(task.loss, point[None]) for point in points]
+    task.release()
+    return found
 
 
 def _timed(loss: Callable[[Tensor], Tensor], x: Tensor) -> tuple[float, float]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def _nothing() -> None:
-    """For `Task.no_adjoint`; a function with a name can be pickled."""
+    """For `Task.no_adjoint` and `Task.release`; a function with a name can be pickled."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,9 @@ class Task:
     """Integrators that `adjoint` knows."""
     no_adjoint: Callable[[], str | None] = _nothing
     """Why `adjoint` cannot be called here, None if it can: derivatives need a variant of the renderer that has them."""
+    release: Callable[[], None] = _nothing
+    """Frees what the black box has loaded, to be loaded again when it is called: scenes of a process slow each other
+    down."""
     full: "Callable[[], Task] | None" = None
     """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""
     mesh: "FittedMesh | None" = None

@@ -1,6 +1,7 @@
 """The tasks that Mitsuba renders: geometry, plateaus, errors and settings, in the variant that is everywhere."""
 
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -59,6 +60,16 @@ def test_what_is_remembered_is_what_would_be_rendered(task) -> None:
     fresh = catalogue.load(task.name, "fast", "scalar_rgb")
     assert fresh.image_error(x) == pytest.approx(remembered, rel=1e-6)
     assert fresh.image_error(x + 0.01) == pytest.approx(task.image_error(x + 0.01), rel=1e-6)
+
+
+def test_a_scene_that_was_released_is_loaded_again() -> None:
+    task = catalogue.load("shad", "fast", "scalar_rgb")
+    x = task.start(0)[None]
+    before = task.image(x)
+    scene = weakref.ref(task.image.__self__.scene)
+    task.release()
+    assert scene() is None
+    assert torch.equal(task.image(x), before)
 
 
 def test_starts_are_within_the_bounds_and_differ(task) -> None:

@@ -239,7 +239,17 @@ class Clock:
     """Time that passes only when a loss says so."""
 
     def __init__(self):
-        self.now, self.calls = 0.0, 0
+        self.now, self.calls, self.released = 0.0, 0, False
+
+    def release(self):
+        self.released = True
+
+    def alone(self, loss):
+        def evaluate(x):
+            assert self.released  # by the task that was measured before
+            return loss(x)
+
+        return evaluate
 
     def loss(self, seconds, factor):
         def evaluate(x):
@@ -256,7 +266,12 @@ def halved(monkeypatch):
     clock = Clock()
     monkeypatch.setattr("experiments.saving.time.perf_counter", lambda: clock.now)
     whole = replace(TASK, loss=clock.loss(iter([100, 0.036, 0.7, 0.036, 0.036, 0.001, 0.036]), 1.25))
-    task = replace(TASK, loss=clock.loss(iter([100, 0.003, 0.003, 0.5, 0.003, 0.003, 0.002]), 1.0), full=lambda: whole)
+    task = replace(
+        TASK,
+        loss=clock.loss(iter([100, 0.003, 0.003, 0.5, 0.003, 0.003, 0.002]), 1.0),
+        full=lambda: replace(whole, loss=clock.alone(whole.loss)),
+        release=clock.release,
+    )
     return task, clock
 
 

@@ -170,7 +170,10 @@ class BoxSearch:
         return reflect(x + math.sqrt(self.n) * directions.mT, self.lower, self.upper)
 
     def _next(self) -> Tensor:
-        """Return the point [n] with the lowest optimistic loss, or the least known one if that is known already."""
+        """Return the point [n] with the lowest optimistic loss, or the least known one if that is known already.
+
+        A process of the loss, which has less to go by, also looks there after every arrival.
+        """
         process, x = self._through_output() if self._expands else self._from_losses()
         known = float((self.pool.points - x).norm(dim=1).min()) < _SAME
         self._moved = float((x - self.best).norm()) / math.sqrt(self.n)

@@ -1,6 +1,5 @@
 """Fitting tasks through Mitsuba: the scene is loaded when it is first rendered, once per process."""
 
-import gc
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,7 +76,6 @@ class Reference:
         """Free the scenes."""
         for name in ("scene", "moving"):
             vars(self).pop(name, None)
-        gc.collect()
 
     def image(self, x: Tensor) -> Tensor:
         images = self.scene(x).double()

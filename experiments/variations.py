@@ -85,8 +85,10 @@ def load(name: str, preset: Preset, variant: str, evaluations: int | None, chang
         evaluations: that a run may use; those of the task if None.
         change: what differs; ValueError if the task cannot be changed in this way.
     """
-    fresh = change.noise in ("call", "point")
-    return (_load if fresh else _kept)(name, preset, variant, evaluations, change)
+    if change.noise in ("fixed", "other"):
+        return _kept(name, preset, variant, evaluations, change)
+    _kept.cache_clear()
+    return _load(name, preset, variant, evaluations, change)
 
 
 def _load(name: str, preset: Preset, variant: str, evaluations: int | None, change: Change) -> Varied:
@@ -125,12 +127,18 @@ def _seen(task: Task, change: Change) -> Task:
     setting = dataclasses.replace(made.setting, spp=spp)
     compress = None if change.jpeg is None else lambda image: jpeg(image, change.jpeg or 0)
     reference = Seen(made, setting, change.noise, compress)
+
+    def release() -> None:
+        reference.release()
+        made.release()
+
     return dataclasses.replace(
         task,
         loss=reference.loss,
         image=reference.image,
         image_loss=reference.loss_of,
         residuals=reference.residuals,
+        release=release,
         adjoint=None,  # it is one of the task as it was
     )
 

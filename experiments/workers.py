@@ -107,7 +107,11 @@ class _Worker:
 
     def give(self, job: Job) -> None:
         self.job = job
-        self.connection.send(job)
+        try:
+            self.connection.send(job)
+        except BrokenPipeError:
+            self.process.join()
+            raise RuntimeError(f"a worker process ended with code {self.process.exitcode} between its jobs") from None
 
     def messages(self) -> Iterator[tuple[Job, Message]]:
         """Yield what has arrived; the last message of a job frees the worker."""

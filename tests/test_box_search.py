@@ -274,6 +274,34 @@ def test_outputs_that_vary_fast_are_not_taken_for_noise():
         assert search.value == lowest
 
 
+def test_where_noise_ceases_the_best_is_what_was_evaluated():
+    solution = vector(1.3)
+    search = TrustRegion(vector(-3.0), sigma=1.5, bounds=(-5.0, 5.0), loss=misfit(bump, solution), restarts=99, seed=0)
+    noise, lowest, judged = torch.Generator().manual_seed(0), math.inf, set()
+    for k in range(100):
+        clean = bump(search.ask())
+        size = 0.3 if k < 30 else 0.0
+        outputs = clean + size * torch.randn(clean.shape, generator=noise, dtype=torch.float64)
+        lowest = min(lowest, *(float(misfit(bump, solution)(one)) for one in outputs))
+        search.tell(outputs)
+        judged.add(search._search._noisy)
+    assert judged == {True, False}
+    assert not search._search._noisy
+    assert search.value == lowest
+
+
+def test_a_loss_that_is_not_finite_at_a_predicted_output_is_passed_over():
+    """Predictions of a noisy output leave the domain of the root."""
+    generator = torch.Generator().manual_seed(0)
+    search = TrustRegion(
+        vector(-3.0), sigma=1.5, bounds=(-5.0, 5.0), loss=lambda y: (y - 0.3).sqrt().sum(), noise=0.1, seed=0
+    )
+    for _ in range(40):
+        clean = bump(search.ask()) + 0.31
+        search.tell(clean + 0.3 * torch.rand(clean.shape, generator=generator, dtype=torch.float64))
+        assert math.isfinite(search.value)
+
+
 def test_without_bounds_or_with_more_parameters_it_is_not_used():
     for n, bounds in ((1, None), (5, (-2.0, 2.0))):
         for loss in (None, torch.sum):

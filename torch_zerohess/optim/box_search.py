@@ -39,12 +39,15 @@ _REFUSED = 10
 """Outputs in a row that are not finite, after which the search ends."""
 _TELLING = 10
 """Evaluations over n + 1 from which high noise is told from fast variation."""
+_PROPORTION = 1e3
+"""Losses above this times the median, over the lowest one, are cut."""
 _EXPANSIONS = 3
 """Around predicted minima, until one predicts the loss; a loss for which none does is itself predicted from then on."""
 
 _STATE = (
     *("sigma", "evaluations", "iterations", "rounds", "done", "message", "phase"),
     *("best", "lowest", "best_sigma", "x", "_moved", "_settled", "_exploring", "_refused", "_expands", "_noisy"),
+    *("_record", "_holes"),
 )
 
 
@@ -69,7 +72,7 @@ class BoxSearch:
     ) -> None:
         self.n, self.lower, self.upper, self.loss = len(start), lower, upper, loss
         self.restarts, self.tolerance, self.noise, self.generator = restarts, tolerance, noise, generator
-        self.pool = Pool(self.n, pool, start.device)
+        self.pool = Pool(self.n, max(pool, 2 * self.n + 2), start.device)  # at least the start, its samples and steps
         self.best = self.x = start
         self.lowest = math.inf
         self.sigma = self.best_sigma = 1.0
@@ -80,6 +83,10 @@ class BoxSearch:
         """Of an output."""
         self._moved, self._expands, self._noisy = math.inf, loss is not None, False
         self._settled = self._exploring = self._refused = 0
+        self._record: list[Any] = [start, math.inf, 1.0]
+        """The lowest loss that was evaluated: its point, it, and sigma then."""
+        self._holes = start[None][:0]
+        """Points [H, n] whose outputs were not finite."""
 
     def points(self) -> Tensor:
         """Draw the next points [K, n]."""
@@ -100,10 +107,7 @@ class BoxSearch:
             self.done, self.message = True, f"{_REFUSED} batches in a row had values that are not finite"
             return
         self._remember(points[finite], losses[finite], outputs[finite])
-        if not bool(finite.all()) and len(self.pool):  # as bad as the worst that is known
-            worst = self.pool.outputs[int(self.pool.values.argmax())]  # type: ignore[index]
-            bad = points[~finite]
-            self.pool.add(bad, self.pool.values.max().expand(len(bad)), worst.expand(len(bad), -1), self.best, 1.0)
+        self._holes = torch.cat([self._holes, points[~finite]])[-self.pool.capacity :]
         if self.phase == "trial":
             self._settle(self._moved)
         self.x = points[-1]
@@ -115,7 +119,7 @@ class BoxSearch:
         while outputs is not None and sigma < 10.0:
             weights = torch.exp(-0.5 * ((self.pool.points - self.best) / sigma).square().sum(1))
             near = weights > 1e-3
-            if int(near.sum()) > self.n:
+            if int(near.sum()) > min(self.n, self.pool.capacity - 2):
                 u = (self.pool.points[near] - self.best) / sigma
                 if self.loss is None:
                     return fit_values(u, self.pool.values[near], weights[near]), sigma
@@ -145,9 +149,10 @@ class BoxSearch:
             self.pool.thin(self.best)
         self.pool.add(points, losses, outputs, self.best, 1.0)
         k = int(losses.argmin())
-        if float(losses[k]) < self.lowest:
-            self.best, self.lowest = points[k], float(losses[k])
-            self.best_sigma = max(self.sigma, self.tolerance)
+        if float(losses[k]) < self._record[1]:
+            self._record = [points[k], float(losses[k]), max(self.sigma, self.tolerance)]
+            if not self._noisy:
+                self.best, self.lowest, self.best_sigma = self._record
 
     def _settle(self, moved: float) -> None:
         """Arrive where step after step stays at the best point."""
@@ -175,12 +180,16 @@ class BoxSearch:
         A process of the loss, which has less to go by, also looks there after every arrival.
         """
         process, x = self._through_output() if self._expands else self._from_losses()
-        known = float((self.pool.points - x).norm(dim=1).min()) < _SAME
-        self._moved = float((x - self.best).norm()) / math.sqrt(self.n)
-        if known or (self._exploring and not self._expands):
+        explores = self._exploring > 0 and not self._expands
+        self._moved = math.inf if explores else float((x - self.best).norm()) / math.sqrt(self.n)
+        if explores or self._is_known(process, x):
             spots = self._uniform(4 * _CANDIDATES)
             x = spots[int(process.uncertainty(process.covariance(spots)).argmax())]
         return x
+
+    def _is_known(self, process: GaussianProcess, x: Tensor) -> bool:
+        """Whether there is nothing to learn at x [n]."""
+        return float((process.points - x).norm(dim=1).min()) < _SAME
 
     def _through_output(self) -> tuple[GaussianProcess, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
@@ -192,6 +201,7 @@ class BoxSearch:
         if self._noisy:
             outputs = process.predict(self.pool.points)
             values = torch.stack([self.loss(one.view(self.shape)).detach().double().reshape(()) for one in outputs])
+            values = values.nan_to_num(nan=math.inf, neginf=math.inf)
             self._judge(values)
         output = outputs[int(values.argmin())]
         for _ in range(_EXPANSIONS):
@@ -205,26 +215,39 @@ class BoxSearch:
 
     def _from_losses(self) -> tuple[GaussianProcess, Tensor]:
         """Predict the loss, and return the point [n] that is lowest."""
-        process, values = self._fit(self.pool.values[:, None]), self.pool.values
+        values = self.pool.values
+        middle, lowest = float(values.median()), float(values.min())
+        if middle > lowest:  # what is out of all proportion, such as a penalty, says no more than that it is high
+            values = values.clamp(max=lowest + _PROPORTION * (middle - lowest))
+        process = self._fit(values[:, None])
         if self._noisy:
             values = process.predict(self.pool.points)[:, 0]
             self._judge(values)
         return process, self._lowest(_LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING))
 
     def _fit(self, outputs: Tensor) -> GaussianProcess:
-        """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again."""
-        tells = self.noise > 0.0 or len(self.pool) >= _TELLING * (self.n + 1)
-        process = GaussianProcess.fit(self.pool.points, outputs, NOISES + HIGH_NOISES if tells else NOISES)
-        before, self._noisy = self._noisy, process.noise >= HIGH_NOISES[0]
+        """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again.
+
+        Where an output was not finite it is taken to be as that with the highest loss. A loss alone says too little to
+        tell noise from ripples: it is noisy if `noise` says so.
+        """
+        worst = outputs[int(self.pool.values.argmax())]
+        points = torch.cat([self.pool.points, self._holes])
+        outputs = torch.cat([outputs, worst.expand(len(self._holes), -1)])
+        enough = min(_TELLING * (self.n + 1), self.pool.capacity)
+        tells = self.noise > 0.0 or (self.loss is not None and len(self.pool) >= enough)
+        process = GaussianProcess.fit(points, outputs, NOISES + HIGH_NOISES if tells else NOISES)
+        before, self._noisy = self._noisy, self.noise > 0.0 or process.noise >= HIGH_NOISES[0]
         if before and not self._noisy:
-            self._judge(self.pool.values)
+            self.best, self.lowest, self.best_sigma = self._record
         return process
 
     def _judge(self, values: Tensor) -> None:
         """Make the point of the pool with the lowest of values [P] the best one."""
         k = int(values.argmin())
-        self.best, self.lowest = self.pool.points[k], float(values[k])
-        self.best_sigma = max(self.sigma, self.tolerance)
+        if math.isfinite(values[k]):
+            self.best, self.lowest = self.pool.points[k], float(values[k])
+            self.best_sigma = max(self.sigma, self.tolerance)
 
     def _lowest(self, model: "_LossModel") -> Tensor:
         """Return the best of candidates around the best point and all over the box, improved by ever smaller steps."""

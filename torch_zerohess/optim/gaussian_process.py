@@ -61,18 +61,21 @@ class GaussianProcess:
         P, m = outputs.shape
         mean = outputs.mean(0)
         change = outputs - mean
+        scale = float(change.abs().max())
+        flat = scale <= 1e-14 * float(mean.abs().max())
+        unit = change / scale if not flat else torch.zeros_like(change)
         distance = _distance(points, points)
         lengths, levels = distance.new_tensor(LENGTHS), distance.new_tensor(noises)
         scaled = distance / lengths[:, None, None]
         values, vectors = torch.linalg.eigh(torch.cat([kernel(scaled) for kernel in KERNELS]) + _CONSTANT)
-        power = (vectors * (change @ change.mT @ vectors)).sum(1).clamp_min(0.0)
+        power = (vectors * (unit @ unit.mT @ vectors)).sum(1).clamp_min(0.0)
         spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [kernels x lengths, noises, P]
         variances = (power[:, None] / spectrum).sum(2) / (P * m) + math.ulp(0.0)
         evidence = -P * variances.log() - spectrum.log().sum(2)
         evidence -= (lengths.log() / _SPREAD).square().repeat(len(KERNELS))[:, None]
         shape, level = divmod(int(evidence.argmax()), len(noises))
         kernel, length = KERNELS[shape // len(LENGTHS)], LENGTHS[shape % len(LENGTHS)]
-        noise, variance = noises[level], float(variances[shape, level])
+        noise, variance = noises[level], 1.0 if flat else scale**2 * float(variances[shape, level])
         covariance = kernel(distance / length) + _CONSTANT
         covariance.diagonal().add_(noise)
         factor = torch.linalg.cholesky(covariance)

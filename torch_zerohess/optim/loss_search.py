@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.optim.box_search import BoxSearch
+from torch_zerohess.optim.gaussian_process import GaussianProcess
+from torch_zerohess.optim.local_model import LocalModel
 from torch_zerohess.optim.search import Search
 
 _NEAR = 0.1
@@ -22,7 +24,7 @@ _WIDTH = 0.3
 _PATIENCE = 3
 """Evaluations over n + 1 in which one model must find something better, or it is the turn of the other."""
 _FINEST = 1e-3
-"""Sigma at which quadratics end, over the tolerance of the search."""
+"""Sigma at which quadratics end, over the tolerance of the search, and the last step with which they have converged."""
 _APART = 0.05
 """Distance from what the process knows at which an evaluation tells it something new."""
 
@@ -54,17 +56,21 @@ class LossSearch(BoxSearch):
             generator=generator,
         )
         self._close: Search | None = None
+        """Quadratics, also when they have ended."""
+        self._closing = False
         self._finished = torch.full_like(start, math.inf)
         """Where quadratics have ended."""
+        self._solved = False
+        """Whether they had converged there: at a cusp they do not."""
         self._steps = self._waited = 0
 
     def points(self) -> Tensor:
         """Draw the next points [K, n]."""
-        return super().points() if self._close is None else self._close.points()
+        return self._close.points() if self._close is not None and self._closing else super().points()
 
     def take(self, points: Tensor, losses: Tensor, outputs: Tensor | None = None) -> None:
         """Go on with the losses [K] of points [K, n]."""
-        if self._close is not None:
+        if self._close is not None and self._closing:
             self._finish(self._close, points, losses)
             return
         before = self.lowest
@@ -75,33 +81,38 @@ class LossSearch(BoxSearch):
         turn = self._steps >= _STEPS or self._waited >= _PATIENCE * (self.n + 1)
         if turn and new and not self._noisy and not self.done:
             self._steps = self._waited = 0
-            self._close = self._quadratics()
+            self._close, self._closing = self._quadratics(), True
+            self._close.go_on(self.pool, self.lowest, _WIDTH)
 
-    def model_at_best(self) -> Any:
+    def model_at_best(self) -> tuple[LocalModel, float] | None:
         """See `TrustRegion.model_at_best`."""
-        return super().model_at_best() if self._close is None else self._close.model_at_best()
+        if self._close is not None and torch.equal(self._close.best, self.best):
+            return self._close.model_at_best()
+        return super().model_at_best()
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors, numbers, strings, lists and dicts."""
         return {
             **super().state_dict(),
             "close": None if self._close is None else self._close.state_dict(),
-            "finished": self._finished,
-            "counts": [self._steps, self._waited],
+            "finish": [self._finished, self._solved, self._steps, self._waited, self._closing],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self._finished = state["finished"]
-        self._steps, self._waited = state["counts"]
+        self._finished, self._solved, self._steps, self._waited, self._closing = state["finish"]
         self._close = None
         if state["close"] is not None:
             self._close = self._quadratics()
             self._close.load_state_dict(state["close"])
 
+    def _is_known(self, process: GaussianProcess, x: Tensor) -> bool:
+        solved = self._solved and torch.equal(self._finished, self.best)
+        return (solved and float((x - self.best).norm()) < _APART) or super()._is_known(process, x)
+
     def _quadratics(self) -> Search:
-        """Return a local search from the best point, with what is known."""
-        search = Search(
+        """Return a local search from the best point."""
+        return Search(
             self.best,
             self.lower,
             self.upper,
@@ -112,8 +123,6 @@ class LossSearch(BoxSearch):
             pool=self.pool.capacity,
             generator=self.generator,
         )
-        search.go_on(self.pool, self.lowest, _WIDTH)
-        return search
 
     def _finish(self, search: Search, points: Tensor, losses: Tensor) -> None:
         """Let quadratics go on, and return to the process where they find nothing better."""
@@ -122,13 +131,16 @@ class LossSearch(BoxSearch):
         self.evaluations += len(points)
         self.iterations += search.iterations - tried
         finite = torch.isfinite(losses)
+        self._holes = torch.cat([self._holes, points[~finite]])[-self.pool.capacity :]
         for point, loss in zip(points[finite], losses[finite], strict=True):
             if float((self.pool.points - point).norm(dim=1).min()) > _APART:
                 self._remember(point[None], loss[None], loss[None, None])
-        if search.lowest < self.lowest:
+        if search.lowest <= self.lowest:
             self.best, self.lowest, self.best_sigma = search.best, search.lowest, search.best_sigma
+            self._record = [self.best, self.lowest, self.best_sigma]
         self.x, self.sigma = search.x, search.sigma
         self._waited = 0 if search.lowest < before else self._waited + len(points)
         if search.done or self._waited >= _PATIENCE * (self.n + 1):
-            self._close, self._finished, self._waited = None, self.best, 0
+            self._closing, self._finished, self._waited = False, self.best, 0
+            self._solved = search.sigma * float(search.step.norm()) < _FINEST
             self._arrive(f"quadratics reached {search.tolerance} of sigma or found nothing better for a while")

@@ -11,7 +11,7 @@ _FLAT = 4
 
 
 class Pool:
-    """The latest evaluations: points [P, n], losses [P] and, where the black box returns a tensor, outputs [P, m].
+    """Evaluations, the latest or those least alike (`thin`): points [P, n], losses [P] and, if any, outputs [P, m].
 
     Every evaluation keeps the Gaussian it was drawn from. At (x, sigma) its weight is N(z; x, sigma) over the mixture
     of these Gaussians (deterministic-mixture weights: Owen and Zhou 2000, section 2, "balance heuristic"). In n > 4
@@ -62,8 +62,10 @@ class Pool:
         pair = divmod(int(alike.argmin()), len(self))
         k = max(pair, key=lambda i: (not torch.equal(self.points[i], keep), float(self.values[i])))
         rest = torch.arange(len(self), device=self.points.device) != k
-        self.points, self.values, self._origin = self.points[rest], self.values[rest], self._origin[rest]
+        self.points, self.values = self.points[rest], self.values[rest]
         self.outputs = None if self.outputs is None else self.outputs[rest]
+        groups, self._origin = torch.unique(self._origin[rest], return_inverse=True)
+        self._centers, self._sigmas = self._centers[groups], self._sigmas[groups]
 
     def weights(self, x: Tensor, sigma: float) -> Tensor:
         """Weights [P] at most 7.4 for a fit around x [n]; 1 for an evaluation at x itself."""

@@ -84,7 +84,7 @@ class Search:
         return self.loss is not None and self.n > _FEW
 
     def go_on(self, pool: Pool, lowest: float, sigma: float) -> None:
-        """Begin with the evaluations of another search, of which the start is the best, with this loss there."""
+        """Begin with the evaluations of another search, whose best point is the start, with this loss there."""
         self.pool.add(pool.points, pool.values, None, self.x, 1.0)
         self.fx = self.lowest = self.local_value = lowest
         self.sigma, self.phase = sigma, "trial"

@@ -35,7 +35,7 @@ class TrustRegion:
 
     Where sigma has become small the search has arrived at a minimum, possibly a local one. It then starts again, in
     turn from a random point and around the best one, with more samples per iteration, up to `restarts` times; in a box
-    it looks for some steps where it knows least.
+    it is more optimistic for some steps, or, of the loss alone, looks where it knows least.
 
     Args:
         x0: start [n], float32 or float64, within the bounds.
@@ -44,10 +44,11 @@ class TrustRegion:
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         loss: from one output [*out] to a scalar, differentiable by torch; None if the black box returns the loss.
         restarts: how often to go on after arriving. 0 for a local search.
-        tolerance: the search has arrived when sigma is below this times the first sigma.
+        tolerance: the search has arrived when sigma, or in a box the length of three steps in a row, is below this
+            times the first sigma; quadratics of a `LossSearch` go on to a thousandth of that.
         noise: standard deviation of repeated losses at one point, if it is known. Smaller decreases do not count. In a
-            box it is told from the outputs, after some 10 (n + 1) of them, or at once if this is positive; `x` is then
-            the point with the lowest loss of the predicted output, and `value` is that loss.
+            box it is also told from outputs, after some 10 (n + 1) of them; in noise `x` is the point with the lowest
+            loss of the predicted output, or lowest predicted loss, and `value` is that.
         pool: evaluations kept; by default 60 or 6 n, and enough for a full quadratic of a loss alone up to n = 20. In a
             box the time of an iteration grows with its third power.
         seed: of the samples; from torch's global generator if None.
@@ -186,7 +187,8 @@ class TrustRegion:
     def tell(self, values: Any) -> None:
         """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
 
-        Values that are not finite are left out, and the step to such a point is refused and shortened. Raises
+        Values that are not finite are left out, and the step to such a point is refused and shortened, or in a box such
+        points are taken for the worst. Raises
         ValueError for a wrong shape, or if the start itself has no finite value. The search is as before if this, or
         the loss, raises.
         """

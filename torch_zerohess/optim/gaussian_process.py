@@ -79,7 +79,8 @@ class GaussianProcess:
         covariance = kernel(distance / length) + _CONSTANT
         covariance.diagonal().add_(noise)
         factor = torch.linalg.cholesky(covariance)
-        return cls(points, kernel, length, mean, torch.cholesky_solve(change, factor), variance, noise, factor)
+        weights = torch.cholesky_inverse(factor) @ change  # of many elements: faster than to solve for each
+        return cls(points, kernel, length, mean, weights, variance, noise, factor)
 
     def predict(self, x: Tensor) -> Tensor:
         """Expected outputs [Q, m] at points x [Q, n]."""

@@ -228,8 +228,20 @@ def loss_derivatives(
         (slope,) = torch.autograd.grad(value, y, create_graph=True)
         if not slope.requires_grad:
             return float(value.detach()), _finite(slope.detach().flatten()), torch.zeros_like(directions).flatten(1)
-        products = [torch.autograd.grad(slope, y, one, retain_graph=True)[0].flatten() for one in directions]
-    return float(value.detach()), _finite(slope.detach().flatten()), _finite(torch.stack(products))
+
+        def product(direction: Tensor) -> Tensor:
+            return torch.autograd.grad(slope, y, direction, retain_graph=True)[0]
+
+        # A generic combination of directions is an eigenvector only if all of them are, with the same eigenvalue.
+        generic = torch.cos(torch.arange(1.0, len(directions) + 1.0)).to(directions)
+        probe = torch.tensordot(generic, directions, dims=1)
+        image, square = product(probe), float(probe.square().sum())
+        scale = float((image * probe).sum()) / square if square > 0.0 else 0.0
+        if float((image - scale * probe).norm()) <= 1e-12 * abs(scale) * math.sqrt(square):
+            products = scale * directions.flatten(1)
+        else:
+            products = torch.stack([product(one).flatten() for one in directions])
+    return float(value.detach()), _finite(slope.detach().flatten()), _finite(products)
 
 
 def _finite(derivatives: Tensor) -> Tensor:

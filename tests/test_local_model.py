@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_zerohess.optim.local_model import fit_outputs, fit_values
+from torch_zerohess.optim.local_model import fit_outputs, fit_values, loss_derivatives
 from torch_zerohess.optim.pool import Pool
 from truths import vector
 
@@ -318,3 +318,25 @@ def test_a_loss_without_derivatives_where_it_is_needed_says_nothing():
     assert bool(torch.isfinite(model.full_hessian()).all())
     root = fit_outputs(u, u @ torch.ones(2, 3).double() * 0, torch.ones(6).double(), torch.sum, torch.Size([3]))
     assert float(root.full_gradient().abs().max()) == 0.0
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        lambda y: y.square().mean(),
+        lambda y: (torch.arange(1.0, 7.0, dtype=torch.float64).view(2, 3) * y.square()).sum(),
+        lambda y: (y[0] * y[1]).sum() + y.exp().sum(),
+        lambda y: 3.0 * y.sum(),
+    ],
+    ids=["mean square", "weighted", "coupled", "linear"],
+)
+@pytest.mark.parametrize("count", [1, 5])
+def test_second_derivatives_of_a_loss_are_those_of_torch_func(loss, count):
+    generator = torch.Generator().manual_seed(0)
+    output = torch.randn(2, 3, generator=generator, dtype=torch.float64)
+    directions = torch.randn(count, 2, 3, generator=generator, dtype=torch.float64)
+    value, slope, products = loss_derivatives(loss, output, directions)
+    hessian = torch.func.hessian(loss)(output).reshape(6, 6)
+    assert value == pytest.approx(float(loss(output)))
+    assert torch.allclose(slope, torch.func.grad(loss)(output).flatten())
+    assert torch.allclose(products, directions.flatten(1) @ hessian)

@@ -1,5 +1,6 @@
 """The runs in a folder, as the tables, figures and reports read them."""
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +39,8 @@ class Results:
 
     folder: Path
     runs: dict[str, dict[str, list[Run]]]
-    unfinished: int
+    unfinished: Counter[str]
+    """How many of each method."""
 
 
 def load(folder: Path, tasks: Collection[str] | None = None) -> Results:
@@ -46,18 +48,18 @@ def load(folder: Path, tasks: Collection[str] | None = None) -> Results:
     if not folder.is_dir():
         raise SystemExit(f"DIR must be a folder that `python -m experiments run` has written to, got {folder}")
     runs: dict[str, dict[str, list[Run]]] = {}
-    unfinished = 0
+    unfinished: Counter[str] = Counter()
     for task in _folders(folder):
         if tasks is not None and task.name not in tasks:
             continue
         for method in _folders(task):
-            unfinished += sum(1 for _ in method.glob("*.journal"))
+            unfinished[method.name] += sum(1 for _ in method.glob("*.journal"))
             numbers = sorted(int(path.stem) for path in method.glob("*.json") if path.stem.isdigit())
             mine = [_run(Files(method, number)) for number in numbers]
             if mine:
                 runs.setdefault(task.name, {})[method.name] = mine
     if not runs:
-        going = f", {unfinished} are unfinished" if unfinished else ""
+        going = f", {count} are unfinished" if (count := unfinished.total()) else ""
         raise SystemExit(f"DIR must have runs that have ended; {folder} has none{going}")
     return Results(folder, runs, unfinished)
 

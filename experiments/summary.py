@@ -99,7 +99,8 @@ def summarize(results: Results, reference: str | None = None, methods: Collectio
     """Return the tables, with ratios to a method, by default the first of `REFERENCES`; of some methods, or of all."""
     if methods is not None:
         runs = {task: {m: r for m, r in mine.items() if m in methods} for task, mine in results.runs.items()}
-        results = replace(results, runs={task: mine for task, mine in runs.items() if mine})
+        unfinished = Counter({name: count for name, count in results.unfinished.items() if name in methods})
+        results = replace(results, runs={task: mine for task, mine in runs.items() if mine}, unfinished=unfinished)
     found = {method for runs in results.runs.values() for method in runs}
     reference = reference or next((name for name in REFERENCES if name in found), None)
     rows = [row for task in results.runs for row in _rows(task, results, reference)]
@@ -112,7 +113,7 @@ def summarize(results: Results, reference: str | None = None, methods: Collectio
         _speed_up("all", [row for row in rows if row.method != reference]),
         [_overhead(*cell) for cell in cells],
         [failure for cell in cells for failure in _failures(*cell)],
-        results.unfinished,
+        results.unfinished.total(),
     )
 
 

@@ -111,6 +111,8 @@ def test_overhead_failures_and_unfinished_runs(folder):
         ("our_g", "failed", "ValueError: no", 2),
     }
     assert summary.unfinished == 1
+    assert summarize(load_results(folder), methods=["our_g"]).unfinished == 1
+    assert summarize(load_results(folder), methods=["trust_region"]).unfinished == 0
 
 
 def test_the_reference_is_the_best_that_there_is(tmp_path):

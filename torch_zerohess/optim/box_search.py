@@ -4,8 +4,9 @@ A Gaussian process (`GaussianProcess`) predicts the output anywhere in the box f
 loss of the prediction says where to look next: at the point with the lowest loss among the outputs that lie within
 `_OPTIMISM` standard deviations of the prediction (a composite objective: Astudillo and Frazier 2019). One evaluation
 follows another; each is trial and sample at once. Where nothing lower is expected, the search looks where it knows
-least, so it leaves local minima and plateaus. Where outputs differ from call to call (the evidence tells) the best
-point is the one with the lowest loss of the prediction, which is an average of what was evaluated around it.
+least, so it leaves local minima and plateaus. Where outputs differ from call to call (the evidence tells; of a loss
+alone the `noise` setting) the best point is the one with the lowest loss of the prediction, which is an average of what
+was evaluated around it.
 """
 
 import math
@@ -25,7 +26,7 @@ MOST = 4
 _OPTIMISM = 0.3
 """Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
 _EXPLORING = 2.0
-"""The same in the steps after an arrival, and where the loss itself is predicted."""
+"""The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
 _SCALES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
 """Distances of candidates from the best point."""
 _CANDIDATES = 24
@@ -40,7 +41,7 @@ _REFUSED = 10
 _TELLING = 10
 """Evaluations over n + 1 from which high noise is told from fast variation."""
 _PROPORTION = 1e3
-"""Losses above this times the median, over the lowest one, are cut."""
+"""Losses are cut above the lowest one plus this times the distance of the median from it."""
 _EXPANSIONS = 3
 """Around predicted minima, until one predicts the loss; a loss for which none does is itself predicted from then on."""
 

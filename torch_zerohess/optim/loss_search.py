@@ -30,31 +30,13 @@ _APART = 0.05
 
 
 class LossSearch(BoxSearch):
-    """State of a search over z [n], float64, within finite lower and upper [n]; the first sigma is 1."""
+    """State of a search over z [n], float64, within finite lower and upper [n]; the first sigma is 1.
 
-    def __init__(
-        self,
-        start: Tensor,
-        lower: Tensor,
-        upper: Tensor,
-        *,
-        restarts: int,
-        tolerance: float,
-        noise: float,
-        pool: int,
-        generator: torch.Generator,
-    ) -> None:
-        super().__init__(
-            start,
-            lower,
-            upper,
-            loss=None,
-            restarts=restarts,
-            tolerance=tolerance,
-            noise=noise,
-            pool=pool,
-            generator=generator,
-        )
+    Further settings are those of `BoxSearch`, without its `loss`.
+    """
+
+    def __init__(self, start: Tensor, lower: Tensor, upper: Tensor, **settings: Any) -> None:
+        super().__init__(start, lower, upper, loss=None, **settings)
         self._close: Search | None = None
         """Quadratics, also when they have ended."""
         self._closing = False

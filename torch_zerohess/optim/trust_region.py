@@ -188,9 +188,8 @@ class TrustRegion:
         """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
 
         Values that are not finite are left out, and the step to such a point is refused and shortened, or in a box such
-        points are taken for the worst. Raises
-        ValueError for a wrong shape, or if the start itself has no finite value. The search is as before if this, or
-        the loss, raises.
+        points are taken for the worst. Raises ValueError for a wrong shape, or if the start itself has no finite value.
+        The search is as before if this, or the loss, raises.
         """
         if self._asked is None:
             raise RuntimeError("ask for points before telling their values")

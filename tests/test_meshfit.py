@@ -355,13 +355,29 @@ def test_losses_of_handles_share_their_renders() -> None:
     trial = Trial(TASK, "x", 0)
     control = TASK.mesh.control(1)
     unit = torch.full((3,), 0.1, dtype=torch.float64)
-    losses = _losses(trial, control, trial.start, unit, margin=1000.0)
+    losses = _losses(trial, control, trial.start, unit, margin=1000.0, silhouette=0.0)
     z = torch.randn(len(control), 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = losses(z.flatten(0, 1)).view(len(control), 2)
     assert trial.evaluations == 2
     # With boxes as large as the images every handle has the whole loss of the image that it was in.
     whole = TASK.loss(control.displaced(trial.start, z.transpose(0, 1) * unit))
     torch.testing.assert_close(found, whole.expand(len(control), 2), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("name", ["meshfit", "meshfit_color"])
+def test_a_pixel_that_only_one_covers_counts_more(name) -> None:
+    task = catalogue.load(name)
+    trial, control = Trial(task, "x", 0), task.mesh.control(0)
+    zero = torch.zeros(len(control), task.mesh.channels, dtype=torch.float64)
+    unit = torch.ones(task.mesh.channels, dtype=torch.float64)
+    without, found = (
+        _losses(trial, control, trial.start, unit, margin=1000.0, silhouette=weight)(zero) for weight in (0.0, 0.5)
+    )
+    mesh, target = task.image(trial.start[None])[0], -task.residuals(torch.zeros_like(task.image(trial.start[None])[0]))
+    shown = [picture.view(8, 64, 64, -1).sum(3) > 1e-6 for picture in (mesh, target)]
+    mistaken = (shown[0] ^ shown[1]).sum().double()
+    assert mistaken > 100
+    torch.testing.assert_close(found - without, (0.5 * mistaken / mesh.numel()).expand(len(control)), rtol=1e-4, atol=0)
 
 
 def test_newton_steps_go_to_the_minimum_of_each_block() -> None:
@@ -408,7 +424,7 @@ def test_colors_are_fitted_with_the_vertices() -> None:
     torch.manual_seed(0)
     task = catalogue.load("meshfit_color")
     trial = Trial(task, "our_g_local", 1000)
-    METHODS["our_g_local"].solve(trial, SHORT)
+    METHODS["our_g_local"].solve(trial, {**SHORT, "silhouette": 0.0})
     assert trial.rows[-1].image_error < 0.95 * trial.rows[0].image_error
     x = task.mesh.rows(trial.x)
     assert float((x[:, 3:] - 0.5).abs().max()) > 0.01

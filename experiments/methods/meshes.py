@@ -14,7 +14,8 @@ the cameras, which are known, and no render. All handles are perturbed in the sa
 its own few parameters, with a gradient and a Hessian that a few images determine. What the others do to the same pixels
 is noise; what they do elsewhere is not in it. The gradients together are that of the whole loss, but for the faint ends
 of the bumps, and for the smoothing over what others do, which is with the density of their samples; the Hessians are
-the diagonal blocks of that of the whole loss.
+the diagonal blocks of that of the whole loss. A pixel that only one of mesh and target covers counts as more than its
+shading: where an ear is missing, or a dark web fills the gap beside it, the squares of the pixels alone have minima.
 
 Large steps: Nicolet, Jacobson and Jakob 2021, "Large steps in inverse rendering of geometry".
 """
@@ -47,13 +48,14 @@ def handles(
     credit: Literal["all", "local"],
     newton: int = 0,
     levels: tuple[int, ...] = LEVELS,
-    steps: int = 40,
+    steps: int = 80,
     samples: int = 8,
     sigma: tuple[float, float] = (0.1, 0.05),
     color: float = 0.5,
     rate: float = 0.3,
     size: float = 0.5,
     momentum: tuple[float, float] = (0.5, 0.95),
+    silhouette: float = 1.0,
 ) -> None:
     """Descend with the handles of one level after the other, and end.
 
@@ -73,6 +75,8 @@ def handles(
             pixels, each as if it were alone.
         size: of a step of Adam, in units of sigma.
         momentum: shares of what was before in the means of the gradient and of the curvature.
+        silhouette: added to the square of a pixel that only one of mesh and target covers, with credit "local". A thin
+            part that is dark, or missing, is a small error of the shading and a local minimum of it.
     """
     mesh, x = _mesh(trial.task), trial.start
     first_order = zh.Smoothing(sigma=1.0, samples=samples, order=1, baseline="none")
@@ -88,7 +92,7 @@ def handles(
             smoothing = smoothing.replace(sigma=width)
             if credit == "local":
                 reach = BEYOND * width * float(unit[0]) * mesh.cameras.pixels + 1
-                local = _losses(trial, control, x, unit, reach)
+                local = _losses(trial, control, x, unit, reach, silhouette)
                 estimate = zh.estimate(local, zero, smoothing, value="smoothed")
             else:
                 estimate = zh.estimate(_loss(trial, control, x, unit), zero.flatten(), smoothing, value="smoothed")
@@ -177,13 +181,15 @@ def _loss(trial: Trial, control: Control, x: Tensor, unit: Tensor) -> Callable[[
     return lambda z: trial.loss(control.displaced(x, z.unflatten(1, (-1, len(unit))) * unit))
 
 
-def _losses(trial: Trial, control: Control, x: Tensor, unit: Tensor, margin: float) -> Callable[[Tensor], Tensor]:
+def _losses(
+    trial: Trial, control: Control, x: Tensor, unit: Tensor, margin: float, silhouette: float
+) -> Callable[[Tensor], Tensor]:
     """The losses of all handles, as one black box of `channels` parameters that each handle evaluates as often.
 
     A point of a handle goes into an image together with a point of every other one, in the order in which they come:
     [handles * K, channels] -> [handles * K] for K evaluations.
     """
-    sums, squared = control.sums(x, margin), _squared(trial.task)
+    sums, squared = control.sums(x, margin), _squared(trial.task, silhouette)
 
     def losses(points: Tensor) -> Tensor:
         z = points.unflatten(0, (len(control), -1)).transpose(0, 1)
@@ -192,11 +198,19 @@ def _losses(trial: Trial, control: Control, x: Tensor, unit: Tensor, margin: flo
     return losses
 
 
-def _squared(task: Task) -> Callable[[Tensor], Tensor]:
+def _squared(task: Task, silhouette: float) -> Callable[[Tensor], Tensor]:
     """Shares of the pixels in the loss: images [K, v, side, side, ...] -> [K, v, side, side]."""
-    residuals = task.residuals
+    residuals, mesh = task.residuals, _mesh(task)
     assert residuals is not None
-    return lambda y: torch.vmap(residuals)(y).square().div(y[0].numel()).unflatten(1, (*y.shape[1:4], -1)).sum(4)
+
+    def squared(images: Tensor) -> Tensor:
+        differences = torch.vmap(residuals)(images)
+        target = images[:1] - differences[:1].view_as(images[:1])  # exactly 0 where it is
+        mistaken = mesh.covered(images) != mesh.covered(target)
+        square = differences.square().unflatten(1, (*mistaken.shape[1:], -1)).sum(4)
+        return (square + silhouette * mistaken) / images[0].numel()
+
+    return squared
 
 
 class _Means:

@@ -63,6 +63,11 @@ class FittedMesh:
         rows = self.rows(x)
         return render(self.cameras, rows[..., :3], self.faces, rows[..., 3:] if self.channels > 3 else None)
 
+    def covered(self, images: Tensor) -> Tensor:
+        """Pixels [*batch, v, side, side] of views that show a mesh: the background is 0, and shading is not."""
+        shown = images != 0
+        return shown if self.channels == 3 else shown.any(-1)
+
     def spacing(self, x: Tensor, level: int) -> float:
         """Mean length of the edges of x [n] between the vertices of a coarser level."""
         corners = self.rows(x)[self.faces, :3]

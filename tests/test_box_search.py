@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_zerohess.optim import TrustRegion
-from torch_zerohess.optim.box_search import BoxSearch, _LossModel
+from torch_zerohess.optim.box_search import BoxSearch, LossModel
 from torch_zerohess.optim.gaussian_process import GaussianProcess, gaussian, matern
 from torch_zerohess.optim.pool import Pool
 from truths import vector
@@ -91,7 +91,7 @@ def test_the_optimistic_loss_of_a_mean_square_is_that_of_the_nearest_output(opti
     points, x = 2 * normal(8, 2), 2 * normal(50, 2, seed=3)
     target = waves(vector(0.5, -0.2)[None])[0]
     process = GaussianProcess.fit(points, waves(points))
-    model = _LossModel(process, waves(points[:1])[0], lambda y: (y - target).square().mean(), torch.Size([5]), optimism)
+    model = LossModel(process, waves(points[:1])[0], lambda y: (y - target).square().mean(), torch.Size([5]), optimism)
     c = process.covariance(x)
     away = (process.mean + c @ process.weights - target).square().mean(1).sqrt()
     nearest = (away - optimism * process.uncertainty(c).sqrt()).clamp_min(0.0)
@@ -106,7 +106,7 @@ def test_an_expansion_knows_whether_it_holds():
     quadratic = lambda y: (y - 1.0).square().mean()  # noqa: E731
     quartic = lambda y: (y - 1.0).pow(4).mean()  # noqa: E731
     for loss, holds in ((quadratic, True), (quartic, False)):
-        model = _LossModel(process, waves(points[:1])[0], loss, torch.Size([5]), 0.0)
+        model = LossModel(process, waves(points[:1])[0], loss, torch.Size([5]), 0.0)
         assert model.is_true(x, float(loss(output))) is holds
 
 

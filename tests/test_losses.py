@@ -96,6 +96,13 @@ def test_dissimilarity_as_scikit_image_has_it(shape) -> None:
     assert 0.01 < loss < 1
 
 
+@pytest.mark.parametrize("level", [1.0, 30.0, 1000.0])
+def test_dissimilarity_of_bright_flat_images_in_float32(level) -> None:
+    target, image = torch.full((16, 16), level), level + 0.01 * images(16, 16).float()
+    expected = float(zh.losses.ssim(target.double())(image.double()))
+    assert float(zh.losses.ssim(target)(image)) == pytest.approx(expected, rel=1e-5)
+
+
 def test_dissimilarity_of_one_small_window() -> None:
     target, image = images(3, 3), images(3, 3, seed=1)
     weights = np.exp(-0.5 * (np.array([-1.0, 0.0, 1.0]) / 1.5) ** 2)

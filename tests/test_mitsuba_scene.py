@@ -267,6 +267,40 @@ def test_minimize_finds_the_radiance() -> None:
     torch.testing.assert_close(fit.x.float(), target, atol=1e-3, rtol=0.0)
 
 
+def test_scenes_of_two_variants_live_together() -> None:
+    x = torch.tensor([[0.2, 0.5, 0.7]])
+    scenes = [MitsubaScene(lamp, [Value(RADIANCE)], spp=1, variant=name, threads=1) for name in VARIANTS]
+    for scene in scenes * 2:
+        assert scene(x)[0, 2, 2].tolist() == pytest.approx(x[0].tolist(), rel=1e-5)
+
+
+def test_start_is_within_the_bounds() -> None:
+    """Also where the value of the scene is not, or not after its rounding to float32."""
+
+    def rough(mi):
+        return {**plane(mi), "plane": {"type": "rectangle", "bsdf": {"type": "roughconductor", "alpha": 1e-4}}}
+
+    for scene in (
+        scalar(plane, [Value(REFLECTANCE, bounds=(0, 0.1))], depth=2),
+        scalar(rough, [Value("plane.bsdf.alpha.value", elements=1)], depth=2),
+    ):
+        assert bool((scene.x0 >= scene.bounds[0]).all() and (scene.x0 <= scene.bounds[1]).all())
+        fit = zh.minimize(scene, scene.x0, sigma=0.1, bounds=scene.bounds, loss=torch.mean, max_evaluations=12)
+        assert fit.evaluations == 12
+
+
+def test_bounds_of_names_that_share_a_value_are_those_that_all_accept() -> None:
+    """A refractive index accepts everything, a reflectance does not."""
+
+    def metal(mi):
+        return {**plane(mi), "disk": {"type": "disk", "bsdf": {"type": "conductor", "eta": rgb(0.2, 0.3, 0.4)}}}
+
+    names = (REFLECTANCE, "disk.bsdf.eta.value")
+    for order in (names, names[::-1]):
+        lower, upper = scalar(metal, [Value(order)]).bounds
+        assert (lower.tolist(), upper.tolist()) == ([0.0] * 3, [1.0] * 3)
+
+
 # What is wrong
 
 
@@ -277,7 +311,8 @@ def test_minimize_finds_the_radiance() -> None:
         ([Value("plane.bsdf.reflectanse.value")], f"no parameter .*; near ones: {REFLECTANCE}"),
         ([Value(REFLECTANCE), Value(REFLECTANCE)], "more than once"),
         ([Value(REFLECTANCE, bounds=(0, 2))], "bounds of .* must lie within 0 to 1.*got 0 to 2"),
-        ([Value(REFLECTANCE, bounds=((0, 1), (0, 1)))], "a pair or 3 pairs"),
+        ([Value(REFLECTANCE, bounds=((0, 1), (0, 1)))], r"a pair \(lower, upper\) or 3 of them"),
+        ([Value(REFLECTANCE, bounds=(0, 0.5, 1))], r"a pair \(lower, upper\) or 3 of them, got \(0, 0.5, 1\)"),
         ([Value(REFLECTANCE, bounds=(1, 0))], "lower < upper, got 1, 0"),
         ([Value(REFLECTANCE, unit=0)], "unit must be a number other than 0, got 0"),
         ([Value(REFLECTANCE, elements=2)], "elements must be 1 or None, got 2"),
@@ -285,6 +320,7 @@ def test_minimize_finds_the_radiance() -> None:
         ([Transform(REFLECTANCE, move=((1, 0, 0),))], "take Value"),
         ([Transform("plane.to_world")], "at least one vector, got none"),
         ([Transform("plane.to_world", move=((0, 0, 0),))], "not all 0"),
+        ([Transform("plane.to_world", move=(1, 0, 0))], "vectors of 3 numbers, not all 0, got 1"),
         ([Transform("plane.to_world", move=((1, 0, 0),), unit=(1.0, 2.0))], "unit must be a number or 1"),
         ([Value((REFLECTANCE, "sensor.film.size"))], "must have the same size"),
     ],
@@ -298,9 +334,11 @@ def test_wrong_parameters(parameters, message) -> None:
     ("arguments", "message"),
     [
         ({"film": (0, 4)}, r"film must be a pair \(width, height\) of pixels >= 1, got \(0, 4\)"),
-        ({"spp": 0}, "spp must be an integer of at least 1, got 0"),
-        ({"depth": 0}, "depth must be an integer of at least 1, got 0"),
-        ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
+        ({"film": 8}, r"film must be a pair \(width, height\) of pixels >= 1, got 8"),
+        ({"spp": 0}, "spp must be an integer from 1 to 2147483647, got 0"),
+        ({"depth": 0}, "depth must be an integer from 1 to 2147483647, got 0"),
+        ({"seed": -1}, "seed must be an integer from 0 to 2147483647, got -1"),
+        ({"seed": 2**32}, "seed must be an integer from 0 to 2147483647, got 4294967296"),
         ({"depth": 2, "integrator": {"type": "path"}}, "give either depth or integrator, got both"),
         ({"noise": "none"}, "noise must be one of fixed, call, point, got 'none'"),
         ({"nan": "zero"}, "nan must be one of raise, keep, got 'zero'"),
@@ -316,6 +354,10 @@ def test_wrong_points() -> None:
     for wrong in (torch.zeros(3), torch.zeros(2, 4)):
         with pytest.raises(ValueError, match=r"x must have shape \[K, 3\]"):
             scene(wrong)
+    with pytest.raises(ValueError, match=r"x must have shape \[3\]"):
+        scene.set(torch.zeros(2))
+    with pytest.raises(ValueError, match=r"loss must return a tensor with one number per image, got 1.0"):
+        scalar(lamp, [Value(RADIANCE)], loss=lambda image: 1.0)(torch.zeros(1, 3))
     with pytest.raises(ValueError, match=r"must be finite, got nan for .*\[1\] in point 0"):
         scene(torch.tensor([[0.0, math.nan, 0.0]]))
 

@@ -121,6 +121,23 @@ def test_a_step_to_where_the_loss_is_not_finite_is_shortened():
     assert float(x.detach()) == pytest.approx(1e-3)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("optimizer", [zh.optim.Newton, zh.optim.NewtonCG])
+def test_the_radius_outlives_convergence(optimizer, dtype):
+    x, goal = torch.zeros(3, dtype=dtype, requires_grad=True), torch.ones(3, dtype=dtype)
+    steps = optimizer([x], radius=2.0)
+
+    def loss():
+        return 5 + (x - goal).square().sum() + 0.1 * (x - goal).pow(4).sum()
+
+    for _ in range(15):
+        steps.step(loss)
+    goal = goal + 1  # as a sigma that is annealed, or new data, would have it
+    for _ in range(4):
+        steps.step(loss)
+    torch.testing.assert_close(x.detach(), goal, rtol=0, atol=1e-3)
+
+
 def test_where_the_loss_is_finite_nowhere_else():
     x = vector(1.0, 1.0).requires_grad_()
     optimizer = zh.optim.Newton([x], radius=2.0)
@@ -133,7 +150,8 @@ def test_where_the_loss_is_finite_nowhere_else():
 def test_errors():
     x = torch.ones(2, requires_grad=True)
     for settings, message in (
-        ({"radius": -1.0}, "radius must be positive, got -1.0"),
+        ({"radius": -1.0}, "radius must be positive and finite, got -1.0"),
+        ({"radius": math.inf}, "radius must be positive and finite, got inf"),
         ({"radius": float("nan")}, "radius"),
         ({"modification": "clip"}, "modification must be 'shift' or 'abs', got 'clip'"),
         ({"curvature": "full"}, "curvature"),
@@ -145,5 +163,7 @@ def test_errors():
         zh.optim.Newton([torch.ones(10_001, requires_grad=True)])
     with pytest.raises(TypeError, match="closure must return the loss, a tensor with a graph, got None"):
         zh.optim.Newton([x]).step(lambda: None)
-    with pytest.raises(ValueError, match="with a graph"):
+    with pytest.raises(ValueError, match="closure must return a loss with a graph"):
         zh.optim.Newton([x]).step(lambda: x.detach().sum())
+    with pytest.raises(ValueError, match="params must have a parameter that requires grad, got none"):
+        zh.optim.Newton([x.detach()])

@@ -233,7 +233,7 @@ def test_what_the_closure_raises_leaves_parameters_and_state():
 def test_errors():
     x = torch.ones(2, requires_grad=True)
     for settings, message in (
-        ({"radius": 0.0}, "radius must be positive, got 0.0"),
+        ({"radius": 0.0}, "radius must be positive and finite, got 0.0"),
         ({"line_search_iterations": 0}, "line_search_iterations must be at least 1, got 0"),
         ({"line_search_tolerance": -1.0}, "line_search_tolerance must be finite and not negative, got -1.0"),
         ({"recompute": 0}, "recompute must be at least 1, got 0"),

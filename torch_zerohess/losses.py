@@ -126,8 +126,10 @@ def _dissimilarity(images: Tensor, target: Tensor, *, window_size: int, data_ran
     from kornia.metrics import ssim as similarity
 
     # Without eps, which keeps equal images from having similarity 1, the denominator is still at least a b > 0.
-    windows = similarity(images, target.expand_as(images), window_size, data_range, eps=0.0, padding="valid")
-    return 1 - windows.mean((1, 2, 3))
+    # Variances are differences of second moments: of bright, flat regions nothing would be left in float32.
+    wide, fixed = images.double(), target.double().expand_as(images)
+    windows = similarity(wide, fixed, window_size, data_range, eps=0.0, padding="valid")
+    return (1 - windows.mean((1, 2, 3))).to(images.dtype)
 
 
 def _channels_first(image: Tensor, ndim: int) -> Tensor:

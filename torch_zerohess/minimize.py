@@ -9,6 +9,7 @@ from torch import Tensor
 from torch_zerohess.evaluation import BlackBoxCall, checked_input
 from torch_zerohess.evaluators import Evaluator, Inline
 from torch_zerohess.optim import TrustRegion
+from torch_zerohess.optim.second_order import check_count
 
 
 @dataclass(frozen=True)
@@ -65,14 +66,14 @@ def minimize(
             that cannot be differentiated is fine.
         x0: start [n], float32 or float64.
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution.
-        loss: white box after fn, [*out] -> scalar, in torch. Where there is one, give it: each evaluation then tells
-            as many equations as the output has numbers.
+        loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
+            there is one, give it: each evaluation then tells as many equations as the output has numbers.
         bounds: lower and upper, numbers or [n].
         max_evaluations: points that fn may be called with.
         method: "trust_region".
         vectorized: False for an fn of one point, [n] -> scalar or [*out].
         evaluator: where evaluations run; in this process if None.
-        callback: gets an `Iterate` after every batch; the search ends if it returns True.
+        callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this.
         settings: further ones of `TrustRegion`: restarts, tolerance, noise, pool.
@@ -95,6 +96,7 @@ def minimize(
             f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(x0)} "
             f"parameters, got {max_evaluations}"
         )
+    check_count(max_evaluations=max_evaluations)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or Inline())
     history: list[Iterate] = []
     try:
@@ -123,9 +125,14 @@ def _search(
         history.append(Iterate(search.evaluations, search.value, search.x))
         if target is not None and search.value <= target:
             return f"the value is at most the target {target}"
-        if callback is not None and callback(history[-1]) is True:
+        if callback is not None and _is_true(callback(history[-1])):
             return "the callback asked to end"
     return search.message
+
+
+def _is_true(answer: object) -> bool:
+    """Whether a callback wants to end; what else it may return, such as the count of what it wrote, does not."""
+    return str(getattr(answer, "dtype", type(answer).__name__)) in ("bool", "torch.bool") and bool(answer)
 
 
 def _minimum(search: TrustRegion, history: list[Iterate], message: str) -> Minimum:

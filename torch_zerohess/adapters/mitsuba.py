@@ -34,6 +34,10 @@ __all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
 Description = Mapping[str, Any] | str | os.PathLike[str] | Callable[[ModuleType], Mapping[str, Any]]
 
 
+_MOST = 2**31
+"""Mitsuba's integers are below this."""
+
+
 class MitsubaScene:
     """Black box of n parameters: points [K, n] to linear images [K, height, width, channels], float32, or losses [K].
 
@@ -110,9 +114,10 @@ class MitsubaScene:
         self.labels = [label for one in self.parameters for label in one.labels]
         """Of the columns of x [n]."""
         self.x0 = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64)
-        """[n], the scene as it was loaded."""
+        """[n], the scene as it was loaded, or the nearest within the bounds."""
         lower, upper = zip(*(pair for one in self.parameters for pair in one.limits), strict=True)
         self.bounds = torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
+        self.x0 = self.x0.clamp(*self.bounds)
         """Lower and upper [n], infinite where there are none; renders are of points clamped to them."""
         self.values.keep([name for one in self.parameters for name in one.names])
         self._calls = seed
@@ -124,6 +129,7 @@ class MitsubaScene:
             ValueError: x has another shape, or is not finite.
             FloatingPointError: a pixel is not finite.
         """
+        self._select()
         if x.ndim != 2 or x.shape[1] != self.n:
             columns = ", ".join(self.labels)
             raise ValueError(f"x must have shape [K, {self.n}] for {columns}, got {list(x.shape)}")
@@ -138,17 +144,27 @@ class MitsubaScene:
         else:
             with torch.no_grad():
                 losses = [self.loss(image) for image in images]
-            if any(one.numel() != 1 for one in losses):
-                raise ValueError(f"loss must return one number per image, got shape {list(losses[0].shape)}")
+            for one in losses:
+                if not isinstance(one, Tensor) or one.numel() != 1:
+                    got = f"shape {list(one.shape)}" if isinstance(one, Tensor) else f"{one!r}"
+                    raise ValueError(f"loss must return a tensor with one number per image, got {got}")
             out = torch.stack([one.reshape(()) for one in losses]) if losses else torch.empty(0)
             out = out.to(x.dtype)
         return out.to(x.device)
 
     def set(self, x: Tensor) -> None:
         """Give the scene the parameters x [n], for renders of one's own."""
+        if x.shape != (self.n,):
+            raise ValueError(f"x must have shape [{self.n}] for {', '.join(self.labels)}, got {list(x.shape)}")
+        self._select()
         for parameter, part in zip(self.parameters, x.split([one.n for one in self.parameters]), strict=True):
             parameter.write(self.values, part.tolist())
         self.values.update()
+
+    def _select(self) -> None:
+        """Make the variant of this scene the current one of the process: another scene may have another."""
+        if self.mi.variant() != self.variant:
+            self.mi.set_variant(self.variant)
 
     def _image(self, x: Tensor) -> Tensor:
         self.set(x)
@@ -204,11 +220,12 @@ def _check(
     noise: str,
     nan: str,
 ) -> None:
-    if film is not None and (len(film) != 2 or not all(isinstance(side, int) and side >= 1 for side in film)):
+    pair = tuple(film) if isinstance(film, Sequence) else ()
+    if film is not None and (len(pair) != 2 or not all(isinstance(side, int) and side >= 1 for side in pair)):
         raise ValueError(f"film must be a pair (width, height) of pixels >= 1, got {film!r}")
     for name, value, least in (("spp", spp, 1), ("depth", depth, 1), ("seed", seed, 0)):
-        if value is not None and (not isinstance(value, int) or value < least):
-            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+        if value is not None and (not isinstance(value, int) or not least <= value < _MOST):
+            raise ValueError(f"{name} must be an integer from {least} to {_MOST - 1}, got {value!r}")
     if depth is not None and integrator is not None:
         raise ValueError("depth is that of the integrator `path`: give either depth or integrator, got both")
     for name, text, choices in (("noise", noise, ("fixed", "call", "point")), ("nan", nan, ("raise", "keep"))):

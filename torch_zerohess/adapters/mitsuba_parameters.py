@@ -82,7 +82,7 @@ class Transform:
             raise ValueError(f"{self.names[0]}: move and turn must have at least one vector, got none")
         for what, vectors in (("move", self.move), ("turn", self.turn)):
             for vector in vectors:
-                if len(vector) != 3 or not any(vector):
+                if not isinstance(vector, Sequence) or len(vector) != 3 or not any(vector):
                     raise ValueError(f"{self.names[0]}: {what} must be vectors of 3 numbers, not all 0, got {vector!r}")
         for name in self.names:
             kind = type(values[name]).__name__
@@ -218,8 +218,9 @@ class Numbers:
         self.labels = [first] if self.n == 1 else [f"{first}[{i}]" for i in range(self.n)]
         flat = now.reshape(-1) / value.unit
         self.x0 = [float(flat.mean())] if self.n == 1 else flat.tolist()
-        low, high = (side / value.unit for side in accepted(first))
-        low, high = min(low, high), max(low, high)
+        takes = [accepted(name) for name in self.names]
+        ends = max(one for one, _ in takes) / value.unit, min(one for _, one in takes) / value.unit
+        low, high = min(ends), max(ends)
         self.limits = ranges(first, value.bounds or (low, high), self.n)
         for least, most in self.limits:
             if least < low or most > high:
@@ -270,10 +271,10 @@ def ranges(name: str, bounds: Range | Sequence[Range] | None, n: int) -> list[Ra
     """Return n pairs of a lower and an upper bound."""
     if bounds is None:
         return [(-math.inf, math.inf)] * n
-    several = list(bounds) if isinstance(bounds[0], Sequence) else [bounds] * n
-    pairs = [(float(one[0]), float(one[1])) for one in several]  # type: ignore[index]
-    if len(pairs) != n:
-        raise ValueError(f"bounds of {name} must be a pair or {n} pairs (lower, upper), got {len(pairs)} pairs")
+    several: Sequence[Any] = bounds if isinstance(bounds[0], Sequence) else [bounds] * n
+    if len(several) != n or any(len(one) != 2 for one in several):
+        raise ValueError(f"bounds of {name} must be a pair (lower, upper) or {n} of them, got {bounds!r}")
+    pairs = [(float(low), float(high)) for low, high in several]
     for low, high in pairs:
         if not low < high:
             raise ValueError(f"bounds of {name} must be lower < upper, got {low:g}, {high:g}")

@@ -4,9 +4,8 @@ A Gaussian process (`GaussianProcess`) predicts the output anywhere in the box f
 loss of the prediction says where to look next: at the point with the lowest loss among the outputs that lie within
 `_OPTIMISM` standard deviations of the prediction (a composite objective: Astudillo and Frazier 2019). One evaluation
 follows another; each is trial and sample at once. Where nothing lower is expected, the search looks where it knows
-least, so it leaves local minima and plateaus. Where outputs differ from call to call (the evidence tells; of a loss
-alone the `noise` setting) the best point is the one with the lowest loss of the prediction, which is an average of what
-was evaluated around it.
+least, so it leaves local minima and plateaus. Where outputs differ from call to call (the evidence tells, of a loss
+alone `noise`) the best point is that with the lowest loss of the prediction, an average of what is around it.
 """
 
 import math
@@ -75,10 +74,8 @@ class BoxSearch:
         self.restarts, self.tolerance, self.noise, self.generator = restarts, tolerance, noise, generator
         self.pool = Pool(self.n, max(pool, 2 * self.n + 2), start.device)  # at least the start, its samples and steps
         self.best = self.x = start
-        self.lowest = math.inf
-        self.sigma = self.best_sigma = 1.0
-        self.evaluations = self.iterations = self.rounds = 0
-        self.done, self.message = False, ""
+        self.lowest, self.sigma, self.best_sigma = math.inf, 1.0, 1.0
+        self.evaluations, self.iterations, self.rounds, self.done, self.message = 0, 0, 0, False, ""
         self.phase: Literal["start", "trial"] = "start"
         self.shape = torch.Size()
         """Of an output."""
@@ -192,6 +189,7 @@ class BoxSearch:
         """Whether there is nothing to learn at x [n]."""
         return float((process.points - x).norm(dim=1).min()) < _SAME
 
+    @torch.no_grad()
     def _through_output(self) -> tuple[GaussianProcess, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
         assert self.pool.outputs is not None
@@ -201,12 +199,12 @@ class BoxSearch:
         outputs, values = self.pool.outputs, self.pool.values
         if self._noisy:
             outputs = process.predict(self.pool.points)
-            values = torch.stack([self.loss(one.view(self.shape)).detach().double().reshape(()) for one in outputs])
+            values = torch.stack([self.loss(one.view(self.shape)).double().reshape(()) for one in outputs])
             values = values.nan_to_num(nan=math.inf, neginf=math.inf)
             self._judge(values)
         output = outputs[int(values.argmin())]
         for _ in range(_EXPANSIONS):
-            model = _LossModel(process, output, self.loss, self.shape, optimism)
+            model = LossModel(process, output, self.loss, self.shape, optimism)
             x = self._lowest(model)
             output = process.predict(x[None])[0]
             if model.is_true(x, float(self.loss(output.view(self.shape)))):
@@ -217,14 +215,16 @@ class BoxSearch:
     def _from_losses(self) -> tuple[GaussianProcess, Tensor]:
         """Predict the loss, and return the point [n] that is lowest."""
         values = self.pool.values
-        middle, lowest = float(values.median()), float(values.min())
+        lowest, middle = float(values.min()), float(values.median())
         if middle > lowest:  # what is out of all proportion, such as a penalty, says no more than that it is high
             values = values.clamp(max=lowest + _PROPORTION * (middle - lowest))
+        spread = float(values.max()) - lowest or 1.0
+        values = (values - lowest) / spread  # their squares do not overflow
         process = self._fit(values[:, None])
         if self._noisy:
             values = process.predict(self.pool.points)[:, 0]
-            self._judge(values)
-        return process, self._lowest(_LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING))
+            self._judge(values * spread + lowest)
+        return process, self._lowest(LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING))
 
     def _fit(self, outputs: Tensor) -> GaussianProcess:
         """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again.
@@ -250,7 +250,7 @@ class BoxSearch:
             self.best, self.lowest = self.pool.points[k], float(values[k])
             self.best_sigma = max(self.sigma, self.tolerance)
 
-    def _lowest(self, model: "_LossModel") -> Tensor:
+    def _lowest(self, model: "LossModel") -> Tensor:
         """Return the best of candidates around the best point and all over the box, improved by ever smaller steps."""
         near = [self.best + scale * self._normal(_CANDIDATES, self.n) for scale in _SCALES]
         candidates = torch.cat([*near, self._uniform(4 * _CANDIDATES)]).clamp(self.lower, self.upper)
@@ -274,7 +274,7 @@ class BoxSearch:
         return normal(self.generator, self.lower, *shape)
 
 
-class _LossModel:
+class LossModel:
     """Optimistic loss of predicted outputs, from a quadratic expansion of the loss around one output [m].
 
     An output that is off by s standard deviations v^1/2 in its worst direction has the loss

@@ -230,7 +230,7 @@ def loss_derivatives(
             return float(value.detach()), _finite(slope.detach().flatten()), torch.zeros_like(directions).flatten(1)
 
         def product(direction: Tensor) -> Tensor:
-            return torch.autograd.grad(slope, y, direction, retain_graph=True)[0]
+            return torch.autograd.grad(slope, y, direction, retain_graph=True, materialize_grads=True)[0]
 
         # A generic combination of directions is an eigenvector only if all of them are, with the same eigenvalue.
         generic = torch.cos(torch.arange(1.0, len(directions) + 1.0)).to(directions)

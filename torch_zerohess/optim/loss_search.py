@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.optim.box_search import BoxSearch
+from torch_zerohess.optim.box_search import BoxSearch, LossModel
 from torch_zerohess.optim.gaussian_process import GaussianProcess
 from torch_zerohess.optim.local_model import LocalModel
 from torch_zerohess.optim.search import Search
@@ -88,9 +88,14 @@ class LossSearch(BoxSearch):
             self._close = self._quadratics()
             self._close.load_state_dict(state["close"])
 
-    def _is_known(self, process: GaussianProcess, x: Tensor) -> bool:
+    def _lowest(self, model: LossModel) -> Tensor:
+        """Return the best point itself where quadratics have found the minimum that the process sees nearby."""
+        x = super()._lowest(model)
         solved = self._solved and torch.equal(self._finished, self.best)
-        return (solved and float((x - self.best).norm()) < _APART) or super()._is_known(process, x)
+        return self.best if solved and float((x - self.best).norm()) < _APART else x
+
+    def _is_known(self, process: GaussianProcess, x: Tensor) -> bool:
+        return torch.equal(x, self.best) or super()._is_known(process, x)
 
     def _quadratics(self) -> Search:
         """Return a local search from the best point."""

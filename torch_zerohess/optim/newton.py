@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.optim.newton_step import NewtonStep, Step
-from torch_zerohess.optim.second_order import Model, check_positive
+from torch_zerohess.optim.second_order import Model, check_positive, check_radius
 from torch_zerohess.optim.subproblem import diagonal_step
 
 MOST = 10_000
@@ -58,7 +58,8 @@ class Newton(NewtonStep):
         adapt: bool = True,
         max_radius: float = math.inf,
     ) -> None:
-        check_positive(radius=radius, max_radius=max_radius)
+        check_radius(radius)
+        check_positive(max_radius=max_radius)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'shift' or 'abs', got {modification!r}")
         defaults = {

@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from torch_zerohess.optim.newton_step import NewtonStep, Step
-from torch_zerohess.optim.second_order import Model, check_count, check_not_negative, check_positive
+from torch_zerohess.optim.second_order import Model, check_count, check_not_negative, check_positive, check_radius
 from torch_zerohess.optim.steihaug import steihaug
 
 
@@ -64,7 +64,8 @@ class NewtonCG(NewtonStep):
         max_radius: float = math.inf,
         noise: float = 2.0,
     ) -> None:
-        check_positive(radius=radius, tolerance=tolerance, max_radius=max_radius)
+        check_radius(radius)
+        check_positive(tolerance=tolerance, max_radius=max_radius)
         check_not_negative(damping=damping, noise=noise)
         check_count(iterations=iterations)
         defaults = {

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, pair
 
+_ROUNDING = 10.0
+"""Units of rounding of the loss below which a decrease cannot be tested."""
+
 
 class Step(NamedTuple):
     """A step s [N], the decrease -(g.s + s.Hs/2) that the model promises, and why the search for it ended."""
@@ -22,7 +25,8 @@ class NewtonStep(SecondOrder):
     """Steps to the minimum of a quadratic model inside |s| <= radius, with or without a test.
 
     With `adapt` the closure is called once more, without derivatives: a step that does not lower the loss is taken
-    back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1).
+    back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Where
+    the predicted decrease is within the rounding of the loss no step is taken, and the radius stays.
     """
 
     exit: str | None = None
@@ -36,7 +40,7 @@ class NewtonStep(SecondOrder):
         """Take one step and return the loss before it, [] without a graph.
 
         Raises ValueError if the loss, its gradient or curvature is not finite, or if with `adapt` the loss is not
-        finite at the end of a step that was shortened ten times; and what the closure raises. The parameters are then
+        finite at the end of a step that was shortened nine times; and what the closure raises. The parameters are then
         as they were.
         """
         group: dict[str, Any] = self.param_groups[0]
@@ -50,13 +54,13 @@ class NewtonStep(SecondOrder):
         if not group["adapt"]:
             self._add(s)
             return model.loss
+        if not decrease > _ROUNDING * torch.finfo(model.loss.dtype).eps * abs(float(model.loss)):
+            return model.loss  # converged: the test would compare rounding errors, and shrink the radius for good
         slope = float(model.gradient.dot(s))
         bend = -2.0 * (decrease + slope)  # s.Hs
         for trial in range(TRIALS):
             scale = 0.25**trial
             predicted, length = -scale * (slope + 0.5 * scale * bend), scale * float(s.norm())
-            if not predicted > 0.0:
-                return model.loss
             actual = self._try(scale * s, closure, model.loss)
             if math.isfinite(actual):
                 group["radius"] = min(_next_radius(actual / predicted, length, radius), group["max_radius"])

@@ -14,7 +14,7 @@ from torch_zerohess.optim.second_order import (
     SecondOrder,
     check_count,
     check_not_negative,
-    check_positive,
+    check_radius,
 )
 
 MODIFICATIONS = ("abs", "radius")
@@ -42,7 +42,7 @@ class NonlinearCG(SecondOrder):
       changes.
 
     A point where the loss or its gradient is not finite is left by taking back three quarters of the move to it, up to
-    ten times, also at the start of the next step.
+    nine times, also at the start of the next step.
 
     Args:
         params: parameters, one group.
@@ -73,7 +73,7 @@ class NonlinearCG(SecondOrder):
         curvature: str = "exact",
         modification: str = "abs",
     ) -> None:
-        check_positive(radius=radius)
+        check_radius(radius)
         check_not_negative(line_search_tolerance=line_search_tolerance)
         check_count(line_search_iterations=line_search_iterations, recompute=recompute)
         if modification not in MODIFICATIONS:
@@ -97,7 +97,7 @@ class NonlinearCG(SecondOrder):
             hvp: [N] -> [N], the Hessian at the present parameters times a unit vector, where it is not to come from
                 the graph of the loss: by finite differences, for example. The graph needs first derivatives only.
 
-        Raises ValueError if loss, gradient or curvature is not finite even after the move was shortened ten times,
+        Raises ValueError if loss, gradient or curvature is not finite even after the move was shortened nine times,
         and what the closure raises; parameters and state are then as they were.
         """
         group: dict[str, Any] = self.param_groups[0]

@@ -38,7 +38,7 @@ Phase = Literal["start", "sample", "trial"]
 _STATE = (
     *("sigma", "evaluations", "iterations", "rounds", "done", "message", "phase", "step"),
     *("first", "best", "best_sigma", "x", "fx", "lowest", "local", "local_value"),
-    *("_spread", "_need", "_paired", "_patience", "_refused", "_faithful", "_reach", "_retries", "_misled"),
+    *("_need", "_paired", "_patience", "_refused", "_faithful", "_reach", "_retries", "_misled"),
 )
 """What changes as the search goes on, besides the model, the pool and the generator."""
 
@@ -66,7 +66,7 @@ class Search:
         self.restarts, self.tolerance, self.noise, self.generator = restarts, tolerance, noise, generator
         self.pool = Pool(self.n, pool, start.device)
         self.first = self.best = self.local = self.x = self.step = start
-        self.fx = self.lowest = self.local_value = self._spread = math.inf
+        self.fx = self.lowest = self.local_value = math.inf
         self.sigma = self.best_sigma = 1.0
         self.evaluations = self.iterations = self.rounds = 0
         self.done, self.message = False, ""
@@ -109,7 +109,8 @@ class Search:
         self._remember(points[finite], losses[finite])
         self._refused = 0 if bool(finite.all()) else self._refused + 1
         if self._refused >= _REFUSED:
-            self.done, self.message = True, f"{_REFUSED} batches in a row had values that are not finite"
+            self._refused = 0  # a later round may have started where nothing is finite
+            self._arrive(f"{_REFUSED} batches in a row had values that are not finite", last=self.rounds == 0)
             return
         if self.phase == "trial":
             self.iterations += 1
@@ -125,7 +126,7 @@ class Search:
                 self.fx = float(losses[0]) if bool(finite[0]) else math.inf
             self.phase = "trial"
         if self.sigma < self.tolerance:
-            self._arrive()
+            self._arrive(f"sigma fell below {self.tolerance} of the first one")
         if self.phase == "trial" and not self.done:
             self._plan()
 
@@ -198,7 +199,6 @@ class Search:
         self._need = 0
         u, weights = (self.pool.points[near] - self.x) / self.sigma, weights[near]
         self.model = self._fit(u, near, weights)
-        self._spread = float(self.pool.values[near].max() - self.pool.values[near].min())
         radius = self._reach * math.sqrt(self.n)
         lower, upper = (self.lower - self.x) / self.sigma, (self.upper - self.x) / self.sigma
         if self.model.basis is None:
@@ -222,9 +222,7 @@ class Search:
         slack = 2.0 * self.noise
         promised = self.model.decrease(self.step)
         ratio = (self.fx - fz + slack) / (promised + slack) if promised + slack > 0.0 else -math.inf
-        least = 1e-3 * abs(self.fx)
-        if self.rounds:  # not on a plateau, then: the loss may have a large offset
-            least = min(least, 0.1 * self._spread)
+        least = min(1e-3 * abs(self.fx), 0.1 * max(promised, 0.0))  # the loss may have a large offset
         if min(fz, self.local_value) < self.fx - max(least, slack):
             self._patience = 0
             if fz <= self.local_value:
@@ -288,11 +286,11 @@ class Search:
         self.phase, self._need = "sample", min(count, _BATCH)
         self._paired = paired and count > 1
 
-    def _arrive(self) -> None:
+    def _arrive(self, reason: str, *, last: bool = False) -> None:
         """End, or start another round."""
         self.rounds += 1
-        if self.rounds > self.restarts:
-            self.done, self.message = True, f"sigma fell below {self.tolerance} of the first one, {self.rounds} times"
+        if last or self.rounds > self.restarts:
+            self.done, self.message = True, f"{reason}, in round {self.rounds}"
             return
         self.sigma = 1.5
         self.x = self.best

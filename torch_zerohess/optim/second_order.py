@@ -15,7 +15,7 @@ Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
 Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
 TRIALS = 10
-"""How often a step to a point where the loss is not finite is shortened."""
+"""Evaluations of a step, shortened after each at which the loss is not finite."""
 
 
 class Model:
@@ -61,6 +61,8 @@ class SecondOrder(Optimizer):
         if defaults["curvature"] not in CURVATURES:
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
         super().__init__(params, defaults)
+        if not self._parameters:
+            raise ValueError("params must have a parameter that requires grad, got none")
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Refuse a second group of parameters: the quadratic model has one Hessian."""
@@ -78,6 +80,8 @@ class SecondOrder(Optimizer):
         curvature = self.param_groups[0]["curvature"]
         with torch.enable_grad():
             losses, through = pair(closure())
+            if not losses.requires_grad:
+                raise ValueError("closure must return a loss with a graph, got one without: no parameter is in it")
             parts = list(losses.reshape(-1).unbind()) if separate else [losses.mean()]
             return Model(
                 losses, [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts]
@@ -117,6 +121,12 @@ def check_positive(**settings: float) -> None:
     for name, value in settings.items():
         if not value > 0.0:
             raise ValueError(f"{name} must be positive, got {value}")
+
+
+def check_radius(radius: float) -> None:
+    """Raise ValueError for a radius that is not positive or not finite."""
+    if not 0.0 < radius < math.inf:
+        raise ValueError(f"radius must be positive and finite, got {radius}")
 
 
 def check_not_negative(**settings: float) -> None:

@@ -54,7 +54,7 @@ def steihaug(
         uncertain = float(bend.abs()) < error
         if uncertain and iteration:
             return finish(s, images_s, "noise")
-        # Rounding in a float32 product is not a direction of negative curvature.
+        # What is too small to divide by goes to the boundary, too.
         if not uncertain and float(bend) <= float(direction.dot(direction)) * torch.finfo(direction.dtype).tiny:
             length = _to_boundary(s, direction, radius)
             return finish(s + length * direction, images_s + length * image, "negative curvature")

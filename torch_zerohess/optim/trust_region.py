@@ -42,7 +42,8 @@ class TrustRegion:
         sigma: smoothing at the start, in units of the parameters: of the order of the distance to the solution.
             One value, or one per parameter [n] where they have different units.
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
-        loss: from one output [*out] to a scalar, differentiable by torch; None if the black box returns the loss.
+        loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch: `.double()`
+            networks in it. None if the black box returns the loss.
         restarts: how often to go on after arriving. 0 for a local search.
         tolerance: the search has arrived when sigma, or in a box the length of three steps in a row, is below this
             times the first sigma; quadratics of a `LossSearch` go on to a thousandth of that.
@@ -84,9 +85,9 @@ class TrustRegion:
             raise ValueError(f"x0 must be a tensor [n], float32 or float64, got {x0!r}")
         if not bool(torch.isfinite(x0).all()):
             raise ValueError(f"x0 must be finite, got {x0}")
-        for name, value, lowest in (("restarts", restarts, 0), ("noise", noise, 0.0)):
-            if not lowest <= value < math.inf:
-                raise ValueError(f"{name} must be at least {lowest}, got {value}")
+        for name, value in (("restarts", restarts), ("noise", noise)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be finite and at least 0, got {value}")
         if not 0.0 < tolerance < 1.0:
             raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
         if pool is not None and pool < 4:
@@ -209,12 +210,23 @@ class TrustRegion:
 
         Tensors, numbers, strings, lists and dicts: `torch.save`, and `torch.load` with weights_only=True.
         """
-        return {"n": self.n, "asked": self._asked, **self._search.state_dict()}
+        kind = type(self._search).__name__
+        return {"kind": kind, "unit": self._unit, "asked": self._asked, **self._search.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a `state_dict`; the settings and the loss stay those given here."""
-        if state["n"] != self.n:
-            raise ValueError(f"state must be of a search with {self.n} parameters, got one with {state['n']}")
+        """Go on from a `state_dict`; the settings and the loss stay those given here.
+
+        ValueError if these do not go with it: other parameters, another sigma, or finite bounds there and not here.
+        """
+        unit, kind = state["unit"].to(self._unit), type(self._search).__name__
+        if len(unit) != self.n:
+            raise ValueError(f"state must be of a search with {self.n} parameters, got one with {len(unit)}")
+        if not bool((unit == self._unit).all()):
+            raise ValueError(f"state must be of a search with sigma = {self._unit.tolist()}, got {unit.tolist()}")
+        if state["kind"] != kind:
+            raise ValueError(
+                f"state must be of a search with such bounds and loss as here ({kind}), got one of {state['kind']}"
+            )
         self._asked = state["asked"]
         self._search.load_state_dict(state)
 
@@ -236,12 +248,13 @@ class TrustRegion:
                 f"values must have outputs {list(self._search.shape)} as before, got {list(values.shape[1:])}"
             )
         self._search.shape = values.shape[1:]
-        losses = [self.loss(one) for one in values]
+        with torch.no_grad():
+            losses = [self.loss(one) for one in values]
         if not all(isinstance(one, Tensor) for one in losses):
             raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")
         if any(one.numel() != 1 for one in losses):
             raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
-        return torch.stack([one.detach().double().reshape(()) for one in losses]), values.flatten(1)
+        return torch.stack([one.double().reshape(()) for one in losses]), values.flatten(1)
 
 
 def _capacity(n: int, loss_alone: bool) -> int:
@@ -268,7 +281,7 @@ def _box(bounds: tuple[float | Tensor, float | Tensor] | None, x0: Tensor) -> tu
         return -infinite, infinite
     if len(bounds) != 2:
         raise ValueError(f"bounds must be (lower, upper), got {len(bounds)} entries")
-    lower, upper = (torch.as_tensor(one, dtype=torch.float64, device=x0.device) for one in bounds)
+    lower, upper = (torch.as_tensor(one, dtype=torch.float64, device=x0.device).detach() for one in bounds)
     for name, one in (("lower", lower), ("upper", upper)):
         if one.shape not in ((), x0.shape):
             raise ValueError(f"the {name} bound must be a number or [{len(x0)}], got shape {list(one.shape)}")

@@ -75,8 +75,12 @@ def bench(
         memory_samples: its antithetic samples.
         out: JSON file to write.
     """
-    if repeats < 1:
-        raise ValueError(f"repeats must be at least 1, got {repeats}")
+    smallest = min((number for pair in sizes for number in pair), default=0)
+    given = {"repeats": repeats, "sizes": smallest, "memory_samples": memory_samples, "memory_n": memory_n}
+    for name, value in given.items():
+        least = 0 if name == "memory_n" else 1
+        if value < least:
+            raise SystemExit(f"{name} must be at least {least}, got {value}")
     threads, available = torch.get_num_threads(), extension.available
     torch.set_num_threads(1)
     try:

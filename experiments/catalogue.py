@@ -2,8 +2,10 @@
 
 import difflib
 import importlib
-from collections.abc import Iterable, Sequence
-from typing import Literal
+import importlib.util
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
 
 from experiments.task import Task
 
@@ -18,20 +20,35 @@ RENDERED = {name: f"experiments.tasks.{name}" for name in ("mug", "shad", "bunny
 """Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
 FITTING |= RENDERED
 TRAINING = {name: f"experiments.tasks.{name}" for name in ("cnn", "cnn_wide", "cnn5", "cnn_texture")}
-"""Tasks whose unknowns are the weights of a network before the black box: modules with `Task` and `PRESETS`."""
+"""Tasks whose unknowns are the weights of a network before Mitsuba: modules with `Task` and `PRESETS`."""
 
 
 def load(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:
     """Return a fitting task, with a Mitsuba variant if it is rendered; ImportError says what to install."""
     more = (variant,) if name in RENDERED else ()
-    try:
+    with _packages_of(name):
         task: Task = importlib.import_module(FITTING[name]).task(preset, *more)
+    return task
+
+
+def training(name: str) -> Any:
+    """Return the module of a training task; ImportError says what to install."""
+    with _packages_of(name):
+        return importlib.import_module(TRAINING[name])
+
+
+@contextmanager
+def _packages_of(name: str) -> Iterator[None]:
+    """Say what to install for a task; Mitsuba is looked for here, since tasks import it when they first render."""
+    try:
+        if (name in RENDERED or name in TRAINING) and importlib.util.find_spec("mitsuba") is None:
+            raise ModuleNotFoundError(name="mitsuba")
+        yield
     except ImportError as error:
         raise ImportError(
             f"task {name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'",
             name=error.name,
         ) from error
-    return task
 
 
 def chosen(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:

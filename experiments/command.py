@@ -14,6 +14,8 @@ from experiments.records import write
 
 _PACKAGES = ("torch", "torch_zerohess", "numpy", "scipy", "cma", "DFO-LS", "mitsuba")
 NAME = "command.json"
+SHARED = ("preset", "variant", "threads")
+"""Settings that all methods of a task must have in common."""
 
 
 def read_command(folder: Path) -> dict[str, Any]:
@@ -26,20 +28,24 @@ def read_command(folder: Path) -> dict[str, Any]:
 def register(folder: Path, settings: dict[str, dict[str, Any]]) -> None:
     """Note this command, the machine and the settings (task -> method -> name -> value).
 
-    SystemExit if the folder has runs of the same task and method that were made with other settings: their medians
-    would mean nothing.
+    SystemExit if the folder has runs of the same task and method that were made with other settings, or of the task
+    with another preset or renderer: their medians, and the ratios of methods, would mean nothing.
     """
     known = read_command(folder)
+    settings = json.loads(json.dumps(settings))
     for task, methods in settings.items():
-        for method, new in methods.items():
-            new = json.loads(json.dumps(new))
-            old = known["settings"].get(task, {}).get(method)
-            if old is not None and old != new and any((folder / task / method).glob("*.json*")):
+        made = known["settings"].setdefault(task, {})
+        for method in sorted({**made, **methods}, key=lambda name: name not in methods):
+            old, new = made.get(method, {}), methods.get(method)
+            if new is None:  # another method of the task
+                new = {name: value for name, value in next(iter(methods.values())).items() if name in SHARED}
+                old = {name: value for name, value in old.items() if name in new}
+            if old and old != new and any((folder / task / method).glob("*.json*")):
                 raise SystemExit(
                     f"{folder / task / method} was made with {_differences(old, new)}; "
                     "delete it, or give another folder as --out"
                 )
-            known["settings"].setdefault(task, {})[method] = new
+        made.update(methods)
     command = {
         "command": shlex.join(["python", "-m", "experiments", *sys.argv[1:]]),
         "started": time.strftime("%Y-%m-%d %H:%M:%S %Z"),

@@ -59,3 +59,5 @@ def main() -> None:
     except BrokenPipeError:  # `| head` has read enough; what is left to flush goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
+    except ImportError as error:
+        raise SystemExit(str(error)) from error

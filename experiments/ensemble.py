@@ -72,6 +72,7 @@ class Ensemble:
             own = settings_of(method.name, loaded.name)
             settings = {
                 "preset": self.preset,
+                "variant": self.variant,
                 "level": LEVELS[-1],
                 "limit": self.limit,
                 "evaluations": loaded.evaluations,

@@ -25,6 +25,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torch_zerohess as zh
+from experiments.catalogue import chosen
 from experiments.functions import BoxTask, PlaneWave, box2, box10, true_gradient, true_hessian
 from experiments.tables import table
 
@@ -35,6 +36,8 @@ from matplotlib.ticker import NullFormatter
 Function = Callable[[Tensor], Tensor]
 Quantities = dict[str, Tensor]
 QUANTITIES = ("value", "gradient", "hessian", "hvp")
+PROBLEMS = {"BOX2": 2, "BOX10": 10, "WAVE10": 10}
+"""Parameters of each."""
 OURS, PAPER = "aggregate + center", "per-element + none"
 _TRUTH_SCRAMBLES = 16
 _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest budget
@@ -169,7 +172,7 @@ def error(
     seed: int = 0,
     out: Path = Path("results/error"),
     budgets: tuple[int, ...] = (32, 128, 512, 2048),
-    problems: tuple[str, ...] = ("BOX2", "BOX10", "WAVE10"),
+    problems: tuple[str, ...] = tuple(PROBLEMS),
     side: int = 64,
 ) -> ErrorReport:
     """Measure the relative RMSE of the estimators against evaluations and seconds, and plot it.
@@ -179,12 +182,15 @@ def error(
         seed: of everything random.
         out: folder for error.json, error_evaluations.png and error_seconds.png.
         budgets: black-box evaluations of one estimate, f(x) included.
-        problems: any of BOX2, BOX10 and WAVE10.
+        problems: any of box2, box10 and wave10.
         side: pixels along the image side of the BOX tasks.
     """
-    if runs < 2 or min(budgets) < 16:
-        raise ValueError(f"runs must be at least 2 and budgets at least 16, got {runs} and {budgets}")
-    made = [_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in problems]
+    smallest = min(budgets, default=0)
+    for argument, value, least in (("runs", runs, 2), ("budgets", smallest, 16), ("side", side, 1), ("seed", seed, 0)):
+        if value < least:
+            raise SystemExit(f"{argument} must be at least {least}, got {value}")
+    names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
+    made = [_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in names]
     jobs = [(problem, method, budget) for problem in made for method in METHODS for budget in budgets]
     tallies = [_Tally(problem, method, budget) for problem, method, budget in jobs]
     for run in tqdm(range(runs), desc="error", disable=None):
@@ -205,9 +211,7 @@ def error(
 
 def _problem(name: str, truth_evaluations: int, side: int, seed: int) -> Problem:
     tasks: dict[str, Callable[[int], BoxTask]] = {"BOX2": box2, "BOX10": box10}
-    n = {"BOX2": 2, "BOX10": 10, "WAVE10": 10}.get(name)
-    if n is None:
-        raise ValueError(f"problems must be any of BOX2, BOX10 and WAVE10, got {name!r}")
+    n = PROBLEMS[name]
     generator = torch.Generator().manual_seed(seed)
     v = torch.nn.functional.normalize(torch.randn(n, generator=generator, dtype=torch.float64), dim=0)
     if name in tasks:

@@ -142,15 +142,17 @@ def _picture(axis: Any, picture: Tensor) -> None:
 
 
 def _errors(axis: Any, runs: Sequence[Trace]) -> None:
-    """Image error over that at the start, against evaluations."""
+    """Image error over that at the start, against evaluations; nothing of a run that never reported a point."""
     for one in runs:
         rows = [(record.evaluations, error) for record, error in zip(one.records, one.error, strict=True)][1:]
-        axis.step(*zip(*rows, strict=True), where="post", label=one.method)
+        if rows:
+            axis.step(*zip(*rows, strict=True), where="post", label=one.method)
     for level in LEVELS:
         axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
     axis.set(xscale="log", yscale="log", xlabel="evaluations", ylabel="image error / at the start")
     axis.grid(which="major", alpha=0.3)
-    axis.legend(fontsize=8, frameon=False)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8, frameon=False)
     plain_ticks(axis)
 
 

@@ -1,7 +1,8 @@
 """The journal of a run: the values of every evaluated batch, so that a run that was killed can be replayed.
 
 A batch is a line of JSON (a hash of the points, times, shape and type of the values) followed by the compressed values.
-What a kill left of a last batch is cut off when the journal is opened again.
+From the first batch on that a kill or a power cut has left in parts, the journal is cut off when it is read again. A
+batch reaches the disk when the system writes it, within a minute: that much a power cut costs.
 """
 
 import fcntl
@@ -78,19 +79,26 @@ class Journal:
         self.close()
 
     def _read(self) -> Iterator[Entry]:
-        self._file.seek(0)
         whole = 0
         while True:
-            line = self._file.readline()
-            head: dict[str, Any] = json.loads(line) if line.endswith(b"\n") else {"bytes": 1}
-            data = self._file.read(head["bytes"])
-            if len(data) < head["bytes"]:
+            self._file.seek(whole)
+            entry = self._batch()
+            if entry is None:
                 self._file.truncate(whole)
                 return
             whole = self._file.tell()
-            values = np.frombuffer(bytearray(zlib.decompress(data)), head["type"]).reshape(head["shape"])
-            yield Entry(head["points"], torch.from_numpy(values), head["seconds"], head["black_box_seconds"])
-            self._file.seek(whole)
+            yield entry
+
+    def _batch(self) -> Entry | None:
+        """Return the batch at the position of the file; None if it is not whole."""
+        line = self._file.readline()
+        try:
+            head: dict[str, Any] = json.loads(line)
+            data = zlib.decompress(self._file.read(head["bytes"]))
+            values = torch.from_numpy(np.frombuffer(bytearray(data), head["type"]).reshape(head["shape"]))
+            return Entry(head["points"], values, head["seconds"], head["black_box_seconds"])
+        except (ValueError, TypeError, KeyError, zlib.error):
+            return None
 
 
 def _digest(points: Tensor) -> str:

@@ -1,7 +1,6 @@
 """`python -m experiments list`: what there is, what goes with what, and what is missing."""
 
 import ast
-import importlib
 import importlib.util
 from pathlib import Path
 
@@ -30,15 +29,20 @@ def listing() -> str:
             lines.append([name, str(task.n), task.title])
         else:
             lines.append([name, "", task])
-    lines += [[name, "", _first_line(module)] for name, module in TRAINING.items()]
+    networks: dict[str, tuple[str, ...]] = {}
+    for name, module in TRAINING.items():
+        methods = _methods(name)
+        if isinstance(methods, tuple):
+            networks[name] = methods
+        lines.append([name, "", _first_line(module) if name in networks else str(methods)])
     for method in METHODS.values():
         for reason, names in _reasons(method.name, tasks).items():
             where = "anywhere" if len(names) == len(tasks) else f"on {', '.join(names)}"
             reasons.append(f"{method.name} not {where}: {reason}")
     names = list(dict.fromkeys([*METHODS, *TRAINING_METHODS]))
     titles = {**dict.fromkeys(TRAINING_METHODS, ""), **{name: method.title for name, method in METHODS.items()}}
-    marks: list[list[object]] = [[name, *_marks(name, tasks), titles[name]] for name in names]
-    parts = [table(["task", "n", "what is sought"], lines), table(["method", *tasks, *TRAINING, ""], marks)]
+    marks: list[list[object]] = [[name, *_marks(name, tasks, networks), titles[name]] for name in names]
+    parts = [table(["task", "n", "what is sought"], lines), table(["method", *tasks, *networks, ""], marks)]
     return "\n\n".join([*parts, *(["\n".join(reasons)] if reasons else [])])
 
 
@@ -50,18 +54,18 @@ def _loaded(name: str) -> Task | str:
         return str(error)
 
 
-def _marks(name: str, tasks: dict[str, Task]) -> list[str]:
-    fitting = ["+" if name in METHODS and not unusable(METHODS[name], task) else "." for task in tasks.values()]
-    return [*fitting, *("+" if name in _training(module) else "." for module in TRAINING.values())]
-
-
-def _training(module: str) -> tuple[str, ...]:
-    """Return the methods of a training task; none if it cannot be used here."""
+def _methods(name: str) -> tuple[str, ...] | str:
+    """Return the methods of a training task, or why it cannot be used here."""
     try:
-        methods: tuple[str, ...] = importlib.import_module(module).Task.methods
-    except ImportError:
-        return ()
+        methods: tuple[str, ...] = catalogue.training(name).Task.methods
+    except ImportError as error:
+        return str(error)
     return methods
+
+
+def _marks(name: str, tasks: dict[str, Task], networks: dict[str, tuple[str, ...]]) -> list[str]:
+    fitting = ["+" if name in METHODS and not unusable(METHODS[name], task) else "." for task in tasks.values()]
+    return [*fitting, *("+" if name in methods else "." for methods in networks.values())]
 
 
 def _reasons(name: str, tasks: dict[str, Task]) -> dict[str, list[str]]:

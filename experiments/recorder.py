@@ -18,7 +18,7 @@ class Recorder:
 
     A run that was killed is replayed: the method starts again, evaluations are answered from the journal and rows that
     the log already has are taken from there, with their times, so that no black box is called twice and both clocks go
-    on where they were. Without `files` nothing is written.
+    on where they were; `skip` hears of the calls and points that it has missed. Without `files` nothing is written.
     """
 
     def __init__(
@@ -28,6 +28,7 @@ class Recorder:
         run: int,
         files: Files | None = None,
         watch: Callable[[Record], None] | None = None,
+        skip: Callable[[int, int], None] | None = None,
     ) -> None:
         self.task, self.method, self.run = task, method, run
         self.rows: list[Record] = []
@@ -36,7 +37,9 @@ class Recorder:
         self._journal = Journal(files.journal) if files else None
         self._log = Log(files.log) if files else None
         self._logged = iter(self._log.records if self._log else ())
-        self._watch = watch
+        self._watch, self._skip = watch, skip
+        self._missed = [0, 0]
+        """Calls and points that were answered from the journal."""
         self._clock = Clock()
 
     @property
@@ -49,6 +52,9 @@ class Recorder:
         self._clock.start()
         entry = self._replayed(x)
         if entry is None:
+            if self._skip and any(self._missed):
+                self._skip(*self._missed)
+                self._missed = [0, 0]
             began = time.perf_counter()
             with torch.no_grad():
                 values = fn(x, *aux)
@@ -58,6 +64,7 @@ class Recorder:
                 self._journal.append(x, values, self.seconds, self.black_box_seconds)
         else:
             values, self.black_box_seconds = entry.values, entry.black_box_seconds
+            self._missed = [self._missed[0] + 1, self._missed[1] + len(x)]
             self._clock.set(max(entry.seconds, self.rows[-1].seconds if self.rows else 0.0))
         self.evaluations += len(x)
         self._clock.start()
@@ -94,6 +101,10 @@ class Recorder:
             self._watch(record)
         self._clock.start()
         return record
+
+    def stop(self) -> None:
+        """Stop the clock: what follows is not counted, up to the next evaluation."""
+        self._clock.stop()
 
     def close(self, *, ended: bool) -> None:
         """Close the files; the journal of a run that has ended is not needed any more."""

@@ -75,31 +75,57 @@ class Files:
 
 
 class Log:
-    """Appends records to a file, flushed line by line, so that an interrupted run leaves all it had.
+    """Appends records to a file, flushed line by line, so that a killed run leaves all it had.
 
-    `records` are those the file already has; a last line that was cut off is removed from it.
+    Lines reach the disk when the system writes them, within a minute, and all of them when the log is closed: a power
+    cut takes the last rows of a run that goes on, which are made again, and none of a run that has an outcome.
+
+    `records` are those the file already has; from the first line on that is cut or broken they are removed from it.
     """
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.records: list[Record] = list(read(path)) if path.exists() else []
-        self._file: BinaryIO = path.open("ab")
-        self._file.truncate(path.read_bytes().rfind(b"\n") + 1)
+        self.records: list[Record] = []
+        self._file: BinaryIO = path.open("a+b")
+        self._file.seek(0)
+        whole = 0
+        for line in self._file:
+            record = _record(line)
+            if record is None:
+                break
+            self.records.append(record)
+            whole += len(line)
+        self._file.truncate(whole)
 
     def __call__(self, record: Record) -> None:
         self._file.write(json.dumps(asdict(record)).encode() + b"\n")
         self._file.flush()
 
     def close(self) -> None:
+        os.fsync(self._file.fileno())
         self._file.close()
 
 
 def read(path: Path) -> Iterator[Record]:
-    """Yield the records of a log; a last line that was cut off is left out."""
-    with path.open() as lines:
-        for line in lines:
-            if line.endswith("\n"):
-                yield Record(**json.loads(line))
+    """Yield the records of a log without a last line that was cut off; SystemExit names another that is broken."""
+    with path.open("rb") as lines:
+        for number, line in enumerate(lines, 1):
+            record = _record(line)
+            if record is not None:
+                yield record
+            elif line.endswith(b"\n"):
+                raise SystemExit(
+                    f"line {number} of {path} is not a row of a run; delete the file and {path.stem}.json beside it, "
+                    "then the same `run` command makes the run again"
+                )
+
+
+def _record(line: bytes) -> Record | None:
+    """Return the record of a line; None if it is cut or broken."""
+    try:
+        return Record(**json.loads(line)) if line.endswith(b"\n") else None
+    except (ValueError, TypeError):
+        return None
 
 
 def write_outcome(outcome: Outcome, files: Files) -> None:
@@ -109,12 +135,21 @@ def write_outcome(outcome: Outcome, files: Files) -> None:
 
 
 def read_outcome(path: Path) -> Outcome:
-    return Outcome(**json.loads(path.read_text()))
+    """Return an outcome; SystemExit names a file that has none, or only a part of one."""
+    try:
+        return Outcome(**json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise SystemExit(
+            f"{path} is not the outcome of a run ({error}); delete it, then the same `run` command makes it again"
+        ) from error
 
 
 def write(path: Path, text: str) -> None:
-    """Replace a file at once, so that no moment has half of it."""
+    """Replace a file at once, so that no moment has half of it, nor the disk after a power cut."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
-    part.write_text(text)
+    with part.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
     os.replace(part, path)

@@ -72,9 +72,13 @@ class Reference:
         """[h, w, 3]."""
         return self.scene(self.solution[None])[0].double()
 
+    def prepare(self) -> None:
+        """Load the scene and render it once."""
+        _ = self.target
+
     def release(self) -> None:
-        """Free the scenes."""
-        for name in ("scene", "moving"):
+        """Free the scenes; the target, which goes with them, is rendered again when it is needed."""
+        for name in ("scene", "moving", "target"):
             vars(self).pop(name, None)
 
     def image(self, x: Tensor) -> Tensor:
@@ -170,6 +174,7 @@ def rendered(
         adjoint=reference.adjoint,
         adjoints=tuple(one for one in ADJOINTS if one != "direct_projective" or setting.depth == 2),
         no_adjoint=lambda: unavailable(variant),
+        prepare=reference.prepare,
         release=reference.release,
         full=None if setting == full else whole,
     )

@@ -45,6 +45,10 @@ def report(
         out: the page; DIR/report.html if not given.
     """
     path = out or folder / "report.html"
+    if path.is_dir():
+        raise SystemExit(f"out must be a file, such as {path / 'report.html'}, got the folder {path}")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page(folder))
     print(path)
 

@@ -40,7 +40,7 @@ def train_all(
     folder = out / kind.name
     results: list[Result] = []
     scene = preset.scene(variant, threads)
-    shared = {"preset": asdict(preset), "variant": scene.variant}
+    shared = {"preset": asdict(preset), "variant": scene.variant, "threads": threads}
     register(out, {kind.name: {method.name: {**shared, "method": _settings(kind, method)} for method in methods}})
     size = f"{preset.film}x{preset.film} pixels, {preset.spp} samples per pixel"
     print(f"{kind.name}: Mitsuba {scene.variant}, {size}", flush=True)
@@ -106,11 +106,11 @@ def _train(task: TrainingTask, method: Method, files: Files, weights: Path, name
         def solve() -> None:
             nonlocal diverged
             try:
-                result = train(task, method, files.run, recorder)
+                encoder = train(task, method, files.run, recorder)
             except DivergedError as error:
                 diverged = error
                 raise
-            torch.save(result.encoder.state_dict(), weights)
+            torch.save(encoder.state_dict(), weights)
 
         try:
             end = ending(solve)

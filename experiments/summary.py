@@ -71,7 +71,7 @@ class Overhead:
 
 @dataclass(frozen=True)
 class Failure:
-    """Runs that ended for the same reason, before both errors were small enough."""
+    """Runs that ended for the same reason, before they had reached the goal of the task."""
 
     task: str
     method: str
@@ -206,7 +206,7 @@ def as_text(summary: Summary) -> str:
     if summary.failures:
         rows = [[f.task, f.method, f.status, f"{f.runs}", f.reason] for f in summary.failures]
         headers = ["task", "method", "", "runs", "reason"]
-        parts.append("runs that ended before both errors were reduced by 99.9 %\n" + text_table(headers, rows))
+        parts.append("how runs ended that did not reach their goal\n" + text_table(headers, rows))
     if summary.unfinished:
         parts.append(f"{summary.unfinished} unfinished runs are left out")
     return "\n\n".join(parts)
@@ -229,12 +229,14 @@ def task_table(summary: Summary, task: str) -> tuple[list[str], list[list[object
                 runs,
             ]
         )
-    return [*headers, "overhead [ms]", "runs"], rows
+    return [*headers, "overhead per row [ms]", "runs"], rows
 
 
 def _cell(row: Row) -> str:
     share = f"{100 * row.share:.0f}%"
-    return f"{row.evaluations:.0f} {row.seconds:.3g}s {share}" if row.evaluations is not None else f"- {share}"
+    if row.evaluations is None:
+        return f"- {share}"
+    return f"{row.evaluations:.1f}".removesuffix(".0") + f" {row.seconds:.3g}s {share}"
 
 
 def _speed_up_text(summary: Summary) -> str:

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from experiments.scenes.fitted_mesh import FittedMesh
 
 
-def _nothing() -> None:
-    """For `Task.no_adjoint` and `Task.release`; a function with a name can be pickled."""
+def _nothing(*_: int) -> None:
+    """For `Task.no_adjoint`, `prepare`, `release` and `skip`; a function with a name can be pickled."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,11 @@ class Task:
     """Integrators that `adjoint` knows."""
     no_adjoint: Callable[[], str | None] = _nothing
     """Why `adjoint` cannot be called here, None if it can: derivatives need a variant of the renderer that has them."""
+    prepare: Callable[[], None] = _nothing
+    """Loads what the black box needs, before the clock of a run starts."""
+    skip: Callable[[int, int], None] = _nothing
+    """Lets a black box whose noise is fresh in every call go on as after so many calls and points, for runs that go on
+    after a kill."""
     release: Callable[[], None] = _nothing
     """Frees what the black box has loaded, to be loaded again when it is called: scenes of a process slow each other
     down."""

@@ -82,15 +82,17 @@ class Result:
     parameter_error: tuple[float, float]
 
 
-def train(task: TrainingTask, method: Method, run: int, recorder: Recorder) -> Result:
-    """Train a new encoder until the evaluations of the preset are used; `recorder` gets a row per iteration.
+def train(task: TrainingTask, method: Method, run: int, recorder: Recorder) -> nn.Module:
+    """Train a new encoder until the evaluations of the preset are used, and return it.
+
+    `recorder` gets a row per iteration, of `pooled` in every so many.
 
     Both errors of the first row are of the held-out images. After that the image error is the mean over the batches of
     the last twentieth of the run, which costs no renders; the parameter error is that of the held-out images. `pooled`
     renders no predictions, so that its image error is that of the held-out images, in every tenth row. Run r
     starts from the weights and draws the samples of seed r, the same for all methods.
     """
-    encoder, start = encoders(task, run)
+    encoder, _ = encoders(task, run)
     recorder.row(lambda: (task.image_error(encoder), task.parameter_error(encoder)))
     if method.optimizer == "pooled":
 
@@ -104,9 +106,8 @@ def train(task: TrainingTask, method: Method, run: int, recorder: Recorder) -> R
         train_pooled(task, encoder, run, recorder, report)
     else:
         _train_sampled(task, method, encoder, recorder)
-    return Result(
-        method.name, run, encoder, start, recorder.seconds, recorder.evaluations, *_errors(task, start, encoder)
-    )
+    recorder.stop()
+    return encoder
 
 
 def _train_sampled(task: TrainingTask, method: Method, encoder: nn.Module, recorder: Recorder) -> None:
@@ -143,14 +144,9 @@ def trained(task: TrainingTask, outcome: Outcome, weights: Path) -> Result:
     """Return the result of a run that has ended, from its outcome and the weights of its encoder."""
     encoder, start = encoders(task, outcome.run)
     encoder.load_state_dict(torch.load(weights, weights_only=True))
-    errors = _errors(task, start, encoder)
-    return Result(outcome.method, outcome.run, encoder, start, outcome.seconds, outcome.evaluations, *errors)
-
-
-def _errors(task: TrainingTask, start: nn.Module, end: nn.Module) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Image and parameter errors of the held-out images, each before and after training."""
-    image, parameter = ((error(start), error(end)) for error in (task.image_error, task.parameter_error))
-    return image, parameter
+    # Of the held-out images, each before and after training.
+    image, parameter = ((error(start), error(encoder)) for error in (task.image_error, task.parameter_error))
+    return Result(outcome.method, outcome.run, encoder, start, outcome.seconds, outcome.evaluations, image, parameter)
 
 
 def _optimizer(method: Method, encoder: nn.Module) -> torch.optim.Optimizer:

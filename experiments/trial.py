@@ -70,7 +70,7 @@ class Trial:
         self.ended: Finished | None = None
         self.diverged: DivergedError | None = None
         files = Files(folder / task.name / method, run) if folder else None
-        self._recorder = Recorder(task.name, method, run, files, watch)
+        self._recorder = Recorder(task.name, method, run, files, watch, task.skip)
         self._first = self._row(self.start, None, None)
 
     @property
@@ -223,6 +223,7 @@ def attempt(
     An exception of the method is an outcome too. A run whose journal does not belong to it, because the code has
     changed since it was killed, starts from the beginning.
     """
+    task.prepare()
     _seed(run + _SEEDS)
     trial = Trial(task, method, run, folder, limit=limit, watch=watch)
     try:

@@ -6,8 +6,9 @@ import itertools
 import math
 import random
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
@@ -16,11 +17,14 @@ from tqdm import tqdm
 
 from experiments import catalogue
 from experiments.catalogue import Preset
+from experiments.ensemble import unusable
 from experiments.methods import METHODS, Method
+from experiments.records import Record
+from experiments.results import Run
 from experiments.settings import settings, space
 from experiments.tables import table
 from experiments.task import Task
-from experiments.trial import Trial, attempt
+from experiments.trial import attempt
 
 TUNING = 1000
 """Runs from this number upward are for tuning; tables report those below."""
@@ -33,6 +37,8 @@ class Score:
     settings: dict[str, Any]
     reached: list[int | None]
     """Evaluations until the image error is reduced by `level`, by run; None where it never was."""
+    failures: list[str] = field(default_factory=list)
+    """Why runs failed, one for each."""
 
     @property
     def share(self) -> float:
@@ -65,7 +71,7 @@ def tune(
     """Try settings of a method drawn at random from its search space, and print the best.
 
     The settings in use are tried first. A setting is better than another if more runs reach the level, or as many
-    with a smaller median number of evaluations.
+    with a smaller median number of evaluations. Ctrl-C prints those that were tried so far.
 
     Args:
         task: a fitting task.
@@ -94,12 +100,23 @@ def tune(
     if evaluations is not None:
         loaded = dataclasses.replace(loaded, evaluations=evaluations)
     (chosen,) = catalogue.chosen("method", [method], list(METHODS))
+    reason = unusable(METHODS[chosen], loaded)
+    if reason:
+        raise SystemExit(f"method must be one that can be run on {name}, got {chosen}: {reason}")
     current = settings(chosen, name)
     choices = space(chosen, loaded.sigma)
     free = dict(_choices(one, list(choices)) for one in over) or choices
     candidates = [current, *({**current, **one} for one in draw(free, trials, seed))]
     bar = tqdm(candidates, unit=" settings", desc=f"{name} {chosen}", dynamic_ncols=True)
-    scores = [score(loaded, METHODS[chosen], one, range(first, first + runs), level) for one in bar]
+    scores: list[Score] = []
+    try:
+        for one in bar:
+            scores += [score(loaded, METHODS[chosen], one, range(first, first + runs), level)]
+    except KeyboardInterrupt:
+        bar.close()
+        if scores:
+            print(report(scores, list(choices), level, best))
+        raise SystemExit(f"\ninterrupted after {len(scores)} of {len(candidates)} settings") from None
     print(report(scores, list(choices), level, best))
 
 
@@ -131,38 +148,37 @@ def draw(choices: Mapping[str, Sequence[Any]], count: int, seed: int) -> list[di
 
 
 def score(task: Task, method: Method, candidate: dict[str, Any], runs: range, level: float) -> Score:
-    """Run a method from every start; a run that fails has not reached the level."""
-    return Score(candidate, [_reached(task, method, candidate, run, level) for run in runs])
-
-
-def _reached(task: Task, method: Method, candidate: dict[str, Any], run: int, level: float) -> int | None:
-    trials: list[Trial] = []
-
-    def solve(trial: Trial) -> None:
-        trials.append(trial)
-        method.solve(trial, candidate)
-
-    attempt(task, method.name, run, solve)
-    rows = trials[-1].rows
-    allowed = (1 - level) * (rows[0].image_error or 0.0)
-    found = (row.evaluations for row in rows if row.image_error is not None and row.image_error <= allowed)
-    return next(found, None)
+    """Run a method from every start; a run that fails counts as far as it got."""
+    reached: list[int | None] = []
+    failures: list[str] = []
+    for run in runs:
+        rows: list[Record] = []
+        outcome = attempt(task, method.name, run, lambda trial: method.solve(trial, candidate), watch=rows.append)
+        record = Run(outcome, rows).reached("image", level)
+        reached.append(record.evaluations if record else None)
+        if outcome.status == "failed":
+            failures.append(outcome.reason)
+    return Score(candidate, reached, failures)
 
 
 def report(scores: Sequence[Score], names: Sequence[str], level: float, best: int) -> str:
-    """Return a table of the best settings, the ones in use marked."""
+    """Return a table of the best settings, the ones in use marked, and why runs failed."""
     ranked = sorted(enumerate(scores), key=lambda one: one[1].rank)
     chosen = [(rank, number, one) for rank, (number, one) in enumerate(ranked, 1) if rank <= best or number == 0]
     rows = [
         [
             f"{rank}{' in use' if number == 0 else ''}",
-            f"{100 * one.share:.0f} %",
+            f"{100 * one.share:.0f} %{f', {len(one.failures)} failed' if one.failures else ''}",
             None if math.isinf(one.median) else one.median,
             *(_text(one.settings.get(name)) for name in names),
         ]
         for rank, number, one in chosen
     ]
-    return table(["rank", "share", f"median evaluations to {100 * level:g} %", *names], rows)
+    runs = sum(len(one.reached) for one in scores)
+    failures = Counter(reason for one in scores for reason in one.failures).most_common()
+    lines = [f"{count} of {runs} runs failed: {reason}" for reason, count in failures]
+    headers = ["rank", "share", f"median evaluations to {100 * level:g} %", *names]
+    return "\n".join([table(headers, rows), *lines])
 
 
 def _text(value: Any) -> str:

@@ -128,6 +128,10 @@ def _seen(task: Task, change: Change) -> Task:
     compress = None if change.jpeg is None else lambda image: jpeg(image, change.jpeg or 0)
     reference = Seen(made, setting, change.noise, compress)
 
+    def prepare() -> None:
+        reference.prepare()
+        made.prepare()
+
     def release() -> None:
         reference.release()
         made.release()
@@ -138,6 +142,8 @@ def _seen(task: Task, change: Change) -> Task:
         image=reference.image,
         image_loss=reference.loss_of,
         residuals=reference.residuals,
+        prepare=prepare,
+        skip=reference.skip,
         release=release,
         adjoint=None,  # it is one of the task as it was
     )
@@ -182,8 +188,13 @@ class Seen(Reference):
         return clean if self._change is None else self._change(clean)
 
     def image(self, x: Tensor) -> Tensor:
-        _ = self.target  # rendered before the noise becomes another
+        self.prepare()  # the target is rendered before the noise becomes another
         return super().image(x)
+
+    def skip(self, calls: int, points: int) -> None:
+        """See `Task.skip`."""
+        self.prepare()
+        self.scene.skip(calls, points)
 
 
 def jpeg(image: Tensor, quality: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +12,9 @@ import pytest
 import torch
 
 import torch_zerohess as zh
+from experiments import catalogue
 from experiments.bench import BenchReport, bench
+from experiments.commands import main
 from experiments.error import OURS, PAPER, ErrorReport, error
 from experiments.functions import (
     Exponential,
@@ -80,9 +83,39 @@ def test_the_truth_is_far_better_than_what_it_judges(report) -> None:
     assert report.truth_error["WAVE10"]["hessian"] == 0
 
 
-def test_unknown_problem_is_named(tmp_path) -> None:
-    with pytest.raises(ValueError, match="BOX3"):
-        error(runs=2, problems=("BOX3",), out=tmp_path)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"problems": ("box3",)}, "problems must be some of BOX2, BOX10, WAVE10, got BOX3"),
+        ({"runs": 1}, "runs must be at least 2, got 1"),
+        ({"budgets": (32, 8)}, "budgets must be at least 16, got 8"),
+        ({"budgets": ()}, "budgets must be at least 16, got 0"),
+        ({"side": 0}, "side must be at least 1, got 0"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
+    ],
+)
+def test_wrong_arguments_of_error_are_named(tmp_path, wrong, message) -> None:
+    with pytest.raises(SystemExit, match=message):
+        error(**{"runs": 2, "out": tmp_path, **wrong})
+
+
+def test_problems_have_lower_case_names_too(tmp_path) -> None:
+    found = error(runs=2, budgets=(32,), problems=("wave10", "WAVE10"), out=tmp_path)
+    assert {m.problem for m in found.measurements} == {"WAVE10"}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"repeats": 0}, "repeats must be at least 1, got 0"),
+        ({"sizes": ((2, 8), (4, 0))}, "sizes must be at least 1, got 0"),
+        ({"memory_n": -1}, "memory_n must be at least 0, got -1"),
+        ({"memory_samples": 0}, "memory_samples must be at least 1, got 0"),
+    ],
+)
+def test_wrong_arguments_of_bench_are_named(wrong, message) -> None:
+    with pytest.raises(SystemExit, match=message):
+        bench(**wrong)
 
 
 @pytest.fixture(scope="module")
@@ -225,6 +258,55 @@ def test_box2_is_a_plateau_that_smoothing_gives_a_slope() -> None:
 def test_table_aligns_numbers() -> None:
     text = table(["case", "n"], [["a", 1.23456], ["bb", None], ["c", 12345.6]])
     assert text.splitlines() == ["case      n", "----  -----", "a      1.23", "bb        -", "c     12346"]
+
+
+@pytest.fixture
+def no_mitsuba(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+
+
+@pytest.mark.usefixtures("no_mitsuba")
+def test_tasks_that_mitsuba_renders_say_that_it_is_missing() -> None:
+    for name in (*catalogue.RENDERED, *catalogue.TRAINING):
+        one = catalogue.training if name in catalogue.TRAINING else catalogue.load
+        with pytest.raises(ImportError, match=rf"task {name} needs mitsuba, .*pip install 'torch_zerohess") as raised:
+            one(name)
+        assert raised.value.name == "mitsuba"
+    assert catalogue.load("caustic").name == "caustic"
+    assert catalogue.load("meshfit").name == "meshfit"
+
+
+@pytest.mark.usefixtures("no_mitsuba")
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["run", "mug"],
+        ["run", "quad", "cnn", "--methods", "trust_region,pooled"],
+        ["tune", "mug", "--method", "our_g"],
+        ["losses", "--tasks", "mug"],
+        ["gradients", "mug"],
+    ],
+    ids=" ".join,
+)
+def test_commands_say_what_to_install(monkeypatch, tmp_path, command) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["experiments", *command])
+    with pytest.raises(SystemExit, match="needs mitsuba, which is not installed: pip install 'torch_zerohess"):
+        main()
+    assert not list(tmp_path.iterdir())  # nothing was run before
+
+
+@pytest.mark.usefixtures("no_mitsuba")
+def test_list_and_gallery_show_what_is_missing(monkeypatch, tmp_path, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["experiments", "list"])
+    main()
+    printed = capsys.readouterr().out
+    for name in (*catalogue.RENDERED, *catalogue.TRAINING):
+        assert re.search(rf"^{name} +task {name} needs mitsuba, which is not installed", printed, re.MULTILINE)
+    monkeypatch.setattr(sys, "argv", ["experiments", "gallery", str(tmp_path), "--tasks", "mug"])
+    with pytest.raises(SystemExit, match="no task of this command can be shown"):
+        main()
+    assert "task mug needs mitsuba" in "".join(capsys.readouterr())
 
 
 def test_a_reader_that_has_enough_ends_a_command_without_a_traceback() -> None:

@@ -205,6 +205,16 @@ def test_figure_of_the_caustic(tmp_path):
         assert image.width > 2 * image.height
 
 
+def test_figure_of_a_run_that_ended_before_its_first_report(tmp_path):
+    task: Task = caustic.task()
+    start, end = task.start(0), 0.5 * task.start(0)
+    seen, ended = look(task, start), made([start], task=task)
+    for other in (None, made([start, end], task=task)):
+        gallery_figures.caustic(ended, seen, other, tmp_path / "figure12.png")
+        with Image.open(tmp_path / "figure12.png") as image:
+            assert image.width > 0
+
+
 def test_the_surface_of_the_caustic():
     # B-splines sum to 1, and uniform ones of a linear sequence are linear.
     torch.testing.assert_close(

@@ -1,6 +1,7 @@
 """Runs of the harness: what is counted and logged, how they end, and that a kill changes nothing."""
 
 import json
+import os
 import random
 import signal
 import subprocess
@@ -181,6 +182,35 @@ def test_a_run_goes_on_from_whatever_a_kill_left(tmp_path):
         whole.resume(log, journal, tmp_path / str(trial))
 
 
+def test_a_run_goes_on_from_what_a_power_cut_left(tmp_path):
+    """Blocks that never reached the disk are zeros, wherever they are."""
+    whole = Snapshots(tmp_path / "whole")
+    log, journal = whole.taken[-1]
+    draw = random.Random(1)
+    for trial in range(20):
+        first, second = draw.randrange(len(log)), draw.randrange(len(journal))
+        zeros = [
+            content[:at] + bytes(len(content[at : at + 400])) + content[at + 400 :]
+            for content, at in ((log, first), (journal, second))
+        ]
+        files = Files(tmp_path / str(trial) / "bowl" / "search", 0)
+        files.folder.mkdir(parents=True)
+        files.log.write_bytes(zeros[0])
+        files.journal.write_bytes(zeros[1])
+        outcome = attempt(whole.task(), "search", 0, solve, tmp_path / str(trial))
+        assert rows(files.log) == whole.rows
+        assert (outcome.x, outcome.evaluations) == (whole.outcome.x, whole.outcome.evaluations)
+
+
+def test_what_a_run_leaves_is_on_the_disk_before_its_outcome_has_its_name(tmp_path, monkeypatch):
+    events, sync, move = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda file: (events.append(os.fstat(file).st_ino), sync(file)))
+    monkeypatch.setattr(os, "replace", lambda part, path: (events.append(path.name), move(part, path)))
+    attempt(TASK, "halve", 0, lambda t: HALVE.solve(t, {}), tmp_path)
+    files = Files(tmp_path / "bowl" / "halve", 0)
+    assert events == [files.log.stat().st_ino, files.outcome.stat().st_ino, "0.json"]
+
+
 def test_a_replay_calls_no_black_box(tmp_path):
     whole = Snapshots(tmp_path / "whole")
     log, journal = whole.taken[-1]
@@ -271,6 +301,21 @@ def test_other_settings_are_refused(results):
         ensemble(results[0], preset="paper", limit=5).plan([TASK], [HALVE])
     with pytest.raises(SystemExit, match=r"evaluations = 400 \(now 401\)"):
         ensemble(results[0]).plan([replace(TASK, evaluations=401)], [HALVE])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"preset": "paper"}, r"halve was made with preset = fast \(now paper\); delete it"),
+        ({"variant": "scalar_rgb"}, r"halve was made with variant = auto \(now scalar_rgb\); delete it"),
+    ],
+)
+def test_one_table_has_one_preset_and_one_renderer(tmp_path, changes, message):
+    one = ensemble(tmp_path)
+    one.run(one.plan([TASK], [HALVE]))
+    with pytest.raises(SystemExit, match=message):
+        ensemble(tmp_path, **changes).plan([TASK], [SEARCH])
+    ensemble(tmp_path, limit=5).plan([TASK], [SEARCH])  # a method may have its own time
 
 
 def test_the_folder_says_how_it_was_made(results):

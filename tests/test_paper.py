@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import re
 
 import pytest
 import torch
@@ -188,6 +189,36 @@ def test_every_space_draws_settings_that_a_method_takes():
             assert outcome.status != "failed", f"{name} {drawn}: {outcome.reason}"
     assert space("our_h", 0.2)["trust_region"] == pytest.approx((0.02, 0.04, 0.1, 0.2, 0.4, 1.0))
     assert space("our_hvpa", 0.2)["trust_region"] == space("our_hvpa", 1.0)["trust_region"]
+
+
+def test_tune_says_why_runs_failed(capsys):
+    tune("quad", method="our_g", runs=2, evaluations=50, over=("samples=abc",), level=0.5)
+    *rows, said = capsys.readouterr().out.splitlines()
+    assert re.match(r"2 of 4 runs failed: \w+Error: ", said)
+    (broken,) = (line for line in rows if " abc " in line)
+    assert "0 %, 2 failed" in broken
+    assert sum("failed" in line for line in rows) == 1
+
+
+def test_tune_refuses_methods_that_do_not_apply():
+    with pytest.raises(SystemExit, match=r"one that can be run on quad, got dfo_ls: .*\w"):
+        tune("quad", method="dfo_ls")
+
+
+def test_tune_prints_what_it_has_when_interrupted(capsys, monkeypatch):
+    real, calls = attempt, []
+
+    def interrupted(*given, **more):
+        calls.append(given)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return real(*given, **more)
+
+    monkeypatch.setattr("experiments.tune.attempt", interrupted)
+    with pytest.raises(SystemExit, match="interrupted after 1 of 3 settings"):
+        tune("quad", method="our_g", runs=2, evaluations=50, over=("samples=2,4",))
+    _, _, row = capsys.readouterr().out.splitlines()
+    assert row.startswith("1 in use")
 
 
 def test_tune_prints_the_settings_in_use_and_better_ones(capsys):

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import re
+import shlex
 from dataclasses import asdict, replace
 
 import matplotlib.image
@@ -346,6 +347,10 @@ def test_report_writes_the_page(folder, tmp_path, capsys):
     assert (folder / "report.html").read_text() == page(folder)
     report(folder, tmp_path / "other.html")
     assert (tmp_path / "other.html").read_text() == page(folder)
+    report(folder, tmp_path / "new" / "one" / "page.html")
+    assert (tmp_path / "new" / "one" / "page.html").read_text() == page(folder)
+    with pytest.raises(SystemExit, match=r"out must be a file, .* got the folder .*new"):
+        report(folder, tmp_path / "new")
 
 
 @pytest.mark.parametrize("command", [table, plot, report])
@@ -354,6 +359,22 @@ def test_folders_without_runs_are_refused(command, tmp_path):
         command(tmp_path / "nowhere")
     with pytest.raises(SystemExit, match="has none"):
         command(tmp_path)
+
+
+@pytest.mark.parametrize("left", ["", '{"task": "bow', "{}", "\0" * 8])
+def test_broken_outcomes_are_named(folder, left):
+    path = folder / "bowl" / "our_g" / "1.json"
+    path.write_text(left)
+    with pytest.raises(SystemExit, match=rf"{path} is not the outcome of a run .*delete it"):
+        table(folder)
+
+
+def test_broken_rows_are_named(folder):
+    path = folder / "bowl" / "our_g" / "1.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([lines[0], "\0" * 9 + "\n", *lines[2:]]))
+    with pytest.raises(SystemExit, match=rf"line 2 of {path} is not a row of a run; delete the file and 1.json"):
+        table(folder)
 
 
 def test_list_names_everything():
@@ -381,11 +402,60 @@ def test_list_says_what_is_missing(monkeypatch):
         ({"tasks": ("quad",), "runs": 0}, "runs must be at least 1, got 0"),
         ({"tasks": ("quad",), "jobs": -1}, "jobs must be at least 1, got -1"),
         ({"tasks": ("cnn",), "methods": "cma_es"}, "methods must be some of fr22, .* got cma_es"),
+        ({"tasks": ("quad", "cnn"), "threads": 0}, "threads must be at least 1, got 0"),
+        ({"tasks": ("cnn",), "seed": -1}, "seed must be at least 0, got -1"),
+        (
+            {"tasks": ("quad", "cnn_texture"), "methods": "dfo_ls"},
+            "no method of this command can be run on these tasks",
+        ),
     ],
 )
 def test_wrong_arguments_are_named(arguments, message, tmp_path):
     with pytest.raises(SystemExit, match=message):
         run(arguments.pop("tasks"), out=tmp_path, **arguments)
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """What would have been trained: tasks and methods."""
+    calls = []
+
+    def train_all(kind, preset, methods, *_):
+        calls.append((kind.name, [method.name for method in methods]))
+
+    monkeypatch.setattr("experiments.run_training.train_all", train_all)
+    return calls
+
+
+def test_tasks_that_no_method_goes_with_are_left_out(tmp_path, capsys, trained):
+    run(("quad", "cnn"), methods="pooled,dfo_ls", out=tmp_path)
+    assert trained == [("cnn", ["pooled"])]
+    assert re.search("^quad is left out: pooled: trains networks only; dfo_ls: ", capsys.readouterr().out, re.MULTILINE)
+    assert not list(tmp_path.iterdir())
+    run(("cnn", "quad"), methods="cobyqa", runs=1, out=tmp_path)
+    printed = capsys.readouterr().out
+    assert "cnn is left out: methods must be some of fr22, " in printed
+    assert "got cobyqa" in printed
+    assert "1 of 1 runs have ended" in printed
+    run(("cnn", "cnn_texture"), methods="our_g,our_hvp", out=tmp_path)
+    assert trained[1:] == [("cnn", ["our_g", "our_hvp"]), ("cnn_texture", ["our_g"])]
+    assert "our_hvp is left out on cnn_texture: methods must be some of fr22, " in capsys.readouterr().out
+
+
+def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path):
+    run(("quad",), methods="cobyqa", runs=1, out=tmp_path)
+    (tmp_path / "quad" / "cobyqa" / "0.json").write_text("")
+    with pytest.raises(SystemExit, match=r"0.json is not the outcome of a run"):
+        run(("quad",), methods="cobyqa", runs=2, out=tmp_path)
+    assert not (tmp_path / "quad" / "cobyqa" / "1.json").exists()
+
+
+def test_commands_that_are_printed_can_be_pasted(tmp_path, capsys):
+    out = tmp_path / "two words"
+    run(("quad",), methods="cobyqa", runs=1, out=out)
+    lines = capsys.readouterr().out.splitlines()
+    hints = [shlex.split(line.partition(": ")[2]) for line in lines if "python -m experiments" in line]
+    assert hints == [["python", "-m", "experiments", name, str(out)] for name in ("plot", "report")]
 
 
 def test_run_runs_prints_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):

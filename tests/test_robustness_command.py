@@ -16,6 +16,7 @@ from experiments.scenes.meshes import to_srgb
 from experiments.summary import summarize
 from experiments.task import uniform
 from experiments.tasks import mug
+from experiments.trial import Trial, attempt
 from experiments.variations import Change, from_srgb, jpeg, varied
 from experiments.variations import load as load_varied
 
@@ -148,6 +149,35 @@ def test_noise_of_mitsuba():
     torch.testing.assert_close(other[0], other[1])
     assert float(fresh.min()) > 1e-5
     assert abs(float(fresh[0] - fresh[1])) > 1e-6
+
+
+@pytest.mark.parametrize("noise", ["fixed", "other", "call", "point"])
+def test_a_run_goes_on_with_the_noise_that_would_have_come(noise, tmp_path):
+    small = replace(mug.task(variant="scalar_rgb"), setting=Setting((16, 12), 2, 2))
+    x = torch.zeros(2, 1).double()
+
+    def losses(folder, *counts):
+        for count in counts:  # the process starts again after each but the last
+            trial = Trial(varied(small, Change(noise=noise)), "m", 0, folder)
+            found = [trial.loss(x) for _ in range(count)]
+            trial.close(ended=False)
+        return torch.stack(found)
+
+    whole, interrupted = losses(tmp_path / "whole", 5), losses(tmp_path / "parts", 2, 3, 5)
+    torch.testing.assert_close(interrupted, whole, rtol=0, atol=0)
+    assert len(whole[:, 0].unique()) == (5 if noise in ("call", "point") else 1)
+
+
+def test_scenes_are_loaded_before_the_clock_starts(task, scenes):
+    loaded = []
+
+    def solve(trial):
+        loaded.append(len(scenes))
+        trial.loss(trial.start[None])
+        loaded.append(len(scenes))
+
+    attempt(varied(task, Change(noise="point")), "m", 0, solve)
+    assert loaded[0] == loaded[1] == 2  # that of the task, for the errors, and its own
 
 
 def test_srgb_there_and_back():

@@ -161,6 +161,10 @@ class MitsubaScene:
             parameter.write(self.values, part.tolist())
         self.values.update()
 
+    def skip(self, calls: int, points: int) -> None:
+        """Let fresh noise go on as after so many calls with so many points in all."""
+        self._calls += {"fixed": 0, "call": calls, "point": points}[self.noise]
+
     def _select(self) -> None:
         """Make the variant of this scene the current one of the process: another scene may have another."""
         if self.mi.variant() != self.variant:

@@ -1,5 +1,6 @@
 """Runs of training tasks: logs that resume, errors and predictions as pictures, the network as ONNX, a table."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +13,7 @@ from experiments import export, figures, predictions
 from experiments.command import register
 from experiments.journal import DivergedError
 from experiments.recorder import Recorder
-from experiments.records import Files, Outcome, Record, read_outcome, write_outcome
+from experiments.records import Files, Outcome, Record, read_outcome, write, write_outcome
 from experiments.results import load
 from experiments.tables import table
 from experiments.training import Method, Result, train, trained
@@ -110,7 +111,9 @@ def _train(task: TrainingTask, method: Method, files: Files, weights: Path, name
             except DivergedError as error:
                 diverged = error
                 raise
-            torch.save(encoder.state_dict(), weights)
+            content = io.BytesIO()
+            torch.save(encoder.state_dict(), content)
+            write(weights, content.getvalue())
 
         try:
             end = ending(solve)

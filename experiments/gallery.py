@@ -5,7 +5,6 @@ experiments with a caustic and with two mirrors (figures 9, 12 and 13 of the sou
 task. Tasks that are not pictures are shown as a map of their loss if they have two parameters.
 """
 
-import html
 import itertools
 import math
 import shutil
@@ -24,6 +23,7 @@ from experiments.animation import Look, Trace, finer, frames, look, percent, sav
 from experiments.catalogue import FITTING, RENDERED, TRAINING, Preset, chosen
 from experiments.command import machine
 from experiments.ensemble import unusable
+from experiments.html_page import html_page, html_table, html_text
 from experiments.measures import described, measures
 from experiments.methods import METHODS
 from experiments.records import Record
@@ -192,12 +192,7 @@ def _alike(found: Trace, seen: Look) -> str:
     return described(known | dict(itertools.islice(more.items(), 1)))
 
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse } td, th { padding: .15em .8em; border-bottom: 1px solid #ddd; text-align: left }
-.wide { overflow-x: auto } figure { display: inline-block; margin: .4em; vertical-align: top } img { max-width: 100% }
-figcaption { font-size: 13px; max-width: 40em }
-"""
+_STYLE = "figure { margin: .4em } img { max-width: 100% } figcaption { max-width: 40em }"
 _CAPTIONS = {
     "figure9": "All tasks: start, end of the run, target, with more samples per pixel than the runs had. "
     "Tasks without a picture: bands of equal loss, the point red.",
@@ -209,24 +204,15 @@ _CAPTIONS = {
 
 
 def _page(shown: Sequence[Shown], files: Sequence[Path]) -> str:
-    headers, rows = _table(shown)
-    head = "".join(f"<th>{html.escape(one)}</th>" for one in headers)
-    body = "".join(f"<tr>{''.join(f'<td>{_cell(value)}</td>' for value in row)}</tr>" for row in rows)
     titles = {found.task.name: f"{found.task.name.upper()}: {found.task.title}." for found, _ in shown} | _CAPTIONS
     pictures = "".join(
-        f"<figure><img src='{path.name}' alt='{path.stem}'><figcaption>{html.escape(titles[path.stem])}</figcaption>"
+        f"<figure><img src='{path.name}' alt='{path.stem}'><figcaption>{html_text(titles[path.stem])}</figcaption>"
         "</figure>"
         for path in files
     )
     about = ", ".join(f"{name} {value}" for name, value in machine().items())
-    return (
-        "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>Gallery</title>"
-        f"<style>{_STYLE}</style></head><body><h1>Gallery</h1>{pictures}"
-        f"<h2>Runs</h2><p>Image errors are relative to the start, parameter errors root mean squares in the units of "
-        f"the task; seconds of one run on: {html.escape(about)}.</p>"
-        f"<div class='wide'><table><tr>{head}</tr>{body}</table></div></body></html>\n"
+    body = (
+        f"{pictures}<h2>Runs</h2><p>Image errors are relative to the start, parameter errors root mean squares in the "
+        f"units of the task; seconds of one run on: {html_text(about)}.</p>{html_table(*_table(shown))}"
     )
-
-
-def _cell(value: object) -> str:
-    return "-" if value is None else html.escape(f"{value:.3g}" if isinstance(value, float) else str(value))
+    return html_page("Gallery", _STYLE, body)

@@ -15,7 +15,6 @@ The truth about a gradient is a far larger sample of scrambled Sobol points; its
 import csv
 import json
 import math
-import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from experiments.catalogue import FITTING, chosen, load
 from experiments.methods.trust_region import trust_region
 from experiments.objectives import FACTORIES, FORMS, Moments, Pictures, normal, pictures_of
 from experiments.records import Record
-from experiments.results import METRICS, Run
+from experiments.results import METRICS, Run, median
 from experiments.settings import settings
 from experiments.tables import table
 from experiments.tasks import brdf
@@ -254,10 +253,9 @@ def _fits(one: Pictures, runs: int, evaluations: int, limit: float) -> Iterator[
         for metric in METRICS:
             for form in FORMS:
                 reached = [record for run in ended[form] if (record := run.reached(metric, LEVEL))]
-                enough = 2 * len(reached) >= runs
-                median = statistics.median(record.evaluations for record in reached) if enough else None
-                seconds = statistics.median(record.seconds for record in reached) if enough else None
-                yield Fit(one.task.name, name, form, metric, median, len(reached) / runs, seconds, runs)
+                evaluations_to = median([record.evaluations for record in reached], runs)
+                seconds = median([record.seconds for record in reached], runs)
+                yield Fit(one.task.name, name, form, metric, evaluations_to, len(reached) / runs, seconds, runs)
 
 
 def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> Run:

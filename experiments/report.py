@@ -1,21 +1,21 @@
 """One self-contained HTML page about an ensemble: tables, curves, pictures, settings, machine and command."""
 
 import base64
-import html
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import matplotlib.image
-import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
 from experiments import catalogue, figures
+from experiments.animation import pixels
 from experiments.catalogue import FITTING
 from experiments.command import flat, read_command
+from experiments.html_page import html_page, html_table, html_text
 from experiments.measures import described, measures
 from experiments.results import Run, load
 from experiments.saving import known_saving, line
@@ -23,12 +23,9 @@ from experiments.summary import Summary, summarize, task_table
 from experiments.task import Task
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .15em .8em; border-bottom: 1px solid #ddd }
-th { text-align: left } td { font-variant-numeric: tabular-nums; white-space: nowrap } img.curves { max-width: 100% }
-.wide { overflow-x: auto } figure { display: inline-block; width: 170px; margin: .3em; vertical-align: top }
+figure { width: 170px; margin: .3em } figcaption { text-align: center; overflow-wrap: anywhere }
 figure img { width: 160px; height: auto; image-rendering: pixelated; border: 1px solid #ddd }
-figcaption { text-align: center; font-size: 13px; overflow-wrap: anywhere }
+img.curves { max-width: 100% }
 pre { background: #f5f5f5; padding: .6em; white-space: pre-wrap } summary { cursor: pointer }
 """
 
@@ -49,7 +46,7 @@ def report(
         raise SystemExit(f"out must be a file, such as {path / 'report.html'}, got the folder {path}")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page(folder))
+    path.write_text(page(folder), encoding="utf-8")
     print(path)
 
 
@@ -64,7 +61,7 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
         settings = known["settings"].get(name, {})
         preset = next((one.get("preset", "fast") for one in settings.values()), "fast")
         task = (tasks or {}).get(name) or _load(name, preset)
-        parts += [f"<h2 id='{_text(name)}'>{_text(name)}</h2>", _about(task), _tables(summary, name)]
+        parts += [f"<h2 id='{html_text(name)}'>{html_text(name)}</h2>", _about(task), _tables(summary, name)]
         parts.append(_curves(name, methods, chosen))
         if task is not None:
             run, ends = _ends(task, methods)
@@ -73,10 +70,7 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
     title = f"Results of {', '.join(results.runs)}"
     if summary.unfinished:
         parts.insert(0, f"<p>Unfinished runs that are not shown: {summary.unfinished}.</p>")
-    return (
-        f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>{_text(title)}</title>"
-        f"<style>{_STYLE}</style></head><body><h1>{_text(title)}</h1>{''.join(parts)}</body></html>\n"
-    )
+    return html_page(title, _STYLE, "".join(parts))
 
 
 def _load(name: str, preset: Any) -> Task | None:
@@ -91,31 +85,32 @@ def _commands(commands: Sequence[Mapping[str, Any]]) -> str:
         return ""
     lines = "\n".join(f"{one['command']}    # {one['started']}" for one in commands)
     machine = ", ".join(f"{name} {value}" for name, value in commands[-1]["machine"].items())
-    return f"<h2>Command and machine</h2><pre>{_text(lines)}</pre><p>{_text(machine)}</p>"
+    return f"<h2>Command and machine</h2><pre>{html_text(lines)}</pre><p>{html_text(machine)}</p>"
 
 
 def _speed_ups(summary: Summary) -> str:
     rows = [[s.method, s.seconds, s.evaluations, s.cases] for s in (*summary.speed_ups, summary.mean_speed_up)]
     return (
-        f"<h2>Mean ratio to {_text(summary.reference)}</h2><p>Seconds and evaluations of a method divided by those of "
-        f"{_text(summary.reference)}, averaged over the tasks, errors and levels that both reach.</p>"
-        + _table(["method", "seconds", "evaluations", "cases"], rows)
+        f"<h2>Mean ratio to {html_text(summary.reference)}</h2><p>Seconds and evaluations of a method divided by "
+        f"those of {html_text(summary.reference)}, averaged over the tasks, errors and levels that both reach.</p>"
+        + html_table(["method", "seconds", "evaluations", "cases"], rows)
     )
 
 
 def _about(task: Task | None) -> str:
     if task is None:
         return ""
-    return f"<p>Sought: {_text(task.title)}. Parameters: {_text(task.parameters)}. Needs: {_text(task.needs)}.</p>"
+    about = f"Sought: {task.title}. Parameters: {task.parameters}. Needs: {task.needs}."
+    return f"<p>{html_text(about)}</p>"
 
 
 def _tables(summary: Summary, task: str) -> str:
     headers, rows = task_table(summary, task)
     found = "<p>Median evaluations and seconds, and share of the runs, until an error is reduced by:</p>"
-    found += _table(headers, rows)
+    found += html_table(headers, rows)
     failures = [one for one in summary.failures if one.task == task]
     if failures:
-        found += "<p>Runs that ended before both errors were reduced by 99.9 %:</p>" + _table(
+        found += "<p>How runs ended that did not reach their goal:</p>" + html_table(
             ["method", "runs", "", "reason"], [[one.method, one.runs, one.status, one.reason] for one in failures]
         )
     return found
@@ -124,7 +119,7 @@ def _tables(summary: Summary, task: str) -> str:
 def _curves(name: str, methods: dict[str, list[Run]], chosen: Mapping[str, figures.Style]) -> str:
     image = io.BytesIO()
     figures.curves(name, methods, image, chosen)
-    return f"<img class='curves' alt='error curves of {_text(name)}' src='{_embedded(image.getvalue())}'>"
+    return f"<img class='curves' alt='error curves of {html_text(name)}' src='{_embedded(image.getvalue())}'>"
 
 
 def _ends(task: Task, methods: Mapping[str, Sequence[Run]]) -> tuple[int, dict[str, Tensor]]:
@@ -158,8 +153,8 @@ def _pictures(task: Task, run: int, ends: Mapping[str, Tensor]) -> str:
 
 
 def _figure(name: str, picture: Tensor | None, caption: str) -> str:
-    image = "" if picture is None else f"<img alt='{_text(name)}' src='{_embedded(_png(picture))}'>"
-    return f"<figure>{image}<figcaption><b>{_text(name)}</b><br>{_text(caption)}</figcaption></figure>"
+    image = "" if picture is None else f"<img alt='{html_text(name)}' src='{_embedded(_png(picture))}'>"
+    return f"<figure>{image}<figcaption><b>{html_text(name)}</b><br>{html_text(caption)}</figcaption></figure>"
 
 
 def _left_out(task: Task, ends: Mapping[str, Tensor], folder: Path) -> str:
@@ -168,34 +163,21 @@ def _left_out(task: Task, ends: Mapping[str, Tensor], folder: Path) -> str:
         return ""
     best = min(ends.values(), key=task.image_error)
     found = known_saving(task, line(ends["start"], best), folder)
-    return f"<h3>Left out</h3><p>Used: {_text(task.needs)}. Against the full setting of the source, {_text(found)}.</p>"
+    used = f"Used: {task.needs}. Against the full setting of the source, {found}."
+    return f"<h3>Left out</h3><p>{html_text(used)}</p>"
 
 
 def _settings(settings: Mapping[str, dict[str, Any]]) -> str:
     if not settings:
         return ""
     rows = [[name, ", ".join(f"{key} = {value}" for key, value in flat(one).items())] for name, one in settings.items()]
-    return f"<details><summary>Settings</summary>{_table(['method', 'settings'], rows)}</details>"
-
-
-def _table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    head = "".join(f"<th>{_text(name)}</th>" for name in headers)
-    body = "".join("<tr>" + "".join(f"<td>{_text(value)}</td>" for value in row) + "</tr>" for row in rows)
-    return f"<div class='wide'><table><tr>{head}</tr>{body}</table></div>"
-
-
-def _text(value: object) -> str:
-    if value is None:
-        return "-"
-    return html.escape(f"{value:.3g}" if isinstance(value, float) else str(value), quote=True)
+    return f"<details><summary>Settings</summary>{html_table(['method', 'settings'], rows)}</details>"
 
 
 def _png(picture: Tensor) -> bytes:
     """PNG of [h, w] or [h, w, 3] in [0, 1]."""
-    pixels = (255 * picture.detach().double().clamp(0, 1)).round().to(torch.uint8)
-    rgb = pixels if pixels.ndim == 3 else pixels[..., None].expand(-1, -1, 3)
     out = io.BytesIO()
-    matplotlib.image.imsave(out, np.ascontiguousarray(rgb.numpy()), format="png")
+    matplotlib.image.imsave(out, pixels(picture), format="png")
     return out.getvalue()
 
 

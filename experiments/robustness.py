@@ -19,7 +19,7 @@ from experiments.catalogue import FITTING, Preset, chosen
 from experiments.command import register
 from experiments.ensemble import Ensemble, ordered, unusable
 from experiments.methods import METHODS
-from experiments.results import Results, Run, load
+from experiments.results import Results, Run, load, median
 from experiments.settings import settings as settings_of
 from experiments.tables import table
 from experiments.trial import LEVELS, LIMIT
@@ -255,7 +255,6 @@ def row(cell: Cell, runs: Sequence[Run]) -> Row:
     ends = [(run.error("image")[-1], run.records[-1].parameter_error) for run in runs if run.records]
     image = [error for error, _ in ends if error is not None]
     parameter = [error**0.5 for _, error in ends if error is not None]
-    enough = 2 * len(reached) >= len(runs)
     return Row(
         cell.task,
         cell.sweep,
@@ -264,8 +263,8 @@ def row(cell: Cell, runs: Sequence[Run]) -> Row:
         len(runs),
         sum(run.reached("image", LEVELS[0]) is not None for run in runs) / len(runs),
         len(reached) / len(runs),
-        float(statistics.median(record.evaluations for record in reached)) if enough else None,
-        statistics.median(record.seconds for record in reached) if enough else None,
+        median([record.evaluations for record in reached], len(runs)),
+        median([record.seconds for record in reached], len(runs)),
         statistics.median(image) if image else None,
         statistics.median(parameter) if parameter else None,
     )

@@ -23,7 +23,7 @@ from typing import Annotated, Literal
 import tyro
 
 from experiments.catalogue import chosen
-from experiments.results import METRICS, Results, Run, load
+from experiments.results import METRICS, Results, Run, load, median
 from experiments.tables import table as text_table
 from experiments.trial import LEVELS
 
@@ -136,14 +136,13 @@ def _rows(task: str, results: Results, reference: str | None) -> Iterator[Row]:
 
 def _row(task: str, method: str, metric: str, level: float, runs: Sequence[Run]) -> Row:
     reached = [record for run in runs if (record := run.reached(metric, level))]
-    enough = 2 * len(reached) >= len(runs)
     return Row(
         task,
         method,
         metric,
         level,
-        float(statistics.median(record.seconds for record in reached)) if enough else None,
-        float(statistics.median(record.evaluations for record in reached)) if enough else None,
+        median([record.seconds for record in reached], len(runs)),
+        median([record.evaluations for record in reached], len(runs)),
         len(reached) / len(runs),
         len(runs),
     )

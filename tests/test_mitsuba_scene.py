@@ -61,7 +61,7 @@ def test_pose_is_the_product_of_its_parts(variant) -> None:
     pose = Transform(
         ("ball.to_world", "bead.to_world"),
         move=((1, 0, 0), (0, 1, 1)),
-        turn=((0, 0, 1), (1, 1, 0)),
+        turn=(np.array([0.0, 0.0, 1.0]), (1, 1, 0)),
         unit=(2.0, 0.5, 90.0, 10.0),
         pivot=(0.5, -1.0, 0.0),
     )

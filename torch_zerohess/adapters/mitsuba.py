@@ -33,7 +33,6 @@ __all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
 
 Description = Mapping[str, Any] | str | os.PathLike[str] | Callable[[ModuleType], Mapping[str, Any]]
 
-
 _MOST = 2**31
 """Mitsuba's integers are below this."""
 
@@ -113,12 +112,12 @@ class MitsubaScene:
         self.n = sum(one.n for one in self.parameters)
         self.labels = [label for one in self.parameters for label in one.labels]
         """Of the columns of x [n]."""
-        self.x0 = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64)
-        """[n], the scene as it was loaded, or the nearest within the bounds."""
         lower, upper = zip(*(pair for one in self.parameters for pair in one.limits), strict=True)
         self.bounds = torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
-        self.x0 = self.x0.clamp(*self.bounds)
         """Lower and upper [n], infinite where there are none; renders are of points clamped to them."""
+        start = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64)
+        self.x0 = start.clamp(*self.bounds)
+        """[n], the scene as it was loaded, or the nearest within the bounds."""
         self.values.keep([name for one in self.parameters for name in one.names])
         self._calls = seed
 

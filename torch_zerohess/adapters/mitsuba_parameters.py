@@ -82,7 +82,7 @@ class Transform:
             raise ValueError(f"{self.names[0]}: move and turn must have at least one vector, got none")
         for what, vectors in (("move", self.move), ("turn", self.turn)):
             for vector in vectors:
-                if not isinstance(vector, Sequence) or len(vector) != 3 or not any(vector):
+                if not hasattr(vector, "__len__") or len(vector) != 3 or not any(vector):
                     raise ValueError(f"{self.names[0]}: {what} must be vectors of 3 numbers, not all 0, got {vector!r}")
         for name in self.names:
             kind = type(values[name]).__name__

@@ -22,6 +22,7 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 import torch_zerohess as zh
 from experiments.catalogue import FITTING, chosen, load
@@ -136,9 +137,14 @@ def losses(
         )
     shown = {name: pictures_of(load(name)) for name in chosen("tasks", tasks, list(FITTING))}
     swept = [one for name, one in shown.items() if name in SOLUTIONS]
+    curves = tqdm([(one, scale * one.task.sigma) for one in swept for scale in SCALES], "curves", disable=None)
     report = LossReport(
-        [bias for one in swept for scale in SCALES for bias in _sweep(one, scale * one.task.sigma, sweep, seed)],
-        [error for one in swept for error in _gradient_errors(one, samples, runs, truth, seed)],
+        [bias for one, sigma in curves for bias in _sweep(one, sigma, sweep, seed)],
+        [
+            error
+            for one in tqdm(swept, "gradients", disable=None)
+            for error in _gradient_errors(one, samples, runs, truth, seed)
+        ],
         [fit for one in shown.values() for fit in _fits(one, runs, evaluations, limit)],
     )
     print(text(report))
@@ -249,10 +255,13 @@ def _relative(one: Pictures, estimates: Sequence[Moments], form: str, truth: Ten
 
 def _fits(one: Pictures, runs: int, evaluations: int, limit: float) -> Iterator[Fit]:
     for name in one.losses:
-        ended = {form: [_fit(one, name, form, run, evaluations, limit) for run in range(runs)] for form in FORMS}
+        ended: dict[str, list[Run]] = {form: [] for form in FORMS}
+        jobs = [(form, run) for form in FORMS for run in range(runs)]
+        for form, run in tqdm(jobs, f"fits of {one.task.name}, {name}", disable=None):
+            ended[form].append(_fit(one, name, form, run, evaluations, limit))
         for metric in METRICS:
             for form in FORMS:
-                reached = [record for run in ended[form] if (record := run.reached(metric, LEVEL))]
+                reached = [record for ended_run in ended[form] if (record := ended_run.reached(metric, LEVEL))]
                 evaluations_to = median([record.evaluations for record in reached], runs)
                 seconds = median([record.seconds for record in reached], runs)
                 yield Fit(one.task.name, name, form, metric, evaluations_to, len(reached) / runs, seconds, runs)

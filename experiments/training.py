@@ -85,7 +85,7 @@ class Result:
 def train(task: TrainingTask, method: Method, run: int, recorder: Recorder) -> nn.Module:
     """Train a new encoder until the evaluations of the preset are used, and return it.
 
-    `recorder` gets a row per iteration, of `pooled` in every so many.
+    `recorder` gets a row per iteration, or with `pooled` one for several.
 
     Both errors of the first row are of the held-out images. After that the image error is the mean over the batches of
     the last twentieth of the run, which costs no renders; the parameter error is that of the held-out images. `pooled`

@@ -1,5 +1,5 @@
 // Perturbed points, the perturbations that rounding leaves of them, and their importance weights.
-// Literal reference: torch_zerohess/proposals.py.
+// Literal reference: torch_zerohess/sampling/proposals.py.
 #pragma once
 
 #include "quantiles.h"

@@ -1,4 +1,4 @@
-// Counter-based uniform noise, Philox 4x32-10 (Salmon et al. 2011). Literal reference: torch_zerohess/philox.py.
+// Counter-based uniform noise, Philox 4x32-10 (Salmon et al. 2011). Literal reference: torch_zerohess/sampling/philox.py.
 #pragma once
 
 #include <cstdint>

@@ -1,4 +1,4 @@
-// Inverse CDFs of the normal density and its derivative lobes. Literal reference: torch_zerohess/quantiles.py.
+// Inverse CDFs of the normal density and its derivative lobes. Literal reference: torch_zerohess/sampling/quantiles.py.
 // Only + - * / sqrt, in the order of the reference and compiled without contraction: the same bits everywhere.
 #pragma once
 

@@ -8,21 +8,21 @@ from typing import Any
 import tyro
 
 import torch_zerohess as zh
-from experiments.bench import bench
-from experiments.check_caustic import check_caustic
-from experiments.error import error
-from experiments.figures import plot
-from experiments.gallery import gallery
-from experiments.gradients import gradients
 from experiments.listing import list_
-from experiments.losses import losses
-from experiments.nonpsd_error import nonpsd_error
-from experiments.report import report
-from experiments.robustness import robustness
+from experiments.reports.figures import plot
+from experiments.reports.gallery import gallery
+from experiments.reports.report import report
+from experiments.reports.summary import table
 from experiments.run import run
-from experiments.stability import stability
-from experiments.summary import table
-from experiments.tune import tune
+from experiments.studies.bench import bench
+from experiments.studies.caustic import check_caustic
+from experiments.studies.estimators import error
+from experiments.studies.gradients import gradients
+from experiments.studies.losses import losses
+from experiments.studies.nonpsd import nonpsd_error
+from experiments.studies.robustness import robustness
+from experiments.studies.stability import stability
+from experiments.studies.tune import tune
 
 
 def doctor() -> None:

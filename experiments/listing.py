@@ -4,13 +4,13 @@ import ast
 import importlib.util
 from pathlib import Path
 
-from experiments import catalogue
-from experiments.catalogue import FITTING, TRAINING
-from experiments.ensemble import unusable
+from experiments.ensembles.ensemble import unusable
 from experiments.methods import METHODS
-from experiments.tables import table
-from experiments.task import Task
-from experiments.training import METHODS as TRAINING_METHODS
+from experiments.methods.training import METHODS as TRAINING_METHODS
+from experiments.problems import catalogue
+from experiments.problems.catalogue import FITTING, TRAINING
+from experiments.problems.task import Task
+from experiments.reports.tables import table
 
 
 def list_() -> None:

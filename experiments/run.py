@@ -7,16 +7,16 @@ from typing import Annotated, Any
 
 import tyro
 
-from experiments import catalogue
-from experiments.catalogue import FITTING, TRAINING, Preset, chosen
-from experiments.ensemble import Ensemble, unusable
+from experiments.ensembles.ensemble import Ensemble, unusable
 from experiments.methods import METHODS
-from experiments.records import read_outcome
-from experiments.results import load
-from experiments.summary import as_text, summarize
-from experiments.training import METHODS as TRAINING_METHODS
-from experiments.training import Method
-from experiments.trial import LIMIT
+from experiments.methods.training import METHODS as TRAINING_METHODS
+from experiments.methods.training import Method
+from experiments.problems import catalogue
+from experiments.problems.catalogue import FITTING, TRAINING, Preset, chosen
+from experiments.reports.results import load
+from experiments.reports.summary import as_text, summarize
+from experiments.runs.records import read_outcome
+from experiments.runs.trial import LIMIT
 
 RUNS = {"fitting": 20, "training": 1}
 """Runs of each method, if not given."""
@@ -135,6 +135,6 @@ def _train(
     variant: str,
     threads: int | None,
 ) -> None:
-    from experiments.run_training import train_all  # needs Mitsuba
+    from experiments.ensembles.run_training import train_all  # needs Mitsuba
 
     train_all(module.Task, module.PRESETS[preset], methods, runs, out, variant, threads)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from experiments.methods import Method
-from experiments.task import Task
+from experiments.problems.task import Task
 
 TARGET = torch.tensor([1.0, -2.0], dtype=torch.float64)
 

@@ -1,4 +1,4 @@
-"""The direction of imports, what the package loads, and the size of its modules, read from the source itself."""
+"""The direction of imports in both trees, what importing loads, and the size of modules, read from the source."""
 
 import ast
 import subprocess
@@ -7,28 +7,31 @@ from pathlib import Path
 
 import pytest
 
-import torch_zerohess
-
-PACKAGE = Path(__file__).parents[1] / "torch_zerohess"
-# DESIGN section 4, left to right. A module may import only from those before it; a folder counts as one.
-LAYERS = [
-    *("smoothing", "philox", "quantiles", "proposals", "extension", "kernels", "linear_map", "stein", "samplers"),
-    *("perturbations", "evaluators", "evaluation", "standard_error", "estimate", "finite_differences", "opaque"),
-    *("blackbox", "curvature", "schedules", "losses", "optim", "minimize", "adapters", "doctor"),
-]
+ROOT = Path(__file__).parents[1]
+# A folder, or a module at the top of its tree, imports only from those before it. Imports inside functions count too.
+LAYERS = {
+    "torch_zerohess": [
+        *("smoothing", "losses", "sampling", "evaluators", "estimation", "autograd", "surrogates", "linalg"),
+        *("search", "optim", "minimize", "adapters", "doctor"),
+    ],
+    "experiments": [
+        *("problems", "runs", "methods", "ensembles", "reports", "studies", "listing", "run", "commands", "__main__"),
+    ],
+}
 MOST_LINES = 320
-MODULES = sorted(PACKAGE.rglob("*.py"))
+MODULES = {tree: sorted((ROOT / tree).rglob("*.py")) for tree in LAYERS}
+CASES = [pytest.param(tree, path, id=str(path.relative_to(ROOT))) for tree in LAYERS for path in MODULES[tree]]
 
 
-def name(path: Path) -> str:
-    """Dotted name within the package: optim.newton, or the empty string for its __init__."""
-    parts = path.relative_to(PACKAGE).with_suffix("").parts
+def name(tree: str, path: Path) -> str:
+    """Dotted name within the tree: optim.newton, or the empty string for its __init__."""
+    parts = path.relative_to(ROOT / tree).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported(path: Path) -> set[str]:
-    """Modules of the package that a file imports, anywhere in it."""
-    known = {name(module) for module in MODULES}
+def imported(tree: str, path: Path) -> set[str]:
+    """Modules of the tree that a file imports, anywhere in it."""
+    known = {name(tree, module) for module in MODULES[tree]}
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         names: list[str] = []
@@ -36,10 +39,9 @@ def imported(path: Path) -> set[str]:
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path.name}:{node.lineno}: import by the full name, not a relative one"
-            module = node.module or ""
-            names = [f"{module}.{alias.name}" for alias in node.names]
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
         for full in names:
-            if full.split(".")[0] == "torch_zerohess":
+            if full.split(".")[0] == tree:
                 tail = full.split(".")[1:]
                 while ".".join(tail) not in known:  # a name inside a module
                     tail = tail[:-1]
@@ -47,24 +49,28 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def test_every_module_has_a_layer() -> None:
-    layers = {name(path).split(".")[0] for path in MODULES} - {""}
-    assert layers - set(LAYERS) == set(), "add it to LAYERS, where it belongs"
+@pytest.mark.parametrize("tree", LAYERS)
+def test_every_module_has_a_layer(tree: str) -> None:
+    layers = {name(tree, path).split(".")[0] for path in MODULES[tree]} - {""}
+    assert layers == set(LAYERS[tree]), "a folder or module has no layer, or a layer has no module"
 
 
-@pytest.mark.parametrize("path", [path for path in MODULES if name(path)], ids=name)
-def test_imports_go_one_way(path: Path) -> None:
-    own = name(path)
-    layer = own.split(".")[0]
-    for other in imported(path):
-        assert other != "", f"{own} imports from the top of the package: import from the module itself"
+@pytest.mark.parametrize(("tree", "path"), CASES)
+def test_imports_go_one_way(tree: str, path: Path) -> None:
+    own = name(tree, path)
+    if not own:  # the door to everything
+        return
+    layers, layer = LAYERS[tree], own.split(".")[0]
+    for other in imported(tree, path):
+        assert other != "", f"{own} imports from the top of {tree}: import from the module itself"
         above = other.split(".")[0]
-        allowed = above == layer or LAYERS.index(above) < LAYERS.index(layer)  # within a folder: see the next test
-        assert allowed, f"{own} imports {other}, which is to its right"
+        allowed = above == layer or layers.index(above) < layers.index(layer)  # within a folder: see the next test
+        assert allowed, f"{own} imports {other}, which comes after it"
 
 
-def test_modules_of_one_folder_have_no_cycle() -> None:
-    graph = {name(path): imported(path) for path in MODULES if name(path)}
+@pytest.mark.parametrize("tree", LAYERS)
+def test_no_import_cycle(tree: str) -> None:
+    graph = {name(tree, path): imported(tree, path) for path in MODULES[tree] if name(tree, path)}
     done: set[str] = set()
     while len(done) < len(graph):
         ready = {module for module in graph if module not in done and graph[module] - {module} <= done}
@@ -72,11 +78,36 @@ def test_modules_of_one_folder_have_no_cycle() -> None:
         done |= ready
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: name(path) or "__init__")
-def test_modules_are_small_and_say_what_they_are(path: Path) -> None:
+def test_the_library_knows_nothing_of_the_experiments() -> None:
+    for path in MODULES["torch_zerohess"]:
+        assert "experiments" not in {
+            full.split(".")[0]
+            for node in ast.walk(ast.parse(path.read_text()))
+            for full in (
+                [node.module or ""]
+                if isinstance(node, ast.ImportFrom)
+                else [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else []
+            )
+        }
+
+
+@pytest.mark.parametrize(("tree", "path"), CASES)
+def test_modules_are_small_and_say_what_they_are(tree: str, path: Path) -> None:
     text = path.read_text()
     assert len(text.splitlines()) <= MOST_LINES
     assert ast.get_docstring(ast.parse(text)), "a module begins with what it is about"
+
+
+PRIVATE = ("torch._C", "torch._", "forward_ad._", "_functorch")
+
+
+def test_private_names_of_torch_are_in_one_file() -> None:
+    for path in MODULES["torch_zerohess"]:
+        if name("torch_zerohess", path) != "autograd.transforms":
+            found = [one for one in PRIVATE if one in path.read_text()]
+            assert not found, f"{path}: {found} belong into autograd/transforms.py"
 
 
 LOADED = """
@@ -88,13 +119,15 @@ print("\\n".join(sorted(set(sys.modules) - before)))
 """
 
 
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
+
+
 def test_import_loads_nothing_but_torch_and_the_standard_library() -> None:
-    command = [sys.executable, "-W", "error", "-c", LOADED]
-    done = subprocess.run(
-        command, cwd=Path(torch_zerohess.__file__).parents[1], capture_output=True, text=True, check=True
-    )
-    loaded = {module.split(".")[0] for module in done.stdout.split()}
+    loaded = run("-W", "error", "-c", LOADED).stdout.split()
     assert "torch_zerohess" in loaded
-    assert loaded - {"torch_zerohess", "torch"} - set(sys.stdlib_module_names) == set()
+    assert {module.split(".")[0] for module in loaded} - {"torch_zerohess", "torch"} - set(
+        sys.stdlib_module_names
+    ) == set()
     # Nor the parts of torch that a plain `import torch` leaves alone because they are slow: import never compiles.
-    assert not [module for module in done.stdout.split() if module.startswith(("torch.utils.cpp", "torch._inductor"))]
+    assert not [module for module in loaded if module.startswith(("torch.utils.cpp", "torch._inductor"))]

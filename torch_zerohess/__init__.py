@@ -11,13 +11,13 @@ Hessian-vector products of F are estimated from one batch of evaluations of f (S
 """
 
 from torch_zerohess import adapters, evaluators, losses, optim
-from torch_zerohess.blackbox import BlackBox, smooth
-from torch_zerohess.curvature import CurvatureOperator, hvp
+from torch_zerohess.autograd.blackbox import BlackBox, smooth
+from torch_zerohess.autograd.curvature import CurvatureOperator, hvp
 from torch_zerohess.doctor import doctor
-from torch_zerohess.estimate import Estimate, estimate
-from torch_zerohess.finite_differences import finite_difference_hvp
+from torch_zerohess.estimation.estimate import Estimate, estimate
+from torch_zerohess.estimation.finite_differences import finite_difference_hvp
 from torch_zerohess.minimize import Minimum, minimize
-from torch_zerohess.schedules import LinearSigma
+from torch_zerohess.optim.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing
 
 __all__ = [

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from torch_zerohess import extension
 from torch_zerohess.adapters import mitsuba_variants
+from torch_zerohess.sampling import extension
 
 _OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "numpy")
 

@@ -17,7 +17,7 @@ from scipy.optimize import BFGS
 from torch import Tensor
 
 from experiments.methods.sampled import Annealing, SampledGradient
-from experiments.trial import Trial
+from experiments.runs.trial import Trial
 
 Array = NDArray[np.float64]
 Function = Callable[[Tensor], float]

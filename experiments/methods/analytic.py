@@ -14,8 +14,8 @@ import torch_zerohess as zh
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.sampled import Annealing
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 
 def analytic_1(trial: Trial, *, rate: float = 0.1, start: float = 1.0, end: float = 0.01, steps: int = 300) -> None:

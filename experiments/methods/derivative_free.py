@@ -16,8 +16,8 @@ from scipy.optimize import Bounds, minimize
 
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 Array = NDArray[np.float64]
 MOST = 100

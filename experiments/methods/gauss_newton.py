@@ -17,8 +17,8 @@ from torch import Tensor
 
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 FEWEST = 100
 """Parameters from which on it is offered: `trust_region` needs fewer evaluations below."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from experiments.trial import Trial
+from experiments.runs.trial import Trial
 
 
 def with_settings(solve: Callable[..., None], **fixed: Any) -> Callable[[Trial, Mapping[str, Any] | None], None]:

@@ -30,9 +30,9 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
-from experiments.scenes.fitted_mesh import Control, FittedMesh
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.scenes.fitted_mesh import Control, FittedMesh
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 LEVELS = (1, 2, 3, 3, 4)
 """Of the icosphere, whose vertices are the handles in turn."""

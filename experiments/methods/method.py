@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 
 def everywhere(task: Task) -> str | None:

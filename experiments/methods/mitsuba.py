@@ -16,8 +16,8 @@ import torch
 
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 _LEAST = 0.01
 """Learning rate at the end, over that at the start."""

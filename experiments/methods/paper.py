@@ -11,7 +11,7 @@
 S antithetic pairs per sample set; evaluations are those of one gradient, or of one move of a line search. The line
 search is `zh.optim.NonlinearCG`. Sigma falls linearly from start to end in `steps` steps and stays there. The radius of
 the trust region is in units of the parameters for our_h, and in units of sigma for our_hvp and our_hvpa, as in the
-source. Settings: `experiments.settings`.
+source. Settings: `experiments.methods.settings`.
 
 What differs from the source: our_h and our_hvpa subtract f(x) from every value, for the one evaluation more, without
 which a Hessian drowns in the noise of a constant; the optimizer's own differences are in its docstring.
@@ -26,8 +26,8 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method, everywhere
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 DIFFERENCE = 1 / 3
 """Half the distance of the two gradients of our_hvp, in units of sigma."""

@@ -22,7 +22,7 @@ from experiments.methods.adaptive_differences import bfgs_adaptive_fd
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.sampled import Annealing, SampledGradient
-from experiments.trial import Trial
+from experiments.runs.trial import Trial
 
 Array = NDArray[np.float64]
 SHORTEST = 1e-3

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
-from experiments.trial import Trial
+from experiments.runs.trial import Trial
 
 
 @dataclass(frozen=True)

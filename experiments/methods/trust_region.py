@@ -5,8 +5,8 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
-from experiments.task import Task
-from experiments.trial import Trial
+from experiments.problems.task import Task
+from experiments.runs.trial import Trial
 
 
 def trust_region(trial: Trial, *, sigma: float | None = None, output: bool = True) -> None:

@@ -3,6 +3,6 @@
 from torch_zerohess.optim.newton import Newton
 from torch_zerohess.optim.newton_cg import NewtonCG
 from torch_zerohess.optim.nonlinear_cg import NonlinearCG
-from torch_zerohess.optim.trust_region import TrustRegion
+from torch_zerohess.search.trust_region import TrustRegion
 
 __all__ = ["Newton", "NewtonCG", "NonlinearCG", "TrustRegion"]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from torch_zerohess.curvature import CurvatureOperator
+from torch_zerohess.autograd.curvature import CurvatureOperator
 
 Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
 """What a closure returns: the loss, or the loss and where its white box ends."""

@@ -1,0 +1,1 @@
+"""Many runs: planned, spread over processes, and their provenance noted."""

@@ -1,0 +1,213 @@
+"""Processes that run jobs, one thread each; a process that dies takes only its own job with it."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from experiments.methods import METHODS, Method
+from experiments.problems import catalogue
+from experiments.problems.catalogue import Preset
+from experiments.problems.task import Task
+from experiments.runs.records import Files, Outcome, Record, write_outcome
+from experiments.runs.trial import attempt
+
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+_PROGRESS = 0.2
+"""Seconds between two messages about a running job."""
+_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""Signals that come from without, so that a process killed by one says nothing about the method."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a method on a task; both by name, or as objects that can be pickled."""
+
+    task: str | Task
+    method: str | Method
+    run: int
+    folder: Path
+    preset: Preset
+    variant: str
+    limit: float
+    settings: dict[str, Any]
+    """Written to the outcome."""
+    method_settings: Any
+    """Given to the method."""
+    budget: int
+    """Evaluations of the task."""
+
+    @property
+    def task_name(self) -> str:
+        return self.task if isinstance(self.task, str) else self.task.name
+
+    @property
+    def method_name(self) -> str:
+        return self.method if isinstance(self.method, str) else self.method.name
+
+    @property
+    def files(self) -> Files:
+        return Files(self.folder / self.task_name / self.method_name, self.run)
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """A job that could not be run, for a reason that says nothing about the method."""
+
+    reason: str
+
+
+Message = Record | Outcome | Trouble
+
+
+def run_jobs(jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Message]]:
+    """Run jobs in `count` processes; yield records on the way and for each job an outcome or trouble at its end."""
+    waiting = deque(jobs)
+    workers: list[_Worker] = []
+    try:
+        while waiting or any(worker.job for worker in workers):
+            workers = [worker for worker in workers if worker.process.is_alive() or worker.job]
+            while waiting and len(workers) < count:
+                workers.append(_Worker())
+            for worker in workers:
+                if worker.job is None and waiting:
+                    worker.give(waiting.popleft())
+            ready = wait([worker.connection for worker in workers if worker.job])
+            for worker in [worker for worker in workers if worker.connection in ready]:
+                yield from worker.messages()
+    finally:
+        for worker in workers:
+            worker.process.kill()
+            worker.process.join()
+
+
+class _Worker:
+    """A process, the pipe to it and its job."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs,), daemon=True)
+        with _one_thread():
+            self.process.start()
+        theirs.close()
+        self.job: Job | None = None
+        self._started = False
+
+    def give(self, job: Job) -> None:
+        self.job = job
+        try:
+            self.connection.send(job)
+        except BrokenPipeError:
+            self.process.join()
+            raise RuntimeError(f"a worker process ended with code {self.process.exitcode} between its jobs") from None
+
+    def messages(self) -> Iterator[tuple[Job, Message]]:
+        """Yield what has arrived; the last message of a job frees the worker."""
+        assert self.job is not None
+        try:
+            message: Message | None = self.connection.recv()
+        except (EOFError, OSError):
+            self.process.join()
+            if not self._started:
+                raise RuntimeError(f"a worker process ended with code {self.process.exitcode} at its start") from None
+            message = _death(self.job, self.process.exitcode or 0)
+        if message is None:
+            self._started = True
+            return
+        job = self.job
+        if not isinstance(message, Record):
+            self.job = None
+        yield job, message
+
+
+def _death(job: Job, code: int) -> Outcome | Trouble:
+    """Return what the death of a process means for its job: a crash is the method's, a kill is not."""
+    if -code in _OUTSIDE:
+        return Trouble(f"its process was killed by {signal.Signals(-code).name}; the same command goes on with it")
+    cause = signal.Signals(-code).name if code < 0 else f"code {code}"
+    names = job.task_name, job.method_name, job.run
+    outcome = Outcome(*names, "failed", f"its process ended with {cause}", 0.0, 0.0, 0, 0, [], job.settings)
+    write_outcome(outcome, job.files)
+    return outcome
+
+
+def _work(connection: Connection) -> None:
+    """Run jobs until the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's: it ends this process
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    torch.set_num_threads(1)
+    connection.send(None)
+    while True:
+        try:
+            job: Job = connection.recv()
+        except EOFError:
+            return
+        connection.send(_execute(job, connection))
+
+
+def _follow_parent() -> None:
+    """End with the parent: a parent that was killed may be started again, and writes the same files."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
+
+
+def _execute(job: Job, connection: Connection) -> Message:
+    last = 0.0
+
+    def watch(record: Record) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last > _PROGRESS:
+            connection.send(record)
+            last = now
+
+    try:
+        task = _load(job.task, job.preset, job.variant) if isinstance(job.task, str) else job.task
+        method = METHODS[job.method] if isinstance(job.method, str) else job.method
+        method.load()
+        return attempt(
+            task,
+            method.name,
+            job.run,
+            lambda trial: method.solve(trial, job.method_settings),
+            job.folder,
+            limit=job.limit,
+            settings=job.settings,
+            watch=watch,
+        )
+    except Exception as error:
+        return Trouble(f"{type(error).__name__}: {error}")
+
+
+@lru_cache(maxsize=1)  # a scene that stays loaded slows down the next
+def _load(name: str, preset: Preset, variant: str) -> Task:
+    return catalogue.load(name, preset, variant)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let processes that start inside have one thread each: libraries read these variables when they are loaded."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

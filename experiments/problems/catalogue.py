@@ -1,0 +1,62 @@
+"""Tasks by name, loaded when they are used, so that nothing is imported that a command does not need."""
+
+import difflib
+import importlib
+import importlib.util
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
+
+from experiments.problems.task import Task
+
+Preset = Literal["fast", "paper"]
+
+FITTING = {
+    name: f"experiments.problems.tasks.{name}"
+    for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "caustic", "meshfit", "meshfit_color")
+}
+"""Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
+RENDERED = {name: f"experiments.problems.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror")}
+"""Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
+FITTING |= RENDERED
+TRAINING = {name: f"experiments.problems.tasks.{name}" for name in ("cnn", "cnn_wide", "cnn5", "cnn_texture")}
+"""Tasks whose unknowns are the weights of a network before Mitsuba: modules with `Task` and `PRESETS`."""
+
+
+def load(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:
+    """Return a fitting task, with a Mitsuba variant if it is rendered; ImportError says what to install."""
+    more = (variant,) if name in RENDERED else ()
+    with _packages_of(name):
+        task: Task = importlib.import_module(FITTING[name]).task(preset, *more)
+    return task
+
+
+def training(name: str) -> Any:
+    """Return the module of a training task; ImportError says what to install."""
+    with _packages_of(name):
+        return importlib.import_module(TRAINING[name])
+
+
+@contextmanager
+def _packages_of(name: str) -> Iterator[None]:
+    """Say what to install for a task; Mitsuba is looked for here, since tasks import it when they first render."""
+    try:
+        if (name in RENDERED or name in TRAINING) and importlib.util.find_spec("mitsuba") is None:
+            raise ModuleNotFoundError(name="mitsuba")
+        yield
+    except ImportError as error:
+        raise ImportError(
+            f"task {name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'",
+            name=error.name,
+        ) from error
+
+
+def chosen(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:
+    """Return names without repetition; SystemExit names those that do not exist, and what may have been meant."""
+    found = list(dict.fromkeys(name.strip() for name in names if name.strip()))
+    unknown = [name for name in found if name not in known]
+    if not found or unknown:
+        near = [match for name in unknown for match in difflib.get_close_matches(name, known, n=2)]
+        guess = f" (did you mean {' or '.join(near)}?)" if near else ""
+        raise SystemExit(f"{what} must be some of {', '.join(known)}, got {', '.join(unknown) or 'none'}{guess}")
+    return found

@@ -1,0 +1,189 @@
+"""Fitting tasks through Mitsuba: the scene is loaded when it is first rendered, once per process."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from experiments.problems.scenes.adjoint import ADJOINTS, unavailable, value_and_gradient
+from experiments.problems.scenes.meshes import to_srgb
+from experiments.problems.task import Task
+from torch_zerohess.adapters.mitsuba import MitsubaScene
+
+_REMEMBERED = 256
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Film [pixels], samples per pixel and longest path of a render."""
+
+    film: tuple[int, int]
+    spp: int
+    depth: int
+
+    def __str__(self) -> str:
+        return f"{self.film[0]}x{self.film[1]} pixels, {self.spp} samples per pixel, depth {self.depth}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderedTask(Task):
+    """A task of `rendered`, with what it was made of."""
+
+    solution: Tensor
+    """[n]."""
+    setting: Setting
+    scene: Callable[[Setting], MitsubaScene]
+    """Loads the scene in a setting."""
+    moving: Callable[[Setting], MitsubaScene]
+    """The same for derivatives."""
+
+
+class Reference:
+    """A scene, the image of the solution, and the mean squared differences to it.
+
+    Args:
+        make: loads the scene.
+        solution: [n].
+        depth: longest path.
+        moving: loads the scene for derivatives, see `value_and_gradient`.
+    """
+
+    def __init__(
+        self, make: Callable[[], MitsubaScene], solution: Tensor, depth: int, moving: Callable[[], MitsubaScene]
+    ) -> None:
+        self._make, self.solution = make, solution
+        self._depth, self._make_moving = depth, moving
+        self._known: OrderedDict[bytes, float] = OrderedDict()
+
+    @cached_property
+    def scene(self) -> MitsubaScene:
+        return self._make()
+
+    @cached_property
+    def moving(self) -> MitsubaScene:
+        return self._make_moving()
+
+    @cached_property
+    def target(self) -> Tensor:
+        """[h, w, 3]."""
+        return self.scene(self.solution[None])[0].double()
+
+    def prepare(self) -> None:
+        """Load the scene and render it once."""
+        _ = self.target
+
+    def release(self) -> None:
+        """Free the scenes; the target, which goes with them, is rendered again when it is needed."""
+        for name in ("scene", "moving", "target"):
+            vars(self).pop(name, None)
+
+    def image(self, x: Tensor) -> Tensor:
+        images = self.scene(x).double()
+        for point, image in zip(x, images, strict=True):
+            self._known[_key(point)] = float(self.loss_of(image))
+        while len(self._known) > _REMEMBERED:
+            self._known.popitem(last=False)
+        return images
+
+    def loss(self, x: Tensor) -> Tensor:
+        return (self.image(x) - self.target).square().mean((1, 2, 3))
+
+    def loss_of(self, image: Tensor) -> Tensor:
+        return self.residuals(image).square().mean()
+
+    def residuals(self, image: Tensor) -> Tensor:
+        return (image - self.target).flatten()
+
+    def error(self, x: Tensor) -> float:
+        """Loss of x [n]; what was just rendered is not rendered again."""
+        known = self._known.get(_key(x))
+        return float(self.loss(x[None])[0]) if known is None else known
+
+    def picture(self, x: Tensor) -> Tensor:
+        return shown(self.scene(x[None])[0])
+
+    def adjoint(self, x: Tensor, integrator: str, seed: int) -> tuple[Tensor, Tensor]:
+        """See `Task.adjoint`."""
+        return value_and_gradient(
+            self.scene, x, integrator, self.loss_of, depth=self._depth, moving=self.moving, seed=seed
+        )
+
+
+def rendered(
+    *,
+    scene: Callable[[Setting], MitsubaScene],
+    moving: Callable[[Setting], MitsubaScene],
+    variant: str,
+    setting: Setting,
+    full: Setting,
+    solution: Tensor,
+    needs: str,
+    parameter_error: Callable[[Tensor], float] | None = None,
+    **facts: Any,
+) -> RenderedTask:
+    """Return the task of finding the parameters [n] of a scene from its render at the solution.
+
+    The loss is the mean squared difference of linear images; all renders share one seed, also that of the reference.
+
+    Args:
+        scene: loads the scene in a setting.
+        moving: the same with shapes in place of instances, for derivatives.
+        variant: of both.
+        setting: of this task.
+        full: that of the source.
+        solution: [n].
+        needs: why the setting is enough.
+        parameter_error: of x [n]; the mean squared difference to the solution if None.
+        facts: `name`, `title`, `parameters`, `start`, `sigma`, `bounds` and `evaluations` of the task.
+    """
+    reference = Reference(lambda: scene(setting), solution, setting.depth, lambda: moving(setting))
+
+    def whole() -> RenderedTask:
+        return rendered(
+            scene=scene,
+            moving=moving,
+            variant=variant,
+            setting=full,
+            full=full,
+            solution=solution,
+            needs=needs,
+            parameter_error=parameter_error,
+            **facts,
+        )
+
+    return RenderedTask(
+        **facts,
+        solution=solution,
+        setting=setting,
+        scene=scene,
+        moving=moving,
+        needs=f"{setting}; {needs}",
+        n=len(solution),
+        loss=reference.loss,
+        image_error=reference.error,
+        parameter_error=parameter_error or (lambda x: float((x - solution).square().mean())),
+        image=reference.image,
+        image_loss=reference.loss_of,
+        residuals=reference.residuals,
+        picture=reference.picture,
+        target_picture=lambda: shown(reference.target),
+        adjoint=reference.adjoint,
+        adjoints=tuple(one for one in ADJOINTS if one != "direct_projective" or setting.depth == 2),
+        no_adjoint=lambda: unavailable(variant),
+        prepare=reference.prepare,
+        release=reference.release,
+        full=None if setting == full else whole,
+    )
+
+
+def shown(image: Tensor) -> Tensor:
+    """Linear image as sRGB in [0, 1]."""
+    return torch.from_numpy(to_srgb(image)).double() / 255
+
+
+def _key(x: Tensor) -> bytes:
+    return x.detach().double().contiguous().numpy().tobytes()

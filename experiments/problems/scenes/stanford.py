@@ -1,0 +1,150 @@
+"""The Stanford bunny for tasks, read from the installed package `pymeshfix`, or a bunny of ellipsoids without it.
+
+Lengths are in heights of the bunny; y is up and the origin is the centre of the bounding box. The scan has 50 000
+vertices; those in one cell of a grid are merged into one, about 5 000 are left. It is open at the bottom.
+"""
+
+import importlib.util
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from experiments.problems.scenes.icosphere import icosphere, vertex_normals
+
+Array = npt.NDArray[np.float64]
+Faces = npt.NDArray[np.uint32]
+Surface = tuple[Array, Array, Faces]  # vertices [m, 3], unit normals [m, 3], triangles [k, 3]
+Source = Literal["pymeshfix", "procedural"]
+
+CELL = 1 / 40
+"""Side of a grid cell, in heights of the bunny."""
+_SCALARS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+def bunny_surface() -> tuple[Surface, Source]:
+    """Vertices [m, 3], unit normals [m, 3] and triangles [k, 3], wound counterclockwise, and where they are from."""
+    path = _scan()
+    if path is None:
+        vertices, faces = _procedural()
+        source: Source = "procedural"
+    else:
+        points, triangles = read_ply(path)
+        turned = np.stack([points[:, 0], points[:, 2], -points[:, 1]], -1)  # z was up
+        vertices, faces = cluster(_unit_height(turned), triangles, CELL)
+        source = "pymeshfix"
+    vertices = _unit_height(vertices)
+    return (vertices, vertex_normals(vertices, faces), faces.astype(np.uint32)), source
+
+
+def _scan() -> Path | None:
+    """File of the scan, without importing the package."""
+    spec = importlib.util.find_spec("pymeshfix")
+    if spec is None or spec.origin is None:
+        return None
+    path = Path(spec.origin).parent / "examples" / "StanfordBunny.ply"
+    return path if path.is_file() else None
+
+
+def _unit_height(vertices: Array) -> Array:
+    low, high = vertices.min(0), vertices.max(0)
+    centred: Array = (vertices - 0.5 * (low + high)) / (high[1] - low[1])
+    return centred
+
+
+def read_ply(path: Path) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Vertices [m, 3] and triangles [k, 3] of a binary PLY file with elements vertex and face, in this order.
+
+    Unlike Mitsuba's reader it passes over header lines it does not know (`obj_info`).
+
+    Raises:
+        ValueError: the file is not such a PLY, or has polygons of more than three corners.
+    """
+    data = path.read_bytes()
+    head, mark, body = data.partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    form = next((line[1] for line in lines if line[:1] == ["format"]), None)
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(form or "")
+    if not mark or lines[:1] != [["ply"]] or order is None:
+        raise ValueError(f"path must be a binary PLY file, got {path} with format {form}")
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    for line in lines:
+        if line[:1] == ["element"]:
+            elements.append((line[1], int(line[2]), []))
+        elif line[:1] == ["property"]:
+            elements[-1][2].append(line[1:])
+    if [name for name, _, _ in elements] != ["vertex", "face"] or [one[0] for one in elements[1][2]] != ["list"]:
+        raise ValueError(f"path must be a PLY file of vertices and then faces with one list each, got {path}")
+    (_, count, scalars), (_, triangles, ((_, length, index, _),)) = elements
+    vertex = np.dtype([(name, order + _SCALARS[kind]) for kind, name in scalars])
+    face = np.dtype([("corners", order + _SCALARS[length]), ("index", order + _SCALARS[index], (3,))])
+    if len(body) != count * vertex.itemsize + triangles * face.itemsize:
+        raise ValueError(f"path must be a PLY file of triangles of the stated length, got {path}, {len(body)} bytes")
+    rows = np.frombuffer(body, vertex, count)
+    faces = np.frombuffer(body, face, triangles, count * vertex.itemsize)
+    if not (faces["corners"] == 3).all():
+        raise ValueError(f"path must be a PLY file of triangles, got {path} with faces of other sizes")
+    return np.stack([rows[axis] for axis in "xyz"], -1).astype(np.float64), faces["index"].astype(np.int64)
+
+
+def cluster(vertices: Array, faces: npt.NDArray[np.integer], cell: float) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Merge the vertices of every grid cell of side `cell` into their mean; collapsed and double triangles go.
+
+    Triangles that this turns over are wound the other way, to face along the normals of the vertices that were merged.
+
+    Returns: vertices [m, 3] and triangles [k, 3].
+    """
+    keys = np.floor(vertices / cell).astype(np.int64)
+    _, member = np.unique(keys, axis=0, return_inverse=True)
+    member = member.reshape(-1)
+    counts = np.bincount(member)[:, None]
+    normals = vertex_normals(vertices, faces)
+    means, outward = (np.stack([np.bincount(member, one) for one in of.T], -1) / counts for of in (vertices, normals))
+    merged = member[faces]
+    merged = merged[(merged != np.roll(merged, 1, axis=1)).all(1)]
+    _, first = np.unique(np.sort(merged, axis=1), axis=0, return_index=True)
+    merged = merged[first]
+    a, b, c = (means[merged[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * outward[merged].sum(1)).sum(1) < 0
+    merged[inward] = merged[inward, ::-1]
+    used, renamed = np.unique(merged, return_inverse=True)
+    return means[used], renamed.reshape(-1, 3)
+
+
+_ELLIPSOIDS = (  # centre, half axes, radius of the ball as a length
+    ((0.00, -0.22, 0.00), (0.30, 0.26, 0.25)),  # body
+    ((0.20, -0.28, 0.02), (0.20, 0.20, 0.24)),  # haunches
+    ((-0.24, 0.06, 0.02), (0.20, 0.17, 0.16)),  # head
+    ((-0.17, 0.33, 0.10), (0.06, 0.22, 0.05)),  # ears
+    ((-0.11, 0.30, -0.09), (0.06, 0.20, 0.05)),
+    ((0.42, -0.30, 0.02), (0.08, 0.08, 0.08)),  # tail
+    ((-0.22, -0.40, 0.10), (0.12, 0.07, 0.07)),  # paws
+    ((-0.22, -0.40, -0.10), (0.12, 0.07, 0.07)),
+)
+
+
+def _procedural() -> tuple[Array, npt.NDArray[np.int64]]:
+    """A closed surface: how far the blended ellipsoids reach from a point inside, in the directions of an icosphere."""
+    directions, faces = icosphere(5)
+    origin = np.array([-0.10, -0.06, 0.0])
+    reach = np.linspace(0.0, 1.0, 201)[1:]
+    field = np.zeros((len(directions), len(reach)))
+    for centre, axes in _ELLIPSOIDS:
+        ray, offset = directions / axes, (origin - centre) / axes
+        square = (ray**2).sum(1)[:, None] * reach**2 + 2 * (ray @ offset)[:, None] * reach + offset @ offset
+        field += np.exp(4.0 * (1.0 - square))  # 1 on the ellipsoid
+    last = len(reach) - 1 - np.argmax(field[:, ::-1] >= 1.0, axis=1)
+    rows = np.arange(len(directions))
+    inside, outside = np.log(field[rows, last]), np.log(field[rows, np.minimum(last + 1, len(reach) - 1)])
+    exact = reach[last] + (reach[1] - reach[0]) * inside / (inside - outside)
+    return origin + exact[:, None] * directions, faces

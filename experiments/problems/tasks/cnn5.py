@@ -1,0 +1,69 @@
+"""CNN5: a network predicts position, rotation and colour of a mug from an image, without labels.
+
+Five black-box parameters in units that change the image about equally: position across the view in 4 mm, rotation of
+the handle in 20 degrees, diffuse reflectance (r, g, b) in 0.1. The network is that of CNN with five outputs: 268 773
+weights, as in the source. Positions are U(-2, 2) cm, rotations those of CNN, reflectances U(0.1, 0.9).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from experiments.methods.pooled import Pooled
+from experiments.problems.scenes.mug import COLOR, DEGREES, POSE, mug_scene
+from experiments.problems.training_task import Encoder, Preset, TrainingTask
+from torch_zerohess.adapters.mitsuba import MitsubaScene
+
+UNITS = (0.4, 1.0, 0.1, 0.1, 0.1)
+"""In centimetres, 20 degrees and reflectance."""
+LOWER, UPPER = (-2.0, 11.5, 0.1, 0.1, 0.1), (2.0, 15.5, 0.9, 0.9, 0.9)
+"""Range of the training and held-out parameters, in centimetres, 20 degrees and reflectance."""
+OUTPUT = (-3.5, 4.5, 0.0, 0.0, 0.0), (3.5, 22.5, 1.0, 1.0, 1.0)
+"""Range of the predictions, in the same."""
+
+
+@dataclass(frozen=True)
+class Cnn5Preset(Preset):
+    """Size of the task, its network and scene."""
+
+    def encoder(self) -> Encoder:
+        lower, upper = ([value / unit for value, unit in zip(side, UNITS, strict=True)] for side in OUTPUT)
+        return Encoder(self.film, self.pools, lower, upper)
+
+    def scene(self, variant: str = "auto", threads: int | None = None) -> MitsubaScene:
+        film = (self.film, self.film)
+        return mug_scene((POSE, COLOR), film, self.spp, self.depth, variant=variant, threads=threads)
+
+
+class Task(TrainingTask):
+    """Position, rotation and colour [K, 5] of the mug, in `UNITS`."""
+
+    name = "cnn5"
+    n = 5
+    sigma = (1.0, 0.05)
+    bounds = (-math.inf, -math.inf, 0.0, 0.0, 0.0), (math.inf, math.inf, 10.0, 10.0, 10.0)
+    measure = "rms error [units]"
+    pooled = Pooled(lengths=(1.25, 0.6, 10.0, 10.0, 10.0), temperature=0.03)
+
+    def of_scene(self, x: Tensor) -> Tensor:
+        return x * torch.tensor(UNITS, dtype=x.dtype)
+
+    def parameters(self, count: int, generator: torch.Generator, *, held_out: bool) -> Tensor:
+        lower, upper, units = torch.tensor(LOWER), torch.tensor(UPPER), torch.tensor(UNITS)
+        return (lower + (upper - lower) * torch.rand(count, 5, generator=generator)) / units
+
+    @staticmethod
+    def measured(parameter_error: float) -> float:
+        return float(parameter_error**0.5)
+
+    def caption(self, x: Tensor) -> str:
+        position, rotation = self.of_scene(x)[:2].tolist()
+        return f"{position:.2f} cm, {DEGREES * rotation:.0f}°"
+
+
+PRESETS = {
+    "fast": Cnn5Preset(64, 8, 2, (2, 2, 2), evaluations=4000, images=1024, held_out=32),
+    "paper": Cnn5Preset(256, 32, 6, (2, 4, 4), evaluations=12000, images=4096, held_out=64),
+}

@@ -1,0 +1,118 @@
+"""CNN-TEXTURE: a network emits the 32x32 texture on a mug from an image of the mug, without ever seeing a texture.
+
+1024 black-box parameters, the reflectances of a grey label on the front of the mug. Textures are 32x32 crops of
+pictures of skimage.data, 2 to 8 of their pixels to one of the texture; the held-out ones are from other pictures than
+those of training. A label is 34 pixels wide at 96x96, so that the render determines each of its own pixels, those at
+the sides the least, where they are seen at a slant.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from experiments.methods.pooled import Pooled
+from experiments.problems.scenes.meshes import to_srgb
+from experiments.problems.scenes.mug import LABEL, LABEL_SIDE, mug_scene
+from experiments.problems.training_task import Preset, TrainingTask
+from torch_zerohess.adapters.mitsuba import MitsubaScene
+
+TRAINING = ("camera", "chelsea", "brick", "gravel", "coins", "moon", "rocket", "page")
+HELD_OUT = ("astronaut", "coffee")
+
+
+@dataclass(frozen=True)
+class TexturePreset(Preset):
+    """Size of the task, its network and scene."""
+
+    def encoder(self) -> "Decoder":
+        return Decoder(self.film)
+
+    def scene(self, variant: str = "auto", threads: int | None = None) -> MitsubaScene:
+        film = (self.film, self.film)
+        return mug_scene((LABEL,), film, self.spp, self.depth, label=True, variant=variant, threads=threads)
+
+
+class Decoder(nn.Module):
+    """Image [B, 3, h, w] to texture [B, 1024] in (0, 1): about 10 000 weights.
+
+    Two convolutions, a linear map along each axis from the pixels of the image to those of the texture, and two more
+    convolutions. Where the label is in the image is learned.
+    """
+
+    def __init__(self, film: int, channels: int = 8) -> None:
+        super().__init__()
+        self.see = nn.Sequential(
+            nn.Conv2d(3, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, channels, 3, padding=1)
+        )
+        self.across, self.down = nn.Linear(film, LABEL_SIDE), nn.Linear(film, LABEL_SIDE)
+        self.show = nn.Sequential(
+            nn.ReLU(), nn.Conv2d(channels, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, 1, 3, padding=1)
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        features = self.across(self.see(4.0 * image - 1.4))
+        return torch.sigmoid(self.show(self.down(features.mT).mT).flatten(1))
+
+
+class Task(TrainingTask):
+    """Texture [K, 1024], row by row from below."""
+
+    name = "cnn_texture"
+    n = LABEL_SIDE**2
+    sigma = (0.2, 0.02)
+    bounds = (0.0,), (1.0,)
+    measure = "PSNR of the texture [dB]"
+    pooled = Pooled(lengths=None, temperature=1.0, steps=900, rank=1100, rate=(3e-3, 2e-4), first=1100)
+    methods = ("fr22", "our_g", "pooled")
+
+    def parameters(self, count: int, generator: torch.Generator, *, held_out: bool) -> Tensor:
+        return torch.stack([_crop(HELD_OUT if held_out else TRAINING, generator) for _ in range(count)])
+
+    @staticmethod
+    def measured(parameter_error: float) -> float:
+        return float(-10.0 * np.log10(parameter_error))
+
+    def caption(self, x: Tensor) -> str:
+        return f"mean {float(x.mean()):.2f}"
+
+    def pictures(self, images: Tensor, x: Tensor) -> npt.NDArray[np.uint8]:
+        """Render and texture side by side."""
+        height = images.shape[2]
+        textures = x.reshape(-1, 1, LABEL_SIDE, LABEL_SIDE).flip(2).clamp(0.0, 1.0)
+        textures = functional.interpolate(textures.float(), (height, height)).expand(-1, 3, -1, -1)
+        return to_srgb(torch.cat([images, textures], 3).movedim(1, 3).numpy())
+
+
+def _crop(names: Sequence[str], generator: torch.Generator) -> Tensor:
+    """Return a random crop of a random picture, averaged down to the size of the texture, [1024], mirrored or not."""
+
+    def pick(stop: int) -> int:
+        return int(torch.randint(stop, (1,), generator=generator))
+
+    picture = _picture(names[pick(len(names))])
+    scale = 2 + pick(min(7, min(picture.shape) // LABEL_SIDE - 1))
+    side = LABEL_SIDE * scale
+    top, left = pick(picture.shape[0] - side + 1), pick(picture.shape[1] - side + 1)
+    texture = functional.avg_pool2d(picture[None, None, top : top + side, left : left + side], scale)[0, 0]
+    return (texture.flip(1) if pick(2) else texture).flatten()
+
+
+@cache
+def _picture(name: str) -> Tensor:
+    """Return a picture of skimage.data [h, w], grey, 0 to 1."""
+    from skimage import color, data, util
+
+    picture = util.img_as_float32(getattr(data, name)())
+    return torch.from_numpy(color.rgb2gray(picture[..., :3]) if picture.ndim == 3 else picture).float()
+
+
+PRESETS = {
+    "fast": TexturePreset(96, 8, 2, (1, 1, 1), evaluations=1100, images=1024, held_out=32),
+    "paper": TexturePreset(192, 32, 6, (1, 1, 1), evaluations=1100, images=1024, held_out=64),
+}

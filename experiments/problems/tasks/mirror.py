@@ -1,0 +1,56 @@
+"""MIRROR: position and rotation of the Stanford bunny, seen through two mirrors only.
+
+Parameters: x and y in scene lengths (the bunny is one high) and the rotation about y in units of 100 degrees, each from
+-1 to 1. Solution 0; starts 0.25 +- 0.1 away from it in each of them, with random signs. Loss: mean squared difference
+of linear images. Sigma: 0.25, the distance to the solution.
+
+Paths need four segments (mirror, mirror, bunny, light); light that falls on the bunny through a mirror or from the
+bunny itself changes the loss little. The `fast` preset has 48x48 pixels, the `paper` preset 64x64 with four times the
+samples.
+"""
+
+from functools import partial
+from typing import Literal
+
+import torch
+
+from experiments.problems.rendered import Setting, rendered
+from experiments.problems.scenes.bunny import IN_MIRRORS, SEEN_AT, as_mesh, in_mirrors
+from experiments.problems.task import Task, around
+from torch_zerohess.adapters.mitsuba import MitsubaScene
+
+FULL = Setting((64, 64), 32, 6)
+PRESETS = {"fast": Setting((48, 48), 8, 4), "paper": FULL}
+
+
+def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
+    """The scene in a setting; without instances its bunny is a mesh."""
+    return MitsubaScene(
+        partial(in_mirrors, instances=instances),
+        [IN_MIRRORS if instances else as_mesh(IN_MIRRORS, SEEN_AT)],
+        film=setting.film,
+        spp=setting.spp,
+        depth=setting.depth,
+        variant=variant,
+        threads=1,
+    )
+
+
+def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
+    return rendered(
+        name="mirror",
+        title="position and rotation of the Stanford bunny in two mirrors",
+        parameters="x, y in scene lengths, rotation in units of 100 degrees, all -1 to 1; "
+        "starts +-.25 +- .1, solution 0",
+        scene=lambda one: load(one, True, variant),
+        moving=lambda one: load(one, False, variant),
+        variant=variant,
+        setting=PRESETS[preset],
+        full=FULL,
+        needs="two mirrors and direct light",
+        solution=torch.zeros(3).double(),
+        start=around(3, 0.25, 0.1),
+        sigma=0.25,
+        bounds=(-torch.ones(3).double(), torch.ones(3).double()),
+        evaluations=400,
+    )

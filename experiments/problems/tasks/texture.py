@@ -1,0 +1,56 @@
+"""TEXTURE: the 1024 grey values of a 32x32 texture, the task with many parameters.
+
+Parameters: the pixels, row by row, between 0 and 1. The target is the photograph `skimage.data.camera`, averaged over
+blocks of 16x16 pixels. Starts: every pixel uniform in (0, 1). Loss: mean squared difference of the pixels, so that the
+image error and the parameter error are the same number. Sigma: 0.3, of the order of the difference of a pixel to its
+target.
+
+The render is the texture itself, as nothing else in an image of it would depend on the parameters: no light, camera or
+film. Both presets are the same.
+"""
+
+from typing import Literal
+
+import torch
+from skimage import data
+from torch import Tensor
+
+from experiments.problems.task import Task, uniform
+
+SIDE = 32
+
+
+def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+    photograph = torch.tensor(data.camera() / 255.0)
+    reference = photograph.unflatten(0, (SIDE, -1)).unflatten(2, (SIDE, -1)).mean((1, 3))
+    target, n = reference.flatten(), SIDE**2
+
+    def residuals(image: Tensor) -> Tensor:
+        return (image - reference).flatten()
+
+    def loss(x: Tensor) -> Tensor:
+        return (x - target).square().mean(1)
+
+    def error(x: Tensor) -> float:
+        return float(loss(x[None])[0])
+
+    return Task(
+        name="texture",
+        title="the pixels of a 32x32 texture",
+        parameters="1024 grey values, 0 to 1; starts U(0, 1)",
+        needs="the texture itself: no light, camera or film",
+        n=n,
+        loss=loss,
+        start=uniform(torch.zeros(n).double(), torch.ones(n).double()),
+        sigma=0.3,
+        evaluations=100_000,
+        image_error=error,
+        parameter_error=error,
+        bounds=(torch.zeros(n).double(), torch.ones(n).double()),
+        image=lambda x: x.view(-1, SIDE, SIDE),
+        image_loss=lambda image: residuals(image).square().mean(),
+        residuals=residuals,
+        analytic=lambda x, sigma: loss(x[None])[0] + sigma**2,
+        picture=lambda x: x.view(SIDE, SIDE).clamp(0, 1),
+        target_picture=lambda: reference,
+    )

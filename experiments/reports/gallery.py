@@ -1,0 +1,219 @@
+"""`python -m experiments gallery`: what the tasks look like, and what an optimisation of each of them does.
+
+Each task is run once and its pictures are those of the points that the method reported: an overview of all tasks, the
+experiments with a caustic and with two mirrors (figures 9, 12 and 13 of the source's supplement), and an animation per
+task. Tasks that are not pictures are shown as a map of their loss if they have two parameters.
+"""
+
+import itertools
+import math
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from tqdm import tqdm
+
+from experiments.ensembles.ensemble import unusable
+from experiments.ensembles.provenance import machine
+from experiments.methods import METHODS
+from experiments.problems import catalogue
+from experiments.problems.catalogue import FITTING, RENDERED, TRAINING, Preset, chosen
+from experiments.reports import gallery_figures
+from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together, trace
+from experiments.reports.html_page import html_page, html_table, html_text
+from experiments.reports.measures import described, measures
+from experiments.reports.tables import table
+from experiments.runs.records import Record
+
+METHOD = "trust_region"
+OWN = {**dict.fromkeys(("meshfit", "meshfit_color"), "our_h_local"), "caustic": "gauss_newton"}
+"""Tasks for which another method is recommended."""
+OTHER = "cma_es_bounded"
+"""The method that figure 12 compares with, as the source does."""
+HEIGHTS = 192, 128
+"""Of the pictures of an animation, about: one task, several together."""
+_REFRESH = 0.2 if sys.stderr.isatty() else 30.0
+"""Seconds between two changes of the progress bar."""
+
+Shown = tuple[Trace, Look]
+
+
+def gallery(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = Path("results"),
+    /,
+    tasks: tuple[str, ...] = tuple(FITTING),
+    method: str | None = None,
+    run: int = 0,
+    limit: float = 60.0,
+    preset: Preset = "fast",
+    out: Path | None = None,
+    count: int = 40,
+    variant: str = "auto",
+) -> list[Trace]:
+    """Run every task once and make pictures of it: figure 9, 12 and 13 of the source, animations, and a page of all.
+
+    Args:
+        folder: of results; predictions of networks that `run` trained there are on the page too.
+        tasks: names of fitting tasks; those without pictures are left out.
+        method: one of those in `list`; the recommended one of each task if not given.
+        run: number of the start.
+        limit: seconds that a run may take.
+        preset: fast or paper.
+        out: folder of the pictures and of index.html; DIR/gallery if not given.
+        count: frames of an animation, at most.
+        variant: of Mitsuba.
+    """
+    if count < 2:
+        raise SystemExit(f"count must be at least 2, got {count}")
+    if run < 0 or not limit > 0:
+        raise SystemExit(f"run must be at least 0 and limit positive, got {run} and {limit:g}")
+    if method is not None:
+        (method,) = chosen("method", [method], list(METHODS))
+    out = out or folder / "gallery"
+    out.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)
+    shown = _traces(chosen("tasks", tasks, list(FITTING)), method, run, limit, preset, variant)
+    if not shown:
+        raise SystemExit("no task of this command can be shown")
+    for one in shown:
+        if one[0].outcome.status == "failed":
+            print(f"{one[0].task.name} failed: {one[0].outcome.reason}")
+    files = [*_figures(shown, out, limit, variant), *_animations(shown, out, count), *_predictions(folder, out)]
+    page = out / "index.html"
+    page.write_text(_page(shown, files), encoding="utf-8")
+    print("\n" + table(*_table(shown)))
+    print("\n" + "\n".join(f"{path} {path.stat().st_size / 1000:.0f} kB" for path in [*files, page]))
+    return [found for found, _ in shown]
+
+
+def _traces(
+    names: Sequence[str], method: str | None, run: int, limit: float, preset: Preset, variant: str
+) -> list[Shown]:
+    shown = []
+    bar = tqdm(names, unit=" tasks", dynamic_ncols=True)
+    for name in bar:
+        bar.set_description(name)
+        try:
+            task = catalogue.load(name, preset, variant)
+        except ImportError as error:
+            bar.write(str(error))
+            continue
+        solver = METHODS[method or OWN.get(name, METHOD)]
+        seen, reason = look(task, task.start(run)), unusable(solver, task)
+        if seen is None or reason:
+            bar.write(f"{name} is left out: {reason or 'it has no picture'}")
+            continue
+        shown.append((trace(task, solver, run, limit, _watch(bar)), seen))
+    return shown
+
+
+def _watch(bar: tqdm) -> Callable[[Record], None]:
+    """Return what shows the last row of a run in a bar, some times a second."""
+    drawn = 0.0
+
+    def watch(record: Record) -> None:
+        nonlocal drawn
+        if time.monotonic() - drawn > _REFRESH:
+            error = math.nan if record.image_error is None else record.image_error
+            bar.set_postfix_str(f"{record.evaluations} evaluations, error {error:.3g}")
+            drawn = time.monotonic()
+
+    return watch
+
+
+def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> list[Path]:
+    """Write figure 9, and 12 and 13 if their tasks are there."""
+    files = [out / "figure9.png"]
+    stills = [(found, finer(found.task, seen)) for found, seen in tqdm(shown, desc="stills", unit=" tasks")]
+    gallery_figures.overview(stills, files[0])
+    for found, seen in stills:
+        if found.task.name == "caustic":
+            other = METHODS[OTHER]
+            more = None
+            if other.name != found.method and not unusable(other, found.task):
+                with tqdm(desc=f"caustic {OTHER}", bar_format="{desc}: [{elapsed}{postfix}]") as bar:
+                    more = trace(found.task, other, found.outcome.run, limit, _watch(bar))
+            files.append(out / "figure12.png")
+            gallery_figures.caustic(found, seen, more, files[-1])
+        if found.task.name == "mirror":
+            files.append(out / "figure13.png")
+            gallery_figures.mirrors(found, seen, gallery_figures.mirrors_from_outside(variant), files[-1])
+    return files
+
+
+def _animations(shown: Sequence[Shown], out: Path, count: int) -> list[Path]:
+    """Write one per task, and one of all rendered tasks together."""
+    files = []
+    small = []
+    for found, seen in tqdm(shown, desc="animations", unit=" tasks", dynamic_ncols=True):
+        rows = shown_rows(found, count)
+        files.append(save(frames(found, seen, rows, HEIGHTS[0]), out / found.task.name))
+        if found.task.name in RENDERED:
+            small.append(frames(found, seen, rows, HEIGHTS[1]))
+    if small:
+        files.insert(0, save(together(small, across=2), out / "rendered"))
+    return files
+
+
+def _predictions(folder: Path, out: Path) -> list[Path]:
+    """Copy what networks predicted, as `run` has drawn it."""
+    files = []
+    for name in TRAINING:
+        path = folder / name / "predictions.png"
+        if path.exists():
+            files.append(Path(shutil.copyfile(path, out / f"{name}.png")))
+    return files
+
+
+def _table(shown: Sequence[Shown]) -> tuple[list[str], list[list[object]]]:
+    headers = ["task", "n", "method", "evaluations", "seconds", "image error", "parameter error", "picture", "ended"]
+    rows: list[list[object]] = []
+    for found, seen in shown:
+        last = found.records[-1]
+        parameter = None if last.parameter_error is None else last.parameter_error**0.5
+        rows.append(
+            [
+                *(found.task.name, found.task.n, found.method, last.evaluations, last.seconds),
+                *(percent(found.error[-1]), parameter, _alike(found, seen), found.outcome.reason),
+            ]
+        )
+    return headers, rows
+
+
+def _alike(found: Trace, seen: Look) -> str:
+    """Say how alike the last picture and the target are, and the first of what else the task measures."""
+    task, x = found.task, found.points[-1]
+    known = {} if task.picture is None else measures(seen.picture(x), seen.target)
+    more = task.measures(x) if task.measures else {}
+    return described(known | dict(itertools.islice(more.items(), 1)))
+
+
+_STYLE = "figure { margin: .4em } img { max-width: 100% } figcaption { max-width: 40em }"
+_CAPTIONS = {
+    "figure9": "All tasks: start, end of the run, target, with more samples per pixel than the runs had. "
+    "Tasks without a picture: bands of equal loss, the point red.",
+    "figure12": "CAUSTIC: what the slab throws on the screen, and its surface (blue is high).",
+    "figure13": "MIRROR: the bunny is seen through two mirrors only; the red line is the way from the eye to it.",
+    "rendered": "The rendered tasks, beside their targets.",
+    **dict.fromkeys(TRAINING, "Held-out inputs, and renders of the predictions before and after training."),
+}
+
+
+def _page(shown: Sequence[Shown], files: Sequence[Path]) -> str:
+    titles = {found.task.name: f"{found.task.name.upper()}: {found.task.title}." for found, _ in shown} | _CAPTIONS
+    pictures = "".join(
+        f"<figure><img src='{path.name}' alt='{path.stem}'><figcaption>{html_text(titles[path.stem])}</figcaption>"
+        "</figure>"
+        for path in files
+    )
+    about = ", ".join(f"{name} {value}" for name, value in machine().items())
+    body = (
+        f"{pictures}<h2>Runs</h2><p>Image errors are relative to the start, parameter errors root mean squares in the "
+        f"units of the task; seconds of one run on: {html_text(about)}.</p>{html_table(*_table(shown))}"
+    )
+    return html_page("Gallery", _STYLE, body)

@@ -1,0 +1,164 @@
+"""The picture figures of the source's supplement: all tasks (9), the caustic (12) and the two mirrors (13)."""
+
+import io
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import torch
+from torch import Tensor
+
+from experiments.reports.animation import Look, Trace, pixels
+from experiments.reports.figures import plain_ticks
+from experiments.runs.trial import LEVELS
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+_COLORS = 256
+"""Of a sheet: enough for its pictures, for a third of the size."""
+
+_ACROSS = 8
+"""Tasks in a row of an overview, at most."""
+_WAY = ((1.5, 0.0, 2.2), (1.5, 0.0, -0.6), (-1.2, 0.0, -0.6), (-1.2, 0.0, -2.4))
+"""From the eye to the bunny of MIRROR."""
+
+
+def overview(shown: Sequence[tuple[Trace, Look]], path: Path) -> None:
+    """Draw figure 9: a column per task, with its start, where the run ended, and what is sought."""
+    bands = -(-len(shown) // _ACROSS)
+    across = -(-len(shown) // bands)
+    figure = plt.figure(figsize=(1.35 * across + 0.4, 4.3 * bands), layout="constrained")
+    methods = {found.method for found, _ in shown}
+    method = methods.pop() if len(methods) == 1 else None
+    for k, band in enumerate(figure.subfigures(bands, 1, squeeze=False)[:, 0]):
+        _band(band, shown[k * across : (k + 1) * across], across, method)
+    save_small(figure, path)
+
+
+def _band(figure: Any, shown: Sequence[tuple[Trace, Look]], across: int, method: str | None) -> None:
+    """Draw `across` columns; `method` is that of all runs, None if there are several."""
+    axes = figure.subplots(3, across, squeeze=False)
+    for axis in axes[:, len(shown) :].flat:
+        axis.axis("off")
+    for column, (found, seen) in zip(axes.T, shown, strict=False):
+        pictures = (seen.picture(found.points[0]), seen.picture(found.points[-1]), seen.target)
+        for axis, picture in zip(column, pictures, strict=True):
+            _picture(axis, picture)
+        column[0].set_title(found.task.name.upper(), fontsize=9)
+        text = found.caption(-1) if method else f"{found.method}, {found.caption(-1)}"
+        column[1].set_xlabel(text.replace(", ", "\n"), fontsize=6.5)
+    for axis, name in zip(axes[:, 0], ("start", method or "end", "target"), strict=True):
+        axis.set_ylabel(name, fontsize=10)
+
+
+def caustic(found: Trace, seen: Look, other: Trace | None, path: Path) -> None:
+    """Draw figure 12: pictures that the slab throws above its surface, and errors; with `other` for comparison."""
+    runs = [found, *([other] if other else [])]
+    columns = [("start", found.points[0], found.caption(0))]
+    columns += [(one.method, one.points[-1], one.caption(-1)) for one in runs]
+    figure = plt.figure(figsize=(2.2 * (len(columns) + 1) + 3.6, 4.9), layout="constrained")
+    parts: Any = figure.subfigures(1, 2, width_ratios=[2.2 * (len(columns) + 1), 3.6])
+    left, right = parts
+    axes = left.subplots(2, len(columns) + 1)
+    largest = max(float((_surface(x) - _surface(x).mean()).abs().max()) for _, x, _ in columns)
+    for (top, below), (name, x, text) in zip(axes.T, columns, strict=False):
+        _picture(top, seen.picture(x))
+        top.set_title(name, fontsize=10)
+        top.set_xlabel(text.replace(", ", "\n"), fontsize=8)
+        below.imshow((_surface(x) - _surface(x).mean()).numpy(), cmap="RdBu", vmin=-largest, vmax=largest)
+        below.set(xticks=[], yticks=[])
+        below.set_xlabel("surface", fontsize=8)
+    _picture(axes[0][-1], seen.target)
+    axes[0][-1].set_title("target", fontsize=10)
+    axes[1][-1].axis("off")
+    _errors(right.subplots(), runs)
+    save_small(figure, path)
+
+
+def mirrors(found: Trace, seen: Look, experiment: Tensor, path: Path) -> None:
+    """Draw figure 13: the experiment from outside [h, w, 3], start, end and target, and the error."""
+    panels = [
+        ("experiment", experiment, ""),
+        ("start", seen.picture(found.points[0]), found.caption(0)),
+        (found.method, seen.picture(found.points[-1]), found.caption(-1)),
+        ("target", seen.target, ""),
+    ]
+    widths = [1.5, 1, 1, 1, 1.5]
+    figure, axes = plt.subplots(1, 5, figsize=(12.4, 2.9), layout="constrained", width_ratios=widths)
+    for axis, (name, picture, text) in zip(axes, panels, strict=False):
+        _picture(axis, picture)
+        axis.set_title(name, fontsize=10)
+        axis.set_xlabel(text.replace(", ", "\n"), fontsize=8)
+    _errors(axes[-1], [found])
+    save_small(figure, path)
+
+
+def mirrors_from_outside(variant: str, film: tuple[int, int] = (240, 180), spp: int = 64) -> Tensor:
+    """Render the scene of MIRROR from above, with a line from the eye by both mirrors to the bunny: sRGB [h, w, 3]."""
+    from experiments.problems.rendered import shown
+    from experiments.problems.scenes.bunny import IN_MIRRORS, in_mirrors
+    from experiments.problems.scenes.meshes import rgb
+    from torch_zerohess.adapters.mitsuba import MitsubaScene
+
+    def scene(mi: Any) -> dict[str, Any]:
+        found = in_mirrors(mi)
+        view = mi.ScalarTransform4f().look_at(origin=[2.2, 6.5, -4.5], target=[0.2, -0.3, -0.4], up=[0, 1, 0])
+        red = {"type": "diffuse", "reflectance": rgb(0.8, 0.05, 0.05)}
+        grey = {"type": "diffuse", "reflectance": rgb(0.35)}
+        floor = mi.ScalarTransform4f().translate([0, -1.55, 0]).rotate([1, 0, 0], -90).scale(30)
+        line = {
+            f"line{k}": {"type": "cylinder", "p0": list(a), "p1": list(b), "radius": 0.02, "bsdf": red}
+            for k, (a, b) in enumerate(itertools.pairwise(_WAY))
+        }
+        return {
+            **found,
+            **line,
+            "sensor": {**found["sensor"], "to_world": view, "fov": 44.0},
+            "eye": {"type": "sphere", "center": list(_WAY[0]), "radius": 0.12, "bsdf": red},
+            "floor": {"type": "rectangle", "to_world": floor, "bsdf": grey},
+        }
+
+    made = MitsubaScene(scene, [IN_MIRRORS], film=film, spp=spp, depth=6, variant=variant, threads=1)
+    return shown(made(torch.zeros(1, 3).double())[0])
+
+
+def save_small(figure: Any, path: Path) -> None:
+    """Write a figure as a PNG with a palette."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    figure.savefig(file, dpi=100, format="png")
+    plt.close(figure)
+    with Image.open(file) as image:
+        image.convert("RGB").quantize(_COLORS, kmeans=1, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def _picture(axis: Any, picture: Tensor) -> None:
+    axis.imshow(pixels(picture), interpolation="nearest")
+    axis.set(xticks=[], yticks=[])
+
+
+def _errors(axis: Any, runs: Sequence[Trace]) -> None:
+    """Image error over that at the start, against evaluations; nothing of a run that never reported a point."""
+    for one in runs:
+        rows = [(record.evaluations, error) for record, error in zip(one.records, one.error, strict=True)][1:]
+        if rows:
+            axis.step(*zip(*rows, strict=True), where="post", label=one.method)
+    for level in LEVELS:
+        axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
+    axis.set(xscale="log", yscale="log", xlabel="evaluations", ylabel="image error / at the start")
+    axis.grid(which="major", alpha=0.3)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8, frameon=False)
+    plain_ticks(axis)
+
+
+def _surface(x: Tensor) -> Tensor:
+    """Heights of the slab of CAUSTIC on a fine grid, in the units of its coefficients x [1024]."""
+    from experiments.problems.scenes.caustic import COEFFICIENTS, basis
+
+    splines = basis(torch.linspace(0, 1, 128, dtype=torch.float64))
+    return splines @ x.reshape(COEFFICIENTS, COEFFICIENTS) @ splines.mT

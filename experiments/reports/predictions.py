@@ -1,0 +1,40 @@
+"""What trained encoders predict: held-out images beside the renders of the predictions."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import torch
+
+from experiments.methods.training import Result
+from experiments.problems.training_task import TrainingTask
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+
+def draw(task: TrainingTask, results: Sequence[Result], path: Path, count: int = 4) -> None:
+    """Show held-out inputs, the render of the untrained prediction and of that of every trained encoder."""
+    images, parameters = task.held_out
+    images, parameters = images[:count], parameters[:count]
+    columns = [("input", images, parameters)]
+    with torch.no_grad():
+        before = results[0].start(images)
+        columns.append(("before training", task.render(before), before))
+        for result in results:
+            after = result.encoder(images)
+            columns.append((f"{result.method}\n{result.seconds:.0f} s", task.render(after), after))
+    pictures = [task.pictures(renders, x) for _, renders, x in columns]
+    rows, wide = len(images), pictures[0].shape[2] / pictures[0].shape[1]
+    figure, axes = plt.subplots(
+        rows, len(columns), figsize=(1.7 * wide * len(columns), 1.85 * rows + 0.5), layout="constrained", squeeze=False
+    )
+    for column, (title, _, x) in enumerate(columns):
+        for row in range(rows):
+            axis = axes[row][column]
+            axis.imshow(pictures[column][row])
+            axis.set(xticks=[], yticks=[])
+            axis.set_xlabel(task.caption(x[row]), fontsize=9)
+        axes[0][column].set_title(title, fontsize=10)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

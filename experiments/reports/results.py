@@ -1,0 +1,79 @@
+"""The runs in a folder, as the tables, figures and reports read them."""
+
+import statistics
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.runs.records import Files, Outcome, Record, read, read_outcome
+from experiments.runs.trial import reduced
+
+METRICS = ("image", "parameter")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that has ended, with its log."""
+
+    outcome: Outcome
+    records: list[Record]
+
+    def error(self, metric: str) -> list[float | None]:
+        """Errors of all rows, relative to the first; None where a row has none."""
+        errors: list[float | None] = [getattr(record, f"{metric}_error") for record in self.records]
+        first = errors[0] if errors else None
+        if first is None:
+            return [None] * len(errors)
+        return [None if e is None else e / first if first else float(e > 0) for e in errors]
+
+    def reached(self, metric: str, level: float) -> Record | None:
+        """Return the first row whose error is reduced by `level`."""
+        errors: list[float | None] = [getattr(record, f"{metric}_error") for record in self.records]
+        pairs = zip(self.records, errors, strict=True)
+        return next((record for record, error in pairs if reduced(error, errors[0], level)), None)
+
+
+@dataclass(frozen=True)
+class Results:
+    """All runs of a folder by task and method, in the order of their names; those that go on are counted only."""
+
+    folder: Path
+    runs: dict[str, dict[str, list[Run]]]
+    unfinished: Counter[str]
+    """How many of each method."""
+
+
+def load(folder: Path, tasks: Collection[str] | None = None) -> Results:
+    """Read a folder, or only some of its tasks; SystemExit if it has no run that has ended."""
+    if not folder.is_dir():
+        raise SystemExit(f"DIR must be a folder that `python -m experiments run` has written to, got {folder}")
+    runs: dict[str, dict[str, list[Run]]] = {}
+    unfinished: Counter[str] = Counter()
+    for task in _folders(folder):
+        if tasks is not None and task.name not in tasks:
+            continue
+        for method in _folders(task):
+            unfinished[method.name] += sum(1 for _ in method.glob("*.journal"))
+            numbers = sorted(int(path.stem) for path in method.glob("*.json") if path.stem.isdigit())
+            mine = [_run(Files(method, number)) for number in numbers]
+            if mine:
+                runs.setdefault(task.name, {})[method.name] = mine
+    if not runs:
+        going = f", {count} are unfinished" if (count := unfinished.total()) else ""
+        raise SystemExit(f"DIR must have runs that have ended; {folder} has none{going}")
+    return Results(folder, runs, unfinished)
+
+
+def _folders(folder: Path) -> list[Path]:
+    """Folders of tasks or methods, in the order of their names."""
+    return sorted(path for path in folder.iterdir() if path.is_dir())
+
+
+def _run(files: Files) -> Run:
+    return Run(read_outcome(files.outcome), list(read(files.log)) if files.log.exists() else [])
+
+
+def median(values: Collection[float], runs: int) -> float | None:
+    """Median of what at least half of the runs have; None if fewer have it."""
+    return float(statistics.median(values)) if 2 * len(values) >= runs else None

@@ -1,0 +1,64 @@
+"""Error curves of every sweep: a column per sweep, a row per method, a line per value with its quartile band."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+
+from experiments.reports import figures
+from experiments.reports.results import Run
+from experiments.runs.trial import LEVELS
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+_LABELS = {"seconds": "run time [s]", "evaluations": "evaluations"}
+_LINES = ("-", "--", ":", "-.")
+
+
+def draw(
+    task: str, cells: Sequence[tuple[str, str, str, list[Run]]], titles: Mapping[str, str], against: str, path: Path
+) -> None:
+    """Draw the image error of a task, relative to that at the start, on log-log axes.
+
+    Args:
+        task: name.
+        cells: method, sweep, value and runs.
+        titles: of the sweeps.
+        against: "seconds" or "evaluations".
+        path: PNG file.
+    """
+    methods = list(dict.fromkeys(cell[0] for cell in cells))
+    sweeps = [sweep for sweep in titles if any(cell[1] == sweep for cell in cells)]
+    size = (3.3 * len(sweeps) + 0.4, 2.9 * len(methods) + 0.5)
+    figure, axes = plt.subplots(
+        len(methods), len(sweeps), figsize=size, layout="constrained", sharey=True, sharex="row", squeeze=False
+    )
+    for line, method in zip(axes, methods, strict=True):
+        for axis, sweep in zip(line, sweeps, strict=True):
+            values = [(value, runs) for name, one, value, runs in cells if (name, one) == (method, sweep)]
+            _axis(axis, values, against)
+            axis.set_title(titles[sweep], fontsize=9)
+        line[0].set_ylabel(f"{method}\nimage error / at the start", fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel(_LABELS[against])
+    figure.suptitle(f"{task}: median and quartiles")
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def _axis(axis: mpl.axes.Axes, values: Sequence[tuple[str, list[Run]]], against: str) -> None:
+    colors = mpl.colormaps["viridis"]
+    axis.set(xscale="log", yscale="log")
+    for k, (value, runs) in enumerate(values):
+        style = {"color": colors(0.9 * k / max(len(values) - 1, 1)), "linestyle": _LINES[k % len(_LINES)]}
+        figures.band(axis, runs, "image", against, value, style)
+    if values:
+        figures.plain_ticks(axis)
+    for level in LEVELS:
+        axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
+    axis.grid(which="major", alpha=0.3)
+    if values:
+        axis.legend(fontsize=7, frameon=False, loc="lower left")
+    else:
+        axis.text(0.5, 0.5, "does not apply", ha="center", va="center", transform=axis.transAxes, color="grey")

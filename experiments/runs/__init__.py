@@ -1,0 +1,1 @@
+"""One run: counted, timed, journalled and replayed; knows no method by name."""

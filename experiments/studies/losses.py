@@ -1,0 +1,327 @@
+"""Where the loss of an image belongs: inside the black box, or after a black box that returns the image.
+
+With the loss inside, the smoothed objective is E L(f(x + sigma u)); with the image outside it is L(E f(x + sigma u)),
+the loss of a blurred image. Both tend to L(f(x)) as sigma goes to zero; for the mean squared error they differ by the
+mean variance of a pixel under the perturbations. Measured for every loss of `zh.losses`:
+
+- bias: both objectives along the line from the solution of a task through its start, and where they are smallest. On
+  BOX2 the line crosses the plateau on which the squares do not overlap and L(f(x)) is constant;
+- error of the estimated gradient, relative to that of the objective itself, from the same evaluations;
+- evaluations that the trust region needs until the mean squared error of the image is reduced by 99 %.
+
+The truth about a gradient is a far larger sample of scrambled Sobol points; its own error is reported.
+"""
+
+import csv
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import torch_zerohess as zh
+from experiments.methods.settings import settings
+from experiments.methods.trust_region import trust_region
+from experiments.problems.catalogue import FITTING, chosen, load
+from experiments.problems.tasks import brdf
+from experiments.reports.results import METRICS, Run, median
+from experiments.reports.tables import table
+from experiments.runs.records import Record
+from experiments.runs.trial import Finished, Trial, attempt, reduced
+from experiments.studies.objectives import FACTORIES, FORMS, Moments, Pictures, normal, pictures_of
+
+SOLUTIONS = {"box2": (0.3, 0.3), "brdf": brdf.TARGET}
+"""Of the tasks that are swept; others are only fitted."""
+POSITIONS = [round(0.05 * i, 2) for i in range(-10, 26)]
+"""Along the line: 0 is the solution, 1 the start of run 0."""
+WHERE = {"start": 1.0, "half way": 0.5, "near": 0.1}
+"""Points of the line at which gradients are estimated."""
+SCALES = (1.0, 0.25)
+"""Sigma of the sweeps, in units of the task's."""
+LEVEL = 0.99
+_SCRAMBLES = 4
+_Row = TypeVar("_Row")
+
+
+@dataclass(frozen=True)
+class Bias:
+    """A smoothed objective along the line of a task."""
+
+    task: str
+    sigma: float
+    loss: str
+    form: str
+    """inside: E L(f), or image: L(E f)."""
+    minimum: float
+    """Position where it is smallest; an end of POSITIONS if it still falls there."""
+    fall: float
+    """Slope at the start, towards the solution, over the value there: 0 on a plateau."""
+    values: list[float]
+    """At POSITIONS."""
+
+
+@dataclass(frozen=True)
+class GradientError:
+    """Relative RMSE of the estimated gradient of an objective."""
+
+    task: str
+    loss: str
+    form: str
+    where: str
+    evaluations: int
+    rmse: float
+    truth_error: float
+    """Relative standard error of what it is compared with."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The trust region from all starts, until an error is reduced by 99 %."""
+
+    task: str
+    loss: str
+    form: str
+    metric: str
+    """image: mean squared error of the picture, whatever the loss; parameter: that of x."""
+    evaluations: float | None
+    """Median over the runs that get there, if they are at least half of all."""
+    share: float
+    seconds: float | None
+    runs: int
+
+
+@dataclass(frozen=True)
+class LossReport:
+    """Everything that `losses` measured."""
+
+    biases: list[Bias]
+    errors: list[GradientError]
+    fits: list[Fit]
+
+
+def losses(
+    *,
+    tasks: tuple[str, ...] = ("box2", "brdf"),
+    runs: int = 20,
+    samples: tuple[int, ...] = (8, 64),
+    truth: int = 4096,
+    sweep: int = 512,
+    evaluations: int = 2000,
+    limit: float = 60.0,
+    seed: int = 0,
+    out: Path | None = None,
+) -> LossReport:
+    """Measure a loss inside the black box against the same loss after an image-valued one.
+
+    Args:
+        tasks: fitting tasks whose image is a picture; box2 and brdf are swept too, others only fitted.
+        runs: starts of the fits, and independent estimates of a gradient.
+        samples: antithetic pairs of one estimate.
+        truth: evaluations of a true gradient.
+        sweep: evaluations of every position of a sweep.
+        evaluations: that a fit may use.
+        limit: seconds that a fit may take.
+        seed: of the perturbations.
+        out: folder for losses.json, sweep.csv and sweep.png; nothing is written if not given.
+    """
+    least = 4 * _SCRAMBLES
+    if runs < 2 or min(samples, default=0) < 1 or min(truth, sweep) < least:
+        raise SystemExit(
+            f"runs must be at least 2, samples at least 1, truth and sweep at least {least}, "
+            f"got {runs}, {samples}, {truth} and {sweep}"
+        )
+    shown = {name: pictures_of(load(name)) for name in chosen("tasks", tasks, list(FITTING))}
+    swept = [one for name, one in shown.items() if name in SOLUTIONS]
+    curves = tqdm([(one, scale * one.task.sigma) for one in swept for scale in SCALES], "curves", disable=None)
+    report = LossReport(
+        [bias for one, sigma in curves for bias in _sweep(one, sigma, sweep, seed)],
+        [
+            error
+            for one in tqdm(swept, "gradients", disable=None)
+            for error in _gradient_errors(one, samples, runs, truth, seed)
+        ],
+        [fit for one in shown.values() for fit in _fits(one, runs, evaluations, limit)],
+    )
+    print(text(report))
+    if out is not None:
+        _write(report, out)
+        print(f"\nwritten to {out}")
+    return report
+
+
+def text(report: LossReport) -> str:
+    """Return the three tables, the loss inside next to the loss of the image."""
+    parts: list[str] = []
+    rows: list[list[object]] = []
+    if report.biases:
+        for a, b in _pairs(report.biases):
+            minima, falls = [_position(one.minimum) for one in (a, b)], [f"{one.fall:.2f}" for one in (a, b)]
+            rows.append([a.task, f"{a.sigma:g}", a.loss, *minima, *falls])
+        headers = ["task", "sigma", "loss", "minimum: inside", "image", "fall at the start: inside", "image"]
+        title = "smoothed objectives along the line from the solution (0) through the start (1)"
+        parts += [f"{title}; end: smallest there", table(headers, rows)]
+    if report.errors:
+        rows = [
+            [a.task, a.loss, a.where, a.evaluations, a.rmse, b.rmse, a.truth_error, b.truth_error]
+            for a, b in _pairs(report.errors)
+        ]
+        headers = ["task", "loss", "where", "evaluations", "inside", "image", "truth: inside", "image"]
+        title = "relative RMSE of the gradient of either objective, from the same evaluations"
+        parts += [f"\n{title}", table(headers, rows)]
+    rows = [
+        [a.task, a.loss, a.metric, a.evaluations, f"{a.share:.0%}", b.evaluations, f"{b.share:.0%}"]
+        for a, b in _pairs(report.fits)
+    ]
+    headers = ["task", "loss", "error", "inside", "share", "image", "share"]
+    title = f"trust_region: median evaluations until an error is reduced by {100 * LEVEL:g} %, share of the runs"
+    return "\n".join([*parts, f"\n{title}", table(headers, rows)]).lstrip()
+
+
+def _pairs(rows: Sequence[_Row]) -> Iterator[tuple[_Row, _Row]]:
+    """Rows of the loss inside with those of the image, in the order they were measured in."""
+    return zip(rows[::2], rows[1::2], strict=True)
+
+
+def _line(one: Pictures) -> tuple[Tensor, Tensor]:
+    """Return the solution [n] and the way from there to the start of run 0."""
+    solution = torch.tensor(SOLUTIONS[one.task.name], dtype=torch.float64)
+    return solution, one.task.start(0) - solution
+
+
+def _sweep(one: Pictures, sigma: float, count: int, seed: int) -> Iterator[Bias]:
+    solution, way = _line(one)
+    u = normal(count // 2, one.task.n, seed)  # the same at all positions: the curves are smooth
+    moments = [one.moments(solution + position * way, sigma, u) for position in POSITIONS]
+    curves = {form: torch.stack([one.objective(here, form)[0] for here in moments]) for form in FORMS}
+    for i, name in enumerate(one.losses):
+        for form in FORMS:
+            values = curves[form][:, i].tolist()
+            yield Bias(one.task.name, sigma, name, form, _minimum(values), _fall(values), values)
+
+
+def _minimum(values: Sequence[float]) -> float:
+    """Position of the smallest value, by a parabola through it and its neighbours unless it is an end of the line."""
+    i = values.index(min(values))
+    if i in (0, len(values) - 1):
+        return POSITIONS[i]
+    before, here, after = values[i - 1 : i + 2]
+    bend = before - 2 * here + after
+    shift = 0.5 * (before - after) / bend if bend > 0 else 0.0
+    return POSITIONS[i] + (POSITIONS[1] - POSITIONS[0]) * shift
+
+
+def _position(minimum: float) -> str:
+    return f"{minimum:+.3f}" if POSITIONS[0] < minimum < POSITIONS[-1] else "end"
+
+
+def _fall(values: Sequence[float]) -> float:
+    i = POSITIONS.index(1.0)
+    return (values[i + 1] - values[i - 1]) / (POSITIONS[i + 1] - POSITIONS[i - 1]) / values[i]
+
+
+def _gradient_errors(
+    one: Pictures, samples: Sequence[int], runs: int, truth: int, seed: int
+) -> Iterator[GradientError]:
+    solution, way = _line(one)
+    n, sigma = one.task.n, one.task.sigma
+    for where, position in WHERE.items():
+        x = solution + position * way
+        parts = [
+            one.moments(x, sigma, normal(truth // (2 * _SCRAMBLES), n, (seed << 32) + i)) for i in range(_SCRAMBLES)
+        ]
+        true, spread = Moments.mean(parts), math.sqrt(_SCRAMBLES - 1)
+        for pairs in samples:
+            smoothing = zh.Smoothing(sigma=sigma, samples=pairs)
+            found = [one.estimate(x, smoothing.replace(seed=(seed << 32) + run)) for run in range(runs)]
+            exact = {form: one.objective(true, form)[1] for form in FORMS}
+            rmse = {form: _relative(one, found, form, exact[form]) for form in FORMS}
+            own = {form: _relative(one, parts, form, exact[form]) / spread for form in FORMS}
+            for i, name in enumerate(one.losses):
+                for form in FORMS:
+                    numbers = float(rmse[form][i]), float(own[form][i])
+                    yield GradientError(one.task.name, name, form, where, smoothing.evaluations(n), *numbers)
+
+
+def _relative(one: Pictures, estimates: Sequence[Moments], form: str, truth: Tensor) -> Tensor:
+    """RMSE [L] of gradients in units of the true ones [L, n]."""
+    gradients = torch.stack([one.objective(estimate, form)[1] for estimate in estimates])
+    return (gradients - truth).square().sum(2).mean(0).sqrt() / torch.linalg.vector_norm(truth, dim=1)
+
+
+def _fits(one: Pictures, runs: int, evaluations: int, limit: float) -> Iterator[Fit]:
+    for name in one.losses:
+        ended: dict[str, list[Run]] = {form: [] for form in FORMS}
+        jobs = [(form, run) for form in FORMS for run in range(runs)]
+        for form, run in tqdm(jobs, f"fits of {one.task.name}, {name}", disable=None):
+            ended[form].append(_fit(one, name, form, run, evaluations, limit))
+        for metric in METRICS:
+            for form in FORMS:
+                reached = [record for ended_run in ended[form] if (record := ended_run.reached(metric, LEVEL))]
+                evaluations_to = median([record.evaluations for record in reached], runs)
+                seconds = median([record.seconds for record in reached], runs)
+                yield Fit(one.task.name, name, form, metric, evaluations_to, len(reached) / runs, seconds, runs)
+
+
+def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> Run:
+    sigma = settings("trust_region", one.task.name).get("sigma")
+    rows: list[Record] = []
+
+    def watch(row: Record) -> None:
+        rows.append(row)
+        pairs = [(row.image_error, rows[0].image_error), (row.parameter_error, rows[0].parameter_error)]
+        if all(reduced(error, first, LEVEL) for error, first in pairs):
+            raise Finished(f"both errors reduced by {100 * LEVEL:g} %", "finished")
+
+    def solve(trial: Trial) -> None:
+        trust_region(trial, sigma=sigma, output=form == "image")
+
+    task = one.with_loss(loss, evaluations)
+    outcome = attempt(task, f"{loss}, {form}", run, solve, limit=limit, watch=watch)
+    if outcome.status == "failed":
+        raise RuntimeError(outcome.traceback)
+    return Run(outcome, rows)
+
+
+def _write(report: LossReport, out: Path) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "losses.json").write_text(json.dumps({"positions": POSITIONS, **asdict(report)}, indent=1))
+    with (out / "sweep.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["task", "sigma", "loss", "form", "position", "value"])
+        for bias in report.biases:
+            for position, value in zip(POSITIONS, bias.values, strict=True):
+                rows.writerow([bias.task, bias.sigma, bias.loss, bias.form, position, value])
+    if report.biases:
+        _plot(report.biases, out / "sweep.png")
+
+
+def _plot(biases: Sequence[Bias], path: Path) -> None:
+    """Draw the objectives of every task and sigma, each in units of its value at the start."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    names = list(FACTORIES)
+    cells = list(dict.fromkeys((bias.task, bias.sigma) for bias in biases))
+    figure, axes = plt.subplots(
+        len(cells), len(names), figsize=(11, 2.6 * len(cells)), layout="constrained", squeeze=False
+    )
+    for bias in biases:
+        axis = axes[cells.index((bias.task, bias.sigma)), names.index(bias.loss)]
+        start = bias.values[POSITIONS.index(1.0)]
+        line = {"inside": "-", "image": "--"}[bias.form]
+        label = {"inside": "E L(f): loss inside", "image": "L(E f): image-valued"}[bias.form]
+        axis.plot(POSITIONS, [value / start for value in bias.values], line, label=label)
+        axis.set_title(f"{bias.task}, sigma {bias.sigma:.3g}, {bias.loss}", fontsize=10)
+        axis.grid(alpha=0.3)
+    for axis in axes[-1]:
+        axis.set_xlabel("position: 0 solution, 1 start")
+    axes[0, 0].legend(frameon=False, fontsize=9)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,295 @@
+"""`python -m experiments robustness`: how methods do when starts, samples, noise or the reference are other ones.
+
+The sweeps of the source (supplement, Sec. I) and two more. Each value of a sweep is a task of its own with a name that
+says what differs, run and logged as any other, so that `table`, `plot` and `report` read the folder too. What is the
+same in several sweeps is run once. All errors are those of the unchanged task, see `experiments.problems.variations`.
+"""
+
+import csv
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from experiments.ensembles.ensemble import Ensemble, ordered, unusable
+from experiments.ensembles.provenance import register
+from experiments.ensembles.workers import Job
+from experiments.methods import METHODS
+from experiments.methods.settings import settings as settings_of
+from experiments.problems.catalogue import FITTING, Preset, chosen
+from experiments.problems.variations import Change
+from experiments.problems.variations import load as load_varied
+from experiments.reports import robustness_figure
+from experiments.reports.results import Results, Run, load, median
+from experiments.reports.tables import table
+from experiments.runs.trial import LEVELS, LIMIT
+
+LEVEL = LEVELS[1]
+"""The one that evaluations and seconds are counted to."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Values of one circumstance, and what each of them changes."""
+
+    title: str
+    values: tuple[Any, ...]
+    change: Callable[[Any], Change]
+    read: Callable[[str], Any]
+    """Value of a text."""
+
+
+def _quality(text: str) -> int | None:
+    return None if text == "none" else int(text)
+
+
+_FACTORS = (0.25, 0.5, 1.0, 2.0, 3.0)
+SWEEPS = {
+    "start": Sweep(
+        "distance of the start",
+        (0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+        lambda value: Change(start=value),
+        float,
+    ),
+    "pairs": Sweep("antithetic pairs", (1, 2, 4, 6, 8, 10), lambda value: Change(pairs=value), int),
+    "spp": Sweep("samples per pixel", _FACTORS, lambda value: Change(spp=value), float),
+    "noisy_spp": Sweep(
+        "samples per pixel, fresh noise", _FACTORS, lambda value: Change(spp=value, noise="point"), float
+    ),
+    "jpeg": Sweep(
+        "JPEG quality of the reference", (None, 95, 75, 50, 30, 10, 2), lambda value: Change(jpeg=value), _quality
+    ),
+    "noise": Sweep("seed of the renders", ("fixed", "other", "call", "point"), lambda value: Change(noise=value), str),
+}
+"""By name. Starts and samples per pixel are factors of those of the task."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A method at one value of a sweep, and the name of the task that this is."""
+
+    task: str
+    sweep: str
+    value: str
+    method: str
+    varied: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """Medians over the runs of a cell. The median of evaluations and seconds is over those that got there, and there is
+    none if these are fewer than half; of the errors at the end it is over all.
+    """
+
+    task: str
+    sweep: str
+    value: str
+    method: str
+    runs: int
+    share_90: float
+    """Of the runs that reduced the image error by 90 %."""
+    share_99: float
+    evaluations_99: float | None
+    seconds_99: float | None
+    image_error: float | None
+    """At the end, over that at the start."""
+    parameter_error: float | None
+    """At the end: root mean square, in the units of the task."""
+
+
+def robustness(
+    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK...]")] = ("mug", "shad"),
+    /,
+    methods: str = "trust_region,our_hvpa",
+    over: tuple[str, ...] = tuple(SWEEPS),
+    runs: int = 5,
+    preset: Preset = "fast",
+    out: Path = Path("results/robustness"),
+    jobs: int = 1,
+    seed: int = 0,
+    limit: float = LIMIT,
+    evaluations: int | None = None,
+    variant: str = "auto",
+) -> list[Row]:
+    """Run methods under other circumstances and print, draw and save how they did; the same command goes on with it.
+
+    Sweeps are start (distance from the solution), pairs (antithetic pairs of methods that have such a setting), spp
+    (samples per pixel of renders and reference), noisy_spp (the same, every render with a new seed), jpeg (quality of
+    the reference) and noise (seed of the renders: fixed as that of the reference, other, new for every call or point).
+    Only start and pairs apply to tasks that are not rendered.
+
+    Args:
+        tasks: names, see `list`.
+        methods: names separated by commas.
+        over: sweeps, with values if not the usual ones: `spp=0.5,1 jpeg=none,10`.
+        runs: starts for each value.
+        preset: fast or paper.
+        out: folder for logs, robustness.csv and figures.
+        jobs: processes, one thread each.
+        seed: number of the first run.
+        limit: seconds that a run may take.
+        evaluations: that a run may use; those of the task if not given.
+        variant: of Mitsuba.
+    """
+    if evaluations is not None and evaluations < 1:
+        raise SystemExit(f"evaluations must be at least 1, got {evaluations}")
+    names = chosen("TASK", tasks, list(FITTING))
+    wanted = chosen("methods", methods.split(","), list(METHODS))
+    sweeps = dict(_sweep(one) for one in over)
+    ensemble = Ensemble(out, range(seed, seed + runs), preset, jobs, limit, variant)
+    try:
+        planned = [one for name in names for one in plan(ensemble, name, wanted, sweeps, evaluations)]
+        if not planned:
+            raise SystemExit("no sweep of this command applies to these tasks and methods")
+        todo = {(one.varied, one.method, job.run): job for one, many in planned for job in many}
+        register(out, _settings(list(todo.values())))
+        ensemble.run(ordered(todo.values()))
+    except ImportError as error:
+        raise SystemExit(str(error)) from None
+    except KeyboardInterrupt:
+        raise SystemExit(f"\ninterrupted; the same command goes on where it was, logs are in {out}") from None
+    cells = [cell for cell, _ in planned]
+    results = load(out, {cell.varied for cell in cells})
+    found = {cell: _runs(results, cell, ensemble.runs) for cell in cells}
+    rows = [row(cell, runs) for cell, runs in found.items() if runs]
+    print("\n" + as_text(rows))
+    write_csv(rows, out / "robustness.csv")
+    print(f"\n{out / 'robustness.csv'}")
+    for name in names:
+        mine = [(cell.method, cell.sweep, cell.value, runs) for cell, runs in found.items() if cell.task == name]
+        titles = {sweep: SWEEPS[sweep].title for sweep in sweeps}
+        for against in ("evaluations", "seconds"):
+            path = out / f"{name}-robustness-{against}.png"
+            robustness_figure.draw(name, mine, titles, against, path)
+            print(path)
+    return rows
+
+
+def _sweep(text: str) -> tuple[str, Sequence[Any]]:
+    """Return name and values of `name` or `name=value,value`."""
+    name, given, values = text.partition("=")
+    (name,) = chosen("over", [name], list(SWEEPS))
+    try:
+        found = [SWEEPS[name].read(value.strip()) for value in values.split(",")] if given else SWEEPS[name].values
+        for value in found:
+            SWEEPS[name].change(value)
+    except ValueError as error:
+        raise SystemExit(f"over must be NAME or NAME=VALUE,VALUE, got {text}: {error}") from None
+    return name, found
+
+
+def plan(
+    ensemble: Ensemble, name: str, methods: Sequence[str], sweeps: dict[str, Sequence[Any]], evaluations: int | None
+) -> Iterator[tuple[Cell, list[Job]]]:
+    """Yield the cells of a task with their jobs; what does not apply is left out with a line that says so."""
+    for sweep, values in sweeps.items():
+        for method in methods:
+            own = settings_of(method, name)
+            if sweep == "pairs" and "samples" not in own:
+                print(f"{method} has no number of pairs on {name}: left out of that sweep", flush=True)
+                continue
+            for value in values:
+                change = SWEEPS[sweep].change(value)
+                if change.pairs is not None and change.pairs == own["samples"]:
+                    change = Change()
+                try:
+                    jobs = _jobs(ensemble, name, method, own, change, evaluations)
+                except ValueError as error:
+                    print(f"{method}, {sweep} = {_text(sweep, value)} is left out on {name}: {error}", flush=True)
+                    continue
+                yield Cell(name, sweep, _text(sweep, value), method, jobs[0].task_name), jobs
+
+
+def _jobs(
+    ensemble: Ensemble, name: str, method: str, own: dict[str, Any], change: Change, evaluations: int | None
+) -> list[Job]:
+    """Return a job per run; ValueError says why this is not possible."""
+    task = load_varied(name, ensemble.preset, ensemble.variant, evaluations, change)
+    reason = unusable(METHODS[method], task)
+    if reason:
+        raise ValueError(reason)
+    if task.bounds:
+        lower, upper = task.bounds
+        for run in ensemble.runs:
+            start = task.start(run)
+            if not bool(((lower <= start) & (start <= upper)).all()):
+                raise ValueError(f"the start of run {run} would be out of the bounds")
+    own = own if change.pairs is None else {**own, "samples": change.pairs}
+    settings = {
+        "preset": ensemble.preset,
+        "level": LEVELS[-1],
+        "limit": ensemble.limit,
+        "evaluations": task.evaluations,
+        "sigma": task.sigma,
+        "change": asdict(change),
+        "method": own,
+    }
+    given = (ensemble.preset, ensemble.variant, ensemble.limit, settings, own, task.evaluations)
+    return [Job(task, method, run, ensemble.folder, *given) for run in ensemble.runs]
+
+
+def _settings(jobs: Sequence[Job]) -> dict[str, dict[str, dict[str, Any]]]:
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for job in jobs:
+        found.setdefault(job.task_name, {})[job.method_name] = job.settings
+    return found
+
+
+def _runs(results: Results, cell: Cell, numbers: range) -> list[Run]:
+    """Return those of this command: the folder may have more of some cells."""
+    return [one for one in results.runs.get(cell.varied, {}).get(cell.method, []) if one.outcome.run in numbers]
+
+
+def _text(sweep: str, value: Any) -> str:
+    if sweep in ("start", "spp", "noisy_spp"):
+        return f"{value:g}x"
+    return "none" if value is None else str(value)
+
+
+def row(cell: Cell, runs: Sequence[Run]) -> Row:
+    """Return the medians of the runs of a cell."""
+    reached = [record for run in runs if (record := run.reached("image", LEVEL))]
+    ends = [(run.error("image")[-1], run.records[-1].parameter_error) for run in runs if run.records]
+    image = [error for error, _ in ends if error is not None]
+    parameter = [error**0.5 for _, error in ends if error is not None]
+    return Row(
+        cell.task,
+        cell.sweep,
+        cell.value,
+        cell.method,
+        len(runs),
+        sum(run.reached("image", LEVELS[0]) is not None for run in runs) / len(runs),
+        len(reached) / len(runs),
+        median([record.evaluations for record in reached], len(runs)),
+        median([record.seconds for record in reached], len(runs)),
+        statistics.median(image) if image else None,
+        statistics.median(parameter) if parameter else None,
+    )
+
+
+def as_text(rows: Sequence[Row]) -> str:
+    """Return a table for every task and sweep."""
+    headers = ["value", "method", "runs", "90 %", "99 %", "evaluations to 99 %", "seconds"]
+    headers += ["image error at the end", "parameter error"]
+    parts = []
+    for task, sweep in dict.fromkeys((one.task, one.sweep) for one in rows):
+        mine = [one for one in rows if (one.task, one.sweep) == (task, sweep)]
+        cells = [
+            [
+                *(one.value, one.method, one.runs, f"{100 * one.share_90:.0f}%", f"{100 * one.share_99:.0f}%"),
+                *(one.evaluations_99, one.seconds_99, one.image_error, one.parameter_error),
+            ]
+            for one in mine
+        ]
+        parts.append(f"{task}, {SWEEPS[sweep].title}\n{table(headers, cells)}")
+    return "\n\n".join(parts)
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(Row.__dataclass_fields__), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(one) for one in rows)

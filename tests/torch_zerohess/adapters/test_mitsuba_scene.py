@@ -1,0 +1,388 @@
+"""Mitsuba scenes as black boxes: small scenes whose images are known in closed form, in every variant that works."""
+
+import math
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+import torch
+from small_scenes import RADIANCE, REFLECTANCE, VARIANTS, WITHOUT_NOISE, camera, lamp, plane, rgb, screen
+
+import torch_zerohess as zh
+from experiments.problems.scenes.meshes import mi_mesh
+from torch_zerohess.adapters.mitsuba import MitsubaScene, Transform, Value
+
+
+def things(mi):
+    """Two spheres that are turned and moved, and a triangle."""
+    first = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([1, 0, 0], 30)
+    second = mi.ScalarTransform4f().translate([-1, 0, 0]).scale(0.5)
+    vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
+    normals = np.tile([[0.0, -(0.2**0.5), 0.8**0.5]], (3, 1))
+    surface = vertices, normals, np.array([[0, 1, 2]], np.uint32)
+    return {
+        "type": "scene",
+        "sensor": camera(mi),
+        "ball": {"type": "sphere", "to_world": first},
+        "bead": {"type": "sphere", "to_world": second},
+        "triangle": mi_mesh(mi, "triangle", surface, {"type": "diffuse"}),
+        "sky": {"type": "constant"},
+    }
+
+
+@pytest.fixture(params=VARIANTS)
+def variant(request) -> str:
+    return request.param
+
+
+def scalar(description, parameters, **more):
+    more = {"spp": 1, "variant": "scalar_rgb", "threads": 1, **more}
+    return MitsubaScene(description, parameters, **more)
+
+
+def matrix(kind, vector, degrees=0.0):
+    """4x4 of a translation or, by Rodrigues' formula, of a rotation."""
+    out = np.eye(4)
+    if kind == "move":
+        out[:3, 3] = vector
+        return out
+    x, y, z = np.array(vector, float) / np.linalg.norm(vector)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = math.radians(degrees)
+    out[:3, :3] = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return out
+
+
+# Poses
+
+
+def test_pose_is_the_product_of_its_parts(variant) -> None:
+    pose = Transform(
+        ("ball.to_world", "bead.to_world"),
+        move=((1, 0, 0), (0, 1, 1)),
+        turn=(np.array([0.0, 0.0, 1.0]), (1, 1, 0)),
+        unit=(2.0, 0.5, 90.0, 10.0),
+        pivot=(0.5, -1.0, 0.0),
+    )
+    scene = MitsubaScene(things, [pose], variant=variant, threads=1)
+    base = {name: np.array(scene.values[name].matrix, float).reshape(4, 4) for name in pose.names}
+    np.testing.assert_allclose(
+        base["ball.to_world"], matrix("move", [1, 2, 3]) @ matrix("turn", [1, 0, 0], 30), atol=1e-6
+    )
+    for x in ([0.0, 0.0, 0.0, 0.0], [0.3, -2.0, 1.5, 4.0]):
+        scene.set(torch.tensor(x).double())
+        away, back = matrix("move", [0.5, -1, 0]), matrix("move", [-0.5, 1, 0])
+        turns = matrix("turn", [0, 0, 1], 90 * x[2]) @ matrix("turn", [1, 1, 0], 10 * x[3])
+        whole = matrix("move", [2 * x[0], 0.5 * x[1], 0.5 * x[1]]) @ away @ turns @ back
+        for name in pose.names:
+            now = np.array(scene.values[name].matrix, float).reshape(4, 4)
+            np.testing.assert_allclose(now, whole @ base[name], atol=1e-5)
+
+
+def test_turns_leave_the_origin_of_the_object_where_it_is(variant) -> None:
+    scene = MitsubaScene(things, [Transform("ball.to_world", turn=((0, 1, 0),), unit=90.0)], variant=variant, threads=1)
+    scene.set(torch.tensor([0.7]).double())
+    now = np.array(scene.values["ball.to_world"].matrix, float).reshape(4, 4)
+    expected = matrix("move", [1, 2, 3]) @ matrix("turn", [0, 1, 0], 63) @ matrix("turn", [1, 0, 0], 30)
+    np.testing.assert_allclose(now, expected, atol=1e-5)
+
+
+def test_vertices_move_and_turn_and_normals_turn(variant) -> None:
+    pose = Transform("triangle.vertex_positions", move=((1, 0, 0),), turn=((0, 0, 1),), unit=(1.0, 90.0))
+    scene = MitsubaScene(things, [pose], variant=variant, threads=1)
+    names = "triangle.vertex_positions", "triangle.vertex_normals"
+    before = [np.array(scene.values[name], float).reshape(3, 3) for name in names]
+    scene.set(torch.tensor([3.0, 1.0]).double())
+    vertices, normals = (np.array(scene.values[name], float).reshape(3, 3) for name in names)
+    turn = matrix("turn", [0, 0, 1], 90)[:3, :3]
+    centre = np.array([0.5, 1.0, 0.5])  # of the box from (0, 0, 0) to (1, 2, 1)
+    np.testing.assert_allclose(vertices, (before[0] - centre) @ turn.T + centre + [3, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(normals, before[1] @ turn.T, atol=1e-6)
+
+
+def test_labels_bounds_and_start() -> None:
+    pose = Transform("ball.to_world", move=((1, 0, 0),), turn=((0, 1, 0),), bounds=((-2, 3), (-1, 1)))
+    scene = scalar(things, [pose, Transform("bead.to_world", move=((0, 1, 0),))])
+    assert scene.n == 3
+    assert scene.labels == ["ball.to_world.move0", "ball.to_world.turn0", "bead.to_world.move0"]
+    assert scene.x0.tolist() == [0, 0, 0]
+    assert [side.tolist() for side in scene.bounds] == [[-2, -1, -math.inf], [3, 1, math.inf]]
+
+
+# Values
+
+
+def test_radiance_is_what_is_seen(variant) -> None:
+    scene = MitsubaScene(lamp, [Value(RADIANCE)], spp=2, variant=variant, threads=1)
+    assert scene.labels == [f"{RADIANCE}[{i}]" for i in range(3)]
+    torch.testing.assert_close(scene.x0, torch.tensor([0.2, 0.3, 0.4]).double())
+    assert scene.bounds[0].tolist() == [0, 0, 0]
+    x = torch.tensor([[0.1, 2.0, 30.0], [7.0, 0.0, 0.5]]).double()
+    images = scene(x)
+    assert images.dtype == torch.float32
+    torch.testing.assert_close(images, x.float()[:, None, None].expand(2, 4, 4, 3))
+
+
+def test_reflected_light_is_albedo_times_radiance(variant) -> None:
+    grey = Value(REFLECTANCE, elements=1)
+    scene = MitsubaScene(plane, [grey], spp=2, integrator=WITHOUT_NOISE, variant=variant, threads=1)
+    assert (scene.n, scene.labels) == (1, [REFLECTANCE])
+    albedo = torch.tensor([[0.0], [0.25], [1.0]])
+    expected = albedo[:, :, None, None] * torch.tensor([0.5, 1.0, 2.0])
+    torch.testing.assert_close(scene(albedo), expected.expand(3, 4, 4, 3), atol=1e-5, rtol=1e-5)
+
+
+def test_points_beyond_the_bounds_are_rendered_at_the_bounds() -> None:
+    scene = scalar(plane, [Value(REFLECTANCE, bounds=(0.2, 0.7))], integrator=WITHOUT_NOISE)
+    beyond, at = torch.tensor([[-3.0, 0.5, 9.0]]), torch.tensor([[0.2, 0.5, 0.7]])
+    assert torch.equal(scene(beyond), scene(at))
+
+
+def test_unit_scales_a_value() -> None:
+    scene = scalar(plane, [Value(REFLECTANCE, unit=0.01)], integrator=WITHOUT_NOISE)
+    torch.testing.assert_close(scene.x0, torch.full((3,), 50.0).double())
+    assert [side.tolist() for side in scene.bounds] == [[0] * 3, [100] * 3]
+    image = scene(torch.tensor([[10.0, 20.0, 30.0]]))[0, 0, 0]
+    torch.testing.assert_close(image, torch.tensor([0.1 * 0.5, 0.2, 0.3 * 2]), atol=1e-5, rtol=1e-5)
+
+
+def test_elements_of_a_texture_are_where_they_belong(variant) -> None:
+    """Row by row from below, each from the left, colours last."""
+    scene = MitsubaScene(screen, [Value("screen.emitter.radiance.data")], spp=4, variant=variant, threads=1)
+    assert scene.n == 12
+    x = torch.arange(12).double()
+    image = scene(x[None])[0].double()
+    expected = x.reshape(2, 2, 3).flip(0).repeat_interleave(2, 0).repeat_interleave(2, 1)
+    torch.testing.assert_close(image, expected, atol=1e-4, rtol=1e-5)
+
+
+def test_several_names_share_a_value() -> None:
+    def two(mi):
+        return {**plane(mi), "lid": {"type": "disk", "bsdf": {"type": "diffuse", "reflectance": rgb(0.1, 0.1, 0.1)}}}
+
+    scene = scalar(two, [Value((REFLECTANCE, "lid.bsdf.reflectance.value"))], integrator=WITHOUT_NOISE)
+    scene.set(torch.tensor([0.3, 0.4, 0.6]).double())
+    for name in (REFLECTANCE, "lid.bsdf.reflectance.value"):
+        np.testing.assert_allclose(np.array(scene.values[name]).ravel(), [0.3, 0.4, 0.6], rtol=1e-6)
+
+
+# Noise, loss, loading
+
+
+def test_noise_is_the_same_in_all_renders_in_a_call_or_in_none(variant) -> None:
+    x = torch.full((2, 3), 0.5)
+    integrator = {"type": "path", "max_depth": 2}
+    scenes = {
+        noise: MitsubaScene(
+            plane, [Value(REFLECTANCE)], spp=1, integrator=integrator, noise=noise, variant=variant, threads=1
+        )
+        for noise in ("fixed", "call", "point")
+    }
+    fixed, call, point = (torch.cat([scene(x), scene(x)]) for scene in scenes.values())
+    assert torch.equal(fixed, fixed[:1].expand(4, -1, -1, -1))
+    assert torch.equal(call[0], call[1])
+    assert torch.equal(call[2], call[3])
+    assert not torch.equal(call[0], call[2])
+    assert len({tuple(one.flatten().tolist()) for one in point}) == 4
+
+
+def test_seed_changes_the_noise_and_nothing_else() -> None:
+    def image(seed):
+        scene = scalar(plane, [Value(REFLECTANCE)], spp=64, seed=seed, integrator={"type": "path", "max_depth": 2})
+        return scene(torch.full((1, 3), 0.5))[0]
+
+    first, again, other = image(0), image(0), image(1)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    expected = 0.5 * torch.tensor([0.5, 1.0, 2.0])
+    torch.testing.assert_close(first.mean((0, 1)), expected, rtol=0.1, atol=0.0)
+    torch.testing.assert_close(other.mean((0, 1)), expected, rtol=0.1, atol=0.0)
+
+
+def test_loss_inside_is_the_loss_of_the_image() -> None:
+    def loss(image):
+        return (image - 0.25).square().mean()
+
+    x = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]]).double()
+    images = scalar(lamp, [Value(RADIANCE)])(x)
+    losses = scalar(lamp, [Value(RADIANCE)], loss=loss)(x)
+    assert losses.shape == (2,)
+    assert losses.dtype == x.dtype
+    torch.testing.assert_close(losses, torch.stack([loss(one) for one in images]).double())
+    with pytest.raises(ValueError, match="one number per image"):
+        scalar(lamp, [Value(RADIANCE)], loss=lambda image: image[0])(x)
+
+
+def test_a_scene_is_loaded_once(variant) -> None:
+    scene = MitsubaScene(lamp, [Value(RADIANCE)], spp=1, variant=variant, threads=1)
+    with patch.object(scene.mi, "load_dict", side_effect=AssertionError("loaded again")):
+        for _ in range(5):
+            scene(torch.rand(3, 3))
+
+
+def test_film_depth_and_xml(tmp_path: Path) -> None:
+    path = tmp_path / "lamp.xml"
+    path.write_text(
+        """<scene version="3.0.0">
+        <integrator type="path"/>
+        <sensor type="perspective"><film type="hdrfilm"><string name="pixel_format" value="rgb"/></film></sensor>
+        <emitter type="constant" id="sky"><rgb name="radiance" value="0.1, 0.2, 0.3"/></emitter>
+        </scene>"""
+    )
+    scene = scalar(path, [Value("sky.radiance.value")], film=(5, 3), depth=2)
+    image = scene(torch.tensor([[1.0, 2.0, 3.0]]))
+    torch.testing.assert_close(image, torch.tensor([1.0, 2.0, 3.0]).expand(1, 3, 5, 3))
+
+
+# Inside the library
+
+
+def test_black_box_has_the_gradient_and_hessian_of_a_quadratic() -> None:
+    scene = scalar(lamp, [Value(RADIANCE, elements=1)], loss=lambda image: (image.double() - 0.5).square().mean())
+    x = torch.tensor([2.0]).double()
+    estimate = zh.estimate(scene, x, zh.Smoothing(sigma=0.1, samples=32, seed=0))
+    for value, name, truth in ((estimate.gradient, "gradient", 3.0), (estimate.hessian(), "hessian_diagonal", 2.0)):
+        deviation = float(abs(value.squeeze() - truth))
+        assert deviation < 5 * float(estimate.standard_error(name).squeeze()) + 1e-3
+    layer = zh.BlackBox(scalar(lamp, [Value(RADIANCE)]), zh.Smoothing(sigma=0.1, samples=64, seed=0))
+    x = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+    assert layer(x).shape == (4, 4, 3)
+    layer(x)[0, 0, 0].backward()
+    assert x.grad is not None
+    torch.testing.assert_close(x.grad, torch.tensor([1.0, 0.0, 0.0]), atol=0.5, rtol=0.0)
+
+
+def test_minimize_finds_the_radiance() -> None:
+    scene = scalar(lamp, [Value(RADIANCE)])
+    target = torch.tensor([1.5, 0.5, 1.0])
+    fit = zh.minimize(
+        scene,
+        scene.x0,
+        sigma=0.5,
+        bounds=scene.bounds,
+        loss=lambda image: (image - target).square().mean(),
+        max_evaluations=200,
+    )
+    torch.testing.assert_close(fit.x.float(), target, atol=1e-3, rtol=0.0)
+
+
+def test_scenes_of_two_variants_live_together() -> None:
+    x = torch.tensor([[0.2, 0.5, 0.7]])
+    scenes = [MitsubaScene(lamp, [Value(RADIANCE)], spp=1, variant=name, threads=1) for name in VARIANTS]
+    for scene in scenes * 2:
+        assert scene(x)[0, 2, 2].tolist() == pytest.approx(x[0].tolist(), rel=1e-5)
+        scene.mi.set_variant("scalar_spectral")  # as other code of the process may
+
+
+def test_start_is_within_the_bounds() -> None:
+    """Also where the value of the scene is not, or not after its rounding to float32."""
+
+    def rough(mi):
+        return {**plane(mi), "plane": {"type": "rectangle", "bsdf": {"type": "roughconductor", "alpha": 1e-4}}}
+
+    for scene in (
+        scalar(plane, [Value(REFLECTANCE, bounds=(0, 0.1))], depth=2),
+        scalar(rough, [Value("plane.bsdf.alpha.value", elements=1)], depth=2),
+    ):
+        assert bool((scene.x0 >= scene.bounds[0]).all() and (scene.x0 <= scene.bounds[1]).all())
+        fit = zh.minimize(scene, scene.x0, sigma=0.1, bounds=scene.bounds, loss=torch.mean, max_evaluations=12)
+        assert fit.evaluations == 12
+
+
+def test_bounds_of_names_that_share_a_value_are_those_that_all_accept() -> None:
+    """A refractive index accepts everything, a reflectance does not."""
+
+    def metal(mi):
+        return {**plane(mi), "disk": {"type": "disk", "bsdf": {"type": "conductor", "eta": rgb(0.2, 0.3, 0.4)}}}
+
+    names = (REFLECTANCE, "disk.bsdf.eta.value")
+    for order in (names, names[::-1]):
+        lower, upper = scalar(metal, [Value(order)]).bounds
+        assert (lower.tolist(), upper.tolist()) == ([0.0] * 3, [1.0] * 3)
+
+
+# What is wrong
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ([], "parameters must name at least one"),
+        ([Value("plane.bsdf.reflectanse.value")], f"no parameter .*; near ones: {REFLECTANCE}"),
+        ([Value(REFLECTANCE), Value(REFLECTANCE)], "more than once"),
+        ([Value(REFLECTANCE, bounds=(0, 2))], "bounds of .* must lie within 0 to 1.*got 0 to 2"),
+        ([Value(REFLECTANCE, bounds=((0, 1), (0, 1)))], r"a pair \(lower, upper\) or 3 of them"),
+        ([Value(REFLECTANCE, bounds=(0, 0.5, 1))], r"a pair \(lower, upper\) or 3 of them, got \(0, 0.5, 1\)"),
+        ([Value(REFLECTANCE, bounds=(1, 0))], "lower < upper, got 1, 0"),
+        ([Value(REFLECTANCE, unit=0)], "unit must be a number other than 0, got 0"),
+        ([Value(REFLECTANCE, elements=2)], "elements must be 1 or None, got 2"),
+        ([Value("plane.to_world")], "is a transform: take Transform"),
+        ([Transform(REFLECTANCE, move=((1, 0, 0),))], "take Value"),
+        ([Transform("plane.to_world")], "at least one vector, got none"),
+        ([Transform("plane.to_world", move=((0, 0, 0),))], "not all 0"),
+        ([Transform("plane.to_world", move=(1, 0, 0))], "vectors of 3 numbers, not all 0, got 1"),
+        ([Transform("plane.to_world", move=((1, 0, 0),), unit=(1.0, 2.0))], "unit must be a number or 1"),
+        ([Value((REFLECTANCE, "sensor.film.size"))], "must have the same size"),
+    ],
+)
+def test_wrong_parameters(parameters, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        scalar(plane, parameters)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"film": (0, 4)}, r"film must be a pair \(width, height\) of pixels >= 1, got \(0, 4\)"),
+        ({"film": 8}, r"film must be a pair \(width, height\) of pixels >= 1, got 8"),
+        ({"spp": 0}, "spp must be an integer from 1 to 2147483647, got 0"),
+        ({"depth": 0}, "depth must be an integer from 1 to 2147483647, got 0"),
+        ({"seed": -1}, "seed must be an integer from 0 to 2147483647, got -1"),
+        ({"seed": 2**32}, "seed must be an integer from 0 to 2147483647, got 4294967296"),
+        ({"depth": 2, "integrator": {"type": "path"}}, "give either depth or integrator, got both"),
+        ({"noise": "none"}, "noise must be one of fixed, call, point, got 'none'"),
+        ({"nan": "zero"}, "nan must be one of raise, keep, got 'zero'"),
+    ],
+)
+def test_wrong_arguments(arguments, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        scalar(plane, [Value(REFLECTANCE)], **arguments)
+
+
+def test_wrong_points() -> None:
+    scene = scalar(lamp, [Value(RADIANCE)])
+    for wrong in (torch.zeros(3), torch.zeros(2, 4)):
+        with pytest.raises(ValueError, match=r"x must have shape \[K, 3\]"):
+            scene(wrong)
+    with pytest.raises(ValueError, match=r"x must have shape \[3\]"):
+        scene.set(torch.zeros(2))
+    with pytest.raises(ValueError, match=r"loss must return a tensor with one number per image, got 1.0"):
+        scalar(lamp, [Value(RADIANCE)], loss=lambda image: 1.0)(torch.zeros(1, 3))
+    with pytest.raises(ValueError, match=r"must be finite, got nan for .*\[1\] in point 0"):
+        scene(torch.tensor([[0.0, math.nan, 0.0]]))
+
+
+def test_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no_such_scene\.xml"):
+        scalar(tmp_path / "no_such_scene.xml", [Value(RADIANCE)])
+
+    def painted(mi):
+        lost = {"type": "bitmap", "filename": str(tmp_path / "lost.png")}
+        return {**plane(mi), "plane": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": lost}}}
+
+    with pytest.raises(FileNotFoundError, match=r"lost\.png"):
+        scalar(painted, [Value("sky.radiance.value")])
+
+
+def test_pixels_that_are_not_finite() -> None:
+    too_bright = torch.tensor([[1e39, 1.0, 1.0]], dtype=torch.float64)  # infinite in single precision
+    with pytest.raises(FloatingPointError, match='not finite, the first at row 0, column 0; nan="keep"'):
+        scalar(lamp, [Value(RADIANCE)])(too_bright)
+    kept = scalar(lamp, [Value(RADIANCE)], nan="keep")(too_bright)
+    assert not bool(torch.isfinite(kept[..., 0]).any())
+
+
+def test_unknown_variant_says_what_to_use() -> None:
+    with pytest.raises(RuntimeError, match="scalar_rgb"):
+        scalar(lamp, [Value(RADIANCE)], variant="no_such_variant")

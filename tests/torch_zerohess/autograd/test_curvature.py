@@ -1,0 +1,197 @@
+"""Grey-box curvature against `torch.func.hessian` of the same network with the analytic smoothed function behind it.
+
+The samples are many and quasi-random, so that what is left of their error is far below the tolerances, which are
+relative to the largest element; the structure (symmetry, agreement of matrix-free and dense) holds to rounding.
+"""
+
+import pytest
+import torch
+from torch import nn
+from torch.func import functional_call
+
+import torch_zerohess as zh
+from truths import Bump, PlaneWave, Quadratic, Truth
+
+SIGMA = 0.5
+TRUTHS = {
+    "plane wave": PlaneWave(torch.tensor([0.9, -0.7, 1.1], dtype=torch.float64)),
+    "bump": Bump(1.3),
+    "quadratic": Quadratic(
+        torch.diag(torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)) + 0.2, torch.ones(3, dtype=torch.float64)
+    ),
+}
+
+
+def smoothed(truth: Truth, y: torch.Tensor) -> torch.Tensor:
+    """Closed form of a batch y [B, n]."""
+    sigma = torch.full((y.shape[-1],), SIGMA, dtype=torch.float64)
+    return torch.func.vmap(lambda one: truth.smoothed(one, sigma))(y)
+
+
+def network() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(4, 5), nn.Tanh(), nn.Linear(5, 3)).double()
+
+
+def flat_call(net: nn.Module, theta: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+    parts = theta.split([p.numel() for p in net.parameters()])
+    named = {n: part.view_as(p) for (n, p), part in zip(net.named_parameters(), parts, strict=True)}
+    return functional_call(net, named, (inputs,))
+
+
+@pytest.fixture(scope="module", params=TRUTHS)
+def case(request):
+    truth, net = TRUTHS[request.param], network()
+    inputs = torch.randn(6, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    theta = torch.cat([p.detach().flatten() for p in net.parameters()])
+    hessian = torch.func.hessian(lambda t: smoothed(truth, flat_call(net, t, inputs)).square().mean())(theta)
+    y = net(inputs).detach().flatten()
+    inner = torch.func.hessian(lambda z: smoothed(truth, z.view(6, 3)).square().mean())(y)
+    jacobian = torch.func.jacrev(lambda t: flat_call(net, t, inputs).flatten())(theta)
+    layer = zh.BlackBox(truth.f, zh.Smoothing(sigma=SIGMA, samples=1 << 14, sampler="sobol", seed=0), value="smoothed")
+    loss = layer(net(inputs)).square().mean()  # white box, black box, white box
+    return loss, list(net.parameters()), {"exact": hessian, "gauss_newton": jacobian.mT @ inner @ jacobian}
+
+
+@pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
+def test_dense_matches_torch_func(case, mode):
+    loss, parameters, truth = case
+    dense = zh.CurvatureOperator(loss, parameters, mode=mode).to_dense()
+    assert (dense - truth[mode]).abs().max() < 5e-3 * truth[mode].abs().max()
+    torch.testing.assert_close(dense, dense.mT, rtol=0, atol=1e-12 * float(dense.abs().max()))
+
+
+def test_modes_differ_by_the_curvature_of_the_network(case):
+    loss, parameters, truth = case
+    difference = zh.CurvatureOperator(loss, parameters).to_dense()
+    difference -= zh.CurvatureOperator(loss, parameters, mode="gauss_newton").to_dense()
+    expected = truth["exact"] - truth["gauss_newton"]
+    assert expected.abs().max() > 1e-2 * truth["exact"].abs().max()
+    assert (difference - expected).abs().max() < 5e-3 * truth["exact"].abs().max()
+
+
+@pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
+def test_products_match_the_dense_matrix(case, mode):
+    loss, parameters, _ = case
+    operator = zh.CurvatureOperator(loss, parameters, mode=mode)
+    dense = operator.to_dense()
+    block = torch.randn(operator.shape[0], 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(operator @ block, dense @ block)
+    torch.testing.assert_close(operator @ block[:, 0], dense @ block[:, 0])
+    gradient = torch.cat([g.flatten() for g in torch.autograd.grad(loss, parameters, retain_graph=True)])
+    torch.testing.assert_close(operator.gradient, gradient)
+    vectors = [
+        part.view_as(p) for part, p in zip(block[:, 0].split([p.numel() for p in parameters]), parameters, strict=True)
+    ]
+    product = zh.hvp(loss, parameters, vectors, mode=mode)
+    torch.testing.assert_close(torch.cat([one.flatten() for one in product]), dense @ block[:, 0])
+
+
+@pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
+def test_matrix_free_at_the_size_of_the_cnn(mode):
+    """267 745 weights: H v against double differentiation of the closed form, on the same float64 network."""
+    from experiments.problems.tasks.cnn import PRESETS
+
+    torch.manual_seed(0)
+    encoder = PRESETS["fast"].encoder().double()
+    parameters = list(encoder.parameters())
+    assert sum(p.numel() for p in parameters) == 267_745
+    images = torch.rand(2, 3, 64, 64, dtype=torch.float64)
+    wave = PlaneWave(torch.tensor([0.8], dtype=torch.float64))
+    v = [torch.randn_like(p) for p in parameters]
+    y = encoder(images)
+    smooth = smoothed(wave, y).mean()
+    if mode == "exact":
+        slopes = torch.autograd.grad(smooth, parameters, create_graph=True)
+        expected = torch.autograd.grad(slopes, parameters, v)
+    else:
+        names = [name for name, _ in encoder.named_parameters()]
+        values = dict(zip(names, (p.detach() for p in parameters), strict=True))
+        along = dict(zip(names, v, strict=True))
+        step = torch.func.jvp(lambda p: functional_call(encoder, p, (images,)), (values,), (along,))[1]
+        bend = torch.func.hessian(lambda z: smoothed(wave, z).mean())(y.detach())
+        pushed = torch.einsum("aibj,bj->ai", bend, step)
+        expected = torch.autograd.grad(y, parameters, pushed)
+    layer = zh.BlackBox(wave.f, zh.Smoothing(sigma=SIGMA, samples=1 << 13, sampler="sobol", seed=0))
+    found = zh.hvp(layer(encoder(images)).mean(), parameters, v, mode=mode)
+    scale = max(float(one.abs().max()) for one in expected)
+    worst = max(float((a - b).abs().max()) for a, b in zip(found, expected, strict=True))
+    assert worst < 5e-3 * scale
+
+
+def test_two_black_boxes_side_by_side():
+    net, inputs = network(), torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    wave = TRUTHS["plane wave"]
+    smoothing = zh.Smoothing(sigma=SIGMA, samples=64, seed=0)
+    layers = [zh.BlackBox(wave.f, smoothing), zh.BlackBox(lambda z: wave.f(2 * z), smoothing)]
+    y = net(inputs)
+    losses = [layers[0](y).mean(), layers[1](y).sum()]
+    parts = [zh.CurvatureOperator(one, list(net.parameters()), mode="gauss_newton").to_dense() for one in losses]
+    both = zh.CurvatureOperator(sum(losses), list(net.parameters()), mode="gauss_newton").to_dense()
+    torch.testing.assert_close(both, parts[0] + parts[1])
+
+
+def test_through_names_where_the_white_box_ends():
+    net, inputs = network(), torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    y = net(inputs)
+    loss = (y**4).sum()
+    found = zh.CurvatureOperator(loss, list(net.parameters()), mode="gauss_newton", through=y).to_dense()
+    theta = torch.cat([p.detach().flatten() for p in net.parameters()])
+    jacobian = torch.func.jacrev(lambda t: flat_call(net, t, inputs).flatten())(theta)
+    torch.testing.assert_close(found, jacobian.mT @ torch.diag(12 * y.detach().flatten() ** 2) @ jacobian)
+
+
+def test_errors_name_what_is_wrong():
+    x = torch.ones(2, requires_grad=True)
+    layer = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=1.0))
+    chained = layer(x) * torch.ones(2)
+    cases = [
+        (lambda: zh.CurvatureOperator(x.detach().sum(), x), "no graph"),
+        (lambda: zh.CurvatureOperator(x * 2, x), r"shape \[2\]"),
+        (lambda: zh.CurvatureOperator(x.sum(), x, mode="newton"), "mode must be"),
+        (lambda: zh.CurvatureOperator(x.sum(), x, mode="gauss_newton"), "found no BlackBox"),
+        (lambda: zh.CurvatureOperator(layer(chained), x, mode="gauss_newton"), "side by side"),
+        (lambda: zh.CurvatureOperator(x.sum(), x) @ torch.ones(3), r"\[3\]"),
+        (lambda: zh.CurvatureOperator(x.sum(), x, through=x), "through"),
+        (lambda: zh.hvp(x.sum(), x, torch.ones(3)), "shapes of inputs"),
+    ]
+    for make, message in cases:
+        with pytest.raises(ValueError, match=message):
+            make()
+
+
+@pytest.mark.parametrize("common", [True, False])
+@pytest.mark.parametrize("vector", ["one", "batch"])
+def test_finite_difference_hvp(common, vector):
+    """Against H v of the closed form; the step's own error is of second order, here below 3 %."""
+    wave = TRUTHS["plane wave"]
+    sigma = torch.tensor([0.4, 0.6, 0.5], dtype=torch.float64)
+    x = torch.tensor([[0.4, -0.2, 0.1], [0.0, 0.5, -0.3]], dtype=torch.float64)
+    v = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    vectors = v if vector == "one" else v.expand(2, 3) * torch.tensor([[1.0], [-2.0]], dtype=torch.float64)
+    smoothing = zh.Smoothing(sigma=sigma, samples=1 << 14, sampler="sobol", seed=1)
+    found = zh.finite_difference_hvp(wave.f, x, vectors, smoothing, common=common)
+    hessians = torch.func.vmap(torch.func.hessian(lambda z: wave.smoothed(z, sigma)))(x)
+    expected = (hessians @ vectors.expand(2, 3)[..., None])[..., 0]
+    assert (found - expected).abs().max() < 0.03 * expected.abs().max()
+
+
+def test_finite_difference_hvp_of_a_zero_vector_is_zero():
+    smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
+    assert torch.equal(
+        zh.finite_difference_hvp(lambda z: z.sum(1), torch.ones(3), torch.zeros(3), smoothing), torch.zeros(3)
+    )
+
+
+def test_common_random_numbers_reduce_the_noise():
+    wave, x, v = TRUTHS["plane wave"], torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    spread = {
+        common: torch.stack(
+            [
+                zh.finite_difference_hvp(wave.f, x + 0.3, v, zh.Smoothing(sigma=0.5, samples=8, seed=s), common=common)
+                for s in range(200)
+            ]
+        ).std(0)
+        for common in (True, False)
+    }
+    assert bool((spread[True] < spread[False]).all())

@@ -1,0 +1,268 @@
+"""The C++ operators against their literal references in torch: the same bits where promised, else the stated bound."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torch_zerohess.sampling import extension, kernels, proposals
+from torch_zerohess.sampling.kernels import Redrawn
+from truths import spread
+
+SIZES = [1, 2, 3, 7, 8, 9, 127, 128, 129, 300, 1024]
+DENSITIES = [
+    proposals.GAUSSIAN,
+    proposals.FIRST_ORDER,
+    proposals.SECOND_ORDER,
+    proposals.UNIFORM,
+    proposals.SIGNED_LOBES,
+]
+EPS = torch.finfo(torch.float64).eps
+ops = torch.ops.torch_zerohess
+CPU = torch.device("cpu")
+FOLDER = Path(extension.__file__).parents[2]  # of the package under test: a checkout or an installation
+
+
+def test_extension_is_built() -> None:
+    assert extension.available, (
+        f"build the extension first (python setup.py build_ext --inplace): {extension.status}; "
+        "without it this file would compare the references with themselves"
+    )
+
+
+def every_kind(n: int) -> torch.Tensor:
+    """Rows of all kinds, in the first and last dimensions and next to the block boundaries."""
+    places = sorted({0, n // 2, n - 1, min(n - 1, 127), min(n - 1, 128)})
+    made = [(kind, i, j) for kind in range(6) for i in places for j in places]
+    index = torch.arange(len(made))
+    seeds = torch.tensor([0, 1, 2**32, 2**63 - 1]).repeat(len(made))[: len(made)]
+    return torch.cat([torch.stack([seeds, index * 2**33 + index], 1), torch.tensor(made)], 1)
+
+
+@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("n", [1, 3, 129])
+def test_pick_rows_same_bits(density: int, n: int) -> None:
+    for seed, first in ((0, 0), (2**63 - 1, 2**40)):
+        assert torch.equal(
+            ops.pick_rows(seed, first, 500, n, density), proposals.pick_rows(seed, first, 500, n, density)
+        )
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_draw_same_bits(n: int) -> None:
+    rows = every_kind(n)
+    assert torch.equal(ops.draw(rows, n), proposals.draw(rows, n))
+
+
+def test_draw_same_bits_of_very_many_numbers() -> None:
+    # Rare branches too: the normal's far tail begins at a probability of 1e-11, which only made-up uniforms reach (in
+    # core_test.cpp); a lobe's slowest convergence, next to its branch points, is met here.
+    for kind in (proposals.NORMAL, proposals.EVERY_GRADIENT_LOBE):
+        rows = torch.tensor([[3, r, kind, 0, 0] for r in range(100)])
+        assert torch.equal(ops.draw(rows, 1000), proposals.draw(rows, 1000))
+    rows = torch.tensor([[5, r, proposals.DIAGONAL_LOBE, 0, 0] for r in range(100_000)])
+    assert torch.equal(ops.draw(rows, 1), proposals.draw(rows, 1))
+
+
+@pytest.mark.parametrize("antithetic", [True, False])
+@pytest.mark.parametrize("single", [True, False])
+@pytest.mark.parametrize("n", SIZES)
+def test_place_same_bits_and_weights_in_bound(n: int, single: bool, antithetic: bool) -> None:
+    B, S = 2, 5
+    x, sigma = spread(B * n, -3.0, 3.0).view(B, n), spread(n, 1e-9, 2.0)
+    if single:
+        x = x.float().double()
+    for density in DENSITIES:
+        u = proposals.draw(proposals.pick_rows(7, 0, B * S, n, density), n)
+        got = ops.place(u, x, sigma, antithetic, single, density)
+        expected = proposals.place(u, x, sigma, antithetic, single, density)
+        assert got[0].dtype == (torch.float32 if single else torch.float64)
+        assert torch.equal(got[0], expected[0])
+        assert torch.equal(got[1], expected[1])
+        # Sums of n terms, divided: n ulps each; the box's exponent is n log(.) - |u|^2 / 2.
+        grown = 10 * n if density == proposals.UNIFORM else 0
+        assert bool(((got[2] - expected[2]).abs() <= (2 * n + grown + 8) * EPS * expected[2].abs()).all())
+        # The perturbation that was really applied, in exact terms.
+        assert torch.equal(got[1], (got[0].double() - x[:, None]) / sigma)
+
+
+def samples(n: int, K: int, M: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    u = proposals.draw(proposals.pick_rows(1, 0, 2 * K, n, proposals.SECOND_ORDER), n).view(2, K, n)
+    return u, spread(2 * M * n, -1.0, 1.0).view(2, M, n), spread(2 * M * K, -1.0, 1.0).view(2, M, K)
+
+
+def check(got: torch.Tensor, expected: torch.Tensor, magnitudes: torch.Tensor, terms: int) -> None:
+    assert got.shape == expected.shape
+    assert bool(((got - expected).abs() <= (terms + 2) * EPS * magnitudes).all())
+
+
+@pytest.mark.parametrize("M", [1, 3, 9])
+@pytest.mark.parametrize("n", SIZES)
+def test_sums_within_the_bound(n: int, M: int) -> None:
+    K = 11
+    u, t, a = samples(n, K, M)
+    size, squares = u.abs(), u * u
+    check(ops.project(u, t), t @ u.mT, t.abs() @ size.mT, n)
+    check(ops.accumulate(u, a, False), a @ u, a.abs() @ size, K)
+    check(ops.accumulate(u, a, True), a @ squares, a.abs() @ squares, K)
+    if n <= 300:
+        got, weighted = ops.hessian(u, a), u.mT[:, None] * a[:, :, None]
+        check(got, weighted @ u[:, None], weighted.abs() @ size[:, None], K)
+        assert torch.equal(got, got.mT)
+
+
+@pytest.mark.parametrize("antithetic", [True, False])
+@pytest.mark.parametrize("single", [True, False])
+@pytest.mark.parametrize("n", [1, 7, 128, 129, 300])
+def test_redrawn_equals_stored(n: int, single: bool, antithetic: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    B, S, M = 2, 6, 3
+    K = S * (1 + antithetic)
+    rows = kernels.pick_rows(3, 0, B * S, n, proposals.SECOND_ORDER, CPU)
+    x, sigma = spread(B * n, -3.0, 3.0).view(B, n).float().double(), spread(n, 1e-6, 1.0)
+    u = kernels.place(kernels.draw(rows, n), x, sigma, antithetic, single, proposals.GAUSSIAN)[1]
+    redrawn = Redrawn(rows, x, sigma, antithetic, single)
+    t, a = spread(B * M * n, -1.0, 1.0).view(B, M, n), spread(B * M * K, -1.0, 1.0).view(B, M, K)
+    drawn = kernels.project(redrawn, t), kernels.accumulate(redrawn, a), kernels.accumulate_squares(redrawn, a)
+    kept = kernels.project(u, t), kernels.accumulate(u, a), kernels.accumulate_squares(u, a)
+    for one, other in zip(drawn, kept, strict=True):
+        assert torch.equal(one, other)
+    outer = kernels.hessian(u, a)
+    torch.testing.assert_close(kernels.hessian(redrawn, a), outer, rtol=0.0, atol=K * EPS * float(outer.abs().max()))
+    # The reference draws chunk by chunk; two rows at a time here.
+    monkeypatch.setattr(extension, "available", False)
+    monkeypatch.setattr(kernels, "_CHUNK", 2 * B * n)
+    again = kernels.project(redrawn, t), kernels.accumulate(redrawn, a), kernels.accumulate_squares(redrawn, a)
+    for one, other, terms in zip(again, kept, (n, K, K), strict=True):
+        torch.testing.assert_close(one, other, rtol=0.0, atol=10 * terms * EPS * float(1 + other.abs().max()))
+    torch.testing.assert_close(kernels.hessian(redrawn, a), outer, rtol=0.0, atol=K * EPS * float(outer.abs().max()))
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    n, B, S, M = 300, 2, 150, 3
+    rows = kernels.pick_rows(11, 0, B * S, n, proposals.SECOND_ORDER, CPU)
+    x, sigma = torch.zeros(B, n, dtype=torch.float64), torch.ones(n, dtype=torch.float64)
+    t, a = spread(B * M * n, -1.0, 1.0).view(B, M, n), spread(B * M * 2 * S, -1.0, 1.0).view(B, M, 2 * S)
+
+    def everything() -> list[torch.Tensor]:
+        drawn = ops.draw(rows, n)
+        points, u, weights = ops.place(drawn, x, sigma, True, False, proposals.SECOND_ORDER)
+        recipe = (rows, x, sigma, True, False)
+        sums = [ops.project(u, t), ops.accumulate(u, a, False), ops.accumulate(u, a, True), ops.hessian(u, a)]
+        sums += [ops.project_drawn(*recipe, t), ops.accumulate_drawn(*recipe, a, False)]
+        return [drawn, points, u, weights, *sums, ops.accumulate_drawn(*recipe, a, True)]
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = everything()
+        torch.set_num_threads(2)
+        two = everything()
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(p, q) for p, q in zip(one, two, strict=True))
+
+
+def test_noncontiguous_inputs() -> None:
+    u, t, a = samples(9, 6, 2)
+    turned = [one.mT.contiguous().mT for one in (u, t, a)]
+    assert not any(one.is_contiguous() for one in turned)
+    v, s, b = turned
+    for function, other in ((kernels.project, (t, s)), (kernels.accumulate, (a, b)), (kernels.hessian, (a, b))):
+        assert torch.equal(function(v, other[1]), function(u, other[0]))
+    assert torch.equal(kernels.accumulate_squares(v, b), kernels.accumulate_squares(u, a))
+    rows = every_kind(9)
+    assert torch.equal(kernels.draw(rows[::2], 9), kernels.draw(rows[::2].contiguous(), 9))
+    with pytest.raises(RuntimeError, match="contiguous"):
+        ops.project(v, t)
+
+
+def doubles(*shape: int) -> torch.Tensor:
+    return torch.zeros(shape, dtype=torch.float64)
+
+
+def recipe(rows: int = 4, B: int = 2, n: int = 3, sigma: int = 3, columns: int = 5) -> tuple:
+    return torch.zeros(rows, columns, dtype=torch.int64), doubles(B, n), doubles(sigma), True, False
+
+
+WRONG = {
+    "draw: columns of rows": lambda: ops.draw(torch.zeros(2, 4, dtype=torch.int64), 3),
+    "draw: type of rows": lambda: ops.draw(doubles(2, 5), 3),
+    "draw: negative n": lambda: ops.draw(torch.zeros(2, 5, dtype=torch.int64), -1),
+    "place: n": lambda: ops.place(doubles(4, 3), doubles(2, 2), doubles(2), True, False, 0),
+    "place: sigma": lambda: ops.place(doubles(4, 3), doubles(2, 3), doubles(1), True, False, 0),
+    "place: rows not a multiple": lambda: ops.place(doubles(5, 3), doubles(2, 3), doubles(3), True, False, 0),
+    "place: empty": lambda: ops.place(doubles(0, 3), doubles(0, 3), doubles(3), True, False, 0),
+    "place: float32": lambda: ops.place(doubles(4, 3).float(), doubles(2, 3), doubles(3), True, False, 0),
+    "project: n": lambda: ops.project(doubles(1, 4, 3), doubles(1, 2, 4)),
+    "project: batch": lambda: ops.project(doubles(2, 4, 3), doubles(1, 2, 3)),
+    "project: dimensions of u": lambda: ops.project(doubles(4, 3), doubles(1, 2, 3)),
+    "project: dimensions of t": lambda: ops.project(doubles(1, 4, 3), doubles(1, 3)),
+    "accumulate: K": lambda: ops.accumulate(doubles(1, 4, 3), doubles(1, 2, 5), False),
+    "accumulate: dimensions": lambda: ops.accumulate(doubles(1, 4, 3), doubles(1, 4), False),
+    "hessian: K": lambda: ops.hessian(doubles(1, 4, 3), doubles(1, 2, 5)),
+    "hessian: float32": lambda: ops.hessian(doubles(1, 4, 3).float(), doubles(1, 2, 4)),
+    "project_drawn: n": lambda: ops.project_drawn(*recipe(), doubles(2, 1, 4)),
+    "project_drawn: sigma": lambda: ops.project_drawn(*recipe(sigma=1), doubles(2, 1, 3)),
+    "project_drawn: columns of rows": lambda: ops.project_drawn(*recipe(columns=4), doubles(2, 1, 3)),
+    "project_drawn: rows not a multiple": lambda: ops.project_drawn(*recipe(rows=5), doubles(2, 1, 3)),
+    "accumulate_drawn: K": lambda: ops.accumulate_drawn(*recipe(), doubles(2, 1, 5), False),
+    "accumulate_drawn: sigma": lambda: ops.accumulate_drawn(*recipe(sigma=1), doubles(2, 1, 4), False),
+    "accumulate_drawn: rows not a multiple": lambda: ops.accumulate_drawn(*recipe(rows=5), doubles(2, 1, 4), False),
+}
+
+
+@pytest.mark.parametrize("call", WRONG.values(), ids=WRONG.keys())
+def test_wrong_shapes_raise(call) -> None:
+    with pytest.raises((RuntimeError, IndexError)):
+        call()
+
+
+def test_no_batch_at_all_raises_and_does_not_end_the_process() -> None:
+    script = (
+        "import torch, torch_zerohess\n"
+        "rows, none = torch.zeros(4, 5, dtype=torch.int64), torch.zeros(0, 3, dtype=torch.float64)\n"
+        "t = none[:, None]\n"
+        "for name, last in (('project_drawn', (t,)), ('accumulate_drawn', (t, False))):\n"
+        "    try:\n"
+        "        getattr(torch.ops.torch_zerohess, name)(rows, none, torch.ones(3).double(), True, False, *last)\n"
+        "    except RuntimeError:\n"
+        "        print('raised')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=FOLDER, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, ["raised", "raised"]), done.stderr
+
+
+SAME_ESTIMATES = """
+import torch, torch_zerohess as zh
+from torch_zerohess import extension
+for sampler in ("random", "sobol", "orthogonal"):
+    x = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    e = zh.estimate(lambda z: z.sin().prod(1), x, zh.Smoothing(sigma=0.5, samples=8, sampler=sampler, seed=3))
+    print(e.points.sum().item().hex(), *e.hvp(x).tolist())
+print(extension.available)
+"""
+
+
+def test_pure_torch_gives_the_same_estimates(capsys: pytest.CaptureFixture) -> None:
+    exec(SAME_ESTIMATES, {})
+    environment = {**os.environ, "TORCH_ZEROHESS_PURE_TORCH": "1"}
+    command = [sys.executable, "-W", "error", "-c", SAME_ESTIMATES]
+    done = subprocess.run(command, cwd=FOLDER, env=environment, capture_output=True, text=True, check=True)
+    here, there = (text.splitlines() for text in (capsys.readouterr().out, done.stdout))
+    assert [here.pop(), there.pop()] == ["True", "False"]
+    for compiled, pure in zip(here, there, strict=True):
+        points, *hvp = compiled.split()
+        assert pure.split()[0] == points
+        assert [float(v) for v in pure.split()[1:]] == pytest.approx([float(v) for v in hvp], rel=1e-12)
+
+
+def test_missing_extension_warns_once_and_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch_zerohess._C", None)
+    with pytest.warns(RuntimeWarning, match="C\\+\\+20 compiler") as caught:
+        available, reason = extension._load()
+    assert len(caught) == 1
+    assert not available
+    assert "_C" in reason

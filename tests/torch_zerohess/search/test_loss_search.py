@@ -1,0 +1,144 @@
+"""The search in a small box from the loss alone: over plateaus as the process, to the last digit as quadratics."""
+
+import pytest
+import torch
+
+from torch_zerohess import minimize
+from torch_zerohess.optim import TrustRegion
+from torch_zerohess.search.loss_search import LossSearch
+from truths import vector
+
+
+def search_for(f, x0, evaluations, **settings):
+    search = TrustRegion(x0, **{"restarts": 100, **settings})
+    assert isinstance(search._search, LossSearch)
+    while search.evaluations < evaluations and not search.done:
+        search.tell(f(search.ask()))
+    return search
+
+
+def well(z):
+    """A loss [K] that is 1 but for a paraboloid around (2, -2), 4 % of the box, and one near the start."""
+    narrow = (z - vector(2.0, -2.0)).square().sum(1) / 0.8
+    shallow = 0.5 + (z - vector(-2.5, 1.0)).square().sum(1)
+    return torch.minimum(torch.minimum(narrow, shallow), torch.ones(len(z), dtype=torch.float64))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_it_crosses_a_plateau_and_leaves_a_local_minimum(seed):
+    search = search_for(well, vector(-2.0, 1.5), 200, sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
+    assert search.value < 1e-6
+    assert torch.allclose(search.x, vector(2.0, -2.0), atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("condition", [1.0, 1e4])
+def test_a_paraboloid_is_solved_to_the_last_digit(condition, seed):
+    """A process alone ends at a millionth of the variance of the loss."""
+
+    def bowl(z):
+        return (z - vector(0.7, -1.2)).square() @ vector(1.0, condition)
+
+    search = search_for(bowl, vector(-2.0, 2.0), 80, sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
+    assert search.value < 1e-12 * condition
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_follows_a_curved_valley(seed):
+    def rosenbrock(z):
+        return (1 - z[:, 0]).square() + 100 * (z[:, 1] - z[:, 0].square()).square()
+
+    search = search_for(rosenbrock, vector(-1.2, 1.0), 250, sigma=0.5, bounds=(-2.0, 2.0), seed=seed)
+    assert torch.allclose(search.x, vector(1.0, 1.0), atol=1e-2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_leaves_a_plateau_that_is_exactly_flat(seed):
+    """Ten sigma wide: nothing that was evaluated differs from anything else."""
+
+    def hole(z):
+        return ((z - 9.0).square().sum(1) / 9.0).clamp(max=1.0)
+
+    search = search_for(hole, vector(-9.0, -9.0), 150, sigma=1.0, bounds=(-12.0, 12.0), seed=seed)
+    assert search.value < 1e-6
+
+
+@pytest.mark.parametrize("n", [1, 3, 4])
+def test_other_numbers_of_parameters_and_a_small_pool(n):
+    solution = torch.linspace(-1.0, 1.5, n, dtype=torch.float64)
+
+    def quartic(z):
+        d = z - solution
+        return d.square().sum(1) + d[:, 0].pow(4) + 0.5 * d[:, 0] * d[:, -1]
+
+    for settings in ({}, {"pool": 4}):
+        search = search_for(quartic, -solution, 40 * n, sigma=1.0, bounds=(-3.0, 3.0), seed=1, **settings)
+        assert torch.allclose(search.x, solution, atol=1e-3 if not settings else 0.3)
+
+
+def test_holes_and_penalties_are_avoided():
+    """A quarter of the box is not finite, another one returns what a program returns that has failed."""
+
+    def broken(z):
+        loss = (z - vector(0.2, 0.1)).square().sum(1)
+        loss = torch.where((z[:, 0] < 0) & (z[:, 1] < 0), torch.nan, loss)
+        return torch.where((z[:, 0] > 0) & (z[:, 1] < 0), 1e30, loss)
+
+    search = search_for(broken, vector(-2.0, 2.0), 80, sigma=1.0, bounds=(-3.0, 3.0), seed=0)
+    assert torch.allclose(search.x, vector(0.2, 0.1), atol=1e-4)
+    process = search._search
+    assert torch.isfinite(process.pool.values).all()
+    assert len(process._holes)
+
+
+def test_derivatives_at_the_minimum_are_those_of_the_loss():
+    hessian = torch.tensor([[3.0, 1.0], [1.0, 2.0]], dtype=torch.float64)
+
+    def bowl(z):
+        d = z - vector(0.5, -0.5)
+        return 0.5 * ((d @ hessian) * d).sum(1)
+
+    fit = minimize(bowl, vector(2.0, 2.0), sigma=1.0, bounds=(-3.0, 3.0), max_evaluations=60, seed=0)
+    assert torch.allclose(fit.hessian, hessian, rtol=1e-3, atol=1e-3)
+    assert float(fit.gradient.abs().max()) < 1e-3
+
+
+def test_it_resumes_exactly_while_the_process_and_while_quadratics_search():
+    def make():
+        return TrustRegion(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0), restarts=100, seed=3)
+
+    search, quadratics = make(), set()
+    for _ in range(60):
+        points = search.ask()
+        other = make()
+        other.load_state_dict(search.state_dict())
+        quadratics.add(other._search._close is not None)
+        assert torch.equal(other.ask(), points)
+        search.tell(well(points))
+        other.tell(well(points))
+        assert torch.equal(other.ask(), search.ask())
+        assert (other.value, other.evaluations) == (search.value, search.evaluations)
+    assert quadratics == {True, False}
+
+
+def test_noise_is_averaged():
+    generator = torch.Generator().manual_seed(0)
+    errors = []
+    for seed in range(6):
+
+        def noisy(z):
+            clean = (z - 0.5).square().sum(1)
+            return clean + 0.1 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
+
+        search = search_for(noisy, vector(-2.0), 80, sigma=1.0, bounds=(-3.0, 3.0), noise=0.1, seed=seed)
+        errors.append(float(search.x - 0.5))
+        # The lowest of 40 values around the minimum is 0.2 below the truth.
+        assert abs(search.value) < 0.1
+    assert sum(one**2 for one in errors) / 6 < 0.15**2
+
+
+def test_it_ends_after_its_rounds_and_says_why():
+    search = search_for(well, vector(-2.0, 1.5), 400, sigma=1.0, bounds=(-4.0, 4.0), restarts=2, seed=0)
+    assert search.done
+    assert search.rounds == 3
+    assert "3 times" in search.message

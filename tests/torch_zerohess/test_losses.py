@@ -1,0 +1,384 @@
+"""Image losses against closed forms, scikit-image, and finite differences of themselves."""
+
+import json
+import pickle
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+import torch_zerohess as zh
+from experiments.problems.catalogue import load
+from experiments.problems.closed_forms import box2
+from experiments.problems.task import Task
+from experiments.problems.tasks.box2 import fitting
+from experiments.studies.losses import LossReport, losses
+from experiments.studies.objectives import pictures_of
+
+FACTORIES = {
+    "mse": zh.losses.mse,
+    "multiscale_mse": lambda target: zh.losses.multiscale_mse(target, levels=3),
+    "ssim": lambda target: zh.losses.ssim(target, window_size=5),
+}
+EACH = pytest.mark.parametrize("name", FACTORIES)
+
+
+def images(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+@pytest.mark.parametrize("d", [0.0, 0.25, -3.0])
+@pytest.mark.parametrize("shape", [(13, 10), (13, 10, 3), (8, 8, 1)])
+def test_a_constant_difference_counts_fully_at_every_scale(shape, d) -> None:
+    target = images(*shape)
+    assert float(zh.losses.mse(target)(target + d)) == pytest.approx(d**2, abs=1e-15)
+    for levels in (1, 2, 3, 4):
+        assert float(zh.losses.multiscale_mse(target, levels)(target + d)) == pytest.approx(d**2, abs=1e-15)
+
+
+def test_one_pixel_at_three_scales() -> None:
+    target = images(4, 4)
+    image = target.clone()
+    image[2, 1] += 1
+    # Means over 16 pixels, 4 cells of a quarter each, one cell of a sixteenth.
+    expected = (1 / 16 + (1 / 4) ** 2 / 4 + (1 / 16) ** 2) / 3
+    assert float(zh.losses.multiscale_mse(target, levels=3)(image)) == pytest.approx(expected, rel=1e-12)
+    assert float(zh.losses.mse(target)(image)) == pytest.approx(1 / 16, rel=1e-12)
+
+
+def test_cells_at_the_edge_average_the_pixels_they_have() -> None:
+    image = torch.zeros(3, 3)
+    image[2, 2] = 1  # alone in its cell at the second scale, where cells have 4, 2, 2 and 1 pixels
+    assert float(zh.losses.multiscale_mse(torch.zeros(3, 3), levels=2)(image)) == pytest.approx((1 / 9 + 1 / 4) / 2)
+
+
+def test_channels_count_equally() -> None:
+    target, image = images(9, 12, 3), images(9, 12, 3, seed=1)
+    for make in FACTORIES.values():
+        channels = [make(target[..., c])(image[..., c]) for c in range(3)]
+        assert float(make(target)(image)) == pytest.approx(float(torch.stack(channels).mean()), rel=1e-12)
+
+
+@EACH
+def test_equal_images_have_no_loss(name) -> None:
+    for target in (images(12, 9, 3), torch.zeros(12, 9, dtype=torch.float64)):
+        assert float(FACTORIES[name](target)(target)) == pytest.approx(0.0, abs=1e-14)
+
+
+@pytest.mark.parametrize(("p", "q", "data_range"), [(0.2, 0.9, 1.0), (0.0, 1.0, 1.0), (30.0, 200.0, 255.0)])
+def test_dissimilarity_of_flat_images(p, q, data_range) -> None:
+    # Without variance the second factor is b / b.
+    a = (0.01 * data_range) ** 2
+    expected = 1 - (2 * p * q + a) / (p**2 + q**2 + a)
+    one = torch.full((15, 13), p, dtype=torch.float64)
+    loss = zh.losses.ssim(torch.full_like(one, q), data_range=data_range)
+    assert float(loss(one)) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(24, 17), (24, 17, 3)])
+def test_dissimilarity_as_scikit_image_has_it(shape) -> None:
+    target, image = images(*shape), images(*shape, seed=1)
+    image = 0.7 * target + 0.3 * image
+    similarity = structural_similarity(
+        image.numpy(),
+        target.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1 if len(shape) == 3 else None,
+    )
+    loss = float(zh.losses.ssim(target)(image))
+    assert loss == pytest.approx(1 - similarity, rel=1e-9)
+    assert 0.01 < loss < 1
+
+
+@pytest.mark.parametrize("level", [1.0, 30.0, 1000.0])
+def test_dissimilarity_of_bright_flat_images_in_float32(level) -> None:
+    target, image = torch.full((16, 16), level), level + 0.01 * images(16, 16).float()
+    expected = float(zh.losses.ssim(target.double())(image.double()))
+    assert float(zh.losses.ssim(target)(image)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_dissimilarity_of_one_small_window() -> None:
+    target, image = images(3, 3), images(3, 3, seed=1)
+    weights = np.exp(-0.5 * (np.array([-1.0, 0.0, 1.0]) / 1.5) ** 2)
+    weights = np.outer(weights, weights) / weights.sum() ** 2
+    x, y = image.numpy(), target.numpy()
+    m, n = (weights * x).sum(), (weights * y).sum()
+    v, w, k = (weights * (x - m) ** 2).sum(), (weights * (y - n) ** 2).sum(), (weights * (x - m) * (y - n)).sum()
+    expected = 1 - (2 * m * n + 1e-4) * (2 * k + 9e-4) / ((m**2 + n**2 + 1e-4) * (v + w + 9e-4))
+    assert float(zh.losses.ssim(target, window_size=3)(image)) == pytest.approx(expected, rel=1e-10)
+
+
+@EACH
+@pytest.mark.parametrize("shape", [(9, 7), (9, 7, 2)])
+def test_derivatives_are_those_of_finite_differences(name, shape) -> None:
+    loss = FACTORIES[name](images(*shape))
+    x = images(*shape, seed=1).requires_grad_(True)
+    assert torch.autograd.gradcheck(loss, (x,))
+    assert torch.autograd.gradgradcheck(loss, (x,))
+
+
+@EACH
+def test_hessians_of_torch_func_are_those_of_finite_differences(name) -> None:
+    loss = FACTORIES[name](images(8, 6))
+    x, v = images(8, 6, seed=1), images(8, 6, seed=2) - 0.5
+    hessian = torch.func.hessian(loss)(x).reshape(48, 48)
+    assert torch.allclose(hessian, hessian.mT, atol=1e-14)
+    step = 1e-4
+    ahead, behind = (torch.func.grad(loss)(x + side * step * v) for side in (1, -1))
+    slope = ((ahead - behind) / (2 * step)).flatten()
+    # Rounding 1e-16 / step and the third derivative times step^2.
+    assert torch.allclose(hessian @ v.flatten(), slope, rtol=1e-4, atol=1e-7)
+    bend = (loss(x + step * v) - 2 * loss(x) + loss(x - step * v)) / step**2
+    assert float(v.flatten() @ hessian @ v.flatten()) == pytest.approx(float(bend), rel=1e-3)
+
+
+@EACH
+@pytest.mark.parametrize("shape", [(9, 7), (9, 7, 3)])
+def test_batches_are_images_one_by_one(name, shape) -> None:
+    loss = FACTORIES[name](images(*shape))
+    batch = images(2, 4, *shape, seed=1)
+    one_by_one = torch.stack([torch.stack([loss(image) for image in row]) for row in batch])
+    assert torch.allclose(loss(batch), one_by_one, rtol=1e-12)
+    assert torch.allclose(torch.func.vmap(torch.func.vmap(loss))(batch), one_by_one, rtol=1e-12)
+    slopes = torch.func.vmap(torch.func.grad(loss))(batch[0])
+    assert torch.allclose(slopes[1], torch.func.grad(loss)(batch[0, 1]), rtol=1e-12)
+    assert loss(batch[:0]).shape == (0, 4)
+
+
+@EACH
+def test_the_image_decides_on_the_type(name) -> None:
+    target, image = images(9, 7, 3), images(9, 7, 3, seed=1)
+    exact = FACTORIES[name](target)(image)
+    for made_for in (target, target.float(), target.numpy()):
+        loss = FACTORIES[name](made_for)
+        assert loss(image).dtype == torch.float64
+        rounded = loss(image.float())
+        assert rounded.dtype == torch.float32
+        assert float(rounded) == pytest.approx(float(exact), rel=1e-4)
+
+
+@EACH
+def test_the_target_is_kept(name) -> None:
+    target = images(9, 7)
+    loss = FACTORIES[name](target)
+    before = float(loss(torch.zeros_like(target)))
+    target.zero_()
+    assert float(loss(target)) == before > 0
+
+
+@EACH
+def test_pickled_losses_are_the_same(name) -> None:
+    loss, image = FACTORIES[name](images(9, 7)), images(9, 7, seed=1)
+    assert float(pickle.loads(pickle.dumps(loss))(image)) == float(loss(image))
+
+
+@EACH
+def test_wrong_images_are_named(name) -> None:
+    loss = FACTORIES[name](images(8, 6, 3))
+    for wrong in ((8, 6), (6, 8, 3), (8, 6, 4), (3, 8, 6)):
+        got = ", ".join(map(str, wrong))
+        with pytest.raises(ValueError, match=rf"image must be \[\*batch, 8, 6, 3\] .*got \[{got}\]"):
+            loss(torch.zeros(wrong))
+    for wrong in (torch.zeros(8, 6, 3, dtype=torch.uint8), np.zeros((8, 6, 3))):
+        with pytest.raises(TypeError, match=r"image must be a floating-point tensor, got .*(uint8|float64|ndarray)"):
+            loss(wrong)
+
+
+@EACH
+def test_wrong_targets_are_named(name) -> None:
+    with pytest.raises(ValueError, match=r"target must be \[h, w\] or \[h, w, c\], got \[2, 8, 6, 3\]"):
+        FACTORIES[name](torch.zeros(2, 8, 6, 3))
+    with pytest.raises(TypeError, match=r"target must be floating-point.* got torch\.uint8"):
+        FACTORIES[name](torch.zeros(8, 6, dtype=torch.uint8))
+    with pytest.raises(ValueError, match="target must be finite"):
+        FACTORIES[name](torch.full((8, 6), torch.nan))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: zh.losses.multiscale_mse(images(7, 20)), r"must be at least 8x8 pixels for 4 levels, got \[7, 20\]"),
+        (lambda: zh.losses.multiscale_mse(images(7, 20), levels=0), "levels must be at least 1, got 0"),
+        (lambda: zh.losses.ssim(images(20, 10, 3)), r"at least 11x11 pixels for a window of 11, got \[20, 10, 3\]"),
+        (lambda: zh.losses.ssim(images(20, 20), window_size=8), "window_size must be odd and at least 3, got 8"),
+        (lambda: zh.losses.ssim(images(20, 20), data_range=0.0), "data_range must be positive and finite, got 0.0"),
+    ],
+)
+def test_wrong_settings_are_named(make, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_without_kornia_the_package_to_install_is_named(monkeypatch) -> None:
+    for module in ("kornia", "kornia.metrics"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match=r"kornia .*pip install 'torch_zerohess\[losses\]'"):
+        zh.losses.ssim(images(20, 20))
+
+
+def blob(x: torch.Tensor) -> np.ndarray:
+    """Images [K, 16, 20] of a spot of width 0.2 at x [K, 2], in NumPy."""
+    x, y = x.double().numpy()[:, :, None, None].swapaxes(0, 1)
+    row, column = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 20), indexing="ij")
+    return np.exp(-((column - x) ** 2 + (row - y) ** 2) / (2 * 0.2**2))
+
+
+@EACH
+@pytest.mark.parametrize("inside", [False, True])
+def test_minimize_with_the_loss_after_or_inside_the_black_box(name, inside) -> None:
+    target = torch.tensor([[0.3, 0.6]], dtype=torch.float64)
+    loss = FACTORIES[name](blob(target)[0])
+    fn = (lambda x: loss(torch.from_numpy(blob(x)))) if inside else blob
+    start = torch.tensor([0.7, 0.25])
+    fit = zh.minimize(
+        fn, start, sigma=0.2, loss=None if inside else loss, bounds=(0, 1), seed=0, max_evaluations=80, target=1e-7
+    )
+    assert fit.value < 1e-5
+    assert torch.allclose(fit.x, target[0].float(), atol=5e-3)
+
+
+@EACH
+def test_a_network_learns_through_an_image_and_its_loss(name) -> None:
+    """Derivatives of loss(layer(x)) are those of the loss at the image, times the Jacobian of the layer."""
+    loss = FACTORIES[name](blob(torch.tensor([[0.3, 0.6]]))[0])
+    layer = zh.BlackBox(blob, zh.Smoothing(sigma=0.1, samples=16, seed=0))
+    x = torch.tensor([0.6, 0.4], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(layer(x)), x, create_graph=True)
+    jacobian = torch.func.jacrev(layer)(x.detach())
+    assert torch.allclose(gradient, torch.einsum("hwn,hw->n", jacobian, torch.func.grad(loss)(layer(x.detach()))))
+    assert bool(torch.isfinite(torch.autograd.grad(gradient.sum(), x)[0]).all())
+
+
+# The command `losses`, and the two smoothed objectives behind it.
+
+
+def normal(count: int, n: int) -> torch.Tensor:
+    points = torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(count, dtype=torch.float64)
+    return torch.special.ndtri(points)
+
+
+def small_box2(side: int = 16) -> Task:
+    box = box2(side)
+    return fitting(
+        box,
+        title="the place of a small square",
+        parameters="x, y",
+        evaluations=1000,
+        parameter_error=lambda x: float((x - box.loss.target).square().mean()),
+    )
+
+
+def test_objectives_of_a_square_of_the_parameter() -> None:
+    """Pictures f = x^2 p against black: E f = (x^2 + s^2) p and E f^2 = (x^4 + 6 x^2 s^2 + 3 s^4) p^2."""
+    p = images(12, 12, 3)
+
+    def image(x: torch.Tensor) -> torch.Tensor:
+        return x[:, :1, None, None].square() * p
+
+    task = replace(
+        small_box2(),
+        n=1,
+        image=image,
+        residuals=torch.flatten,
+        start=lambda run: torch.ones(1).double(),
+        picture=lambda x: image(x[None])[0],
+    )
+    one = pictures_of(task)
+    x, s = 0.7, 0.4
+    moments = one.moments(torch.tensor([x]).double(), s, normal(1024, 1))
+    power = float(p.square().mean())
+    mse = list(one.losses).index("mse")
+    expected = {
+        "inside": ((x**4 + 6 * x**2 * s**2 + 3 * s**4) * power, (4 * x**3 + 12 * x * s**2) * power),
+        "image": ((x**2 + s**2) ** 2 * power, 4 * x * (x**2 + s**2) * power),
+    }
+    for form, (value, slope) in expected.items():
+        values, gradients = one.objective(moments, form)
+        assert gradients.shape == (3, 1)
+        assert float(values[mse]) == pytest.approx(value, rel=0.01)
+        assert float(gradients[mse, 0]) == pytest.approx(slope, rel=0.04)
+        # One estimate of the package: its relative error is that of 512 samples, below a tenth.
+        estimate = one.estimate(torch.tensor([x]).double(), zh.Smoothing(sigma=s, samples=256, seed=0))
+        assert float(one.objective(estimate, form)[1][mse, 0]) == pytest.approx(slope, rel=0.3)
+
+
+def test_pictures_keep_the_loss_of_the_task() -> None:
+    """BOX2 as it is; the sphere of BRDF fills a part of its picture, and black pixels add nothing."""
+    for name in ("box2", "brdf"):
+        task = load(name)
+        one = pictures_of(task)
+        changed = one.with_loss("mse", 7)
+        assert changed.evaluations == 7
+        x = torch.stack([task.start(run) for run in range(3)])
+        share = task.image(x[:1]).numel() / one.render(x[:1]).numel()
+        assert share == 1 or 0.5 < share < 0.7  # pi / 4 of a frame of 1.1 radii
+        assert torch.allclose(changed.loss(x), share * task.loss(x), rtol=1e-6)
+        assert float(changed.image_loss(changed.image(x[:1])[0])) == pytest.approx(share * float(task.loss(x[:1])[0]))
+
+
+def test_tasks_without_a_picture_are_refused() -> None:
+    with pytest.raises(SystemExit, match="tasks must be some whose image is a picture, got quad"):
+        losses(tasks=("quad",))
+    with pytest.raises(SystemExit, match=r"tasks must be some of .* got box3 \(did you mean box2"):
+        losses(tasks=("box3",))
+
+
+@pytest.mark.parametrize("wrong", [{"runs": 1}, {"samples": ()}, {"truth": 2}, {"sweep": 0}])
+def test_wrong_arguments_of_the_command_are_named(wrong) -> None:
+    with pytest.raises(SystemExit, match="runs must be at least 2, samples at least 1, truth and sweep at least 16"):
+        losses(**wrong)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> LossReport:
+    out = tmp_path_factory.mktemp("losses")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("experiments.studies.losses.load", lambda name: small_box2())
+        found = losses(tasks=("box2",), runs=4, samples=(1, 16), truth=128, sweep=16, evaluations=60, out=out)
+    written = json.loads((out / "losses.json").read_text())
+    assert len(written["biases"]) == len(found.biases) == 2 * 3 * 2
+    assert len((out / "sweep.csv").read_text().splitlines()) == 1 + 12 * len(written["positions"])
+    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    return found
+
+
+def test_the_loss_of_a_mean_picture_is_at_most_the_mean_loss(report) -> None:
+    """Jensen's inequality, for the convex losses and whatever the sample."""
+    for inside, image in zip(report.biases[::2], report.biases[1::2], strict=True):
+        assert (inside.form, image.form, inside.loss) == ("inside", "image", image.loss)
+        if inside.loss != "ssim":
+            assert all(a >= b for a, b in zip(inside.values, image.values, strict=True))
+
+
+def test_objectives_of_squares_are_smallest_at_the_solution_when_sigma_is_small(report) -> None:
+    narrow = min(bias.sigma for bias in report.biases)
+    for bias in report.biases:
+        if bias.sigma == narrow and bias.loss != "ssim":
+            assert abs(bias.minimum) < 0.05
+
+
+def test_gradient_errors_fall_with_samples(report) -> None:
+    for where in ("start", "half way", "near"):
+        for form in ("inside", "image"):
+            errors = {
+                one.evaluations: one.rmse
+                for one in report.errors
+                if (one.where, one.form, one.loss) == (where, form, "mse")
+            }
+            assert sorted(errors) == [3, 33]
+            assert errors[33] < errors[3]
+
+
+def test_fits_get_there(report) -> None:
+    shares = {(fit.loss, fit.form, fit.metric): fit.share for fit in report.fits}
+    assert len(shares) == 3 * 2 * 2
+    assert shares["mse", "image", "image"] == 1.0
+    for fit in report.fits:
+        assert (fit.evaluations is None) == (fit.share < 0.5)
+        assert fit.evaluations is None or 2 < fit.evaluations <= 60

@@ -1,0 +1,39 @@
+"""The C++ kernels, compiled without torch and run under the address and undefined-behaviour sanitizers."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "csrc" / "core_test.cpp"
+FLAGS = ["-std=c++20", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-DZH_NO_CLONES"]
+SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+
+
+def compiled(folder: Path, flags: list[str]) -> Path:
+    if shutil.which("g++") is None:
+        pytest.fail("this test compiles C++: install g++ (Debian: apt-get install g++)")
+    program = folder / "core_test"
+    done = subprocess.run(["g++", *flags, str(SOURCE), "-o", str(program)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def test_kernels_under_sanitizers(tmp_path: Path) -> None:
+    done = subprocess.run([compiled(tmp_path, FLAGS + SANITIZERS)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
+
+
+def test_sanitizers_are_on(tmp_path: Path) -> None:
+    """A run that cannot fail would prove nothing: an overrun of one element must be caught."""
+    wrong = tmp_path / "overrun.cpp"
+    wrong.write_text(
+        f'#include "{SOURCE.parents[2] / "csrc" / "reduce.h"}"\n'
+        "int main() { std::vector<double> u(7); return int(zerohess::dot(u.data(), u.data(), 8)); }\n"
+    )
+    program = tmp_path / "overrun"
+    subprocess.run(["g++", *FLAGS, *SANITIZERS, str(wrong), "-o", str(program)], check=True)
+    done = subprocess.run([program], capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "heap-buffer-overflow" in done.stderr

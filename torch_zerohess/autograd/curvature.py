@@ -1,0 +1,213 @@
+"""Grey-box curvature: the Hessian of a loss behind a network and a black box, as a matrix-free operator.
+
+For a loss L(theta) = l(y(theta)) with white-box y (a network) and sampled l (a black box and whatever follows it),
+
+    exact          H = J^T (d2l/dy2) J + sum_k (dl/dy_k) d2y_k/dtheta2
+    gauss_newton   H = J^T (d2l/dy2) J,      J = dy/dtheta
+
+The second is what the supplement of Wang, Fischer and Ritschel (2025) calls the grey-box Hessian, section E: it drops
+the term in the curvature of the network, hence its "approximately".
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd.graph import Node
+
+from torch_zerohess.autograd.blackbox import Input
+
+_DENSE = 10_000
+
+
+class CurvatureOperator:
+    """Hessian of a scalar loss with respect to parameters, as a symmetric operator that is never formed.
+
+    Args:
+        outputs: the loss, a tensor of one element with a graph. The graph is kept.
+        inputs: the parameters, one tensor or several, N numbers in all.
+        mode: "exact" or "gauss_newton", see the module. "gauss_newton" counts the curvature through the inputs of the
+            black boxes alone: a term of the loss that reaches the parameters in another way has none.
+        through: for "gauss_newton", the tensors y at which the white box ends; the inputs of all `BlackBox` layers
+            between `inputs` and `outputs` if None.
+
+    Raises:
+        ValueError: `outputs` has no graph or more than one element; nothing to go through was found, or one black box
+            stands behind another.
+
+    Example:
+        >>> w = torch.tensor([1.0, 2.0], requires_grad=True)
+        >>> H = CurvatureOperator((w**3).sum(), w)
+        >>> H.shape, H @ torch.tensor([1.0, 0.0])
+        ((2, 2), tensor([6., 0.]))
+    """
+
+    def __init__(
+        self,
+        outputs: Tensor,
+        inputs: Tensor | Sequence[Tensor],
+        *,
+        mode: str = "exact",
+        through: Tensor | Sequence[Tensor] | None = None,
+    ) -> None:
+        if mode not in ("exact", "gauss_newton"):
+            raise ValueError(f"mode must be 'exact' or 'gauss_newton', got {mode!r}")
+        if mode == "exact" and through is not None:
+            raise ValueError("through goes with mode 'gauss_newton'; 'exact' differentiates everything")
+        if outputs.numel() != 1 or not outputs.requires_grad:
+            graph = "no graph" if not outputs.requires_grad else f"shape {list(outputs.shape)}"
+            raise ValueError(f"outputs must be a loss of one element with a graph, got one with {graph}")
+        self._inputs = _listed(inputs)
+        if not self._inputs or not all(one.requires_grad for one in self._inputs):
+            raise ValueError("inputs must be tensors that require grad")
+        self._sizes = [one.numel() for one in self._inputs]
+        self.mode = mode
+        self.shape = (sum(self._sizes), sum(self._sizes))
+        self.dtype, self.device = self._inputs[0].dtype, self._inputs[0].device
+        if mode == "exact":
+            self._through = self._inputs
+            self._slopes = _grad([outputs], self._inputs, None, create_graph=True)
+            self.gradient = self._flat([one.detach() for one in self._slopes])
+        else:
+            self._through = black_box_inputs(outputs) if through is None else _listed(through)
+            self._slopes = _grad([outputs], self._through, None, create_graph=True)
+            self.gradient = self._flat(_grad([outputs], self._inputs, None))
+            self._dummies = [torch.zeros_like(y, requires_grad=True) for y in self._through]
+            self._pulled = _grad(self._through, self._inputs, self._dummies, create_graph=True)
+
+    gradient: Tensor
+    """Gradient of the loss, [N]."""
+
+    def __matmul__(self, v: Tensor) -> Tensor:
+        """Return H v for v [N], or H V for V [N, m]."""
+        if v.dim() not in (1, 2) or len(v) != self.shape[0]:
+            raise ValueError(f"v must have shape [{self.shape[0]}] or [{self.shape[0]}, m], got {list(v.shape)}")
+        if v.dim() == 2:
+            return torch.stack([self @ column for column in v.unbind(1)], 1) if v.shape[1] else v.clone()
+        t = self._split(v)
+        if self.mode == "exact":
+            return self._flat(_grad(self._slopes, self._inputs, t))
+        return self._flat(_grad(self._through, self._inputs, self.output_curvature(self.output_step(v))))
+
+    def output_step(self, v: Tensor) -> list[Tensor]:
+        """Return J v, how far the inputs of the black boxes move along v [N] ("gauss_newton" only)."""
+        # J^T d is linear in the dummy d; its transpose by a second backward pass is J.
+        return _grad(self._pulled, self._dummies, self._split(v))
+
+    def output_curvature(self, t: Sequence[Tensor]) -> list[Tensor]:
+        """Return (d2l/dy2) t for vectors in the shapes of the inputs of the black boxes."""
+        return _grad(self._slopes, self._through, t)
+
+    def to_dense(self) -> Tensor:
+        """Return the matrix [N, N], one product per column; ValueError beyond 10 000 parameters."""
+        if self.shape[0] > _DENSE:
+            raise ValueError(f"to_dense would form a matrix of {self.shape[0]} squared numbers: use H @ v")
+        return self @ torch.eye(self.shape[0], dtype=self.dtype, device=self.device)
+
+    def _split(self, v: Tensor) -> list[Tensor]:
+        v = v.detach().to(self.dtype)
+        return [part.view_as(one) for part, one in zip(v.split(self._sizes), self._inputs, strict=True)]
+
+    def _flat(self, parts: Sequence[Tensor]) -> Tensor:
+        return torch.cat([part.reshape(-1) for part in parts])
+
+
+def hvp(
+    outputs: Tensor, inputs: Tensor | Sequence[Tensor], v: Tensor | Sequence[Tensor], *, mode: str = "exact"
+) -> Tensor | list[Tensor]:
+    """Return the Hessian of a loss with respect to `inputs`, times v: see `CurvatureOperator`.
+
+    v has the shape of `inputs`, a tensor or a sequence of tensors, and so has the result. The graph is kept.
+
+    Example:
+        >>> w = torch.tensor([1.0, 2.0], requires_grad=True)
+        >>> hvp((w**3).sum(), w, torch.tensor([0.0, 1.0]))
+        tensor([ 0., 12.])
+    """
+    parts, vectors = _listed(inputs), _listed(v)
+    if [one.shape for one in parts] != [one.shape for one in vectors]:
+        raise ValueError(
+            f"v must have the shapes of inputs, {[list(one.shape) for one in parts]}, "
+            f"got {[list(one.shape) for one in vectors]}"
+        )
+    product = CurvatureOperator(outputs, parts, mode=mode) @ torch.cat([one.reshape(-1) for one in vectors])
+    pieces = product.split([one.numel() for one in parts])
+    result = [piece.view_as(one) for piece, one in zip(pieces, parts, strict=True)]
+    return result[0] if isinstance(inputs, Tensor) else result
+
+
+def black_box_inputs(outputs: Tensor) -> list[Tensor]:
+    """Return the tensors that enter `BlackBox` layers on the way to `outputs`, each once."""
+    found = {_edge(one): one for one in _entries(outputs.grad_fn)}
+    if not found:
+        raise ValueError(
+            "mode 'gauss_newton' found no BlackBox layer between inputs and outputs (one that is compiled cannot be "
+            "found): name the tensors at which the white box ends in `through`"
+        )
+    for one in found.values():
+        if _entries(one.grad_fn):
+            raise ValueError(
+                "mode 'gauss_newton' needs black boxes side by side, but one stands behind another: use mode 'exact'"
+            )
+        if _edges_before(one.grad_fn) & found.keys():
+            raise ValueError(
+                "mode 'gauss_newton' found a black box whose input is computed from the input of another: name in "
+                "`through` the tensors that both come from"
+            )
+    return list(found.values())
+
+
+def _entries(node: Node | None) -> list[Tensor]:
+    seen, stack, found = {node}, [node], []
+    while stack:
+        current = stack.pop()
+        if current is None:
+            continue
+        if isinstance(current, Input._backward_cls):
+            found.append(current.saved_tensors[0])  # type: ignore[attr-defined]
+        for following, _ in current.next_functions:
+            if following not in seen:
+                seen.add(following)
+                stack.append(following)
+    return found
+
+
+def _edges_before(node: Node | None) -> set[tuple[object, int]]:
+    """Gradient edges that lead into a node, without its own."""
+    seen: set[tuple[object, int]] = set()
+    stack = [node]
+    while stack:
+        current = stack.pop()
+        for following, number in current.next_functions if current is not None else ():
+            if following is not None and (following, number) not in seen:
+                seen.add((following, number))
+                stack.append(following)
+    return seen
+
+
+def _edge(tensor: Tensor) -> tuple[object, int]:
+    edge = torch.autograd.graph.get_gradient_edge(tensor)
+    return edge.node, edge.output_nr
+
+
+def _listed(tensors: Tensor | Sequence[Tensor]) -> list[Tensor]:
+    return [tensors] if isinstance(tensors, Tensor) else list(tensors)
+
+
+def _grad(
+    outputs: Sequence[Tensor], inputs: Sequence[Tensor], vectors: Sequence[Tensor] | None, *, create_graph: bool = False
+) -> list[Tensor]:
+    """Vector-Jacobian product that keeps the graph and gives zeros where nothing depends."""
+    pairs = [
+        (output, None if vectors is None else vectors[index])
+        for index, output in enumerate(outputs)
+        if output.requires_grad
+    ]
+    if not pairs:
+        return [torch.zeros_like(one) for one in inputs]
+    chosen, weights = zip(*pairs, strict=True)
+    return list(
+        torch.autograd.grad(
+            chosen, inputs, weights, retain_graph=True, create_graph=create_graph, materialize_grads=True
+        )
+    )

@@ -1,0 +1,142 @@
+"""The linear map between parameters and samples as an autograd function: all that autograd must know about sampling.
+
+With perturbations U [K, n], an estimate depends on x through U d alone, d = (x - x_0) / sigma, and its derivatives
+through U^T a. Both maps are linear and each is the other's transpose, so that one function, which calls itself in
+`backward` and `jvp`, has derivatives of every order, in every mode, batched or not. U is stored or drawn again.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.sampling import kernels
+from torch_zerohess.sampling.kernels import Redrawn
+
+Samples = Tensor | Redrawn
+
+
+def project(u: Samples, t: Tensor, *, zero: bool = False) -> Tensor:
+    """Return U t, [B, M, K] for u [B, K, n] and t [B, M, n]; `zero` says that t is known to be zero in value."""
+    if torch.compiler.is_compiling() and isinstance(u, Tensor):
+        return t @ u.mT  # Dynamo traces no function with a custom jvp; plain operations need none
+    result: Tensor = _LinearMap.apply(t, False, zero, *_flat(u))
+    return result
+
+
+def _flat(u: Samples) -> tuple[Any, ...]:
+    return (u,) if isinstance(u, Tensor) else tuple(u)
+
+
+def _unflat(parts: tuple[Any, ...]) -> Samples:
+    return parts[0] if len(parts) == 1 else Redrawn(*parts)
+
+
+class _LinearMap(torch.autograd.Function):
+    """`apply(vectors, transposed, zero, *samples)`: U vectors, or U^T vectors where `transposed`."""
+
+    @staticmethod
+    def forward(vectors: Tensor, transposed: bool, zero: bool, *parts: Any) -> Tensor:
+        u = _unflat(parts)
+        if zero or vectors._is_zerotensor():  # a symbolic zero of forward mode has no memory to read
+            K, n = u.shape[1:] if isinstance(u, Tensor) else (u.K, u.x.shape[1])
+            return torch.zeros(*vectors.shape[:2], n if transposed else K, dtype=vectors.dtype, device=vectors.device)
+        return kernels.accumulate(u, vectors) if transposed else kernels.project(u, vectors)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.transposed = inputs[1]
+        tensors = [part for part in inputs[3:] if isinstance(part, Tensor)]
+        ctx.flags = [part for part in inputs[3:] if not isinstance(part, Tensor)]
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+        parts = (*ctx.saved_tensors, *ctx.flags)
+        return (_LinearMap.apply(gradient, not ctx.transposed, False, *parts), None, None, *(None for _ in parts))
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: Any) -> Tensor:
+        result: Tensor = _LinearMap.apply(tangent, ctx.transposed, False, *ctx.saved_tensors, *ctx.flags)
+        return result
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], vectors: Tensor, transposed: bool, zero: bool, *parts: Any) -> Any:
+        """Fold a mapped dimension into M where the samples are shared, else into B."""
+        batched = any(dim is not None for dim in in_dims[3:])
+        if in_dims[0] is None:
+            vectors = vectors.expand(info.batch_size, *vectors.shape)
+        else:
+            vectors = vectors.movedim(in_dims[0], 0)
+        V, B, M = vectors.shape[:3]
+        if not batched:
+            folded = vectors.movedim(0, 1).reshape(B, V * M, -1)
+            result = _LinearMap.apply(folded, transposed, zero, *parts)
+            return result.reshape(B, V, M, -1), 1
+        parts = tuple(_fold(part, dim, V) for part, dim in zip(parts, in_dims[3:], strict=True))
+        result = _LinearMap.apply(vectors.reshape(V * B, M, -1), transposed, zero, *parts)
+        return result.reshape(V, B, M, -1), 0
+
+
+def _fold(part: Any, dim: int | None, V: int) -> Any:
+    """Fold the mapped dimension of a batch-first tensor into its batch; sigma [n] is shared by all and has none."""
+    if not isinstance(part, Tensor) or (dim is None and part.dim() == 1):
+        return part
+    part = part.expand(V, *part.shape) if dim is None else part.movedim(dim, 0)
+    return part.flatten(0, 1)
+
+
+def first_order_only(x: Tensor) -> Tensor:
+    """Return x with a second derivative that raises instead of being silently zero; compiled code has none anyway."""
+    result: Tensor = x if torch.compiler.is_compiling() else _FirstOrderOnly.apply(x)
+    return result
+
+
+class _FirstOrderOnly(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        result: Tensor = _NoDerivative.apply(gradient, *ctx.saved_tensors)
+        return result
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
+        result: Tensor = _NoDerivative.apply(tangent, *ctx.saved_tensors)
+        return result
+
+
+class _NoDerivative(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(gradient: Tensor, x: Tensor) -> Tensor:
+        return gradient.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, None]:
+        raise ValueError(FIRST_ORDER_ERROR)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        raise ValueError(FIRST_ORDER_ERROR)
+
+
+FIRST_ORDER_ERROR = (
+    "these samples serve first derivatives only (proposal 'fr22', or 'optimal' with order=1): "
+    "use Smoothing(proposal='aggregate', order=2) for Hessians and Hessian-vector products"
+)

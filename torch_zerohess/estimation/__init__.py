@@ -1,0 +1,1 @@
+"""One batch of evaluations, and what it says about a smoothed function."""

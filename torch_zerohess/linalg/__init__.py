@@ -1,0 +1,1 @@
+"""Steps inside a ball, a box and a Krylov space."""

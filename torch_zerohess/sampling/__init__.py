@@ -1,0 +1,1 @@
+"""Bits: where perturbations come from, their densities and their weights."""

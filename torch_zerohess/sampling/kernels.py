@@ -1,0 +1,130 @@
+"""The operations that the C++ extension speeds up, each beside its literal reference in torch.
+
+A CPU tensor goes to the extension where it was built; any other device, and an installation without a compiler, to the
+reference. Drawn perturbations have the same bits on both ways; sums differ by rounding only, within n units in the
+last place of the sum of magnitudes.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.sampling import extension, proposals
+
+_MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
+_WIDE = 64  # likewise for the outer products of a Hessian
+_CHUNK = 1 << 22  # elements of drawn rows held at a time
+
+
+class Redrawn(NamedTuple):
+    """Rows of perturbations kept as their recipe, O(K + n), instead of their numbers, O(K n).
+
+    rows: int64 [B * S, 5]; x: [B, n], sigma: [n], float64; K = 2 S with `antithetic`, else S.
+    """
+
+    rows: Tensor
+    x: Tensor
+    sigma: Tensor
+    antithetic: bool
+    single: bool
+
+    @property
+    def K(self) -> int:
+        """Number of rows for each x."""
+        return len(self.rows) // len(self.x) * (2 if self.antithetic else 1)
+
+    def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Yield what `place` returns, for a part of the rows at a time, and which k of the K rows these are."""
+        B, n = self.x.shape
+        S = len(self.rows) // B
+        step = max(1, _CHUNK // (B * n))
+        for first in range(0, S, step):
+            part = self.rows.view(B, S, 5)[:, first : first + step]
+            u = draw(part.reshape(-1, 5), n)
+            index = torch.arange(first, first + part.shape[1], device=u.device)
+            columns = torch.cat([index, index + S]) if self.antithetic else index
+            yield *place(u, self.x, self.sigma, self.antithetic, self.single, proposal), columns
+
+
+def _compiled(tensor: Tensor) -> bool:
+    return extension.available and tensor.device.type == "cpu"
+
+
+def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: torch.device) -> Tensor:
+    """See `proposals.pick_rows`."""
+    pick = torch.ops.torch_zerohess.pick_rows if extension.available else proposals.pick_rows
+    rows: Tensor = pick(seed, first, count, n, proposal)
+    return rows.to(device)
+
+
+def draw(rows: Tensor, n: int) -> Tensor:
+    """See `proposals.draw`."""
+    return torch.ops.torch_zerohess.draw(rows.contiguous(), n) if _compiled(rows) else proposals.draw(rows, n)
+
+
+def place(
+    u: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, proposal: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `proposals.place`."""
+    if _compiled(u):
+        return torch.ops.torch_zerohess.place(u.contiguous(), x, sigma, antithetic, single, proposal)
+    return proposals.place(u, x, sigma, antithetic, single, proposal)
+
+
+def project(u: Tensor | Redrawn, t: Tensor) -> Tensor:
+    """Return sum_d u[b, k, d] t[b, m, d] as [B, M, K]: how far every sample lies along each vector."""
+    if isinstance(u, Tensor):
+        if _compiled(u) and t.shape[1] <= _MANY_VECTORS:
+            return torch.ops.torch_zerohess.project(u.contiguous(), t.contiguous())
+        return t @ u.mT
+    if _compiled(u.x):
+        return torch.ops.torch_zerohess.project_drawn(*u, t.contiguous())
+    result = t.new_empty(*t.shape[:2], u.K)
+    for _, chunk, _, columns in u.chunks():
+        result[..., columns] = t @ chunk.mT
+    return result
+
+
+def accumulate(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+    """Return sum_k a[b, m, k] u[b, k, d] as [B, M, n]: the transpose of `project`."""
+    return _sums(u, a, squares=False)
+
+
+def accumulate_squares(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+    """Return sum_k a[b, m, k] u[b, k, d]^2 as [B, M, n]."""
+    return _sums(u, a, squares=True)
+
+
+def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+    """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] as [B, M, n, n]."""
+    if isinstance(u, Tensor):
+        if _compiled(u) and a.shape[1] <= _MANY_VECTORS and u.shape[2] <= _WIDE:
+            return torch.ops.torch_zerohess.hessian(u.contiguous(), a.contiguous())
+        if a.shape[1] > u.shape[2]:  # many vectors, few parameters: outer products of the samples, in pieces
+            rows = max(1, _CHUNK // u.shape[2] ** 2)
+            pieces = zip(u.split(rows, 1), a.split(rows, 2), strict=True)
+            flat = _total(part @ (one[..., :, None] * one[..., None, :]).flatten(2) for one, part in pieces)
+            result = flat.unflatten(2, (u.shape[2], u.shape[2]))
+        else:
+            result = (u.mT[:, None] * a[:, :, None]) @ u[:, None]
+        return result.triu() + result.triu(1).mT
+    return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
+
+
+def _sums(u: Tensor | Redrawn, a: Tensor, squares: bool) -> Tensor:
+    if isinstance(u, Tensor):
+        if _compiled(u) and a.shape[1] <= _MANY_VECTORS:
+            return torch.ops.torch_zerohess.accumulate(u.contiguous(), a.contiguous(), squares)
+        return a @ (u * u if squares else u)
+    if _compiled(u.x):
+        return torch.ops.torch_zerohess.accumulate_drawn(*u, a.contiguous(), squares)
+    return _total(_sums(chunk, a[..., columns], squares) for _, chunk, _, columns in u.chunks())
+
+
+def _total(pieces: Iterator[Tensor]) -> Tensor:
+    total = next(pieces)
+    for piece in pieces:
+        total = total + piece
+    return total

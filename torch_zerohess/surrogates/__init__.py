@@ -1,0 +1,1 @@
+"""Models fitted to evaluations; they never ask for points."""

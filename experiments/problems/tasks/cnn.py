@@ -43,7 +43,7 @@ class CnnTask(TrainingTask):
     n = 1
     sigma = (1.0, 0.1)
     measure = "rms error [degrees]"
-    pooled = Pooled(lengths=(0.5,), temperature=0.1, steps=1500, rank=64)
+    pooled = Pooled(temperature=0.1, steps=1500, rank=64)
     methods = ("fr22", "our_g", "our_h", "our_hvp", "our_hvpa", "pooled")
     angles: ClassVar[tuple[float, float]] = ANGLES
 

@@ -45,7 +45,7 @@ class Task(TrainingTask):
     sigma = (1.0, 0.05)
     bounds = (-math.inf, -math.inf, 0.0, 0.0, 0.0), (math.inf, math.inf, 10.0, 10.0, 10.0)
     measure = "rms error [units]"
-    pooled = Pooled(lengths=(1.25, 0.6, 10.0, 10.0, 10.0), temperature=0.03)
+    pooled = Pooled(temperature=0.03)
 
     def of_scene(self, x: Tensor) -> Tensor:
         return x * torch.tensor(UNITS, dtype=x.dtype)

@@ -68,7 +68,7 @@ class Task(TrainingTask):
     sigma = (0.2, 0.02)
     bounds = (0.0,), (1.0,)
     measure = "PSNR of the texture [dB]"
-    pooled = Pooled(lengths=None, temperature=1.0, steps=900, rank=1100, rate=(3e-3, 2e-4), first=1100)
+    pooled = Pooled(surrogate="linear", temperature=1.0, steps=900, rank=1100, rate=(3e-3, 2e-4), first=1100)
     methods = ("fr22", "our_g", "pooled")
 
     def parameters(self, count: int, generator: torch.Generator, *, held_out: bool) -> Tensor:

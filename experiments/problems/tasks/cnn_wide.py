@@ -28,7 +28,7 @@ class Task(CnnTask):
 
     name = "cnn_wide"
     sigma = (3.0, 0.1)
-    pooled = Pooled(lengths=(0.5,), temperature=0.1, steps=1500, rank=64)
+    pooled = Pooled(temperature=0.1, steps=1500, rank=64)
     angles = ANGLES
 
 

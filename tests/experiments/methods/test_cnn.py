@@ -23,7 +23,7 @@ TINY = CnnPreset(16, 2, 2, (2, 2, 2), evaluations=84, images=12, held_out=4)
 
 
 class Quick(CnnTask):
-    pooled = Pooled(lengths=(0.5,), temperature=0.1, steps=20, batch=4, draws=4, rank=8, first=8, rows=10)
+    pooled = Pooled(temperature=0.1, steps=20, batch=4, draws=4, rank=8, first=8, rows=10)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_methods_learn(name):
     """On a stand-in for the renderer, a smooth bowl in the angle, each divides the parameter error by ten."""
 
     class Bowl(CnnTask):
-        pooled = Pooled(lengths=(1.0,), temperature=0.1, steps=300, rank=64)
+        pooled = Pooled(temperature=0.1, steps=300, rank=64)
 
         def render(self, rotation):
             x = torch.linspace(0, 1, 16)

@@ -15,8 +15,9 @@ from experiments.methods import Method
 from experiments.methods.settings import settings
 from experiments.problems.rendered import Reference, RenderedTask
 from experiments.problems.task import Task
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Outcome, Record
-from experiments.runs.trial import LIMIT, Trial, attempt
+from experiments.runs.trial import LIMIT, Trial
 
 _GRID = 61
 """Points along the side of a map of the loss; odd, so that the middle is one of them."""
@@ -72,13 +73,13 @@ def trace(
 
     def image_error(x: Tensor) -> float:  # of every row once
         points.append(x.clone())
-        return task.image_error(x)
+        return task.truth.image_error(x)
 
     def solve(trial: Trial) -> None:
         trials.append(trial)
-        method.solve(trial, settings(method.name, task.name))
+        method(trial, settings(method.name, task.name))
 
-    noted = dataclasses.replace(task, image_error=image_error)
+    noted = dataclasses.replace(task, truth=dataclasses.replace(task.truth, image_error=image_error))
     outcome = attempt(noted, method.name, run, solve, limit=limit, watch=watch)
     return Trace(task, method.name, points, trials[-1].rows, outcome)
 
@@ -95,7 +96,7 @@ class Look:
 def look(task: Task, start: Tensor) -> Look | None:
     """Return pictures of a task, or a map of the loss if it has none but two parameters; None if there is neither."""
     if task.picture is not None:
-        return None if task.target_picture is None else Look(task.picture, task.target_picture())
+        return Look(task.picture.of, task.picture.target())
     return _map(task, start) if task.n == 2 else None
 
 

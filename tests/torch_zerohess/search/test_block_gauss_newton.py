@@ -282,9 +282,7 @@ def test_the_model_at_the_best_point_is_gauss_newton():
     solve(search, f, 250)
     model, sigma = search.model_at_best()
     J = torch.func.jacrev(lambda x: f(x[None])[0])(search.x)
-    torch.testing.assert_close(
-        model.full_hessian() / (0.5 * sigma) ** 2, 2 / 30 * J.mT @ J, rtol=0.1, atol=0.01
-    )
+    torch.testing.assert_close(model.full_hessian() / (0.5 * sigma) ** 2, 2 / 30 * J.mT @ J, rtol=0.1, atol=0.01)
 
 
 def test_what_cannot_be_searched_is_refused():

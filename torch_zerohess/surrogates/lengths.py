@@ -102,6 +102,6 @@ def _climb(points: Tensor, change: Tensor, start: Choice, anisotropic: bool) -> 
         with torch.no_grad():
             lengths, noise = now()
             after = float(log_evidence(points, change, start.kernel, lengths, noise))
-    except torch.linalg.LinAlgError:
+    except RuntimeError:  # the class of what a factorization of infinite numbers raises
         return start._replace(evidence=before)
     return Choice(start.kernel, lengths, float(noise), after) if after >= before else start._replace(evidence=before)

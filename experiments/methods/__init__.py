@@ -2,13 +2,16 @@
 
 from experiments.methods import (
     analytic,
+    bayesian,
     derivative_free,
     gauss_newton,
+    learned,
     meshes,
     mitsuba,
     paper,
     quasi_newton,
     trust_region,
+    turbo,
 )
 from experiments.methods.method import Method
 
@@ -16,7 +19,7 @@ METHODS: dict[str, Method] = {
     method.name: method
     for family in (
         *(paper, trust_region, gauss_newton, derivative_free, quasi_newton),
-        *(analytic, meshes, mitsuba),
+        *(bayesian, turbo, learned, analytic, meshes, mitsuba),
     )
     for method in family.METHODS
 }

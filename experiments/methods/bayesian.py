@@ -25,7 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.methods.derivative_free import Best
+from experiments.methods.derivative_free import Best, is_bounded
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.problems.task import Task
@@ -85,9 +85,7 @@ class Model:
         start = model.state_dict()
         if self._state is not None:
             start |= {
-                name: value
-                for name, value in self._state.items()
-                if "raw" in name and start[name].shape == value.shape
+                name: value for name, value in self._state.items() if "raw" in name and start[name].shape == value.shape
             }
             model.load_state_dict(start)
         try:
@@ -187,8 +185,10 @@ def botorch_composite(
     from botorch.acquisition.objective import GenericMCObjective
     from botorch.sampling import SobolQMCNormalSampler
 
-    residuals, model = trial.task.residuals, Model(noise)
-    assert residuals is not None
+    output, model = trial.task.output, Model(noise)
+    assert output is not None
+    assert output.residuals is not None
+    residuals = output.residuals
 
     def propose(z: Tensor, outputs: Tensor, losses: Tensor) -> Tensor:
         components = Components(outputs, rank, left_out)
@@ -241,15 +241,14 @@ def maximiser(acquisition: Any, n: int, restarts: int, raw_samples: int) -> Tens
     return point.detach()
 
 
-def is_small_and_bounded(task: Task) -> str | None:
-    """Say so where a task has no bounds or too many parameters."""
-    if task.bounds is None:
-        return "the task has no bounds"
-    return f"is for at most {MOST} parameters, got n = {task.n}" if task.n > MOST else None
+def _is_small_and_bounded(task: Task) -> str | None:
+    many = f"is for at most {MOST} parameters, got n = {task.n}" if task.n > MOST else None
+    return is_bounded(task) or many
 
 
 def _has_residuals(task: Task) -> str | None:
-    return is_small_and_bounded(task) or ("the black box returns no residuals" if task.residuals is None else None)
+    known = task.output is not None and task.output.residuals is not None
+    return _is_small_and_bounded(task) or (None if known else "the black box returns no residuals")
 
 
 METHODS = (
@@ -257,7 +256,7 @@ METHODS = (
         "botorch_logei",
         f"Bayesian optimization (BoTorch), log expected improvement of the loss, {EVALUATIONS} evaluations",
         with_settings(botorch_logei),
-        is_small_and_bounded,
+        _is_small_and_bounded,
         ("botorch",),
     ),
     Method(

@@ -3,14 +3,15 @@
 from experiments.methods import (
     analytic,
     bayesian,
+    block_gauss_newton,
     derivative_free,
-    gauss_newton,
     learned,
     meshes,
     mitsuba,
+    ours,
     paper,
+    pooled,
     quasi_newton,
-    trust_region,
     turbo,
 )
 from experiments.methods.method import Method
@@ -18,7 +19,7 @@ from experiments.methods.method import Method
 METHODS: dict[str, Method] = {
     method.name: method
     for family in (
-        *(paper, trust_region, gauss_newton, derivative_free, quasi_newton),
+        *(paper, ours, block_gauss_newton, pooled, derivative_free, quasi_newton),
         *(bayesian, turbo, learned, analytic, meshes, mitsuba),
     )
     for method in family.METHODS

@@ -15,8 +15,9 @@ from experiments.methods import Method
 from experiments.methods.settings import settings
 from experiments.problems.rendered import Reference, RenderedTask
 from experiments.problems.task import Task
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Outcome, Record
-from experiments.runs.trial import LIMIT, Trial, attempt
+from experiments.runs.trial import LIMIT, Trial
 
 _GRID = 61
 """Points along the side of a map of the loss; odd, so that the middle is one of them."""
@@ -76,7 +77,7 @@ def trace(
 
     def solve(trial: Trial) -> None:
         trials.append(trial)
-        method.solve(trial, settings(method.name, task.name))
+        method(trial, settings(method.name, task.name))
 
     noted = dataclasses.replace(task, truth=dataclasses.replace(task.truth, image_error=image_error))
     outcome = attempt(noted, method.name, run, solve, limit=limit, watch=watch)

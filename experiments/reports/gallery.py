@@ -18,11 +18,10 @@ import torch
 import tyro
 from tqdm import tqdm
 
-from experiments.ensembles.ensemble import unusable
 from experiments.ensembles.provenance import machine
 from experiments.methods import METHODS
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, RENDERED, TRAINING, Preset, chosen
+from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, Preset, chosen
 from experiments.reports import gallery_figures
 from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together, trace
 from experiments.reports.html_page import html_page, html_table, html_text
@@ -30,8 +29,12 @@ from experiments.reports.measures import described, measures
 from experiments.reports.tables import table
 from experiments.runs.records import Record
 
-METHOD = "trust_region"
-OWN = {**dict.fromkeys(("meshfit", "meshfit_color"), "our_h_local"), "caustic": "gauss_newton"}
+METHOD = "gaussian_process"
+OWN = {
+    **dict.fromkeys(("quad", "box10", "brdf", "texture"), "descent"),
+    **dict.fromkeys(("meshfit", "meshfit_color"), "handles_newton"),
+    "caustic": "block_gauss_newton",
+}
 """Tasks for which another method is recommended."""
 OTHER = "cma_es_bounded"
 """The method that figure 12 compares with, as the source does."""
@@ -99,12 +102,12 @@ def _traces(
     for name in bar:
         bar.set_description(name)
         try:
-            task = catalogue.load(name, preset, variant)
+            task = catalogue.fitting(name, preset, variant)
         except ImportError as error:
             bar.write(str(error))
             continue
         solver = METHODS[method or OWN.get(name, METHOD)]
-        seen, reason = look(task, task.start(run)), unusable(solver, task)
+        seen, reason = look(task, task.start(run)), solver.unusable(task)
         if seen is None or reason:
             bar.write(f"{name} is left out: {reason or 'it has no picture'}")
             continue
@@ -135,7 +138,7 @@ def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> l
         if found.task.name == "caustic":
             other = METHODS[OTHER]
             more = None
-            if other.name != found.method and not unusable(other, found.task):
+            if other.name != found.method and not other.unusable(found.task):
                 with tqdm(desc=f"caustic {OTHER}", bar_format="{desc}: [{elapsed}{postfix}]") as bar:
                     more = trace(found.task, other, found.outcome.run, limit, _watch(bar))
             files.append(out / "figure12.png")
@@ -163,7 +166,7 @@ def _animations(shown: Sequence[Shown], out: Path, count: int) -> list[Path]:
 def _predictions(folder: Path, out: Path) -> list[Path]:
     """Copy what networks predicted, as `run` has drawn it."""
     files = []
-    for name in TRAINING:
+    for name in NETWORKS:
         path = folder / name / "predictions.png"
         if path.exists():
             files.append(Path(shutil.copyfile(path, out / f"{name}.png")))
@@ -200,7 +203,7 @@ _CAPTIONS = {
     "figure12": "CAUSTIC: what the slab throws on the screen, and its surface (blue is high).",
     "figure13": "MIRROR: the bunny is seen through two mirrors only; the red line is the way from the eye to it.",
     "rendered": "The rendered tasks, beside their targets.",
-    **dict.fromkeys(TRAINING, "Held-out inputs, and renders of the predictions before and after training."),
+    **dict.fromkeys(NETWORKS, "Held-out inputs, and renders of the predictions before and after training."),
 }
 
 

@@ -26,7 +26,8 @@ from tqdm import tqdm
 
 import torch_zerohess as zh
 from experiments.problems.catalogue import chosen
-from experiments.problems.closed_forms import BoxTask, PlaneWave, box2, box10, true_gradient, true_hessian
+from experiments.problems.closed_forms import PlaneWave
+from experiments.problems.soft_squares import BoxTask, box2, box10
 from experiments.reports.tables import table
 
 mpl.use("Agg")
@@ -225,9 +226,9 @@ def _problem(name: str, truth_evaluations: int, side: int, seed: int) -> Problem
     sigma = 0.5
     k = torch.nn.functional.normalize(torch.randn(n, generator=generator, dtype=torch.float64), dim=0) / sigma
     x = torch.zeros(n, dtype=torch.float64)
-    wave, scale = PlaneWave(x, k), torch.full((n,), sigma, dtype=torch.float64)
-    hessian = true_hessian(wave, x, scale)
-    truth = {"value": wave.smoothed(x, scale), "gradient": true_gradient(wave, x, scale), "hessian": hessian}
+    wave, scale = PlaneWave(k, phase=0.7 + math.pi / 2), torch.full((n,), sigma, dtype=torch.float64)
+    hessian = wave.hessian(x, scale)
+    truth = {"value": wave.value(x, scale), "gradient": wave.gradient(x, scale), "hessian": hessian}
     truth["hvp"] = hessian @ v
     return Problem(name, wave, x, sigma, v, truth, dict.fromkeys(QUANTITIES, 0.0))
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from experiments.methods import Method
-from experiments.problems.task import Task
+from experiments.problems.task import Output, Picture, Task, Truth
 
 TARGET = torch.tensor([1.0, -2.0], dtype=torch.float64)
 
@@ -24,6 +24,10 @@ def slow_loss(x):
 
 def image(x):
     return x[:, :, None].expand(-1, -1, 3)
+
+
+def image_loss(out):
+    return (out[:, 0] - TARGET).square().sum()
 
 
 def start(run):
@@ -56,11 +60,9 @@ TASK = Task(
     start=start,
     sigma=1.0,
     evaluations=400,
-    image_error=image_error,
-    parameter_error=parameter_error,
-    image=image,
-    picture=picture,
-    target_picture=target_picture,
+    output=Output(image, image_loss),
+    truth=Truth(image_error, parameter_error),
+    picture=Picture(picture, target_picture),
 )
 SLOW = replace(TASK, name="slow", loss=slow_loss)
 

@@ -49,7 +49,7 @@ def analytic_2(trial: Trial, *, radius: float = 2.0, start: float = 1.0, end: fl
 
 def _counted(trial: Trial) -> Callable[[Tensor, float], Tensor]:
     """The convolved loss of x [n] at sigma, with a graph; an evaluation of the trial."""
-    analytic = trial.task.analytic
+    analytic = trial.task.truth.analytic
     assert analytic is not None
 
     def loss(x: Tensor, sigma: float) -> Tensor:
@@ -60,7 +60,7 @@ def _counted(trial: Trial) -> Callable[[Tensor, float], Tensor]:
 
 
 def _is_known(task: Task) -> str | None:
-    return "the convolution of the loss is not known" if task.analytic is None else None
+    return "the convolution of the loss is not known" if task.truth.analytic is None else None
 
 
 METHODS = (

@@ -94,7 +94,8 @@ def dfo_ls(trial: Trial, *, scale: float = 1.0) -> None:
     """DFO-LS: Gauss-Newton on interpolated residuals (Cartis, Fiala, Marteau and Roberts 2019)."""
     import dfols
 
-    residuals, best = trial.task.residuals, Best(trial)
+    assert trial.task.output is not None
+    residuals, best = trial.task.output.residuals, Best(trial)
     assert residuals is not None
 
     def evaluate(x: Array) -> Array:
@@ -140,7 +141,7 @@ def _is_small(task: Task) -> str | None:
 def _has_residuals(task: Task) -> str | None:
     if task.n > MOST_RESIDUALS:
         return f"its interpolation takes gigabytes at n = {task.n}"
-    return "the black box returns no residuals" if task.residuals is None else None
+    return None if task.output and task.output.residuals else "the black box returns no residuals"
 
 
 METHODS = (

@@ -75,7 +75,8 @@ def gauss_newton(
         restart: the radius, in units of the first one, at which the search has arrived; it goes on with the first one.
     """
     task, start, n = trial.task, trial.start, trial.task.n
-    residuals_of = task.residuals
+    assert task.output is not None
+    residuals_of = task.output.residuals
     assert residuals_of is not None
     first = radius = radius or 0.5 * task.sigma
     lengths = torch.tensor(LENGTHS)
@@ -116,7 +117,7 @@ def _within(task: Task, x: Tensor) -> Tensor:
 
 
 def _applies(task: Task) -> str | None:
-    if task.residuals is None:
+    if task.output is None or task.output.residuals is None:
         return "its black box returns the loss only"
     return None if task.n >= FEWEST else f"made for {FEWEST} parameters and more, where trust_region has few samples"
 

@@ -200,7 +200,8 @@ def _losses(
 
 def _squared(task: Task, silhouette: float) -> Callable[[Tensor], Tensor]:
     """Shares of the pixels in the loss: images [K, v, side, side, ...] -> [K, v, side, side]."""
-    residuals, mesh = task.residuals, _mesh(task)
+    assert task.output is not None
+    residuals, mesh = task.output.residuals, _mesh(task)
     assert residuals is not None
 
     def squared(images: Tensor) -> Tensor:
@@ -249,7 +250,7 @@ def _mesh(task: Task) -> FittedMesh:
 def _is_mesh(task: Task) -> str | None:
     if task.mesh is None:
         return "its parameters are not the vertices of a mesh that known cameras see"
-    return None if task.image and task.residuals else "the black box returns no residuals"
+    return None if task.output and task.output.residuals else "the black box returns no residuals"
 
 
 def _method(name: str, title: str, solve: Callable[..., None], **fixed: Any) -> Method:

@@ -41,7 +41,8 @@ def adjoint_adam(
         fresh: whether every adjoint pass has a seed of its own.
     """
     task = trial.task
-    name = next(one for one in reversed(task.adjoints) if one.endswith(integrator))
+    assert task.renderer is not None
+    name = next(one for one in reversed(task.renderer.adjoints) if one.endswith(integrator))
     x = trial.start.clone().requires_grad_()
     optimizer = torch.optim.Adam([x], lr=rate * task.sigma)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, _LEAST, steps)
@@ -57,7 +58,9 @@ def adjoint_adam(
 
 
 def _differentiable(task: Task) -> str | None:
-    return "the black box has no derivative of its own" if task.adjoint is None else task.no_adjoint()
+    if task.renderer is None or task.renderer.adjoint is None:
+        return "the black box has no derivative of its own"
+    return task.renderer.no_adjoint()
 
 
 METHODS = (

@@ -12,7 +12,7 @@ from experiments.runs.trial import Trial
 def trust_region(trial: Trial, *, sigma: float | None = None, output: bool = True) -> None:
     """Minimise with the image and the white-box loss where the task has them and `output` is set, else the loss."""
     task = trial.task
-    loss = task.image_loss if output else None
+    loss = task.output.loss if task.output and output else None
     evaluate = trial.image if loss else trial.loss
     search = zh.optim.TrustRegion(
         trial.start,
@@ -29,7 +29,7 @@ def trust_region(trial: Trial, *, sigma: float | None = None, output: bool = Tru
 
 
 def _needs_image(task: Task) -> str | None:
-    return None if task.image_loss else "its black box returns the loss only, as trust_region uses it"
+    return None if task.output else "its black box returns the loss only, as trust_region uses it"
 
 
 METHODS = (

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from experiments.problems.scenes.adjoint import ADJOINTS, unavailable, value_and_gradient
 from experiments.problems.scenes.meshes import to_srgb
-from experiments.problems.task import Task
+from experiments.problems.task import Output, Picture, Renderer, Task, Truth
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 _REMEMBERED = 256
@@ -31,8 +31,11 @@ class Setting:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedTask(Task):
-    """A task of `rendered`, with what it was made of."""
+    """A task of `rendered`, with its scene and solution."""
 
+    output: Output
+    picture: Picture
+    renderer: Renderer
     solution: Tensor
     """[n]."""
     setting: Setting
@@ -107,7 +110,7 @@ class Reference:
         return shown(self.scene(x[None])[0])
 
     def adjoint(self, x: Tensor, integrator: str, seed: int) -> tuple[Tensor, Tensor]:
-        """See `Task.adjoint`."""
+        """See `Renderer.adjoint`."""
         return value_and_gradient(
             self.scene, x, integrator, self.loss_of, depth=self._depth, moving=self.moving, seed=seed
         )
@@ -164,19 +167,17 @@ def rendered(
         needs=f"{setting}; {needs}",
         n=len(solution),
         loss=reference.loss,
-        image_error=reference.error,
-        parameter_error=parameter_error or (lambda x: float((x - solution).square().mean())),
-        image=reference.image,
-        image_loss=reference.loss_of,
-        residuals=reference.residuals,
-        picture=reference.picture,
-        target_picture=lambda: shown(reference.target),
-        adjoint=reference.adjoint,
-        adjoints=tuple(one for one in ADJOINTS if one != "direct_projective" or setting.depth == 2),
-        no_adjoint=lambda: unavailable(variant),
-        prepare=reference.prepare,
-        release=reference.release,
-        full=None if setting == full else whole,
+        output=Output(reference.image, reference.loss_of, reference.residuals),
+        truth=Truth(reference.error, parameter_error or (lambda x: float((x - solution).square().mean()))),
+        picture=Picture(reference.picture, lambda: shown(reference.target)),
+        renderer=Renderer(
+            adjoint=reference.adjoint,
+            adjoints=tuple(one for one in ADJOINTS if one != "direct_projective" or setting.depth == 2),
+            no_adjoint=lambda: unavailable(variant),
+            prepare=reference.prepare,
+            release=reference.release,
+            full=None if setting == full else whole,
+        ),
     )
 
 

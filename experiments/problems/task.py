@@ -1,4 +1,7 @@
-"""What a fitting task is: a black box, where its runs start, and how far a point is from the solution."""
+"""What a fitting task is: a black box, where its runs start, and how far a point is from the solution.
+
+Tensors are float64. Points come in batches: x is [K, n], or [n] where one point is meant.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,16 +15,74 @@ if TYPE_CHECKING:
 
 
 def _nothing(*_: int) -> None:
-    """For `Task.no_adjoint`, `prepare`, `release` and `skip`; a function with a name can be pickled."""
+    """Do nothing, for `Renderer`. A function with a name can be pickled, a lambda cannot."""
 
 
 @dataclass(frozen=True)
-class Task:
-    """A black box of n parameters and the truth about it. Tensors are float64; points come in batches [K, n].
+class Output:
+    """The black box up to the white-box loss after it, for methods that use more than the loss.
 
-    The black box is there in two forms: `loss` returns one number per point, `image` what the loss is computed from,
-    for methods that can use it. One point costs one evaluation in either form.
+    One point costs one evaluation, whether `Output.image` or `Task.loss` is called.
     """
+
+    image: Callable[[Tensor], Tensor]
+    """[K, n] -> [K, *out]."""
+    loss: Callable[[Tensor], Tensor]
+    """[*out] -> []; differentiable. `Task.loss` is `loss` of `image`."""
+    residuals: Callable[[Tensor], Tensor] | None = None
+    """[*out] -> [m] with loss = mean(residuals^2), for least-squares methods; None if the loss is another."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of the solution. None of it is counted as an evaluation."""
+
+    image_error: Callable[[Tensor], float]
+    """Error of x [n] in the image."""
+    parameter_error: Callable[[Tensor], float]
+    """Mean squared error of x [n], up to symmetries of the task; NaN if there is no true point."""
+    analytic: Callable[[Tensor, float], Tensor] | None = None
+    """Differentiable loss [] of x [n], convolved with a Gaussian of the given sigma (0: the loss itself)."""
+    measures: Callable[[Tensor], dict[str, float]] | None = None
+    """Further measures of x [n], by name."""
+    precision: float | None = None
+    """Parameter error at which a run ends; a reduction by 99.9 % ends it if None."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What points look like: pictures [h, w] or [h, w, 3] in [0, 1]."""
+
+    of: Callable[[Tensor], Tensor]
+    """The picture of x [n]."""
+    target: Callable[[], Tensor]
+    """The picture that is sought."""
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """The program behind the black box: its own derivative, when it is loaded and freed, and its full setting."""
+
+    adjoint: Callable[[Tensor, str, int], tuple[Tensor, Tensor]] | None = None
+    """x [n], one of `adjoints` and the seed of the adjoint pass -> loss [], gradient [n].
+    Counts as two evaluations: a render and its adjoint."""
+    adjoints: tuple[str, ...] = ()
+    """Integrators that `adjoint` knows."""
+    no_adjoint: Callable[[], str | None] = _nothing
+    """Why `adjoint` cannot be called on this machine; None if it can."""
+    prepare: Callable[[], None] = _nothing
+    """Load what the black box needs, before the clock of a run starts."""
+    release: Callable[[], None] = _nothing
+    """Free what is loaded; the next call loads it again. Two loaded scenes slow each other down."""
+    skip: Callable[[int, int], None] = _nothing
+    """Advance fresh noise by so many calls and points, which a replay has answered without the renderer."""
+    full: "Callable[[], Task] | None" = None
+    """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A black box of n parameters, and what is known about it."""
 
     name: str
     title: str
@@ -29,56 +90,31 @@ class Task:
     parameters: str
     """Names, units and ranges."""
     needs: str
-    """What of the full setting the loss depends on, and what is therefore left out."""
+    """The part of the full setting that the loss depends on; the rest is left out."""
     n: int
-    loss: Callable[[Tensor], Tensor]
-    """[K, n] -> [K]."""
     start: Callable[[int], Tensor]
     """Number of the run -> start [n], the same for every method. Runs from 1000 upward are for tuning."""
     sigma: float
-    """Smoothing at the start, in units of the parameters: of the order of the distance to the solution."""
-    evaluations: int
-    """Evaluations that a run may use."""
-    image_error: Callable[[Tensor], float]
-    """Error of x [n] in the image; not counted as an evaluation."""
-    parameter_error: Callable[[Tensor], float]
-    """Mean squared error of x [n], up to symmetries of the task."""
+    """Smoothing at the start, in units of the parameters: about the distance to the solution."""
     bounds: tuple[Tensor, Tensor] | None = None
     """Lower and upper [n]."""
-    image: Callable[[Tensor], Tensor] | None = None
-    """[K, n] -> [K, *out]."""
-    image_loss: Callable[[Tensor], Tensor] | None = None
-    """White box after `image`: [*out] -> []; differentiable, a mean of squares of `residuals`."""
-    residuals: Callable[[Tensor], Tensor] | None = None
-    """[*out] -> [m] with image_loss = mean(residuals^2), for least-squares methods."""
-    analytic: Callable[[Tensor, float], Tensor] | None = None
-    """Differentiable loss of x [n] convolved with a Gaussian of the given sigma (0: the loss itself), where known."""
-    picture: Callable[[Tensor], Tensor] | None = None
-    """What x [n] looks like: [h, w] or [h, w, 3] in [0, 1]."""
-    target_picture: Callable[[], Tensor] | None = None
-    adjoint: Callable[[Tensor, str, int], tuple[Tensor, Tensor]] | None = None
-    """The renderer's own derivative: x [n], one of `adjoints` and a seed of the adjoint pass -> loss [], gradient [n].
-    Counts as two evaluations, a render and its adjoint."""
-    adjoints: tuple[str, ...] = ()
-    """Integrators that `adjoint` knows."""
-    no_adjoint: Callable[[], str | None] = _nothing
-    """Why `adjoint` cannot be called here, None if it can: derivatives need a variant of the renderer that has them."""
-    prepare: Callable[[], None] = _nothing
-    """Loads what the black box needs, before the clock of a run starts."""
-    skip: Callable[[int, int], None] = _nothing
-    """Lets a black box whose noise is fresh in every call go on as after so many calls and points, for runs that go on
-    after a kill."""
-    release: Callable[[], None] = _nothing
-    """Frees what the black box has loaded, to be loaded again when it is called: scenes of a process slow each other
-    down."""
-    full: "Callable[[], Task] | None" = None
-    """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""
+    evaluations: int
+    """Evaluations that a run may use."""
+    loss: Callable[[Tensor], Tensor]
+    """The black box with the loss: [K, n] -> [K]."""
+    output: Output | None = None
+    """None if the black box returns the loss only."""
+    truth: Truth
+    picture: Picture | None = None
+    renderer: Renderer | None = None
+    """None if the black box is a formula, with nothing to load."""
     mesh: "FittedMesh | None" = None
-    """Where the parameters are the vertices of a mesh: its cameras and triangles, which are known without a render."""
-    measures: Callable[[Tensor], dict[str, float]] | None = None
-    """What else there is to know about x [n], by name."""
-    precision: float | None = None
-    """Parameter error that a run should reach beyond the usual levels, where the task is about reaching it."""
+    """The cameras and triangles, which are known without a render, where the parameters are vertices of a mesh."""
+
+
+def least_squares(image: Callable[[Tensor], Tensor], residuals: Callable[[Tensor], Tensor]) -> Output:
+    """Output whose loss is mean(residuals^2)."""
+    return Output(image, lambda out: residuals(out).square().mean(), residuals)
 
 
 def uniform(lower: Tensor, upper: Tensor) -> Callable[[int], Tensor]:

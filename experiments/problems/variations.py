@@ -20,7 +20,7 @@ from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import Reference, RenderedTask, Setting
 from experiments.problems.scenes.meshes import to_srgb
-from experiments.problems.task import Task
+from experiments.problems.task import Output, Task
 
 Noise = Literal["fixed", "other", "call", "point"]
 """Seed of the renders: that of the reference, one other seed, a new one for every call or for every point."""
@@ -130,22 +130,20 @@ def _seen(task: Task, change: Change) -> Task:
 
     def prepare() -> None:
         reference.prepare()
-        made.prepare()
+        made.renderer.prepare()
 
     def release() -> None:
         reference.release()
-        made.release()
+        made.renderer.release()
 
     return dataclasses.replace(
         task,
         loss=reference.loss,
-        image=reference.image,
-        image_loss=reference.loss_of,
-        residuals=reference.residuals,
-        prepare=prepare,
-        skip=reference.skip,
-        release=release,
-        adjoint=None,  # it is one of the task as it was
+        output=Output(reference.image, reference.loss_of, reference.residuals),
+        # The derivative is left out: it is that of the unchanged task.
+        renderer=dataclasses.replace(
+            made.renderer, adjoint=None, prepare=prepare, release=release, skip=reference.skip
+        ),
     )
 
 
@@ -192,7 +190,7 @@ class Seen(Reference):
         return super().image(x)
 
     def skip(self, calls: int, points: int) -> None:
-        """See `Task.skip`."""
+        """See `Renderer.skip`."""
         self.prepare()
         self.scene.skip(calls, points)
 

@@ -72,13 +72,13 @@ def trace(
 
     def image_error(x: Tensor) -> float:  # of every row once
         points.append(x.clone())
-        return task.image_error(x)
+        return task.truth.image_error(x)
 
     def solve(trial: Trial) -> None:
         trials.append(trial)
         method.solve(trial, settings(method.name, task.name))
 
-    noted = dataclasses.replace(task, image_error=image_error)
+    noted = dataclasses.replace(task, truth=dataclasses.replace(task.truth, image_error=image_error))
     outcome = attempt(noted, method.name, run, solve, limit=limit, watch=watch)
     return Trace(task, method.name, points, trials[-1].rows, outcome)
 
@@ -95,7 +95,7 @@ class Look:
 def look(task: Task, start: Tensor) -> Look | None:
     """Return pictures of a task, or a map of the loss if it has none but two parameters; None if there is neither."""
     if task.picture is not None:
-        return None if task.target_picture is None else Look(task.picture, task.target_picture())
+        return Look(task.picture.of, task.picture.target())
     return _map(task, start) if task.n == 2 else None
 
 

@@ -189,7 +189,7 @@ def _alike(found: Trace, seen: Look) -> str:
     """Say how alike the last picture and the target are, and the first of what else the task measures."""
     task, x = found.task, found.points[-1]
     known = {} if task.picture is None else measures(seen.picture(x), seen.target)
-    more = task.measures(x) if task.measures else {}
+    more = task.truth.measures(x) if task.truth.measures else {}
     return described(known | dict(itertools.islice(more.items(), 1)))
 
 

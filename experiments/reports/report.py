@@ -139,17 +139,18 @@ def _pictures(task: Task, run: int, ends: Mapping[str, Tensor]) -> str:
     """Show the start, the results of the first run of every method, and the target, with how they differ from it."""
     shown = []
     for name, x in ends.items():
-        picture, found = None if task.picture is None else task.picture(x), {}
-        if picture is not None and task.target_picture is not None:
-            found = measures(picture, task.target_picture())
-        if task.measures is not None:
-            found |= task.measures(x)
+        picture, found = None, {}
+        if task.picture is not None:
+            picture = task.picture.of(x)
+            found = measures(picture, task.picture.target())
+        if task.truth.measures is not None:
+            found |= task.truth.measures(x)
         if picture is not None or found:
             shown.append(_figure(name, picture, described(found)))
     if not shown:
         return ""
-    if task.target_picture is not None:
-        shown.append(_figure("target", task.target_picture(), ""))
+    if task.picture is not None:
+        shown.append(_figure("target", task.picture.target(), ""))
     return f"<h3>Run {run}</h3>{''.join(shown)}"
 
 
@@ -160,9 +161,9 @@ def _figure(name: str, picture: Tensor | None, caption: str) -> str:
 
 def _left_out(task: Task, ends: Mapping[str, Tensor], folder: Path) -> str:
     """Say what the setting of the task saves over the source's, measured on the way to the best result."""
-    if task.full is None:
+    if task.renderer is None or task.renderer.full is None:
         return ""
-    best = min(ends.values(), key=task.image_error)
+    best = min(ends.values(), key=task.truth.image_error)
     found = known_saving(task, line(ends["start"], best), folder)
     used = f"Used: {task.needs}. Against the full setting of the source, {found}."
     return f"<h3>Left out</h3><p>{html_text(used)}</p>"

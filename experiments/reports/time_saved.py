@@ -46,11 +46,11 @@ def saving(task: Task, points: Tensor) -> Saving:
     One is released before the other is loaded; the first evaluation of each, which loads and compiles, is not timed.
     Raises ValueError if the task has no other setting.
     """
-    if task.full is None:
+    if task.renderer is None or task.renderer.full is None:
         raise ValueError(f"task must have a full setting to be measured against, {task.name} has none")
     if points.ndim != 2 or points.shape[1] != task.n or not len(points):
         raise ValueError(f"points must be [P, {task.n}], got {list(points.shape)}")
-    used, whole = (_measured(one, points) for one in (task, task.full()))
+    used, whole = (_measured(one, points) for one in (task, task.renderer.full()))
     return Saving(
         statistics.median(seconds for seconds, _ in used),
         statistics.median(seconds for seconds, _ in whole),
@@ -60,7 +60,7 @@ def saving(task: Task, points: Tensor) -> Saving:
 
 def known_saving(task: Task, points: Tensor, folder: Path) -> Saving | None:
     """Return the saving of a task, measured once and kept in a folder; None if it has no other setting."""
-    if task.full is None:
+    if task.renderer is None or task.renderer.full is None:
         return None
     path = folder / NAME
     if path.exists():
@@ -79,7 +79,8 @@ def _measured(task: Task, points: Tensor) -> list[tuple[float, float]]:
     """Return seconds and loss of every point."""
     task.loss(points[:1])
     found = [_timed(task.loss, point[None]) for point in points]
-    task.release()
+    if task.renderer:
+        task.renderer.release()
     return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Task
+from experiments.problems.task import Renderer, Task
 from experiments.runs.journal import DivergedError
 from experiments.runs.recorder import Recorder
 from experiments.runs.records import Files, Outcome, Record, Status, write_outcome
@@ -70,7 +70,8 @@ class Trial:
         self.ended: Finished | None = None
         self.diverged: DivergedError | None = None
         files = Files(folder / task.name / method, run) if folder else None
-        self._recorder = Recorder(task.name, method, run, files, watch, task.skip)
+        skip = task.renderer.skip if task.renderer else None
+        self._recorder = Recorder(task.name, method, run, files, watch, skip)
         self._first = self._row(self.start, None, None)
 
     @property
@@ -101,15 +102,16 @@ class Trial:
 
     def image(self, x: Tensor) -> Tensor:
         """Return the images [K, *out] of points [K, n], for K evaluations."""
-        if self.task.image is None:
+        if self.task.output is None:
             raise ValueError(f"the black box of {self.task.name} returns a loss only")
-        return self._evaluate(self.task.image, x)
+        return self._evaluate(self.task.output.image, x)
 
     def adjoint(self, x: Tensor, integrator: str, seed: int = 0) -> tuple[float, Tensor]:
-        """Return loss and gradient [n] at x [n] by the renderer itself, for 2 evaluations; see `Task.adjoint`."""
-        adjoint = self.task.adjoint
-        if adjoint is None or integrator not in self.task.adjoints:
-            known = ", ".join(self.task.adjoints) or "none"
+        """Return loss and gradient [n] at x [n] by the renderer itself, for 2 evaluations; see `Renderer.adjoint`."""
+        renderer = self.task.renderer or Renderer()
+        adjoint = renderer.adjoint
+        if adjoint is None or integrator not in renderer.adjoints:
+            known = ", ".join(renderer.adjoints) or "none"
             raise ValueError(f"integrator must be one of {self.task.name}, {known}, got {integrator}")
 
         def both(points: Tensor) -> Tensor:
@@ -148,7 +150,8 @@ class Trial:
         return self._guard(lambda: self._recorder.evaluate(fn, x.detach().double().clone()))
 
     def _solved(self, row: Record) -> bool:
-        precise = self.task.precision is None or (row.parameter_error or 0.0) <= self.task.precision
+        precision = self.task.truth.precision
+        precise = precision is None or (row.parameter_error or 0.0) <= precision
         errors = (
             (row.image_error, self._first.image_error),
             (row.parameter_error, self._first.parameter_error),
@@ -158,7 +161,7 @@ class Trial:
 
     def _row(self, x: Tensor, sigma: float | None, loss: float | None) -> Record:
         def errors() -> tuple[float, float]:
-            return self.task.image_error(x), self.task.parameter_error(x)
+            return self.task.truth.image_error(x), self.task.truth.parameter_error(x)
 
         return self._guard(lambda: self._recorder.row(errors, sigma=sigma, loss=loss))
 
@@ -223,7 +226,8 @@ def attempt(
     An exception of the method is an outcome too. A run whose journal does not belong to it, because the code has
     changed since it was killed, starts from the beginning.
     """
-    task.prepare()
+    if task.renderer:
+        task.renderer.prepare()
     _seed(run + _SEEDS)
     trial = Trial(task, method, run, folder, limit=limit, watch=watch)
     try:

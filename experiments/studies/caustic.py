@@ -49,10 +49,10 @@ def check_caustic(
     if not path.is_file():
         raise SystemExit(f"DIR must have a run {run} of {method} on caustic that has ended; there is no {path}")
     task, x = caustic.task(preset), torch.tensor(read_outcome(path).x, dtype=torch.float64)
-    assert task.image is not None
-    assert task.residuals is not None
-    splat = task.image(x[None])[0]
-    target = splat - task.residuals(splat).view_as(splat)
+    assert task.output is not None
+    assert task.output.residuals is not None
+    splat = task.output.image(x[None])[0]
+    target = splat - task.output.residuals(splat).view_as(splat)
     rendered = torch.from_numpy(check(x, side=len(splat), spp=spp, variant=variant))
     picture = folder / f"caustic-{method}-{run}.png"
     _draw({"target": target, "photon splat": splat, "particle tracer": rendered}, picture)

@@ -87,7 +87,7 @@ def gradients(
     for name in catalogue.chosen("tasks", tasks, list(catalogue.RENDERED)):
         task = catalogue.load(name, preset, variant)
         assert isinstance(task, RenderedTask)
-        reason = task.no_adjoint()
+        reason = task.renderer.no_adjoint()
         if reason:
             print(f"{name}: {reason}")
         found += measure(task, repeats, spp, pairs, step, sigma)
@@ -152,7 +152,7 @@ Gradient = Callable[[Tensor, int], Tensor]
 
 def _kinds(task: RenderedTask, pairs: tuple[int, ...], sigma: float) -> list[tuple[str, Gradient, int]]:
     """Names, gradients and their evaluations."""
-    adjoint = task.adjoint
+    adjoint = task.renderer.adjoint
 
     def rendered(integrator: str) -> Gradient:
         assert adjoint is not None
@@ -165,7 +165,7 @@ def _kinds(task: RenderedTask, pairs: tuple[int, ...], sigma: float) -> list[tup
             ).gradient
         )
 
-    integrators = () if task.no_adjoint() else task.adjoints
+    integrators = () if task.renderer.no_adjoint() else task.renderer.adjoints
     return [
         *((one, rendered(one), 2) for one in integrators),
         *((f"sampled, {count} pairs", sampled(count), 2 * count) for count in pairs),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
-from experiments.problems.task import Task
+from experiments.problems.task import Output, Task
 from experiments.problems.tasks import brdf
 from torch_zerohess.losses import ImageLoss
 
@@ -102,18 +102,18 @@ class Pictures:
         def inside(x: Tensor) -> Tensor:
             return torch.cat([loss(part) for part in render(x).split(_CHUNK)])
 
-        return replace(self.task, loss=inside, image=render, image_loss=loss, residuals=None, evaluations=evaluations)
+        return replace(self.task, loss=inside, output=Output(render, loss), evaluations=evaluations)
 
 
 def pictures_of(task: Task) -> Pictures:
     """Return a task as pictures; SystemExit if its image is none."""
-    if task.image is None or task.residuals is None or task.picture is None:
+    if task.output is None or task.output.residuals is None or task.picture is None:
         raise SystemExit(f"tasks must be some whose image is a picture, got {task.name}")
-    start, shape = task.image(task.start(0)[None]), task.picture(task.start(0)).shape
-    target = start - task.residuals(start[0]).view_as(start)
-    render = task.image
+    render = task.output.image
+    start, shape = render(task.start(0)[None]), task.picture.of(task.start(0)).shape
+    target = start - task.output.residuals(start[0]).view_as(start)
     if task.name == "brdf":  # its image is the pixels of the sphere alone
-        mask, pixels = brdf.PhongSphere(shape[0]).mask, task.image
+        mask, pixels = brdf.PhongSphere(shape[0]).mask, task.output.image
 
         def render(x: Tensor) -> Tensor:
             return _filled(pixels(x), mask)

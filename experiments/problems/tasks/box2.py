@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from experiments.problems.soft_squares import BoxTask, box2
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
 
 
 def task(preset: Literal["fast", "paper"] = "fast") -> Task:
@@ -52,12 +52,8 @@ def fitting(
         start=uniform(box.start - box.half_range, box.start + box.half_range),
         sigma=box.sigma,
         evaluations=evaluations,
-        image_error=lambda x: float(squares(x[None])[0]),
-        parameter_error=parameter_error,
+        truth=Truth(lambda x: float(squares(x[None])[0]), parameter_error),
         bounds=(torch.full_like(box.start, squares.half_width), torch.full_like(box.start, 1 - squares.half_width)),
-        image=squares.image,
-        image_loss=lambda image: residuals(image).square().mean(),
-        residuals=residuals,
-        picture=lambda x: squares.image(x[None])[0],
-        target_picture=lambda: reference,
+        output=least_squares(squares.image, residuals),
+        picture=Picture(lambda x: squares.image(x[None])[0], lambda: reference),
     )

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
 
 TARGET = (0.6, 0.25, 0.15, 0.5, 0.5, 0.4, 0.7)
 START = ((0.0,) * 7, (0.5,) * 6 + (0.3,))
@@ -109,13 +109,10 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         start=uniform(*(torch.tensor(corner, dtype=torch.float64) for corner in START)),
         sigma=0.2,
         evaluations=50_000,
-        image_error=lambda x: float(loss(x[None])[0]),
-        parameter_error=lambda x: float((x - target).square().mean()),
+        truth=Truth(
+            lambda x: float(loss(x[None])[0]), lambda x: float((x - target).square().mean()), analytic=analytic
+        ),
         bounds=(torch.zeros(7).double(), torch.ones(7).double()),
-        image=sphere,
-        image_loss=lambda pixels: residuals(pixels).square().mean(),
-        residuals=residuals,
-        analytic=analytic,
-        picture=lambda x: sphere.picture(sphere(x[None])[0]),
-        target_picture=lambda: sphere.picture(reference),
+        output=least_squares(sphere, residuals),
+        picture=Picture(lambda x: sphere.picture(sphere(x[None])[0]), lambda: sphere.picture(reference)),
     )

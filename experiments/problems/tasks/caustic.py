@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from experiments.problems.scenes.caustic import COEFFICIENTS, Caustic
-from experiments.problems.task import Task
+from experiments.problems.task import Picture, Renderer, Task, Truth, least_squares
 
 TEXT = ("ZERO", "HESS")
 BACKGROUND = 0.3
@@ -66,15 +66,11 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         start=start,
         sigma=1.0,
         evaluations=50_000,
-        image_error=lambda x: float(loss(x[None])[0]),
-        parameter_error=lambda x: math.nan,
+        truth=Truth(lambda x: float(loss(x[None])[0]), lambda x: math.nan),
         bounds=(torch.full((n,), -LARGEST).double(), torch.full((n,), LARGEST).double()),
-        image=caustic.image,
-        image_loss=lambda image: residuals(image).square().mean(),
-        residuals=residuals,
-        picture=lambda x: (caustic.image(x[None])[0] / brightest).clamp(0, 1),
-        target_picture=lambda: target / brightest,
-        full=lambda: task("paper"),
+        output=least_squares(caustic.image, residuals),
+        picture=Picture(lambda x: (caustic.image(x[None])[0] / brightest).clamp(0, 1), lambda: target / brightest),
+        renderer=Renderer(full=lambda: task("paper")),
     )
 
 

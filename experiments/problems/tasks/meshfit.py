@@ -29,7 +29,7 @@ from torch import Tensor
 from experiments.problems.scenes.fitted_mesh import FittedMesh
 from experiments.problems.scenes.raster import Cameras, render
 from experiments.problems.scenes.stanford import bunny_surface
-from experiments.problems.task import Task
+from experiments.problems.task import Picture, Task, Truth, least_squares
 
 VIEWS = 8
 ELEVATIONS = (30.0, -10.0)
@@ -117,15 +117,10 @@ class MeshFit:
             start=self.start,
             sigma=0.01,
             evaluations=20_000,
-            image_error=lambda x: float(self.loss(x[None])[0]),
-            parameter_error=self.chamfer,
-            image=self.mesh.render,
-            image_loss=lambda images: self.residuals(images).square().mean(),
-            residuals=self.residuals,
-            picture=self.picture,
-            target_picture=lambda: contact_sheet(self.target),
+            output=least_squares(self.mesh.render, self.residuals),
+            truth=Truth(lambda x: float(self.loss(x[None])[0]), self.chamfer, measures=self.measures),
+            picture=Picture(self.picture, lambda: contact_sheet(self.target)),
             mesh=self.mesh,
-            measures=self.measures,
         )
 
 

@@ -18,7 +18,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Task, Truth, uniform
 
 S1 = 1.0
 GRID = 20
@@ -56,9 +56,11 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         start=start,
         sigma=1.0,
         evaluations=50_000,
-        image_error=lambda x: float(loss(x[None])[0] - least),
-        parameter_error=lambda x: float(x.square().mean()),
         bounds=(torch.full((2,), -3.0).double(), torch.full((2,), 3.0).double()),
-        analytic=lambda x, sigma: gaussian(x, math.hypot(S1, sigma)),
-        precision=DISTANCE**2 / 2,
+        truth=Truth(
+            lambda x: float(loss(x[None])[0] - least),
+            lambda x: float(x.square().mean()),
+            analytic=lambda x, sigma: gaussian(x, math.hypot(S1, sigma)),
+            precision=DISTANCE**2 / 2,
+        ),
     )

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Task, Truth, uniform
 
 A, B, C = 5.0, 5.0, 7.5
 
@@ -38,7 +38,5 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         start=uniform(torch.full((2,), 800.0).double(), torch.full((2,), 1000.0).double()),
         sigma=500.0,
         evaluations=100_000,
-        image_error=lambda x: float(loss(x[None])[0]),
-        parameter_error=lambda x: float(x.square().mean()),
-        analytic=analytic,
+        truth=Truth(lambda x: float(loss(x[None])[0]), lambda x: float(x.square().mean()), analytic),
     )

@@ -15,7 +15,7 @@ import torch
 from skimage import data
 from torch import Tensor
 
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
 
 SIDE = 32
 
@@ -44,13 +44,8 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         start=uniform(torch.zeros(n).double(), torch.ones(n).double()),
         sigma=0.3,
         evaluations=100_000,
-        image_error=error,
-        parameter_error=error,
         bounds=(torch.zeros(n).double(), torch.ones(n).double()),
-        image=lambda x: x.view(-1, SIDE, SIDE),
-        image_loss=lambda image: residuals(image).square().mean(),
-        residuals=residuals,
-        analytic=lambda x, sigma: loss(x[None])[0] + sigma**2,
-        picture=lambda x: x.view(SIDE, SIDE).clamp(0, 1),
-        target_picture=lambda: reference,
+        output=least_squares(lambda x: x.view(-1, SIDE, SIDE), residuals),
+        truth=Truth(error, error, analytic=lambda x, sigma: loss(x[None])[0] + sigma**2),
+        picture=Picture(lambda x: x.view(SIDE, SIDE).clamp(0, 1), lambda: reference),
     )

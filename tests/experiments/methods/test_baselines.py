@@ -12,7 +12,7 @@ from experiments.methods.adaptive_differences import adapt
 from experiments.methods.baseline_settings import SPACES, TUNED
 from experiments.methods.sampled import Annealing, SampledGradient
 from experiments.problems import catalogue
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Task, Truth, least_squares, uniform
 from experiments.runs.trial import Trial, attempt
 
 BASELINES = [
@@ -60,13 +60,9 @@ class Line:
             start=uniform(three, 2 * three),
             sigma=1.0,
             evaluations=evaluations,
-            image_error=self.error,
-            parameter_error=lambda x: float((x - self.solution).square().mean()),
+            truth=Truth(self.error, lambda x: float((x - self.solution).square().mean()), self.analytic),
             bounds=(-3 * three, 3 * three),
-            image=self.image,
-            image_loss=lambda image: self.residuals(image).square().mean(),
-            residuals=self.residuals,
-            analytic=self.analytic,
+            output=least_squares(self.image, self.residuals),
         )
 
 
@@ -118,7 +114,8 @@ def test_bounds_are_kept(name) -> None:
     def record(f):
         return lambda x: (seen.append(x.clone()), f(x))[1]
 
-    task = replace(task, bounds=(lower, upper), loss=record(task.loss), image=record(task.image))
+    output = replace(task.output, image=record(task.output.image))
+    task = replace(task, bounds=(lower, upper), loss=record(task.loss), output=output)
     attempt(task, name, 0, lambda trial: METHODS[name].solve(trial, None))
     points = torch.cat(seen)
     assert len(points) > 5
@@ -129,8 +126,8 @@ def test_bounds_are_kept(name) -> None:
 def test_where_methods_apply() -> None:
     task = Line().task()
     assert "no bounds" in METHODS["cma_es_bounded"].applies(replace(task, bounds=None))
-    assert "no residuals" in METHODS["dfo_ls"].applies(replace(task, residuals=None))
-    assert "not known" in METHODS["analytic_2"].applies(replace(task, analytic=None))
+    assert "no residuals" in METHODS["dfo_ls"].applies(replace(task, output=None))
+    assert "not known" in METHODS["analytic_2"].applies(replace(task, truth=replace(task.truth, analytic=None)))
     assert "n = 1024" in METHODS["cobyqa"].applies(replace(task, n=1024))
 
 
@@ -178,7 +175,7 @@ def test_tuned_settings_are_of_methods_that_apply_and_from_their_space() -> None
         task = catalogue.load(name)
         for method, settings in methods.items():
             reason = METHODS[method].applies(task)
-            assert reason in (None, task.no_adjoint())
+            assert reason in (None, task.renderer and task.renderer.no_adjoint())
             if reason:  # Mitsuba has no variant with derivatives here
                 continue
             for key, value in settings.items():
@@ -201,8 +198,7 @@ def test_cma_es_takes_a_single_parameter(name):
         start=uniform(-torch.ones(1).double(), torch.zeros(1).double()),
         sigma=0.5,
         evaluations=400,
-        image_error=lambda x: float((x - solution).square()),
-        parameter_error=lambda x: float((x - solution).square()),
+        truth=Truth(*2 * (lambda x: float((x - solution).square()),)),
         bounds=(-torch.ones(1).double(), torch.ones(1).double()),
     )
     assert attempt(task, name, 0, lambda trial: METHODS[name].solve(trial, {})).status == "finished"

@@ -12,7 +12,7 @@ from experiments.methods import METHODS
 from experiments.methods.baseline_settings import TUNED
 from experiments.methods.settings import CHOSEN, RETUNED, SPACES, TABLE_3, settings, space, table_3
 from experiments.problems import catalogue
-from experiments.problems.task import Task
+from experiments.problems.task import Task, Truth
 from experiments.runs.trial import Trial, attempt
 from experiments.studies.tune import Score, draw, report, tune
 from truths import vector
@@ -33,8 +33,7 @@ def bowl(n: int, evaluations: int = 20_000) -> Task:
         start=lambda run: 3.0 * torch.nn.functional.normalize(vector(*(float(run + i + 1) for i in range(n))), dim=0),
         sigma=0.5,
         evaluations=evaluations,
-        image_error=lambda x: float(x**2 @ scales),
-        parameter_error=lambda x: float((x**2).mean()),
+        truth=Truth(lambda x: float(x**2 @ scales), lambda x: float((x**2).mean())),
     )
 
 
@@ -78,7 +77,8 @@ def test_sigma_falls_linearly_and_the_radius_with_it():
 
     places = []
     task = bowl(2, evaluations=70)
-    measured = dataclasses.replace(task, image_error=lambda x: (places.append(x), task.image_error(x))[1])
+    noted = dataclasses.replace(task.truth, image_error=lambda x: (places.append(x), task.truth.image_error(x))[1])
+    measured = dataclasses.replace(task, truth=noted)
     attempt(measured, "our_hvpa", 0, solve)
     sigmas = [row.sigma for row in trials[0].rows[1:]]
     assert sigmas == pytest.approx([1.0, 0.8, 0.6, 0.4, 0.2, 0.2, 0.2])

@@ -12,6 +12,7 @@ from small_scenes import RADIANCE, REFLECTANCE, VARIANTS, camera, lamp, plane, r
 from experiments.methods import METHODS
 from experiments.problems.scenes import adjoint
 from experiments.problems.scenes.adjoint import ADJOINTS, unavailable, value_and_gradient
+from experiments.problems.task import Renderer
 from experiments.runs.trial import Trial
 from experiments.studies.gradients import differences, gradients
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Transform, Value
@@ -126,8 +127,9 @@ def bowl(calls, x, integrator, seed):
     return (x - TARGET).square().sum(), 2 * (x - TARGET)
 
 
-def differentiable(calls, **more):
-    return replace(TASK, adjoint=partial(bowl, calls), adjoints=("path", "prb", "prb_projective"), **more)
+def differentiable(calls, no_adjoint=lambda: None, **more):
+    renderer = Renderer(partial(bowl, calls), ("path", "prb", "prb_projective"), no_adjoint)
+    return replace(TASK, renderer=renderer, **more)
 
 
 def test_a_derivative_counts_as_two_evaluations() -> None:

@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline
 from experiments.methods.gauss_newton import METHODS, Jacobian
 from experiments.problems import catalogue
 from experiments.problems.scenes.caustic import INDEX, Caustic, basis, refraction
-from experiments.problems.task import Task
+from experiments.problems.task import Task, Truth, least_squares
 from experiments.problems.tasks import caustic
 from experiments.runs.records import Files, read
 from experiments.runs.trial import attempt
@@ -158,15 +158,15 @@ def test_target_is_a_text_with_all_of_the_light(side) -> None:
 
 def test_task_is_the_image_of_the_slab_against_the_text() -> None:
     x = torch.stack([TASK.start(0), TASK.start(1), waves(3.0)])
-    images, target = TASK.image(x), caustic.text(64)
+    images, target = TASK.output.image(x), caustic.text(64)
     assert images.dtype == torch.float64
     expected = (images - target).square().mean((1, 2))
     torch.testing.assert_close(TASK.loss(x), expected)
     for image, one, error in zip(images, x, expected.tolist(), strict=True):
-        assert float(TASK.image_loss(image)) == pytest.approx(error)
-        assert float(TASK.residuals(image).square().mean()) == pytest.approx(error)
-        assert TASK.image_error(one) == pytest.approx(error)
-        assert TASK.picture(one).shape == TASK.target_picture().shape
+        assert float(TASK.output.loss(image)) == pytest.approx(error)
+        assert float(TASK.output.residuals(image).square().mean()) == pytest.approx(error)
+        assert TASK.truth.image_error(one) == pytest.approx(error)
+        assert TASK.picture.of(one).shape == TASK.picture.target().shape
     assert torch.equal(torch.cat([TASK.loss(one[None]) for one in x]), TASK.loss(x))
     torch.testing.assert_close(
         Caustic(64, 128, 2.0).image(1e-3 * x), images
@@ -207,13 +207,11 @@ def linear(n: int, m: int) -> tuple[Task, torch.Tensor]:
         TASK,
         name="linear",
         n=n,
-        image=lambda x: x @ a.T,
-        residuals=lambda image: image - b,
+        output=least_squares(lambda x: x @ a.T, lambda image: image - b),
         start=lambda run: torch.zeros(n).double(),
         sigma=1.0,
         bounds=None,
-        image_error=lambda x: float((a @ x - b).square().mean()) - lowest,
-        parameter_error=lambda x: float((x - best).square().mean()),
+        truth=Truth(lambda x: float((a @ x - b).square().mean()) - lowest, lambda x: float((x - best).square().mean())),
     )
     return task, best
 
@@ -254,7 +252,8 @@ def test_gauss_newton_bends_the_light_within_one_jacobian() -> None:
     task = replace(TASK, evaluations=1 + 1024 + 6)
     outcome = attempt(task, "gauss_newton", 1000, lambda trial: method.solve(trial, None))
     assert outcome.evaluations == 1031
-    assert task.image_error(torch.tensor(outcome.x).double()) < 0.6 * task.image_error(task.start(1000))
+    error = task.truth.image_error
+    assert error(torch.tensor(outcome.x).double()) < 0.6 * error(task.start(1000))
 
 
 def test_particle_tracer_sees_the_same_light() -> None:

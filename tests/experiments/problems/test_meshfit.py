@@ -146,10 +146,10 @@ def test_render_ignores_what_is_behind_the_camera_or_not_a_number() -> None:
 
 def test_batches_do_not_change_images(monkeypatch) -> None:
     x = torch.stack([TASK.start(run) for run in range(3)])
-    images = TASK.image(x)
+    images = TASK.output.image(x)
     assert images.shape == (3, 8, 64, 64)
     monkeypatch.setattr("experiments.problems.scenes.raster._CORNERS", 1)
-    assert torch.equal(TASK.image(x), images)
+    assert torch.equal(TASK.output.image(x), images)
 
 
 @pytest.mark.parametrize("level", [0, 1, 3])
@@ -288,17 +288,17 @@ def test_task(name, n) -> None:
     assert bool(((radius > 0.4 - 1e-9) & (radius < 0.5 + 1e-9)).all())
     assert bool((rows[..., 3:] == 0.5).all())
     losses = task.loss(x)
-    for image, loss, one in zip(task.image(x), losses, x, strict=True):
-        assert float(task.image_loss(image)) == pytest.approx(float(loss), rel=1e-4)  # images are float32
-        assert task.image_error(one) == pytest.approx(float(loss), rel=1e-6)
-    assert task.picture(x[0]).shape == task.target_picture().shape == ((128, 256) if n < 10000 else (128, 256, 3))
-    assert 0 <= float(task.target_picture().min()) < float(task.target_picture().max()) <= 1
+    for image, loss, one in zip(task.output.image(x), losses, x, strict=True):
+        assert float(task.output.loss(image)) == pytest.approx(float(loss), rel=1e-4)  # images are float32
+        assert task.truth.image_error(one) == pytest.approx(float(loss), rel=1e-6)
+    assert task.picture.of(x[0]).shape == task.picture.target().shape == ((128, 256) if n < 10000 else (128, 256, 3))
+    assert 0 <= float(task.picture.target().min()) < float(task.picture.target().max()) <= 1
     # The target stays within its views.
     for edge in (
-        task.target_picture()[0],
-        task.target_picture()[-1],
-        task.target_picture()[:, 0],
-        task.target_picture()[:, -1],
+        task.picture.target()[0],
+        task.picture.target()[-1],
+        task.picture.target()[:, 0],
+        task.picture.target()[:, -1],
     ):
         assert not bool(edge.any())
     assert METHODS["our_h_local"].applies(task) is None
@@ -332,14 +332,14 @@ def test_chamfer_is_the_squared_distance_of_parallel_surfaces() -> None:
 
 def test_a_handle_sums_all_pixels_that_it_changes_and_few_others() -> None:
     mesh, x = TASK.mesh, TASK.start(0)
-    whole = TASK.image(x[None])
+    whole = TASK.output.image(x[None])
     for level, most in ((2, 0.35), (3, 0.15)):
         control = mesh.control(level)
         sums = control.sums(x, margin=2.0)
         for handle in (0, 20, len(control) - 1):
             z = torch.zeros(1, len(control), 3, dtype=torch.float64)
             z[0, handle] = 0.01  # less than a pixel
-            change = (TASK.image(control.displaced(x, z)) - whole).abs()
+            change = (TASK.output.image(control.displaced(x, z)) - whole).abs()
             assert float(change.sum()) > 0
             # Almost all: displacements below a hundredth do not count, but may turn a triangle a little.
             inside = float(sums(change)[0, handle])
@@ -384,7 +384,10 @@ def test_a_pixel_that_only_one_covers_counts_more(name) -> None:
     without, found = (
         _losses(trial, control, trial.start, unit, margin=1000.0, silhouette=weight)(zero) for weight in (0.0, 0.5)
     )
-    mesh, target = task.image(trial.start[None])[0], -task.residuals(torch.zeros_like(task.image(trial.start[None])[0]))
+    mesh, target = (
+        task.output.image(trial.start[None])[0],
+        -task.output.residuals(torch.zeros_like(task.output.image(trial.start[None])[0])),
+    )
     shown = [picture.view(8, 64, 64, -1).sum(3) > 1e-6 for picture in (mesh, target)]
     mistaken = (shown[0] ^ shown[1]).sum().double()
     assert mistaken > 100
@@ -442,4 +445,4 @@ def test_colors_are_fitted_with_the_vertices() -> None:
     # With the places kept, new colours alone change the image to the better.
     grey = x.clone()
     grey[:, 3:] = 0.5
-    assert task.image_error(trial.x) < task.image_error(grey.flatten())
+    assert task.truth.image_error(trial.x) < task.truth.image_error(grey.flatten())

@@ -36,40 +36,40 @@ def test_the_loss_is_zero_at_the_solution_and_far_from_it_at_the_start(task) -> 
     at, there = task.loss(torch.stack([solution, start])).tolist()
     assert at < 1e-12
     assert there > 1e-3
-    assert task.image_error(solution) == pytest.approx(at)
-    assert task.image_error(start) == pytest.approx(there)
-    assert task.parameter_error(solution) == 0.0
+    assert task.truth.image_error(solution) == pytest.approx(at)
+    assert task.truth.image_error(start) == pytest.approx(there)
+    assert task.truth.parameter_error(solution) == 0.0
 
 
 def test_loss_image_and_residuals_are_one(task) -> None:
     x = task.start(1)
-    image = task.image(x[None])[0]
+    image = task.output.image(x[None])[0]
     width, height = task.setting.film
     assert image.shape == (height, width, 3)
     loss = float(task.loss(x[None])[0])
-    assert float(task.image_loss(image)) == pytest.approx(loss)
-    assert float(task.residuals(image).square().mean()) == pytest.approx(loss)
-    target = task.image(vector(*SOLUTIONS[task.name])[None])[0]
+    assert float(task.output.loss(image)) == pytest.approx(loss)
+    assert float(task.output.residuals(image).square().mean()) == pytest.approx(loss)
+    target = task.output.image(vector(*SOLUTIONS[task.name])[None])[0]
     assert float((image - target).square().mean()) == pytest.approx(loss)
 
 
 def test_what_is_remembered_is_what_would_be_rendered(task) -> None:
     x = task.start(2)
     task.loss(torch.stack([x, x + 0.01]))
-    remembered = task.image_error(x)
+    remembered = task.truth.image_error(x)
     fresh = catalogue.load(task.name, "fast", "scalar_rgb")
-    assert fresh.image_error(x) == pytest.approx(remembered, rel=1e-6)
-    assert fresh.image_error(x + 0.01) == pytest.approx(task.image_error(x + 0.01), rel=1e-6)
+    assert fresh.truth.image_error(x) == pytest.approx(remembered, rel=1e-6)
+    assert fresh.truth.image_error(x + 0.01) == pytest.approx(task.truth.image_error(x + 0.01), rel=1e-6)
 
 
 def test_a_scene_that_was_released_is_loaded_again() -> None:
     task = catalogue.load("shad", "fast", "scalar_rgb")
     x = task.start(0)[None]
-    before = task.image(x)
-    scene = weakref.ref(task.image.__self__.scene)
-    task.release()
+    before = task.output.image(x)
+    scene = weakref.ref(task.output.image.__self__.scene)
+    task.renderer.release()
     assert scene() is None
-    assert torch.equal(task.image(x), before)
+    assert torch.equal(task.output.image(x), before)
 
 
 def test_starts_are_within_the_bounds_and_differ(task) -> None:
@@ -83,8 +83,8 @@ def test_starts_are_within_the_bounds_and_differ(task) -> None:
 
 
 def test_the_full_setting_is_the_same_task_with_more_of_everything(task) -> None:
-    full = task.full()
-    assert full.full is None
+    full = task.renderer.full()
+    assert full.renderer.full is None
     assert full.setting.film[0] > task.setting.film[0]
     assert full.setting.spp > task.setting.spp
     assert full.setting.depth >= task.setting.depth
@@ -95,7 +95,7 @@ def test_the_full_setting_is_the_same_task_with_more_of_everything(task) -> None
 
 
 def test_pictures_are_srgb(task) -> None:
-    picture = task.picture(task.start(0))
+    picture = task.picture.of(task.start(0))
     assert picture.shape[-1] == 3
     assert 0.0 <= float(picture.min()) < float(picture.max()) <= 1.0
 
@@ -105,14 +105,14 @@ def test_the_scene_for_derivatives_has_the_same_image(name) -> None:
     task = TASKS[name]
     x = task.start(4)[None]
     same = task.moving(task.setting)(x)
-    torch.testing.assert_close(same.double(), task.image(x), rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(same.double(), task.output.image(x), rtol=0.0, atol=1e-4)
 
 
 # MUG
 
 
 def test_the_parameter_error_of_the_mug_has_a_period() -> None:
-    error = TASKS["mug"].parameter_error
+    error = TASKS["mug"].truth.parameter_error
     for x in (0.3, 5.0, -2.0):
         for turns in (-1, 1, 2):
             assert error(vector(x + 18 * turns)) == pytest.approx(error(vector(x)))
@@ -147,7 +147,7 @@ def test_a_shadow_takes_the_light_that_its_place_and_size_say() -> None:
     task = TASKS["shad"]
     (y0, z0), (y1, z1) = (side.tolist() for side in task.bounds)
     points = torch.tensor([[y0, z0], [y0, z1], [y1, z0], [y1, z1], [-1.5, 1.0], [100.0, 100.0]]).double()
-    images = task.image(points)[..., 0]  # red: that of the light
+    images = task.output.image(points)[..., 0]  # red: that of the light
     missing = (images[-1] - images[:-1]).mean((1, 2))
     half_width = shad.CAMERA * math.tan(math.radians(shad.FIELD_OF_VIEW / 2))
     for found, point in zip(missing.tolist(), points[:-1].tolist(), strict=True):
@@ -195,7 +195,7 @@ def test_without_either_mirror_the_bunny_is_not_seen(removed) -> None:
     x = torch.stack([task.solution, task.start(0), vector(1.0, 1.0, 1.0)])
     blind = MitsubaScene(scene, [IN_MIRRORS], film=(24, 24), spp=4, depth=4, variant="scalar_rgb", threads=1)(x)
     assert torch.equal(blind, blind[:1].expand(3, -1, -1, -1))
-    assert len(torch.unique(task.image(x).round(decimals=3), dim=0)) == 3
+    assert len(torch.unique(task.output.image(x).round(decimals=3), dim=0)) == 3
 
 
 def test_two_mirrors_show_the_bunny_as_it_is_from_farther_away() -> None:

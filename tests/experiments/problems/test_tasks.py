@@ -62,12 +62,12 @@ def test_every_task_says_what_it_is(task) -> None:
 
 def test_errors_vanish_at_the_solution_and_only_there(task) -> None:
     solution = vector(SOLUTIONS[task.name])
-    assert task.image_error(solution) == pytest.approx(0.0, abs=1e-30)
-    assert task.parameter_error(solution) == pytest.approx(0.0, abs=1e-30)
+    assert task.truth.image_error(solution) == pytest.approx(0.0, abs=1e-30)
+    assert task.truth.parameter_error(solution) == pytest.approx(0.0, abs=1e-30)
     for x in starts(task):
-        assert task.image_error(x) > 1e-4
-        assert task.parameter_error(x) > 1e-4
-        assert task.image_error(x) == pytest.approx(float(task.loss(x[None])[0] - task.loss(solution[None])[0]))
+        assert task.truth.image_error(x) > 1e-4
+        assert task.truth.parameter_error(x) > 1e-4
+        assert task.truth.image_error(x) == pytest.approx(float(task.loss(x[None])[0] - task.loss(solution[None])[0]))
 
 
 def test_starts_are_in_their_range_and_the_same_every_time(task) -> None:
@@ -90,14 +90,14 @@ def test_starts_are_in_their_range_and_the_same_every_time(task) -> None:
 @pytest.mark.parametrize("name", IMAGES)
 def test_image_and_loss_are_one_black_box(name) -> None:
     task, x = TASKS[name], starts(TASKS[name], 5)
-    images, losses = task.image(x), task.loss(x)
+    images, losses = task.output.image(x), task.loss(x)
     assert images.dtype == losses.dtype == torch.float64
     for image, loss in zip(images, losses, strict=True):
-        assert float(task.image_loss(image)) == pytest.approx(float(loss), rel=1e-12)
-        assert float(task.residuals(image).square().mean()) == pytest.approx(float(loss), rel=1e-12)
-        assert task.residuals(image).dim() == 1
+        assert float(task.output.loss(image)) == pytest.approx(float(loss), rel=1e-12)
+        assert float(task.output.residuals(image).square().mean()) == pytest.approx(float(loss), rel=1e-12)
+        assert task.output.residuals(image).dim() == 1
     assert torch.equal(torch.cat([task.loss(one[None]) for one in x]), losses)
-    gradient = torch.func.grad(task.image_loss)(images[0])
+    gradient = torch.func.grad(task.output.loss)(images[0])
     assert gradient.shape == images[0].shape
     assert bool(gradient.any())
 
@@ -105,12 +105,12 @@ def test_image_and_loss_are_one_black_box(name) -> None:
 @pytest.mark.parametrize("name", IMAGES)
 def test_pictures_can_be_shown(name) -> None:
     task = TASKS[name]
-    picture, target = task.picture(task.start(0)), task.target_picture()
+    picture, target = task.picture.of(task.start(0)), task.picture.target()
     assert picture.shape == target.shape
     assert target.dim() == 2 or target.shape[2] == 3
     for one in (picture, target):
         assert 0 <= float(one.min()) < float(one.max()) <= 1
-    torch.testing.assert_close(task.picture(vector(SOLUTIONS[name])), target)
+    torch.testing.assert_close(task.picture.of(vector(SOLUTIONS[name])), target)
 
 
 def test_quad_is_the_quadratic() -> None:
@@ -135,7 +135,7 @@ def test_boxes_are_soft_squares(name, preset, side) -> None:
     task, target = catalogue.load(name, preset), squares(np.array(SOLUTIONS[name]), side)
     for x in starts(task, 3):
         image = squares(x.numpy(), side)
-        torch.testing.assert_close(task.image(x[None])[0], torch.from_numpy(image))
+        torch.testing.assert_close(task.output.image(x[None])[0], torch.from_numpy(image))
         assert float(task.loss(x[None])[0]) == pytest.approx(np.mean((image - target) ** 2))
 
 
@@ -146,7 +146,7 @@ def test_box2_starts_on_a_plateau() -> None:
     assert len(far) > 50
     # Two squares that do not overlap: the sum of their energies, but for where pixels sample the soft edge.
     losses = task.loss(far)
-    energy = 2 * float(task.target_picture().square().mean())
+    energy = 2 * float(task.picture.target().square().mean())
     torch.testing.assert_close(losses, torch.full_like(losses, energy), rtol=0.02, atol=0)
     near = task.loss(vector([[0.3, 0.32], [0.3, 0.4]]))
     assert float(near[0]) < float(near[1]) < 0.9 * energy
@@ -157,12 +157,12 @@ def test_squares_of_box10_are_interchangeable() -> None:
     x = task.start(3).view(5, 2)
     expected = min(float((x[list(order)] - solution).square().mean()) for order in permutations(range(5)))
     for order in ([1, 0, 2, 3, 4], [4, 3, 1, 2, 0]):
-        assert task.parameter_error(x[order].flatten()) == pytest.approx(expected)
-        assert task.parameter_error(solution[order].flatten()) == 0.0
-        assert task.image_error(solution[order].flatten()) == pytest.approx(0.0, abs=1e-30)
+        assert task.truth.parameter_error(x[order].flatten()) == pytest.approx(expected)
+        assert task.truth.parameter_error(solution[order].flatten()) == 0.0
+        assert task.truth.image_error(solution[order].flatten()) == pytest.approx(0.0, abs=1e-30)
     merged = solution[[0, 0, 2, 3, 4]].flatten()
-    assert task.parameter_error(merged) == pytest.approx(2 * 0.29**2 / 10)
-    assert task.image_error(merged) > 0.01
+    assert task.truth.parameter_error(merged) == pytest.approx(2 * 0.29**2 / 10)
+    assert task.truth.image_error(merged) > 0.01
 
 
 def quadrature(task: Task, x: torch.Tensor, sigma: float, nodes: int = 60) -> float:
@@ -178,7 +178,7 @@ def test_analytic_is_the_convolution(name, share) -> None:
     task = TASKS[name]
     for x in starts(task, 5):
         sigma = share * task.sigma
-        assert float(task.analytic(x, sigma)) == pytest.approx(quadrature(task, x, sigma), rel=1e-9)
+        assert float(task.truth.analytic(x, sigma)) == pytest.approx(quadrature(task, x, sigma), rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["texture", "brdf"])
@@ -189,7 +189,7 @@ def test_analytic_is_the_mean_of_the_black_box(name, share) -> None:
     u = torch.randn(4000, task.n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     values = task.loss(x + sigma * u)
     # Five standard errors: a false alarm in 2e6.
-    assert float(task.analytic(x, sigma)) == pytest.approx(
+    assert float(task.truth.analytic(x, sigma)) == pytest.approx(
         float(values.mean()), abs=5 * float(values.std()) / 4000**0.5
     )
 
@@ -198,11 +198,11 @@ def test_analytic_is_the_mean_of_the_black_box(name, share) -> None:
 def test_analytic_without_smoothing_is_the_loss(name) -> None:
     task = TASKS[name]
     x = task.start(1)
-    assert float(task.analytic(x, 0.0)) == pytest.approx(float(task.loss(x[None])[0]))
-    gradient = torch.func.grad(task.analytic)(x, 0.0)
+    assert float(task.truth.analytic(x, 0.0)) == pytest.approx(float(task.loss(x[None])[0]))
+    gradient = torch.func.grad(task.truth.analytic)(x, 0.0)
     v = vector(np.cos(np.arange(task.n)))
     h = 1e-5 * task.sigma
-    difference = (task.analytic(x + h * v, 0.0) - task.analytic(x - h * v, 0.0)) / (2 * h)
+    difference = (task.truth.analytic(x + h * v, 0.0) - task.truth.analytic(x - h * v, 0.0)) / (2 * h)
     assert float(gradient @ v) == pytest.approx(float(difference), rel=1e-5)
 
 
@@ -249,7 +249,8 @@ def test_nonpsd_starts_cover_the_square() -> None:
     for x in found:
         least = float(torch.linalg.eigvalsh(hessian(x))[0])
         assert (least < 0) == (float(x.norm()) > nonpsd.S1)
-    assert TASKS["nonpsd"].parameter_error(vector([0.006, 0.008])) == pytest.approx(TASKS["nonpsd"].precision)
+    truth = TASKS["nonpsd"].truth
+    assert truth.parameter_error(vector([0.006, 0.008])) == pytest.approx(truth.precision)
 
 
 def test_error_of_the_hessian_of_nonpsd(capsys) -> None:

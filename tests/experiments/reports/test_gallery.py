@@ -38,7 +38,7 @@ def vector(*numbers):
 def made(points, evaluations=None, task=small.TASK):
     counts = evaluations or [2 * k for k in range(len(points))]
     rows = [
-        Record("t", "m", 0, k, 0.1 * k, n, None, None, task.image_error(x), 0.0)
+        Record("t", "m", 0, k, 0.1 * k, n, None, None, task.truth.image_error(x), 0.0)
         for k, (x, n) in enumerate(zip(points, counts, strict=True))
     ]
     return Trace(task, "m", list(points), rows, ENDED)
@@ -89,8 +89,7 @@ def test_tasks_look_like_their_pictures():
     seen = look(small.TASK, small.TASK.start(0))
     assert seen.picture is small.picture
     assert torch.equal(seen.target, small.picture(small.TARGET))
-    for without in ({"picture": None, "n": 3}, {"target_picture": None}):
-        assert look(replace(small.TASK, **without), torch.zeros(3)) is None
+    assert look(replace(small.TASK, picture=None, n=3), torch.zeros(3)) is None
 
 
 def bowl(at, bounds=None):
@@ -190,7 +189,7 @@ def test_stills_are_finer_than_what_the_run_saw():
         sigma=1.0,
         evaluations=10,
     )
-    seen = finer(task, Look(task.picture, torch.zeros(20, 30, 3)))
+    seen = finer(task, Look(task.picture.of, torch.zeros(20, 30, 3)))
     assert asked == [Setting((210, 140), 64, 2)]  # 7 x 20 is the first multiple beyond 128
     assert seen.picture(torch.ones(1)).shape == seen.target.shape == (140, 210, 3)
     other = Look(small.picture, torch.zeros(2, 2))

@@ -19,6 +19,7 @@ import torch_zerohess as zh
 from experiments.listing import listing
 from experiments.methods import METHODS
 from experiments.problems.catalogue import FITTING, load
+from experiments.problems.task import Renderer
 from experiments.reports.figures import plot, quartiles, styles_of
 from experiments.reports.measures import described, measures
 from experiments.reports.report import page, report
@@ -210,7 +211,7 @@ def test_the_page_needs_nothing_else(folder):
     assert len(images) == 1 + 1 + 2 + 1
     start, result, target = images[1], images[2], images[-1]
     assert np.array_equal(result, target)  # the runs above end at the solution
-    pixels = np.round(255 * TASK.picture(TASK.start(0)).numpy())
+    pixels = np.round(255 * TASK.picture.of(TASK.start(0)).numpy())
     assert np.array_equal(np.round(255 * start[..., 0]), pixels)
     for part in ("60 1s 100%", "ValueError: no", "trust_region", TASK.title, "not shown: 1"):
         assert part in text
@@ -220,7 +221,7 @@ def test_the_page_needs_nothing_else(folder):
 def test_pictures_say_how_far_they_are_from_the_target(folder, no_curves):
     text = page(folder, {"bowl": TASK})
     captions = dict(re.findall(r"<figcaption><b>([^<]*)</b><br>([^<]*)</figcaption>", text))
-    start, target = TASK.picture(TASK.start(0)), TASK.picture(TARGET)
+    start, target = TASK.picture.of(TASK.start(0)), TASK.picture.of(TARGET)
     decibels = -10 * math.log10(float((start - target).square().mean()))
     assert captions == {
         "start": f"PSNR {decibels:.1f} dB",  # too small for a window of SSIM
@@ -228,7 +229,8 @@ def test_pictures_say_how_far_they_are_from_the_target(folder, no_curves):
         "trust_region": "PSNR inf dB",
         "target": "",
     }
-    without = replace(TASK, picture=None, target_picture=None, measures=lambda x: {"distance": float(x[0] - TARGET[0])})
+    truth = replace(TASK.truth, measures=lambda x: {"distance": float(x[0] - TARGET[0])})
+    without = replace(TASK, picture=None, truth=truth)
     text = page(folder, {"bowl": without})
     assert "PSNR" not in text
     assert re.findall(r"<b>([^<]*)</b><br>(distance [^<]*)<", text) == [
@@ -272,8 +274,7 @@ def halved(monkeypatch):
     task = replace(
         TASK,
         loss=clock.loss(iter([100, 0.003, 0.003, 0.5, 0.003, 0.003, 0.002]), 1.0),
-        full=lambda: replace(whole, loss=clock.alone(whole.loss)),
-        release=clock.release,
+        renderer=Renderer(full=lambda: replace(whole, loss=clock.alone(whole.loss)), release=clock.release),
     )
     return task, clock
 
@@ -313,8 +314,12 @@ def test_the_report_measures_the_saving_once(folder, halved, no_curves):
     ("task", "points", "message"),
     [
         (TASK, torch.zeros(1, 2), "task must have a full setting .* bowl has none"),
-        (replace(TASK, full=lambda: TASK), torch.zeros(2), r"points must be \[P, 2\], got \[2\]"),
-        (replace(TASK, full=lambda: TASK), torch.zeros(0, 2), r"points must be \[P, 2\], got \[0, 2\]"),
+        (replace(TASK, renderer=Renderer(full=lambda: TASK)), torch.zeros(2), r"points must be \[P, 2\], got \[2\]"),
+        (
+            replace(TASK, renderer=Renderer(full=lambda: TASK)),
+            torch.zeros(0, 2),
+            r"points must be \[P, 2\], got \[0, 2\]",
+        ),
     ],
 )
 def test_saving_names_what_is_wrong(task, points, message):

@@ -59,7 +59,7 @@ def test_time_for_errors_is_not_counted():
         time.sleep(0.05)
         return 1.0
 
-    trial = Trial(replace(TASK, image_error=slow), "any", 0)
+    trial = Trial(replace(TASK, truth=replace(TASK.truth, image_error=slow)), "any", 0)
     for _ in range(4):
         trial.loss(torch.zeros(1, 2))
         trial.report(trial.start)
@@ -75,7 +75,7 @@ def test_wrong_shapes_are_named(points):
     with pytest.raises(ValueError, match=r"\[2\]"):
         trial.report(torch.zeros(3))
     with pytest.raises(ValueError, match="returns a loss only"):
-        Trial(replace(TASK, image=None), "any", 0).image(torch.zeros(1, 2))
+        Trial(replace(TASK, output=None), "any", 0).image(torch.zeros(1, 2))
 
 
 def swallow(trial):
@@ -110,7 +110,8 @@ def test_how_runs_end(tmp_path, method, status, reason, evaluations):
 
 
 def test_precision_asks_for_more():
-    outcome = attempt(replace(TASK, precision=1e-6), "halve", 0, lambda t: HALVE.solve(t, {}))
+    precise = replace(TASK, truth=replace(TASK.truth, precision=1e-6))
+    outcome = attempt(precise, "halve", 0, lambda t: HALVE.solve(t, {}))
     distance = float((torch.tensor(outcome.x) - TARGET).square().sum())
     assert outcome.status == "finished"
     assert 1e-6 / 4 < distance <= 1e-6
@@ -143,9 +144,9 @@ class Snapshots:
 
         def counted_image(x):
             self.calls += len(x)
-            return TASK.image(x)
+            return TASK.output.image(x)
 
-        return replace(TASK, loss=counted, image=counted_image)
+        return replace(TASK, loss=counted, output=replace(TASK.output, image=counted_image))
 
     def resume(self, log: bytes, journal: bytes, folder: Path) -> int:
         """Go on from files that a kill has left, compare with the uninterrupted run, return the calls it took."""

@@ -86,9 +86,9 @@ CHANGES = [
 def test_errors_are_those_of_the_task(task, change):
     other, x = varied(task, change), torch.tensor([[0.5, 0.5], [1.0, -1.0]]).double()
     other.loss(x)  # whatever a method has seen on the way
-    assert other.image_error(SOLUTION) == 0
-    assert other.image_error(x[0]) == pytest.approx(float(task.loss(x)[0]), abs=1e-12)
-    assert other.parameter_error(SOLUTION + 0.1) == pytest.approx(0.01)
+    assert other.truth.image_error(SOLUTION) == 0
+    assert other.truth.image_error(x[0]) == pytest.approx(float(task.loss(x)[0]), abs=1e-12)
+    assert other.truth.parameter_error(SOLUTION + 0.1) == pytest.approx(0.01)
     assert other.name == f"ramps {change}"
 
 
@@ -104,28 +104,28 @@ def test_fewer_samples_are_more_noise_in_renders_and_reference_alike(task, scene
     other = varied(task, Change(spp=0.25))
     assert float(other.loss(SOLUTION[None])[0]) == 0
     assert scenes[-1].setting == Setting((16, 8), 2, 2)
-    clean, noisy = task.image(SOLUTION[None])[0], other.image(SOLUTION[None])[0]
+    clean, noisy = task.output.image(SOLUTION[None])[0], other.output.image(SOLUTION[None])[0]
     smooth = torch.linspace(0, 1, 16) * 0.3 * 0.25 + 0.5 - 0.15 * torch.linspace(0, 1, 8)[:, None]
     spread = [(image - smooth[..., None]).square().mean().sqrt() for image in (clean, noisy)]
     assert float(spread[1] / spread[0]) == pytest.approx(2.0, rel=1e-4)
 
 
 def test_fresh_noise_leaves_the_reference_alone(task, scenes):
-    clean, seeds = task.image(SOLUTION[None])[0], {}
+    clean, seeds = task.output.image(SOLUTION[None])[0], {}
     for noise in ("other", "call", "point"):
         other = varied(task, Change(noise=noise))
-        images = torch.cat([other.image(SOLUTION.expand(2, 2)), other.image(SOLUTION.expand(1, 2))])
+        images = torch.cat([other.output.image(SOLUTION.expand(2, 2)), other.output.image(SOLUTION.expand(1, 2))])
         seeds[noise] = scenes[-1].seeds
-        assert float(other.residuals(clean).abs().max()) == 0  # the reference has the first seed
+        assert float(other.output.residuals(clean).abs().max()) == 0  # the reference has the first seed
         expected = (images - clean).square().mean((1, 2, 3))
-        again = torch.stack([other.image_loss(image) for image in images])
+        again = torch.stack([other.output.loss(image) for image in images])
         torch.testing.assert_close(again, expected)
         assert float(expected.min()) > 0
     assert seeds == {"other": [0, 1, 1, 1], "call": [0, 1, 1, 2], "point": [0, 1, 2, 3]}
 
 
 def test_a_compressed_reference_is_what_the_renders_are_compared_with(task):
-    clean = task.image(SOLUTION[None])[0]
+    clean = task.output.image(SOLUTION[None])[0]
     loss = varied(task, Change(jpeg=10)).loss(SOLUTION[None])
     assert float(loss) == pytest.approx(float((clean - jpeg(clean, 10)).square().mean()))
     assert float(loss) > 0

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from experiments.ensembles.provenance import register
 from experiments.methods.training import Method, Result, train, trained
 from experiments.problems.training_task import Preset, TrainingTask
-from experiments.reports import export, figures, predictions
+from experiments.reports import error_curves, onnx_export, predictions
 from experiments.reports.results import load
 from experiments.reports.tables import table
 from experiments.runs.journal import DivergedError
@@ -68,16 +68,16 @@ def _conclude(task: TrainingTask, results: Sequence[Result], out: Path) -> None:
     folder = out / task.name
     shown = {result.method for result in results}
     runs = {name: mine for name, mine in load(out).runs[task.name].items() if name in shown}
-    figures.curves(task.name, runs, folder / "errors.png")
+    error_curves.curves(task.name, runs, folder / "errors.png")
     first = [result for result in results if result.run == results[0].run]
     predictions.draw(task, first, folder / "predictions.png")
     print("\n" + summary(type(task), results))
     print(f"\nerrors: {folder / 'errors.png'}\npredictions: {folder / 'predictions.png'}\nlogs: {folder}")
-    if export.missing():
-        print(f"not exported to ONNX: pip install {' '.join(export.missing())}")
+    if onnx_export.missing():
+        print(f"not exported to ONNX: pip install {' '.join(onnx_export.missing())}")
     else:
         path = folder / f"encoder-{first[-1].method}.onnx"
-        difference = export.export(first[-1].encoder, task.held_out[0], path)
+        difference = onnx_export.export(first[-1].encoder, task.held_out[0], path)
         print(f"encoder: {path}, onnxruntime predicts the same parameters to {difference:.1e}")
 
 

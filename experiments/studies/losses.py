@@ -33,7 +33,7 @@ from experiments.reports.results import METRICS, Run, median
 from experiments.reports.tables import table
 from experiments.runs.records import Record
 from experiments.runs.trial import Finished, Trial, attempt, reduced
-from experiments.studies.objectives import FACTORIES, FORMS, Moments, Pictures, normal, pictures_of
+from experiments.studies.loss_objectives import FACTORIES, FORMS, Moments, Pictures, normal, pictures_of
 
 SOLUTIONS = {"box2": (0.3, 0.3), "brdf": brdf.TARGET}
 """Of the tasks that are swept; others are only fitted."""

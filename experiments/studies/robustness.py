@@ -22,7 +22,7 @@ from experiments.methods.settings import settings as settings_of
 from experiments.problems.catalogue import FITTING, Preset, chosen
 from experiments.problems.variations import Change
 from experiments.problems.variations import load as load_varied
-from experiments.reports import robustness_figure
+from experiments.reports import robustness_curves
 from experiments.reports.results import Results, Run, load, median
 from experiments.reports.tables import table
 from experiments.runs.trial import LEVELS, LIMIT
@@ -163,7 +163,7 @@ def robustness(
         titles = {sweep: SWEEPS[sweep].title for sweep in sweeps}
         for against in ("evaluations", "seconds"):
             path = out / f"{name}-robustness-{against}.png"
-            robustness_figure.draw(name, mine, titles, against, path)
+            robustness_curves.draw(name, mine, titles, against, path)
             print(path)
     return rows
 

@@ -15,13 +15,13 @@ from experiments.ensembles.provenance import flat, read_command
 from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING
 from experiments.problems.task import Task
-from experiments.reports import figures
+from experiments.reports import error_curves
 from experiments.reports.animation import pixels
+from experiments.reports.full_setting import known_saving, line
 from experiments.reports.html_page import html_page, html_table, html_text
-from experiments.reports.measures import described, measures
 from experiments.reports.results import Run, load
+from experiments.reports.similarity import described, measures
 from experiments.reports.summary import Summary, summarize, task_table
-from experiments.reports.time_saved import known_saving, line
 
 _STYLE = """
 figure { width: 170px; margin: .3em } figcaption { text-align: center; overflow-wrap: anywhere }
@@ -54,7 +54,7 @@ def report(
 def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
     """Return the page; `tasks` are those that have no name, for their pictures."""
     results, known = load(folder), read_command(folder)
-    summary, chosen = summarize(results), figures.styles_of(results)
+    summary, chosen = summarize(results), error_curves.styles_of(results)
     parts = [_commands(known["commands"])]
     if summary.reference and summary.speed_ups:
         parts.append(_speed_ups(summary))
@@ -117,9 +117,9 @@ def _tables(summary: Summary, task: str) -> str:
     return found
 
 
-def _curves(name: str, methods: dict[str, list[Run]], chosen: Mapping[str, figures.Style]) -> str:
+def _curves(name: str, methods: dict[str, list[Run]], chosen: Mapping[str, error_curves.Style]) -> str:
     image = io.BytesIO()
-    figures.curves(name, methods, image, chosen)
+    error_curves.curves(name, methods, image, chosen)
     return f"<img class='curves' alt='error curves of {html_text(name)}' src='{_embedded(image.getvalue())}'>"
 
 

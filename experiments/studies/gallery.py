@@ -5,6 +5,7 @@ experiments with a caustic and with two mirrors (figures 9, 12 and 13 of the sou
 task. Tasks that are not pictures are shown as a map of their loss if they have two parameters.
 """
 
+import dataclasses
 import itertools
 import math
 import shutil
@@ -16,19 +17,23 @@ from typing import Annotated
 
 import torch
 import tyro
+from torch import Tensor
 from tqdm import tqdm
 
 from experiments.ensembles.ensemble import unusable
 from experiments.ensembles.provenance import machine
-from experiments.methods import METHODS
+from experiments.methods import METHODS, Method
+from experiments.methods.settings import settings
 from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING, RENDERED, TRAINING, Preset, chosen
-from experiments.reports import gallery_figures
-from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together, trace
+from experiments.problems.task import Task
+from experiments.reports import supplement_figures
+from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
 from experiments.reports.html_page import html_page, html_table, html_text
-from experiments.reports.measures import described, measures
+from experiments.reports.similarity import described, measures
 from experiments.reports.tables import table
 from experiments.runs.records import Record
+from experiments.runs.trial import LIMIT, Trial, attempt
 
 METHOD = "trust_region"
 OWN = {**dict.fromkeys(("meshfit", "meshfit_color"), "our_h_local"), "caustic": "gauss_newton"}
@@ -112,6 +117,26 @@ def _traces(
     return shown
 
 
+def trace(
+    task: Task, method: Method, run: int, limit: float = LIMIT, watch: Callable[[Record], None] | None = None
+) -> Trace:
+    """Run a method on a task, without files, and return all that it reported."""
+    points: list[Tensor] = []
+    trials: list[Trial] = []
+
+    def image_error(x: Tensor) -> float:  # of every row once
+        points.append(x.clone())
+        return task.truth.image_error(x)
+
+    def solve(trial: Trial) -> None:
+        trials.append(trial)
+        method.solve(trial, settings(method.name, task.name))
+
+    noted = dataclasses.replace(task, truth=dataclasses.replace(task.truth, image_error=image_error))
+    outcome = attempt(noted, method.name, run, solve, limit=limit, watch=watch)
+    return Trace(task, method.name, points, trials[-1].rows, outcome)
+
+
 def _watch(bar: tqdm) -> Callable[[Record], None]:
     """Return what shows the last row of a run in a bar, some times a second."""
     drawn = 0.0
@@ -130,7 +155,7 @@ def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> l
     """Write figure 9, and 12 and 13 if their tasks are there."""
     files = [out / "figure9.png"]
     stills = [(found, finer(found.task, seen)) for found, seen in tqdm(shown, desc="stills", unit=" tasks")]
-    gallery_figures.overview(stills, files[0])
+    supplement_figures.overview(stills, files[0])
     for found, seen in stills:
         if found.task.name == "caustic":
             other = METHODS[OTHER]
@@ -139,10 +164,10 @@ def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> l
                 with tqdm(desc=f"caustic {OTHER}", bar_format="{desc}: [{elapsed}{postfix}]") as bar:
                     more = trace(found.task, other, found.outcome.run, limit, _watch(bar))
             files.append(out / "figure12.png")
-            gallery_figures.caustic(found, seen, more, files[-1])
+            supplement_figures.caustic(found, seen, more, files[-1])
         if found.task.name == "mirror":
             files.append(out / "figure13.png")
-            gallery_figures.mirrors(found, seen, gallery_figures.mirrors_from_outside(variant), files[-1])
+            supplement_figures.mirrors(found, seen, supplement_figures.mirrors_from_outside(variant), files[-1])
     return files
 
 

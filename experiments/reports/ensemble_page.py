@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ from experiments.reports.full_setting import known_saving, line
 from experiments.reports.html_page import html_page, html_table, html_text
 from experiments.reports.results import Run, load
 from experiments.reports.similarity import described, measures
+from experiments.reports.speed_ups import HEADERS
 from experiments.reports.summary import Summary, summarize, task_table
 
 _STYLE = """
@@ -90,11 +92,11 @@ def _commands(commands: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _speed_ups(summary: Summary) -> str:
-    rows = [[s.method, s.seconds, s.evaluations, s.cases] for s in (*summary.speed_ups, summary.mean_speed_up)]
+    rows = [list(asdict(one).values()) for one in (*summary.speed_ups, summary.mean_speed_up)]
     return (
         f"<h2>Mean ratio to {html_text(summary.reference)}</h2><p>Seconds and evaluations of a method divided by "
         f"those of {html_text(summary.reference)}, averaged over the tasks, errors and levels that both reach.</p>"
-        + html_table(["method", "seconds", "evaluations", "cases"], rows)
+        + html_table(HEADERS, rows)
     )
 
 

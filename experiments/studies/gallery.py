@@ -9,7 +9,6 @@ import dataclasses
 import itertools
 import math
 import shutil
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,6 +29,7 @@ from experiments.problems.task import Task
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
 from experiments.reports.html_page import html_page, html_table, html_text
+from experiments.reports.progress import REFRESH, progress
 from experiments.reports.similarity import described, measures
 from experiments.reports.tables import table
 from experiments.runs.records import Record
@@ -42,8 +42,6 @@ OTHER = "cma_es_bounded"
 """The method that figure 12 compares with, as the source does."""
 HEIGHTS = 192, 128
 """Of the pictures of an animation, about: one task, several together."""
-_REFRESH = 0.2 if sys.stderr.isatty() else 30.0
-"""Seconds between two changes of the progress bar."""
 
 Shown = tuple[Trace, Look]
 
@@ -100,7 +98,7 @@ def _traces(
     names: Sequence[str], method: str | None, run: int, limit: float, preset: Preset, variant: str
 ) -> list[Shown]:
     shown = []
-    bar = tqdm(names, unit=" tasks", dynamic_ncols=True)
+    bar = progress(names, "tasks")
     for name in bar:
         bar.set_description(name)
         try:
@@ -143,7 +141,7 @@ def _watch(bar: tqdm) -> Callable[[Record], None]:
 
     def watch(record: Record) -> None:
         nonlocal drawn
-        if time.monotonic() - drawn > _REFRESH:
+        if time.monotonic() - drawn > REFRESH:
             error = math.nan if record.image_error is None else record.image_error
             bar.set_postfix_str(f"{record.evaluations} evaluations, error {error:.3g}")
             drawn = time.monotonic()
@@ -154,7 +152,7 @@ def _watch(bar: tqdm) -> Callable[[Record], None]:
 def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> list[Path]:
     """Write figure 9, and 12 and 13 if their tasks are there."""
     files = [out / "figure9.png"]
-    stills = [(found, finer(found.task, seen)) for found, seen in tqdm(shown, desc="stills", unit=" tasks")]
+    stills = [(found, finer(found.task, seen)) for found, seen in progress(shown, "stills")]
     supplement_figures.overview(stills, files[0])
     for found, seen in stills:
         if found.task.name == "caustic":
@@ -175,7 +173,7 @@ def _animations(shown: Sequence[Shown], out: Path, count: int) -> list[Path]:
     """Write one per task, and one of all rendered tasks together."""
     files = []
     small = []
-    for found, seen in tqdm(shown, desc="animations", unit=" tasks", dynamic_ncols=True):
+    for found, seen in progress(shown, "animations"):
         rows = shown_rows(found, count)
         files.append(save(frames(found, seen, rows, HEIGHTS[0]), out / found.task.name))
         if found.task.name in RENDERED:

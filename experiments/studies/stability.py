@@ -21,6 +21,7 @@ from torch import Tensor
 
 import torch_zerohess as zh
 from experiments.problems.closed_forms import Bump, ClosedForm, Exponential, PlaneWave, Quadratic, Step
+from experiments.reports.progress import progress
 from experiments.reports.tables import table
 
 _MOST_STANDARD_ERRORS = 5.0
@@ -72,7 +73,7 @@ def stability(*, seed: int = 0, largest: int = 1_000_000, out: Path | None = Non
     Raises:
         SystemExit: with status 1, if something is wrong.
     """
-    rows = [row for case in _cases(largest) for row in _rows(case, seed)]
+    rows = [row for case in progress(_cases(largest), "cases") for row in _rows(case, seed)]
     headers = ["case", "quantity", "relative error", "standard errors", "seconds", "verdict"]
     print(table(headers, [list(asdict(row).values()) for row in rows]))
     if out is not None:

@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from experiments.studies.estimators import OURS, PAPER, ErrorReport, error
+from experiments.studies.estimator_methods import OURS, PAPER
+from experiments.studies.estimators import ErrorReport, error
 
 
 @pytest.fixture(scope="module")

@@ -50,14 +50,18 @@ def register(folder: Path, settings: dict[str, dict[str, Any]]) -> None:
                     "delete it, or give another folder as --out"
                 )
         made.update(methods)
-    command = {
+    known["commands"].append(this_command())
+    write(folder / NAME, json.dumps(known, indent=1))
+
+
+def this_command() -> dict[str, Any]:
+    """Return the command of this process, when, with which code and on which machine."""
+    return {
         "command": shlex.join(["python", "-m", "experiments", *sys.argv[1:]]),
         "started": time.strftime("%Y-%m-%d %H:%M:%S %Z"),
         "machine": machine(),
         **code(),
     }
-    known["commands"].append(command)
-    write(folder / NAME, json.dumps(known, indent=1))
 
 
 def code() -> dict[str, Any]:

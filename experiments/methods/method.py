@@ -31,6 +31,8 @@ class Method:
     """None, or why the method does not apply to a task."""
     packages: tuple[str, ...] = ()
     """What must be installed, by the names on PyPI."""
+    uses: str = "loss"
+    """What it gets from the black box: the loss, the image, derivatives by the renderer."""
     another_scene: bool = False
     """Whether it loads a scene beside that of the black box, which slows both down."""
 

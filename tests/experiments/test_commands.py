@@ -1,13 +1,80 @@
 """The command line: what it loads, what it says when something is wrong or missing, and how it ends."""
 
+import inspect
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from experiments.commands import main
+from experiments.commands import COMMANDS, main, usage
 from experiments.problems import catalogue
+
+ROOT = Path(__file__).parents[2]
+LOADED = """
+import sys
+sys.argv = ["experiments", *sys.argv[1:]]
+from experiments.commands import main
+main()
+print("\\n".join(sorted(sys.modules)), file=sys.stderr)
+"""
+SLOW = ("torch", "numpy", "matplotlib", "mitsuba", "pandas", "scipy", "trimesh", "tyro")
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]], ids=str)
+def test_the_list_of_commands_loads_none_of_them(arguments) -> None:
+    command = [sys.executable, "-c", LOADED, *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == usage()
+    loaded = set(done.stderr.split())
+    assert "experiments.commands" in loaded
+    assert not loaded & set(SLOW)
+
+
+def test_the_list_has_a_line_for_every_command() -> None:
+    for name, command in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(command.help)}$", usage(), re.MULTILINE)
+    assert max(map(len, usage().splitlines())) <= 80
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_can_be_called_and_has_help(name, capsys) -> None:
+    assert COMMANDS[name].load().__doc__
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"])
+    assert ended.value.code == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"usage: python -m experiments {name} ")
+    # Every argument is explained.
+    for argument in inspect.signature(COMMANDS[name].load()).parameters.values():
+        shown = f"--{argument.name.replace('_', '-')}"
+        assert argument.kind is argument.POSITIONAL_ONLY or shown in printed
+
+
+def test_a_long_command_says_at_once_that_it_has_begun(monkeypatch, capsys) -> None:
+    said = []
+
+    def load(self) -> object:
+        said.append(capsys.readouterr().err)
+        return lambda: None
+
+    monkeypatch.setattr("experiments.commands.Command.load", load)
+    main(["run"])
+    main(["list"])
+    assert said == ["run: loading\n", ""]
+
+
+def test_an_unknown_command_is_named_with_those_that_are_near() -> None:
+    with pytest.raises(SystemExit, match=r"COMMAND must be one of list, run, .* got rn \(did you mean run\?\)"):
+        main(["rn"])
+
+
+def test_a_missing_package_is_named(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.delitem(sys.modules, "experiments.reports.error_curves", raising=False)
+    with pytest.raises(SystemExit, match="plot needs matplotlib, which is not installed: pip install 'torch_zerohess"):
+        main(["plot", "results"])
 
 
 @pytest.fixture

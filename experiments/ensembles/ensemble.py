@@ -10,13 +10,14 @@ from typing import Any
 from tqdm import tqdm
 
 from experiments.ensembles.provenance import register
-from experiments.ensembles.workers import Job, Trouble, run_jobs
+from experiments.ensembles.workers import Job, Message, Trouble, run_jobs
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings as settings_of
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
+from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
-from experiments.runs.records import Outcome, Record, read_outcome
+from experiments.runs.records import Outcome, Preparation, Record, read_outcome
 from experiments.runs.trial import LEVELS, LIMIT
 
 _BAR = "{l_bar}{bar}| {n:.1f}/{total} runs [{elapsed}<{remaining}{postfix}]"
@@ -30,21 +31,30 @@ class Ensemble:
     runs: range
     preset: Preset = "fast"
     jobs: int = 1
-    limit: float = LIMIT
+    limit: float | None = None
+    """Seconds of a run; if None `LIMIT`, and for a network task any."""
     variant: str = "auto"
     """Of Mitsuba."""
+    network_runs: range | None = None
+    """Runs on network tasks, if they are not `runs`."""
+    threads: int | None = None
+    """That render the images of a network task; all cores if None. A fitting task has one per process."""
 
     def __post_init__(self) -> None:
-        if len(self.runs) < 1:
-            raise SystemExit(f"runs must be at least 1, got {len(self.runs)}")
-        if self.runs.start < 0:
-            raise SystemExit(f"seed must be at least 0, got {self.runs.start}")
-        if self.jobs < 1:
-            raise SystemExit(f"jobs must be at least 1, got {self.jobs}")
-        if not self.limit > 0:
+        for runs in (self.runs, self.network_runs or self.runs):
+            if len(runs) < 1:
+                raise SystemExit(f"runs must be at least 1, got {len(runs)}")
+            if runs.start < 0:
+                raise SystemExit(f"seed must be at least 0, got {runs.start}")
+        for name, value in (("jobs", self.jobs), ("threads", self.threads)):
+            if value is not None and value < 1:
+                raise SystemExit(f"{name} must be at least 1, got {value}")
+        if self.limit is not None and not self.limit > 0:
             raise SystemExit(f"limit must be a positive number of seconds, got {self.limit:g}")
 
-    def plan(self, tasks: Sequence[str | Task], methods: Sequence[str | Method] | None = None) -> list[Job]:
+    def plan(
+        self, tasks: Sequence[str | Task | NetworkTask], methods: Sequence[str | Method] | None = None
+    ) -> list[Job]:
         """Return all jobs in the order of `ordered`.
 
         methods: None takes all that apply. One that does not apply to a task, or lacks a package, is left out with a
@@ -59,41 +69,26 @@ class Ensemble:
         register(self.folder, table)
         return ordered(jobs)
 
-    def _jobs(self, task: str | Task, methods: Sequence[str | Method] | None) -> list[Job]:
-        loaded = catalogue.load(task, self.preset, self.variant) if isinstance(task, str) else task
+    def _jobs(self, task: str | Task | NetworkTask, methods: Sequence[str | Method] | None) -> list[Job]:
+        preset, variant, threads = self.preset, self.variant, self.threads
+        loaded = catalogue.load(task, preset, variant, threads) if isinstance(task, str) else task
+        network = isinstance(loaded, NetworkTask)
+        shared = {"preset": preset, "variant": variant} | ({"threads": threads} if network else {"level": LEVELS[-1]})
+        limit = LIMIT if self.limit is None and not network else self.limit
         jobs = []
         for name in METHODS if methods is None else methods:
             method = METHODS[name] if isinstance(name, str) else name
-            reason = unusable(method, loaded)
+            reason = method.unusable(loaded)
             if reason:
                 if methods is not None or method.missing():
                     print(f"{method.name} is left out on {loaded.name}: {reason}", flush=True)
                 continue
             own = settings_of(method.name, loaded.name)
-            settings = {
-                "preset": self.preset,
-                "variant": self.variant,
-                "level": LEVELS[-1],
-                "limit": self.limit,
-                "evaluations": loaded.evaluations,
-                "sigma": loaded.sigma,
-                "method": own,
-            }
-            jobs += [
-                Job(
-                    task,
-                    name,
-                    run,
-                    self.folder,
-                    self.preset,
-                    self.variant,
-                    self.limit,
-                    settings,
-                    own,
-                    loaded.evaluations,
-                )
-                for run in self.runs
-            ]
+            budget = {"limit": limit, "evaluations": loaded.evaluations, "sigma": loaded.sigma}
+            settings = shared | budget | {"method": own}
+            runs = self.network_runs or self.runs if network else self.runs
+            fixed = self.folder, preset, variant, limit, settings, own, loaded.evaluations, threads
+            jobs += [Job(task, name, run, *fixed) for run in runs]
         return jobs
 
     def run(self, jobs: Sequence[Job]) -> list[Outcome]:
@@ -123,14 +118,17 @@ class _Progress:
         self._first: dict[tuple[str, str, int], float | None] = {}
         self._interval, self._drawn = 0.1 if sys.stderr.isatty() else 30.0, 0.0
 
-    def __call__(self, job: Job, message: Record | Outcome | Trouble) -> None:
+    def __call__(self, job: Job, message: Message) -> None:
         key = job.task_name, job.method_name, job.run
-        if isinstance(message, Record):
+        name = " ".join(map(str, key))
+        if isinstance(message, Preparation):
+            self._bar.set_postfix_str(f"{name}: {message.done} of {message.total} images rendered", refresh=False)
+        elif isinstance(message, Record):
             self._running[key] = min(message.evaluations / job.budget, 1.0)
             first = self._first.setdefault(key, message.image_error)
             if first and message.image_error is not None:
                 error = 100 * message.image_error / first
-                self._bar.set_postfix_str(f"{' '.join(map(str, key))}: error {error:.3g} %", refresh=False)
+                self._bar.set_postfix_str(f"{name}: error {error:.3g} %", refresh=False)
         else:
             self._ended += 1
             self._running.pop(key, None)
@@ -153,9 +151,3 @@ def ordered(jobs: Iterable[Job]) -> list[Job]:
         return position.setdefault(job.task_name, len(position)), method.another_scene, job.run
 
     return sorted(jobs, key=key)
-
-
-def unusable(method: Method, task: Task) -> str | None:
-    """Return why a method cannot be run on a task, None if it can."""
-    missing = method.missing()
-    return f"needs pip install {' '.join(missing)}" if missing else method.applies(task)

@@ -19,9 +19,10 @@ import torch
 from experiments.methods import METHODS, Method
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
+from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
-from experiments.runs.records import Files, Outcome, Record, write_outcome
-from experiments.runs.trial import attempt
+from experiments.runs.attempt import attempt
+from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _PROGRESS = 0.2
@@ -34,19 +35,21 @@ _OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 class Job:
     """One run of a method on a task; both by name, or as objects that can be pickled."""
 
-    task: str | Task
+    task: str | Task | NetworkTask
     method: str | Method
     run: int
     folder: Path
     preset: Preset
     variant: str
-    limit: float
+    limit: float | None
     settings: dict[str, Any]
     """Written to the outcome."""
     method_settings: Any
     """Given to the method."""
     budget: int
     """Evaluations of the task."""
+    threads: int | None = None
+    """That render the images of a network task; all cores if None."""
 
     @property
     def task_name(self) -> str:
@@ -68,11 +71,11 @@ class Trouble:
     reason: str
 
 
-Message = Record | Outcome | Trouble
+Message = Preparation | Record | Outcome | Trouble
 
 
 def run_jobs(jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Message]]:
-    """Run jobs in `count` processes; yield records on the way and for each job an outcome or trouble at its end."""
+    """Run jobs in `count` processes; yield their progress, and for each job an outcome or trouble at its end."""
     waiting = deque(jobs)
     workers: list[_Worker] = []
     try:
@@ -127,7 +130,7 @@ class _Worker:
             self._started = True
             return
         job = self.job
-        if not isinstance(message, Record):
+        if isinstance(message, Outcome | Trouble):
             self.job = None
         yield job, message
 
@@ -168,34 +171,35 @@ def _follow_parent() -> None:
 def _execute(job: Job, connection: Connection) -> Message:
     last = 0.0
 
-    def watch(record: Record) -> None:
+    def watch(progress: Preparation | Record) -> None:
         nonlocal last
         now = time.monotonic()
         if now - last > _PROGRESS:
-            connection.send(record)
+            connection.send(progress)
             last = now
 
     try:
-        task = _load(job.task, job.preset, job.variant) if isinstance(job.task, str) else job.task
+        task = _load(job.task, job.preset, job.variant, job.threads) if isinstance(job.task, str) else job.task
         method = METHODS[job.method] if isinstance(job.method, str) else job.method
         method.load()
         return attempt(
             task,
             method.name,
             job.run,
-            lambda trial: method.solve(trial, job.method_settings),
+            lambda trial: method(trial, job.method_settings),
             job.folder,
             limit=job.limit,
             settings=job.settings,
             watch=watch,
+            preparing=watch,
         )
     except Exception as error:
         return Trouble(f"{type(error).__name__}: {error}")
 
 
 @lru_cache(maxsize=1)  # a scene that stays loaded slows down the next
-def _load(name: str, preset: Preset, variant: str) -> Task:
-    return catalogue.load(name, preset, variant)
+def _load(name: str, preset: Preset, variant: str, threads: int | None) -> Task | NetworkTask:
+    return catalogue.load(name, preset, variant, threads)
 
 
 @contextlib.contextmanager

@@ -2,20 +2,21 @@
 
 from experiments.methods import (
     analytic,
+    block_gauss_newton,
     derivative_free,
-    gauss_newton,
     meshes,
     mitsuba,
+    ours,
     paper,
+    pooled,
     quasi_newton,
-    trust_region,
 )
 from experiments.methods.method import Method
 
 METHODS: dict[str, Method] = {
     method.name: method
     for family in (
-        *(paper, trust_region, gauss_newton, derivative_free, quasi_newton),
+        *(paper, ours, block_gauss_newton, pooled, derivative_free, quasi_newton),
         *(analytic, meshes, mitsuba),
     )
     for method in family.METHODS

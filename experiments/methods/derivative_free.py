@@ -154,5 +154,7 @@ METHODS = (
         ("cma",),
     ),
     Method("cobyqa", "COBYQA (SciPy), quadratic models", with_settings(cobyqa), _is_small, ("scipy",)),
-    Method("dfo_ls", "DFO-LS, Gauss-Newton on residuals", with_settings(dfo_ls), _has_residuals, ("DFO-LS",)),
+    Method(
+        "dfo_ls", "DFO-LS, Gauss-Newton on residuals", with_settings(dfo_ls), _has_residuals, ("DFO-LS",), uses="image"
+    ),
 )

@@ -2,11 +2,11 @@
 
 | method | perturbed | derivatives of | step |
 |---|---|---|---|
-| our_g_large_steps | vertices | the loss, with the white box (I + w L)^-1 before the black box | Adam |
-| our_g_levels | handles | the loss | Adam |
-| our_hvpa_levels | handles | the loss | Newton-CG |
-| our_g_local | handles | the losses of the handles | Adam |
-| our_h_local, **recommended** | handles | the losses of the handles | Newton, a Hessian per handle; then Adam |
+| large_steps_adam | vertices | the loss, with the white box (I + w L)^-1 before the black box | Adam |
+| levels_adam | handles | the loss | Adam |
+| levels_newton_cg | handles | the loss | Newton-CG |
+| handles_adam | handles | the losses of the handles | Adam |
+| handles_newton, **recommended** | handles | the losses of the handles | Newton, a Hessian per handle; then Adam |
 
 *Handles* are the vertices of a coarser mesh, whose displacements subdivision makes smooth: first few, then more. *The
 loss of a handle* is that of the pixels that it can change, a box in every view around the vertices it moves: this takes
@@ -254,19 +254,16 @@ def _is_mesh(task: Task) -> str | None:
 
 
 def _method(name: str, title: str, solve: Callable[..., None], **fixed: Any) -> Method:
-    return Method(name, title, with_settings(solve, **fixed), _is_mesh, ("scipy",))
+    uses = "image, cameras, triangles" if fixed.get("credit") == "local" else "loss, triangles"
+    return Method(name, title, with_settings(solve, **fixed), _is_mesh, ("scipy",), uses=uses)
 
 
 METHODS = (
     _method(
-        "our_h_local",
-        "ours for meshes: Newton, then Adam, a loss per handle",
-        handles,
-        credit="local",
-        newton=2,
+        "handles_newton", "ours for meshes: Newton, then Adam, a loss per handle", handles, credit="local", newton=2
     ),
-    _method("our_g_local", "Adam, a loss per handle of a mesh", handles, credit="local"),
-    _method("our_g_levels", "Adam, handles of a mesh from coarse to fine", handles, credit="all"),
-    _method("our_hvpa_levels", "Newton-CG, handles of a mesh from coarse to fine", newton_cg),
-    _method("our_g_large_steps", "Adam behind the inverse Laplacian of a mesh", large_steps),
+    _method("handles_adam", "Adam, a loss per handle of a mesh", handles, credit="local"),
+    _method("levels_adam", "Adam, handles of a mesh from coarse to fine", handles, credit="all"),
+    _method("levels_newton_cg", "Newton-CG, handles of a mesh from coarse to fine", newton_cg),
+    _method("large_steps_adam", "Adam behind the inverse Laplacian of a mesh", large_steps),
 )

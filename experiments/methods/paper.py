@@ -11,7 +11,8 @@
 S antithetic pairs per sample set; evaluations are those of one gradient, or of one move of a line search. The line
 search is `zh.optim.NonlinearCG`. Sigma falls linearly from start to end in `steps` steps and stays there. The radius of
 the trust region is in units of the parameters for our_h, and in units of sigma for our_hvp and our_hvpa, as in the
-source. Settings: `experiments.methods.settings`.
+source. Settings: `experiments.methods.settings`. The same derivatives on network tasks:
+`experiments.methods.paper_networks`.
 
 What differs from the source: our_h and our_hvpa subtract f(x) from every value, for the one evaluation more, without
 which a Hessian drowns in the noise of a constant; the optimizer's own differences are in its docstring.
@@ -24,8 +25,11 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.methods import paper_networks
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method, everywhere
+from experiments.methods.paper_networks import has_curvature, is_single
+from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
@@ -147,33 +151,40 @@ def hessians_affordable(task: Task) -> str | None:
 def _method(
     name: str,
     title: str,
-    solve: Callable[..., None],
+    order: int,
     applies: Callable[[Task], str | None] = everywhere,
+    trains: Callable[[NetworkTask], str | None] = everywhere,
     **fixed: str,
 ) -> Method:
-    return Method(name, title, with_settings(solve, **fixed), applies)
+    """A method of either kind of task, with the same derivatives in both."""
+    solve = with_settings((first_order, second_order)[order - 1], **fixed)
+    train = with_settings((paper_networks.first_order, paper_networks.second_order)[order - 1], **fixed)
+    return Method(name, title, solve, applies, train=train, trains=trains)
 
 
 METHODS = (
-    _method("fr22", "Adam on the gradient of Fischer and Ritschel (2023)", first_order, proposal="fr22"),
-    _method("our_g", "Adam on the smoothed gradient", first_order, proposal="aggregate"),
+    _method("fr22", "Adam on the gradient of Fischer and Ritschel (2023)", 1, proposal="fr22"),
+    _method("our_g", "Adam on the smoothed gradient", 1, proposal="aggregate"),
     _method(
         "our_h",
         "conjugate gradients, full Hessian with a sample set per element",
-        second_order,
+        2,
         hessians_affordable,
+        has_curvature,
         derivatives="optimal",
     ),
     _method(
         "our_hvp",
         "conjugate gradients, Hessian-vector products by finite differences",
-        second_order,
+        2,
+        trains=is_single,
         derivatives="differences",
     ),
     _method(
         "our_hvpa",
         "conjugate gradients, Hessian-vector products from shared samples",
-        second_order,
+        2,
+        trains=has_curvature,
         derivatives="aggregate",
     ),
 )

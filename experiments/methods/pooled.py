@@ -20,21 +20,17 @@ on the condition of J.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from experiments.methods.image_model import ImageModel
-from experiments.runs.recorder import Recorder
-
-if TYPE_CHECKING:
-    from experiments.problems.training_task import TrainingTask
-
-ANNEALED = 0.9
-"""Part of the steps in which sigma and the learning rate go down."""
+from experiments.methods.method import Method
+from experiments.methods.paper_networks import ANNEALED
+from experiments.runs.network_trial import NetworkTrial
 
 
 @dataclass(frozen=True)
@@ -61,19 +57,16 @@ class Pooled:
     """Rows of the log, about."""
 
 
-def train_pooled(
-    task: "TrainingTask", encoder: nn.Module, run: int, recorder: Recorder, report: Callable[[float, float, bool], None]
-) -> None:
-    """Train until the evaluations of the preset are used; `report` gets sigma and the loss of the model, now and then.
+def pooled(trial: NetworkTrial, given: Mapping[str, Any]) -> None:
+    """Train until the evaluations are used, with the fields of `Pooled` as settings.
 
-    It is also told whether to measure errors that take renders, every tenth time and at the end.
-
-    Renders are made around the predictions of training images, at distances of sigma.
+    Renders are made around the predictions of training images, at distances of sigma. Predictions are not rendered, so
+    the image error is measured on the held-out images, in every tenth row and in the last one.
     """
-    settings, (images, _) = task.pooled, task.training
+    settings, task, encoder, images = Pooled(**given), trial.task, trial.encoder, trial.images
     optimizer = torch.optim.Adam(encoder.parameters(), lr=settings.rate[0])
-    model = ImageModel(images.flatten(1), settings.lengths, settings.rank, run)
-    budget, fitted, position = task.preset.evaluations, 0, 0
+    model = ImageModel(images.flatten(1), settings.lengths, settings.rank, trial.run)
+    budget, fitted, position = task.evaluations, 0, 0
     for step in range(settings.steps):
         share = min(step / (ANNEALED * settings.steps), 1.0)
         sigma = task.sigma[0] * (task.sigma[1] / task.sigma[0]) ** share
@@ -82,18 +75,18 @@ def train_pooled(
         position += settings.batch
         wanted = min(budget, max(math.ceil(budget * (step + 1) / settings.steps), settings.first))
         if wanted > model.evaluations:
-            points = _around(task, encoder, images[_cycle(chosen, wanted - model.evaluations, len(images))], sigma)
-            model.add(points, recorder.evaluate(task.image, points))
+            points = _around(trial, images[_cycle(chosen, wanted - model.evaluations, len(images))], sigma)
+            model.add(points, trial.image(points))
         if not fitted or model.evaluations >= settings.growth * fitted or model.evaluations == budget > fitted:
             fitted = model.evaluations
             model.fit()
-        value, loss = _smoothed(task, model, encoder(images[chosen]), chosen, sigma)
+        value, loss = _smoothed(trial, settings, model, encoder(images[chosen]), chosen, sigma)
         optimizer.zero_grad()
         value.backward()
         optimizer.step()
         every, last = max(1, settings.steps // settings.rows), step == settings.steps - 1
         if step % every == 0 or last:
-            report(sigma, loss, last or step % (10 * every) == 0)
+            trial.report(sigma=sigma, loss=loss, measured=last or step % (10 * every) == 0)
 
 
 def _cycle(chosen: Tensor, count: int, images: int) -> Tensor:
@@ -101,26 +94,28 @@ def _cycle(chosen: Tensor, count: int, images: int) -> Tensor:
     return (chosen[0] + torch.arange(count)) % images
 
 
-def _around(task: "TrainingTask", encoder: nn.Module, images: Tensor, sigma: float) -> Tensor:
+def _around(trial: NetworkTrial, images: Tensor, sigma: float) -> Tensor:
     """Draw a point [B, n] around the prediction for each image."""
     with torch.no_grad():
-        x = encoder(images)
-        return _inside(task, x + sigma * torch.randn_like(x))
+        x = trial.encoder(images)
+        return _inside(trial, x + sigma * torch.randn_like(x))
 
 
-def _inside(task: "TrainingTask", x: Tensor) -> Tensor:
-    return x if task.bounds is None else x.clamp(*(torch.tensor(bound) for bound in task.bounds))
+def _inside(trial: NetworkTrial, x: Tensor) -> Tensor:
+    bounds = trial.task.bounds
+    return x if bounds is None else x.clamp(*(torch.tensor(bound) for bound in bounds))
 
 
-def _smoothed(task: "TrainingTask", model: ImageModel, x: Tensor, chosen: Tensor, sigma: float) -> tuple[Tensor, float]:
+def _smoothed(
+    trial: NetworkTrial, settings: Pooled, model: ImageModel, x: Tensor, chosen: Tensor, sigma: float
+) -> tuple[Tensor, float]:
     """Return the mean of F over the predictions x [B, n] for training images `chosen` [B], and the mean of f."""
-    settings = task.pooled
     if settings.lengths is None:
         loss = (model(x.detach()) - model.references[chosen]).square().sum(1).mean()
         return (x - model.solutions[chosen]).square().mean(), float(loss)
     with torch.no_grad():
         points = (x[:, None] + sigma * torch.randn(len(x), settings.draws, x.shape[1])).flatten(0, 1)
-        losses = model.distances(model(_inside(task, points)), chosen)
+        losses = model.distances(model(_inside(trial, points)), chosen)
     return local_entropy(x, points, losses, sigma, settings.temperature)
 
 
@@ -140,3 +135,13 @@ def local_entropy(x: Tensor, points: Tensor, losses: Tensor, sigma: float, tempe
     tempered = logs - losses / (temperature * smoothed).clamp_min(torch.finfo(losses.dtype).tiny)
     entropy = torch.logsumexp(tempered, 1) - torch.logsumexp(logs, 1)
     return -(sigma**2) * entropy.mean(), float(smoothed.mean())
+
+
+METHODS = (
+    Method(
+        "pooled",
+        "Adam on the local entropy, from a model of the image fitted to all renders",
+        train=pooled,
+        uses="image",
+    ),
+)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal
 
+from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 
 Preset = Literal["fast", "paper"]
@@ -19,29 +20,38 @@ FITTING = {
 RENDERED = {name: f"experiments.problems.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror")}
 """Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
 FITTING |= RENDERED
-TRAINING = {name: f"experiments.problems.tasks.{name}" for name in ("cnn", "cnn_wide", "cnn5", "cnn_texture")}
-"""Tasks whose unknowns are the weights of a network before Mitsuba: modules with `Task` and `PRESETS`."""
+NETWORKS = {name: f"experiments.problems.tasks.{name}" for name in ("cnn", "cnn_wide", "cnn5", "cnn_texture")}
+"""Tasks whose unknowns are the weights of a network before Mitsuba: `task(preset, variant, threads) -> NetworkTask`."""
+TASKS = FITTING | NETWORKS
 
 
-def load(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:
-    """Return a fitting task, with a Mitsuba variant if it is rendered; ImportError says what to install."""
-    more = (variant,) if name in RENDERED else ()
+def load(name: str, preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> Task | NetworkTask:
+    """Return a task; ImportError says what to install.
+
+    Args:
+        name: one of `TASKS`.
+        preset: "fast" takes minutes, "paper" has the sizes of the source.
+        variant: of Mitsuba, where it renders.
+        threads: that render the images of a network task, all cores if None. A fitting task has one.
+    """
+    more: tuple[Any, ...] = (variant,) if name in RENDERED else (variant, threads) if name in NETWORKS else ()
     with _packages_of(name):
-        task: Task = importlib.import_module(FITTING[name]).task(preset, *more)
+        task: Task | NetworkTask = importlib.import_module(TASKS[name]).task(preset, *more)
     return task
 
 
-def training(name: str) -> Any:
-    """Return the module of a training task; ImportError says what to install."""
-    with _packages_of(name):
-        return importlib.import_module(TRAINING[name])
+def fitting(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:
+    """Return a fitting task, as `load` does."""
+    task = load(name, preset, variant)
+    assert isinstance(task, Task), f"name must be one of {', '.join(FITTING)}, got {name}"
+    return task
 
 
 @contextmanager
 def _packages_of(name: str) -> Iterator[None]:
     """Say what to install for a task; Mitsuba is looked for here, since tasks import it when they first render."""
     try:
-        if (name in RENDERED or name in TRAINING) and importlib.util.find_spec("mitsuba") is None:
+        if (name in RENDERED or name in NETWORKS) and importlib.util.find_spec("mitsuba") is None:
             raise ModuleNotFoundError(name="mitsuba")
         yield
     except ImportError as error:

@@ -103,7 +103,7 @@ _kept = lru_cache(maxsize=1)(_load)  # scenes that stay loaded slow down the nex
 
 @lru_cache(maxsize=1)
 def _base(name: str, preset: Preset, variant: str) -> Task:
-    return catalogue.load(name, preset, variant)
+    return catalogue.fitting(name, preset, variant)
 
 
 def varied(task: Task, change: Change) -> Task:

@@ -226,7 +226,9 @@ def _origin(table: pd.DataFrame, note: str = "") -> str:
     if "runs" in table:
         counts = sorted({int(one) for one in table["runs"]})
         starts = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        parts.append(f"{starts} starts, from number {_only(table, 'first_run')} on, {_only(table, 'limit')} s at most.")
+        limit = _only(table, "limit")
+        end = f", {limit} s at most." if limit else "."
+        parts.append(f"{starts} starts, from number {_only(table, 'first_run')} on{end}")
     commits = ", ".join(f"`{one[:9]}`" for one in dict.fromkeys(table["commit"]))
     parts.append(f"Commit {commits}, {_only(table, 'date')}, {_only(table, 'machine')}.")
     parts += [f"`{one}`" for one in dict.fromkeys("; ".join(dict.fromkeys(table["command"])).split("; "))]

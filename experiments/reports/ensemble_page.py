@@ -78,7 +78,7 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
 
 def _load(name: str, preset: Any) -> Task | None:
     try:
-        return catalogue.load(name, preset) if name in FITTING else None
+        return catalogue.fitting(name, preset) if name in FITTING else None
     except ImportError:
         return None
 

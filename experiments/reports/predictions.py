@@ -6,24 +6,24 @@ from pathlib import Path
 import matplotlib as mpl
 import torch
 
-from experiments.methods.training import Result
-from experiments.problems.training_task import TrainingTask
+from experiments.problems.network_task import NetworkTask
+from experiments.reports.trained_network import Result
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 
 
-def draw(task: TrainingTask, results: Sequence[Result], path: Path, count: int = 4) -> None:
+def draw(task: NetworkTask, results: Sequence[Result], path: Path, count: int = 4) -> None:
     """Show held-out inputs, the render of the untrained prediction and of that of every trained encoder."""
     images, parameters = task.held_out
     images, parameters = images[:count], parameters[:count]
     columns = [("input", images, parameters)]
     with torch.no_grad():
         before = results[0].start(images)
-        columns.append(("before training", task.render(before), before))
+        columns.append(("before training", task.image(before), before))
         for result in results:
             after = result.encoder(images)
-            columns.append((f"{result.method}\n{result.seconds:.0f} s", task.render(after), after))
+            columns.append((f"{result.method}\n{result.seconds:.0f} s", task.image(after), after))
     pictures = [task.pictures(renders, x) for _, renders, x in columns]
     rows, wide = len(images), pictures[0].shape[2] / pictures[0].shape[1]
     figure, axes = plt.subplots(

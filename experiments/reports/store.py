@@ -1,6 +1,6 @@
 """`python -m experiments store DIR --name NAME`: the medians of a folder of results as a table that documents quote."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,13 +9,11 @@ import tyro
 
 from experiments.ensembles.provenance import read_command
 from experiments.methods import METHODS
-from experiments.problems.catalogue import TRAINING, chosen
+from experiments.problems.catalogue import NETWORKS, chosen
 from experiments.reports import stored
 from experiments.reports.medians import medians, reached
-from experiments.reports.results import METRICS, Results, Run, load
-
-REDUCTION = 100.0
-"""A network has got there if its held-out parameter error is divided by this at the end."""
+from experiments.reports.networks import HELD_OUT, per_method
+from experiments.reports.results import Results, Run, load
 
 
 def store(
@@ -37,7 +35,7 @@ def store(
     there = load(folder)
     wanted = chosen("tasks", tasks, list(there.runs)) if tasks else list(there.runs)
     results = load(folder, wanted)
-    networks = [task for task in wanted if task in TRAINING]
+    networks = [task for task in wanted if task in NETWORKS]
     if networks and len(networks) < len(wanted):
         raise SystemExit(f"tasks must all be fitted or all train a network, got {', '.join(wanted)}")
     if count := results.unfinished.total():
@@ -71,20 +69,23 @@ def fitted(results: Results) -> pd.DataFrame:
 
 
 def trained(results: Results) -> pd.DataFrame:
-    """Return a row per task and method: how far errors of held-out images went down, at the median and at worst."""
+    """Return a row per task and method: how far errors of held-out images went down, at the median and at worst.
+
+    A run that failed counts in `runs` alone.
+    """
     rows = []
     for task, methods in results.runs.items():
+        path = results.folder / task / HELD_OUT
+        known = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["method", "run"])
         for method, runs in methods.items():
-            ends = pd.DataFrame([dict(_factors(run)) for run in runs], columns=METRICS, dtype=float)
-            used = pd.DataFrame([(run.outcome.evaluations, run.outcome.seconds) for run in runs])
-            row = _about(task, method, runs) | {"renders": used[0].median(), "seconds": used[1].median()}
-            for metric in METRICS:
-                row[f"{metric}_divided"] = ends[metric].median()
-                row[f"{metric}_divided_worst"] = ends[metric].min()
-            row |= {"runs": len(runs), "reached": int((ends["parameter"] >= REDUCTION).sum())}
-            rows.append(row | {"share": row["reached"] / row["runs"]})
-    found = with_intervals(pd.DataFrame(rows))
-    return found[[*(name for name in found if name not in _SHARES), *_SHARES]]
+            ended = [run.outcome.run for run in runs if run.outcome.status != "failed"]
+            mine = known[(known["method"] == method) & known["run"].isin(ended)]
+            if len(mine) < len(ended) or not ended:
+                raise SystemExit(f"{path} has {len(mine)} of {len(ended)} runs of {method}: call the same `run` again")
+            (found,) = per_method(mine).to_dict("records")
+            rows.append(_about(task, method, runs) | found | {"runs": len(runs), "share": found["reached"] / len(runs)})
+    table = with_intervals(pd.DataFrame(rows)).drop(columns=["parameter_before", "parameter_after"])
+    return table[[*(name for name in table if name not in _SHARES), *_SHARES]]
 
 
 _SHARES = ["reached", "runs", "share", "share_low", "share_high"]
@@ -109,11 +110,3 @@ def _about(task: str, method: str, runs: Sequence[Run]) -> dict[str, Any]:
         "uses": known.uses if known else "",
         "first_run": min(run.outcome.run for run in runs),
     }
-
-
-def _factors(run: Run) -> Iterator[tuple[str, float]]:
-    """Yield by how much each error of a run was divided at its end: first error over the last that was measured."""
-    for metric in METRICS:
-        known = [error for error in run.error(metric) if error is not None]
-        if known:
-            yield metric, 1.0 / max(known[-1], 1e-300)

@@ -23,7 +23,7 @@ from experiments.reports.speed_ups import HEADERS, SpeedUp, speed_ups, with_rati
 from experiments.reports.tables import table as text_table
 from experiments.runs.trial import LEVELS
 
-REFERENCES = ("trust_region", "our_hvpa", "our_hvp", "our_h", "our_g")
+REFERENCES = ("gaussian_process", "descent", "our_hvpa", "our_hvp", "our_h", "our_g")
 """Ratios are to the first of these that a folder has runs of."""
 
 

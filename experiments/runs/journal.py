@@ -5,8 +5,8 @@ From the first batch on that a kill or a power cut has left in parts, the journa
 batch reaches the disk when the system writes it, within a minute: that much a power cut costs.
 """
 
-import fcntl
 import hashlib
+import importlib.util
 import json
 import zlib
 from collections.abc import Iterator
@@ -17,6 +17,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 from torch import Tensor
+
+_FCNTL = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None
+"""Locks of files; Windows has none, so that nothing keeps a second process out there."""
 
 
 class DivergedError(Exception):
@@ -45,7 +48,8 @@ class Journal:
         self._path = path
         self._file: BinaryIO = path.open("a+b")
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _FCNTL:
+                _FCNTL.flock(self._file, _FCNTL.LOCK_EX | _FCNTL.LOCK_NB)
         except OSError as error:
             self._file.close()
             raise BusyError(f"{path} is being written by another process") from error
@@ -75,6 +79,8 @@ class Journal:
         self._file.close()
 
     def delete(self) -> None:
+        if not _FCNTL:  # without a lock to keep, and where an open file cannot be deleted
+            self.close()
         self._path.unlink(missing_ok=True)
         self.close()
 

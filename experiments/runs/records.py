@@ -29,6 +29,17 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Preparation:
+    """Progress of what comes before a run: so many of the images of its task are rendered."""
+
+    task: str
+    method: str
+    run: int
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
 class Outcome:
     """How a run ended: both errors small enough (finished), the method or its budget at an end (stopped), or worse."""
 
@@ -42,7 +53,7 @@ class Outcome:
     evaluations: int
     iterations: int
     x: list[float]
-    """What the method reported last; empty for the weights of a network."""
+    """What the method reported last; empty for a network, see `Files.weights`."""
     settings: dict[str, Any] = field(default_factory=dict)
     traceback: str | None = None
 
@@ -67,6 +78,11 @@ class Files:
     @property
     def outcome(self) -> Path:
         return self.folder / f"{self.run}.json"
+
+    @property
+    def weights(self) -> Path:
+        """Of a network that was trained."""
+        return self.folder / f"{self.run}.pt"
 
     @property
     def journal(self) -> Path:

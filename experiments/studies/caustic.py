@@ -29,7 +29,7 @@ DEPTH = 4
 def check_caustic(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
     /,
-    method: str = "gauss_newton",
+    method: str = "block_gauss_newton",
     run: int = 0,
     preset: Literal["fast", "paper"] = "fast",
     spp: int = 1000,

@@ -19,12 +19,11 @@ import tyro
 from torch import Tensor
 from tqdm import tqdm
 
-from experiments.ensembles.ensemble import unusable
 from experiments.ensembles.provenance import machine
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, RENDERED, TRAINING, Preset, chosen
+from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, Preset, chosen
 from experiments.problems.task import Task
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
@@ -32,11 +31,16 @@ from experiments.reports.html_page import html_page, html_table, html_text
 from experiments.reports.progress import REFRESH, progress
 from experiments.reports.similarity import described, measures
 from experiments.reports.tables import table
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
-from experiments.runs.trial import LIMIT, Trial, attempt
+from experiments.runs.trial import LIMIT, Trial
 
-METHOD = "trust_region"
-OWN = {**dict.fromkeys(("meshfit", "meshfit_color"), "our_h_local"), "caustic": "gauss_newton"}
+METHOD = "gaussian_process"
+OWN = {
+    **dict.fromkeys(("quad", "box10", "brdf", "texture"), "descent"),
+    **dict.fromkeys(("meshfit", "meshfit_color"), "handles_newton"),
+    "caustic": "block_gauss_newton",
+}
 """Tasks for which another method is recommended."""
 OTHER = "cma_es_bounded"
 """The method that figure 12 compares with, as the source does."""
@@ -102,12 +106,12 @@ def _traces(
     for name in bar:
         bar.set_description(name)
         try:
-            task = catalogue.load(name, preset, variant)
+            task = catalogue.fitting(name, preset, variant)
         except ImportError as error:
             bar.write(str(error))
             continue
         solver = METHODS[method or OWN.get(name, METHOD)]
-        seen, reason = look(task, task.start(run)), unusable(solver, task)
+        seen, reason = look(task, task.start(run)), solver.unusable(task)
         if seen is None or reason:
             bar.write(f"{name} is left out: {reason or 'it has no picture'}")
             continue
@@ -128,7 +132,7 @@ def trace(
 
     def solve(trial: Trial) -> None:
         trials.append(trial)
-        method.solve(trial, settings(method.name, task.name))
+        method(trial, settings(method.name, task.name))
 
     noted = dataclasses.replace(task, truth=dataclasses.replace(task.truth, image_error=image_error))
     outcome = attempt(noted, method.name, run, solve, limit=limit, watch=watch)
@@ -158,7 +162,7 @@ def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> l
         if found.task.name == "caustic":
             other = METHODS[OTHER]
             more = None
-            if other.name != found.method and not unusable(other, found.task):
+            if other.name != found.method and not other.unusable(found.task):
                 with tqdm(desc=f"caustic {OTHER}", bar_format="{desc}: [{elapsed}{postfix}]") as bar:
                     more = trace(found.task, other, found.outcome.run, limit, _watch(bar))
             files.append(out / "figure12.png")
@@ -186,7 +190,7 @@ def _animations(shown: Sequence[Shown], out: Path, count: int) -> list[Path]:
 def _predictions(folder: Path, out: Path) -> list[Path]:
     """Copy what networks predicted, as `run` has drawn it."""
     files = []
-    for name in TRAINING:
+    for name in NETWORKS:
         path = folder / name / "predictions.png"
         if path.exists():
             files.append(Path(shutil.copyfile(path, out / f"{name}.png")))
@@ -223,7 +227,7 @@ _CAPTIONS = {
     "figure12": "CAUSTIC: what the slab throws on the screen, and its surface (blue is high).",
     "figure13": "MIRROR: the bunny is seen through two mirrors only; the red line is the way from the eye to it.",
     "rendered": "The rendered tasks, beside their targets.",
-    **dict.fromkeys(TRAINING, "Held-out inputs, and renders of the predictions before and after training."),
+    **dict.fromkeys(NETWORKS, "Held-out inputs, and renders of the predictions before and after training."),
 }
 
 

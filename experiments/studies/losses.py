@@ -23,15 +23,17 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.methods.ours import search
 from experiments.methods.settings import settings
-from experiments.methods.trust_region import trust_region
-from experiments.problems.catalogue import FITTING, chosen, load
+from experiments.problems.catalogue import FITTING, chosen, fitting
 from experiments.reports.medians import medians, objects, reached
 from experiments.reports.progress import progress
 from experiments.reports.results import METRICS, Run
 from experiments.reports.tables import table
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
-from experiments.runs.trial import Finished, Trial, attempt, reduced
+from experiments.runs.run import Finished
+from experiments.runs.trial import Trial, reduced
 from experiments.studies.loss_objectives import FORMS, Moments, Pictures, normal, pictures_of
 from experiments.studies.loss_sweeps import (
     POSITIONS,
@@ -122,7 +124,7 @@ def losses(
             f"runs must be at least 2, samples at least 1, truth and sweep at least {least}, "
             f"got {runs}, {samples}, {truth} and {sweep}"
         )
-    shown = {name: pictures_of(load(name)) for name in chosen("tasks", tasks, list(FITTING))}
+    shown = {name: pictures_of(fitting(name)) for name in chosen("tasks", tasks, list(FITTING))}
     swept = [one for name, one in shown.items() if name in SOLUTIONS]
     curves = progress([(one, scale * one.task.sigma) for one in swept for scale in SCALES], "curves")
     report = LossReport(
@@ -161,7 +163,7 @@ def text(report: LossReport) -> str:
         for a, b in _pairs(report.fits)
     ]
     headers = ["task", "loss", "error", "inside", "share", "image", "share"]
-    title = f"trust_region: median evaluations until an error is reduced by {100 * LEVEL:g} %, share of the runs"
+    title = f"TrustRegion: median evaluations until an error is reduced by {100 * LEVEL:g} %, share of the runs"
     return "\n".join([*parts, f"\n{title}", table(headers, rows)]).lstrip()
 
 
@@ -217,7 +219,7 @@ def _fits(one: Pictures, runs: int, evaluations: int, limit: float) -> Iterator[
 
 
 def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> Run:
-    sigma = settings("trust_region", one.task.name).get("sigma")
+    sigma = settings("descent", one.task.name).get("sigma")
     rows: list[Record] = []
 
     def watch(row: Record) -> None:
@@ -227,7 +229,7 @@ def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit:
             raise Finished(f"both errors reduced by {100 * LEVEL:g} %", "finished")
 
     def solve(trial: Trial) -> None:
-        trust_region(trial, sigma=sigma, output=form == "image")
+        search(trial, sigma=sigma, output=form == "image")
 
     task = one.with_loss(loss, evaluations)
     outcome = attempt(task, f"{loss}, {form}", run, solve, limit=limit, watch=watch)

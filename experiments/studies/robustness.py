@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import pandas as pd
 import tyro
 
-from experiments.ensembles.ensemble import Ensemble, ordered, unusable
+from experiments.ensembles.ensemble import Ensemble, ordered
 from experiments.ensembles.provenance import register
 from experiments.ensembles.workers import Job
 from experiments.methods import METHODS
@@ -105,7 +105,7 @@ class Row:
 def robustness(
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK...]")] = ("mug", "shad"),
     /,
-    methods: str = "trust_region,our_hvpa",
+    methods: str = "gaussian_process,our_hvpa",
     over: tuple[str, ...] = tuple(SWEEPS),
     runs: int = 5,
     preset: Preset = "fast",
@@ -210,7 +210,7 @@ def _jobs(
 ) -> list[Job]:
     """Return a job per run; ValueError says why this is not possible."""
     task = load_varied(name, ensemble.preset, ensemble.variant, evaluations, change)
-    reason = unusable(METHODS[method], task)
+    reason = METHODS[method].unusable(task)
     if reason:
         raise ValueError(reason)
     if task.bounds:

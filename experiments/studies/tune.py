@@ -14,7 +14,6 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from experiments.ensembles.ensemble import unusable
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings, space
 from experiments.problems import catalogue
@@ -23,8 +22,8 @@ from experiments.problems.task import Task
 from experiments.reports.progress import progress
 from experiments.reports.results import Run
 from experiments.reports.tables import table
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
-from experiments.runs.trial import attempt
 
 TUNING = 1000
 """Runs from this number upward are for tuning; tables report those below."""
@@ -96,11 +95,11 @@ def tune(
         raise SystemExit(f"level must be between 0 and 1, got {level}")
     torch.set_num_threads(1)
     (name,) = catalogue.chosen("task", [task], list(catalogue.FITTING))
-    loaded = catalogue.load(name, preset)
+    loaded = catalogue.fitting(name, preset)
     if evaluations is not None:
         loaded = dataclasses.replace(loaded, evaluations=evaluations)
     (chosen,) = catalogue.chosen("method", [method], list(METHODS))
-    reason = unusable(METHODS[chosen], loaded)
+    reason = METHODS[chosen].unusable(loaded)
     if reason:
         raise SystemExit(f"method must be one that can be run on {name}, got {chosen}: {reason}")
     current = settings(chosen, name)
@@ -153,7 +152,7 @@ def score(task: Task, method: Method, candidate: dict[str, Any], runs: range, le
     failures: list[str] = []
     for run in runs:
         rows: list[Record] = []
-        outcome = attempt(task, method.name, run, lambda trial: method.solve(trial, candidate), watch=rows.append)
+        outcome = attempt(task, method.name, run, lambda trial: method(trial, candidate), watch=rows.append)
         record = Run(outcome, rows).reached("image", level)
         reached.append(record.evaluations if record else None)
         if outcome.status == "failed":

@@ -5,47 +5,44 @@ the output is 4.5 + 18 sigmoid. The scene needs no more than direct light at a s
 preset has the source's film, samples and depth.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from experiments.methods.pooled import Pooled
+from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.scenes.mug import DEGREES, mug_scene
-from experiments.problems.training_task import Encoder, Preset, TrainingTask
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 ANGLES = (11.5, 15.5)
 """Range of the training and held-out angles, in units of 20 degrees."""
 OUTPUT = (4.5, 22.5)
 """Range of the predictions, in units of 20 degrees."""
+SIZES = {
+    "fast": Size(64, 8, 2, evaluations=4000, images=1024, held_out=32),
+    "paper": Size(256, 32, 6, evaluations=12000, images=4096, held_out=64, pools=(2, 4, 4)),
+}
 
 
-@dataclass(frozen=True)
-class CnnPreset(Preset):
-    """Size of the task, its network and scene."""
-
-    output: ClassVar[tuple[float, float]] = OUTPUT
-
-    def encoder(self) -> Encoder:
-        return Encoder(self.film, self.pools, self.output[:1], self.output[1:])
-
-    def scene(self, variant: str = "auto", threads: int | None = None) -> MitsubaScene:
-        film = (self.film, self.film)
-        return mug_scene(film=film, spp=self.spp, depth=self.depth, variant=variant, threads=threads)
-
-
-class CnnTask(TrainingTask):
+class Rotation(NetworkTask):
     """Rotation [K, 1] of the mug in units of 20 degrees."""
 
     name = "cnn"
+    title = "a network that predicts the rotation of a mug, from 80 degrees"
     n = 1
     sigma = (1.0, 0.1)
     measure = "rms error [degrees]"
-    pooled = Pooled(lengths=(0.5,), temperature=0.1, steps=1500, rank=64)
-    methods = ("fr22", "our_g", "our_h", "our_hvp", "our_hvpa", "pooled")
     angles: ClassVar[tuple[float, float]] = ANGLES
+    output: ClassVar[tuple[float, float]] = OUTPUT
+
+    def encoder(self) -> Encoder:
+        return Encoder(self.size, self.output[:1], self.output[1:])
+
+    def load(self) -> MitsubaScene:
+        film = (self.size.film, self.size.film)
+        return mug_scene(
+            film=film, spp=self.size.spp, depth=self.size.depth, variant=self.variant, threads=self.threads
+        )
 
     def parameters(self, count: int, generator: torch.Generator, *, held_out: bool) -> Tensor:
         return self.angles[0] + (self.angles[1] - self.angles[0]) * torch.rand(count, 1, generator=generator)
@@ -58,8 +55,5 @@ class CnnTask(TrainingTask):
         return f"{DEGREES * float(x[0]):.1f}°"
 
 
-PRESETS = {
-    "fast": CnnPreset(64, 8, 2, (2, 2, 2), evaluations=4000, images=1024, held_out=32),
-    "paper": CnnPreset(256, 32, 6, (2, 4, 4), evaluations=12000, images=4096, held_out=64),
-}
-Task = CnnTask
+def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+    return Rotation(SIZES[preset], variant, threads)

@@ -6,14 +6,14 @@ weights, as in the source. Positions are U(-2, 2) cm, rotations those of CNN, re
 """
 
 import math
-from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from experiments.methods.pooled import Pooled
+from experiments.problems.network_task import Encoder, NetworkTask
 from experiments.problems.scenes.mug import COLOR, DEGREES, POSE, mug_scene
-from experiments.problems.training_task import Encoder, Preset, TrainingTask
+from experiments.problems.tasks.cnn import SIZES
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 UNITS = (0.4, 1.0, 0.1, 0.1, 0.1)
@@ -24,28 +24,23 @@ OUTPUT = (-3.5, 4.5, 0.0, 0.0, 0.0), (3.5, 22.5, 1.0, 1.0, 1.0)
 """Range of the predictions, in the same."""
 
 
-@dataclass(frozen=True)
-class Cnn5Preset(Preset):
-    """Size of the task, its network and scene."""
-
-    def encoder(self) -> Encoder:
-        lower, upper = ([value / unit for value, unit in zip(side, UNITS, strict=True)] for side in OUTPUT)
-        return Encoder(self.film, self.pools, lower, upper)
-
-    def scene(self, variant: str = "auto", threads: int | None = None) -> MitsubaScene:
-        film = (self.film, self.film)
-        return mug_scene((POSE, COLOR), film, self.spp, self.depth, variant=variant, threads=threads)
-
-
-class Task(TrainingTask):
+class PoseAndColor(NetworkTask):
     """Position, rotation and colour [K, 5] of the mug, in `UNITS`."""
 
     name = "cnn5"
+    title = "a network that predicts position, rotation and colour of a mug"
     n = 5
     sigma = (1.0, 0.05)
     bounds = (-math.inf, -math.inf, 0.0, 0.0, 0.0), (math.inf, math.inf, 10.0, 10.0, 10.0)
     measure = "rms error [units]"
-    pooled = Pooled(lengths=(1.25, 0.6, 10.0, 10.0, 10.0), temperature=0.03)
+
+    def encoder(self) -> Encoder:
+        lower, upper = ([value / unit for value, unit in zip(side, UNITS, strict=True)] for side in OUTPUT)
+        return Encoder(self.size, lower, upper)
+
+    def load(self) -> MitsubaScene:
+        film, parameters = (self.size.film, self.size.film), (POSE, COLOR)
+        return mug_scene(parameters, film, self.size.spp, self.size.depth, variant=self.variant, threads=self.threads)
 
     def of_scene(self, x: Tensor) -> Tensor:
         return x * torch.tensor(UNITS, dtype=x.dtype)
@@ -63,7 +58,5 @@ class Task(TrainingTask):
         return f"{position:.2f} cm, {DEGREES * rotation:.0f}°"
 
 
-PRESETS = {
-    "fast": Cnn5Preset(64, 8, 2, (2, 2, 2), evaluations=4000, images=1024, held_out=32),
-    "paper": Cnn5Preset(256, 32, 6, (2, 4, 4), evaluations=12000, images=4096, held_out=64),
-}
+def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+    return PoseAndColor(SIZES[preset], variant, threads)

@@ -7,8 +7,8 @@ the sides the least, where they are seen at a slant.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,26 +16,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from experiments.methods.pooled import Pooled
+from experiments.problems.network_task import NetworkTask, Size
 from experiments.problems.scenes.meshes import to_srgb
 from experiments.problems.scenes.mug import LABEL, LABEL_SIDE, mug_scene
-from experiments.problems.training_task import Preset, TrainingTask
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 TRAINING = ("camera", "chelsea", "brick", "gravel", "coins", "moon", "rocket", "page")
 HELD_OUT = ("astronaut", "coffee")
-
-
-@dataclass(frozen=True)
-class TexturePreset(Preset):
-    """Size of the task, its network and scene."""
-
-    def encoder(self) -> "Decoder":
-        return Decoder(self.film)
-
-    def scene(self, variant: str = "auto", threads: int | None = None) -> MitsubaScene:
-        film = (self.film, self.film)
-        return mug_scene((LABEL,), film, self.spp, self.depth, label=True, variant=variant, threads=threads)
+SIZES = {
+    "fast": Size(96, 8, 2, evaluations=1100, images=1024, held_out=32),
+    "paper": Size(192, 32, 6, evaluations=1100, images=1024, held_out=64),
+}
 
 
 class Decoder(nn.Module):
@@ -60,16 +51,22 @@ class Decoder(nn.Module):
         return torch.sigmoid(self.show(self.down(features.mT).mT).flatten(1))
 
 
-class Task(TrainingTask):
+class Texture(NetworkTask):
     """Texture [K, 1024], row by row from below."""
 
     name = "cnn_texture"
+    title = "a network that emits the 32x32 texture on a mug"
     n = LABEL_SIDE**2
     sigma = (0.2, 0.02)
     bounds = (0.0,), (1.0,)
     measure = "PSNR of the texture [dB]"
-    pooled = Pooled(lengths=None, temperature=1.0, steps=900, rank=1100, rate=(3e-3, 2e-4), first=1100)
-    methods = ("fr22", "our_g", "pooled")
+
+    def encoder(self) -> nn.Module:
+        return Decoder(self.size.film)
+
+    def load(self) -> MitsubaScene:
+        size, film = self.size, (self.size.film, self.size.film)
+        return mug_scene((LABEL,), film, size.spp, size.depth, label=True, variant=self.variant, threads=self.threads)
 
     def parameters(self, count: int, generator: torch.Generator, *, held_out: bool) -> Tensor:
         return torch.stack([_crop(HELD_OUT if held_out else TRAINING, generator) for _ in range(count)])
@@ -112,7 +109,5 @@ def _picture(name: str) -> Tensor:
     return torch.from_numpy(color.rgb2gray(picture[..., :3]) if picture.ndim == 3 else picture).float()
 
 
-PRESETS = {
-    "fast": TexturePreset(96, 8, 2, (1, 1, 1), evaluations=1100, images=1024, held_out=32),
-    "paper": TexturePreset(192, 32, 6, (1, 1, 1), evaluations=1100, images=1024, held_out=64),
-}
+def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+    return Texture(SIZES[preset], variant, threads)

@@ -5,10 +5,10 @@ disappears on the other; in between, from 40 to 120 degrees, the image does not 
 3.5 + 18.5 sigmoid, the whole circle, so that a network can collapse into the plateau.
 """
 
-from dataclasses import dataclass
+from typing import Literal
 
-from experiments.methods.pooled import Pooled
-from experiments.problems.tasks.cnn import CnnPreset, CnnTask
+from experiments.problems.network_task import NetworkTask
+from experiments.problems.tasks.cnn import SIZES, Rotation
 
 ANGLES = (6.5, 19.0)
 """Range of the training and held-out angles, in units of 20 degrees."""
@@ -16,23 +16,14 @@ OUTPUT = (3.5, 22.0)
 """Range of the predictions, in units of 20 degrees."""
 
 
-@dataclass(frozen=True)
-class WidePreset(CnnPreset):
-    """Size of the task, its network and scene."""
-
-    output = OUTPUT
-
-
-class Task(CnnTask):
+class WideRotation(Rotation):
     """Rotation [K, 1] of the mug in units of 20 degrees."""
 
     name = "cnn_wide"
+    title = "the same from 250 degrees, with a plateau between the ends"
     sigma = (3.0, 0.1)
-    pooled = Pooled(lengths=(0.5,), temperature=0.1, steps=1500, rank=64)
-    angles = ANGLES
+    angles, output = ANGLES, OUTPUT
 
 
-PRESETS = {
-    "fast": WidePreset(64, 8, 2, (2, 2, 2), evaluations=4000, images=1024, held_out=32),
-    "paper": WidePreset(256, 32, 6, (2, 4, 4), evaluations=12000, images=4096, held_out=64),
-}
+def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+    return WideRotation(SIZES[preset], variant, threads)

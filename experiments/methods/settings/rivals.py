@@ -1,28 +1,14 @@
-"""Settings of the baselines, what a user would pick instead of ours, on every task.
+"""Settings of the rivals, what a user would pick instead of ours.
 
 Chosen on starts that no table reports (runs from 1000 upward), by the share of runs that reduce the image error by
-99 % and then by the median of their evaluations. All of `SPACES` were tried on ten starts (four for bfgs_adaptive_fd,
-forty for analytic_2 on BRDF). Of the other quasi-Newton methods on sampled gradients, eight combinations drawn from the
-spaces of `experiments.methods.settings` were tried on four starts, with 8000 evaluations. What is not named here has
-the defaults of the method.
+99 % and then by the median of their evaluations. All of their space (`experiments.methods.settings.spaces`) was tried
+on ten starts (four for bfgs_adaptive_fd, forty for analytic_2 on BRDF). Of the quasi-Newton methods on sampled
+gradients, eight combinations drawn from their space were tried on four starts, with 8000 evaluations. What is not named
+here has the defaults of the method.
 """
 
 from collections.abc import Mapping
 from typing import Any
-
-_SCALE = {"scale": (0.1, 0.25, 0.5, 1.0, 2.0)}
-_DIFFERENCE = {"difference": (1e-6, 1e-4, 1e-2, 0.1, 0.3)}
-_ADAPTIVE = {"samples": (1, 4, 16), "start": (0.1, 1.0), "end": (0.01, 0.1), "steps": (5, 20, 50)}
-_ADJOINT = {"rate": (0.03, 0.1, 0.2, 0.3, 0.5, 1.0), "steps": (50, 100, 300), "fresh": (True, False)}
-SPACES: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
-    **dict.fromkeys(("cma_es", "cma_es_bounded", "cobyqa", "dfo_ls"), _SCALE),
-    **dict.fromkeys(("bfgs_fd", "lbfgs_fd"), _DIFFERENCE),
-    **dict.fromkeys(("bfgs_adaptive_fd", "bfgs_adaptive_fd_frozen"), _ADAPTIVE),
-    **dict.fromkeys(("mitsuba", "mitsuba_path", "mitsuba_projective"), _ADJOINT),
-    "analytic_1": {"rate": (0.03, 0.1, 0.3), "steps": (50, 300)},
-    "analytic_2": {"radius": (0.5, 1.0, 2.0, 5.0, 100.0), "steps": (3, 10)},
-}
-"""What was chosen from."""
 
 
 def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) -> dict[str, Any]:

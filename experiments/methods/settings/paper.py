@@ -1,84 +1,25 @@
-"""Settings of every method on every task; of the source's methods its Table 3, and what had to be tuned again.
-
-Table 3 is in the units of the authors' code. Ours are those of the task, so lengths (sigma, learning rate, the trust
-region of our_h, the tolerance of the line search) are multiplied by `UNITS`: the image of BOX2 and BOX10 has a side of
-500 there and of 1 here. The trust region of our_hvp and our_hvpa is in units of sigma and has no unit. Samples are
-antithetic pairs.
+"""Settings of the source's methods: what its Table 3 leaves open, and what replaces it where it fails on our tasks.
 
 Table 3 does not say over how many steps sigma falls, nor what happens where the curvature is not positive: `steps` and
 `modification` are ours (`CHOSEN`). `RETUNED` replaces Table 3 where it fails on our version of a task. Settings were
-scored on runs from 1000 upward, which no table reports, by the commands given with them; without a command they are
-single trials (our_h and our_hvp on BRDF and NONPSD; our_hvp on TEXTURE). That our_h and our_hvp needed another
-search on BOX2 was seen on the reported runs.
+scored on runs from 1000 upward, which no table reports, by the commands given with them; `tune` is
+`python -m experiments tune`. Without a command they are single trials (our_h and our_hvp on BRDF and NONPSD; our_hvp on
+TEXTURE). That our_h and our_hvp needed another search on BOX2 was seen on the reported runs.
 
 - QUAD: as in Table 3.
-- BOX2, BOX10: a start sigma of 1.5 or 0.6 pixels on a plateau of 100 moves nothing; it is the side / 5 and side / 6,
-  as in the authors' logs. The first-order methods keep their learning rates, which work; they are slow: on BOX2
-  our_g at 0.01 instead of 0.0006 takes a tenth of the evaluations, fewer than any of the second-order methods.
+- BOX2, BOX10: a start sigma of 1.5 or 0.6 pixels on a plateau of 100 moves nothing; ours is the side / 5 and side / 6,
+  as in the authors' logs. The first-order methods keep their learning rates, which work but are slow: on BOX2 our_g at
+  0.01 instead of 0.0006 takes a tenth of the evaluations, fewer than any of the second-order methods.
 - BOX10: of 13 settings for each method (`tune box10 --method M --runs 2 --trials 12 --evaluations 30000`) one of
-  our_hvpa gets there, from one of two starts. Descent on the smoothed loss moves all five squares onto the central
-  place, a local minimum at 58 % of the first error, from a start sigma of 0.001 as from one of 0.17; only noisy steps
-  lead elsewhere.
+  our_hvpa arrives, from one of two starts. Descent on the smoothed loss moves all five squares onto the central place,
+  a local minimum at 58 % of the first error, from a start sigma of 0.001 as from one of 0.17. Only noisy steps lead
+  elsewhere.
 - TEXTURE: with 4 pairs a gradient of 1024 elements is nearly all noise, and so is a curvature. Adam needs a smaller
   learning rate. The line search needs more pairs, the mean as baseline, and no conjugate directions.
-- BRDF and NONPSD are not in Table 3.
-
-Settings of all other methods: `experiments.methods.baseline_settings`.
+- BRDF, NONPSD, MIRROR, CAUSTIC and MESHFIT are not in Table 3.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
-
-from experiments.methods import baseline_settings
-
-
-class Search(NamedTuple):
-    """A second-order method in Table 3."""
-
-    trust_region: float
-    sigma_end: float
-    iterations: int
-    tolerance: float
-    recompute: int
-
-
-class Column(NamedTuple):
-    """A task in Table 3."""
-
-    samples: int
-    sigma_start: float
-    learning_rate: float
-    sigma_end: float
-    our_h: Search
-    our_hvp: Search
-    our_hvpa: Search
-
-
-TABLE_3 = {
-    "quad": Column(
-        4, 1.0, 0.5, 0.01, Search(50, 0.01, 5, 1e-3, 5), Search(50, 0.05, 5, 1e-3, 5), Search(50, 0.05, 5, 1e-3, 5)
-    ),
-    "box2": Column(
-        6, 1.5, 0.3, 0.01, Search(2, 0.01, 10, 1e-3, 10), Search(2, 0.01, 3, 1e-3, 10), Search(2, 0.01, 10, 1e-3, 10)
-    ),
-    "box10": Column(
-        6, 0.6, 0.05, 0.1, Search(10, 0.1, 3, 1e-3, 30), Search(10, 0.1, 3, 1e-3, 30), Search(10, 0.1, 3, 1e-3, 30)
-    ),
-    "mug": Column(
-        1, 3.0, 0.1, 0.01, Search(3, 0.01, 1, 1e-3, 10), Search(4, 0.01, 2, 1e-3, 2), Search(4, 0.01, 1, 1e-3, 5)
-    ),
-    "shad": Column(
-        1, 0.5, 0.02, 0.01, Search(3, 0.01, 1, 1e-3, 10), Search(5, 0.01, 1, 1e-3, 5), Search(3, 0.01, 10, 1e-3, 5)
-    ),
-    "bunny": Column(
-        2, 1.0, 0.02, 0.01, Search(2, 0.005, 1, 1e-3, 5), Search(4, 0.01, 1, 1e-3, 10), Search(4, 0.01, 2, 1e-3, 2)
-    ),
-    "texture": Column(
-        4, 0.5, 0.05, 0.1, Search(10, 0.1, 5, 1e-3, 30), Search(10, 0.1, 5, 1e-3, 30), Search(10, 0.1, 5, 1e-3, 30)
-    ),
-}
-UNITS = {"box2": 1 / 500, "box10": 1 / 500}
-"""Length of 1 in Table 3, in the units of our task; 1 where it is not named."""
+from typing import Any
 
 Settings = dict[str, Any]
 
@@ -253,115 +194,3 @@ RETUNED: dict[str, dict[str, Settings]] = {
     "meshfit_color": dict.fromkeys(("fr22", "our_g"), _MESH),
 }
 """What replaces Table 3, or stands for it; `tune` is `python -m experiments tune`."""
-
-_SIGMAS: dict[str, Settings] = {"box10": {"sigma": 0.24}, "brdf": {"sigma": 0.5}, "nonpsd": {"sigma": 0.7}}
-RECOMMENDED = {task: dict.fromkeys(("trust_region", "trust_region_loss"), one) for task, one in _SIGMAS.items()}
-"""Trust region, with the output and with the loss alone: everything at its default but sigma, where that of the task
-was not the best of those tried.
-
-The defaults themselves (batches, thresholds of misfit and gain, weights) were chosen on runs from 1000 upward of these
-six tasks; on BRDF again after a look at the reported ones.
-`tune brdf --method trust_region --runs 100 --over sigma=0.2,0.25,0.36,0.5` and the like give sigma."""
-
-
-def settings(method: str, task: str) -> Settings:
-    """Return the keyword arguments of a method on a task; empty where its defaults are meant."""
-    found = table_3(method, task)
-    for changes in (CHOSEN, RETUNED, RECOMMENDED, baseline_settings.TUNED):
-        found |= changes.get(task, {}).get(method, {})
-    return found
-
-
-def table_3(method: str, task: str) -> Settings:
-    """Return what Table 3 says, in the units of our task; empty where it says nothing."""
-    column, unit = TABLE_3.get(task), UNITS.get(task, 1.0)
-    if column is None or method not in ("fr22", "our_g", "our_h", "our_hvp", "our_hvpa"):
-        return {}
-    if method in ("fr22", "our_g"):
-        return {
-            "samples": column.samples,
-            "learning_rate": unit * column.learning_rate,
-            "sigma": (unit * column.sigma_start, unit * column.sigma_end),
-        }
-    row: Search = getattr(column, method)
-    return {
-        "samples": column.samples,
-        "trust_region": row.trust_region * (unit if method == "our_h" else 1.0),
-        "sigma": (unit * column.sigma_start, unit * row.sigma_end),
-        "line_search": (row.iterations, unit * row.tolerance),
-        "recompute": row.recompute,
-    }
-
-
-Space = Mapping[str, tuple[Any, ...]]
-
-_ADAM: Space = {
-    "samples": (1, 2, 4, 6),
-    "learning_rate": (0.001, 0.002, 0.005, 0.01, 0.02, 0.05),
-    "sigma": ((1.0, 1e-4), (1.0, 0.01), (1.0, 0.1), (0.5, 0.01), (1.5, 0.01)),
-    "steps": (300, 1000, 3000),
-}
-_LINE_SEARCH: Space = {
-    "samples": (1, 2, 4, 6, 12),
-    "trust_region": (0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
-    "sigma": ((1.0, 1e-4), (1.0, 0.01), (1.0, 0.1), (0.5, 0.01), (1.5, 0.01)),
-    "line_search": ((1, 0.0), (3, 0.0), (10, 0.0)),
-    "recompute": (1, 5, 10, 30),
-    "modification": ("abs", "radius"),
-    "baseline": ("center", "mean"),
-    "steps": (20, 40, 80, 160, 320),
-}
-_QUASI_NEWTON: Space = {
-    "samples": (2, 4, 8),
-    "start": (0.5, 1.0),
-    "end": (0.01, 0.1),
-    "steps": (20, 50, 100, 300),
-}
-_BFGS: Space = {**_QUASI_NEWTON, "longest": (0.5, 1.0, 2.0)}
-_LBFGS: Space = {**_QUASI_NEWTON, "inner": (2, 5, 10)}
-
-SPACES: Mapping[str, Space] = {
-    "fr22": _ADAM,
-    "our_g": _ADAM,
-    "our_h": _LINE_SEARCH,
-    "our_hvp": _LINE_SEARCH,
-    "our_hvpa": _LINE_SEARCH,
-    "bfgs": _BFGS,
-    "bfgs_wolfe": _BFGS,
-    "bfgs_damped": _BFGS,
-    "lbfgs": _LBFGS,
-    "bfgs_frozen": _BFGS,
-    "bfgs_wolfe_frozen": _BFGS,
-    "bfgs_damped_frozen": _BFGS,
-    "lbfgs_frozen": _LBFGS,
-    "trust_region": {"sigma": (0.7, 1.0, 1.2, 1.4, 1.8, 2.5)},
-    **baseline_settings.SPACES,
-}
-"""What `python -m experiments tune` chooses from, by method; lengths that depend on the task in units of its sigma."""
-LENGTHS: Mapping[str, tuple[str, ...]] = {
-    "fr22": ("learning_rate", "sigma"),
-    "our_g": ("learning_rate", "sigma"),
-    "our_h": ("trust_region", "sigma"),
-    "our_hvp": ("sigma",),
-    "our_hvpa": ("sigma",),
-    "trust_region": ("sigma",),
-}
-"""Which of them are lengths."""
-
-
-def space(method: str, sigma: float) -> dict[str, tuple[Any, ...]]:
-    """Return the search space of a method on a task with this sigma; SystemExit if it has none."""
-    if method not in SPACES:
-        raise SystemExit(f"method must be one that can be tuned, {', '.join(SPACES)}, got {method}")
-    lengths = LENGTHS.get(method, ())
-    return {
-        name: tuple(_scaled(choice, sigma) for choice in choices) if name in lengths else choices
-        for name, choices in SPACES[method].items()
-    }
-
-
-def _scaled(choice: Any, sigma: float) -> Any:
-    """Multiply a length, or several, by sigma, to four digits."""
-    if isinstance(choice, tuple):
-        return tuple(_scaled(one, sigma) for one in choice)
-    return float(f"{choice * sigma:.4g}")

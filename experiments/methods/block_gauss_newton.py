@@ -7,9 +7,9 @@ lengths are then evaluated together, which costs nothing beside the samples, and
 loss. Its length is the trust region of the next iteration, and sigma is a share of it. What the steps have told
 corrects J along them (Broyden 1965).
 
-`trust_region` fits one linear model to all evaluations near x, which is what few parameters want. Behind it are as many
-unknowns per pixel as there are parameters, so that with a thousand of them it either steps in the span of a few
-samples or solves for old ones again and again; and it follows the smoothed image whether or not the loss falls.
+`descent` fits one linear model to all evaluations near x, which suits few parameters. That model has as many unknowns
+per pixel as there are parameters: with a thousand of them it steps in the span of a few samples only, or solves for old
+ones again and again. It also follows the smoothed image whether or not the loss falls.
 """
 
 import torch
@@ -21,7 +21,7 @@ from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
 FEWEST = 100
-"""Parameters from which on it is offered: `trust_region` needs fewer evaluations below."""
+"""Parameters from which on it is offered: `descent` needs fewer evaluations below."""
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the trust region."""
 _REFUSED = 0.4
@@ -62,7 +62,7 @@ class Jacobian:
         return -(slope / (curvature + high)) @ vectors.mT
 
 
-def gauss_newton(
+def block_gauss_newton(
     trial: Trial, *, radius: float | None = None, share: float = 0.1, block: float = 0.25, restart: float = 1e-3
 ) -> None:
     """Gauss-Newton on the residuals of a task.
@@ -119,9 +119,15 @@ def _within(task: Task, x: Tensor) -> Tensor:
 def _applies(task: Task) -> str | None:
     if task.output is None or task.output.residuals is None:
         return "its black box returns the loss only"
-    return None if task.n >= FEWEST else f"made for {FEWEST} parameters and more, where trust_region has few samples"
+    return None if task.n >= FEWEST else f"made for {FEWEST} parameters and more, where descent has few samples"
 
 
 METHODS = (
-    Method("gauss_newton", "Gauss-Newton on a Jacobian sampled block by block", with_settings(gauss_newton), _applies),
+    Method(
+        "block_gauss_newton",
+        "ours for images of many parameters: Gauss-Newton on a Jacobian sampled block by block",
+        with_settings(block_gauss_newton),
+        _applies,
+        uses="image",
+    ),
 )

@@ -1,0 +1,32 @@
+"""Settings of every method on every task, as data: each with the command and the starts it was chosen on.
+
+| module | settings of |
+|---|---|
+| `table_3` | the source's methods, by its Table 3 |
+| `paper` | the source's methods, where Table 3 leaves something open or fails |
+| `ours` | our methods |
+| `rivals` | all other methods |
+| `spaces` | what `python -m experiments tune` chooses from |
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from experiments.methods.settings import ours, paper, rivals
+from experiments.methods.settings.spaces import SPACES, space
+from experiments.methods.settings.table_3 import table_3
+
+CHANGES: tuple[Mapping[str, Mapping[str, Mapping[str, Any]]], ...] = (
+    *(paper.CHOSEN, paper.RETUNED, ours.SEARCH, ours.POOLED, rivals.TUNED),
+)
+"""By task and method, in the order in which they replace Table 3."""
+
+__all__ = ["SPACES", "settings", "space"]
+
+
+def settings(method: str, task: str) -> dict[str, Any]:
+    """Return the keyword arguments of a method on a task; empty where its defaults are meant."""
+    found = table_3(method, task)
+    for changes in CHANGES:
+        found |= changes.get(task, {}).get(method, {})
+    return found

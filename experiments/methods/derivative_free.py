@@ -183,5 +183,7 @@ METHODS = (
         _is_small,
         ("Py-BOBYQA",),
     ),
-    Method("dfo_ls", "DFO-LS, Gauss-Newton on residuals", with_settings(dfo_ls), _has_residuals, ("DFO-LS",)),
+    Method(
+        "dfo_ls", "DFO-LS, Gauss-Newton on residuals", with_settings(dfo_ls), _has_residuals, ("DFO-LS",), uses="image"
+    ),
 )

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.reports.progress import progress
 from experiments.reports.tables import table
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import extension, kernels, proposals
@@ -84,18 +85,18 @@ def bench(
             raise SystemExit(f"{name} must be at least {least}, got {value}")
     threads, available = torch.get_num_threads(), extension.available
     torch.set_num_threads(1)
+    timed = [(*size, name, operation) for size in sizes for name, operation in _operations(*size).items()]
     try:
         timings = [
             _timing(name, operation, n, samples, repeats, available)
-            for n, samples in sizes
-            for name, operation in _operations(n, samples).items()
+            for n, samples, name, operation in progress(timed, "timings")
         ]
     finally:
         torch.set_num_threads(threads)
         extension.available = available
     memory = []
     if memory_n:
-        memory = [_memory(name, memory_n, memory_samples) for name in ("stored", "redrawn")]
+        memory = [_memory(name, memory_n, memory_samples) for name in progress(("stored", "redrawn"), "memory")]
     report = BenchReport(timings, memory)
     _print(report)
     if out is not None:

@@ -13,7 +13,7 @@ from experiments.ensembles.run_training import summary, train_all
 from experiments.methods.pooled import Pooled
 from experiments.methods.training import METHODS, encoders, train
 from experiments.problems.tasks.cnn import ANGLES, PRESETS, CnnPreset, CnnTask
-from experiments.reports import export
+from experiments.reports.onnx_export import export
 from experiments.run import run
 from experiments.runs.recorder import Recorder
 from experiments.runs.records import Files, Log, Record, read
@@ -169,7 +169,7 @@ def test_an_interrupted_training_goes_on_with_the_same_rows(scene, tmp_path, nam
 def test_onnx_predicts_the_same(tmp_path):
     torch.manual_seed(0)
     encoder = PRESETS["fast"].encoder()
-    difference = export.export(encoder, torch.rand(5, 3, 64, 64), tmp_path / "encoder.onnx")
+    difference = export(encoder, torch.rand(5, 3, 64, 64), tmp_path / "encoder.onnx")
     assert 0 <= difference < 1e-4
 
 

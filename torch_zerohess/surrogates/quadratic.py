@@ -227,7 +227,11 @@ def loss_derivatives(
             raise ValueError("loss must be differentiable by torch, got a value that does not depend on its output")
         (slope,) = torch.autograd.grad(value, y, create_graph=True)
         if not slope.requires_grad:
-            return float(value.detach()), _finite(slope.detach().flatten()), torch.zeros_like(directions).flatten(1)
+            return (
+                float(value.detach()),
+                _finite(slope.detach().flatten()),
+                torch.zeros_like(directions.reshape(len(directions), -1)),
+            )
 
         def product(direction: Tensor) -> Tensor:
             return torch.autograd.grad(slope, y, direction, retain_graph=True, materialize_grads=True)[0]
@@ -238,7 +242,7 @@ def loss_derivatives(
         image, square = product(probe), float(probe.square().sum())
         scale = float((image * probe).sum()) / square if square > 0.0 else 0.0
         if float((image - scale * probe).norm()) <= 1e-12 * abs(scale) * math.sqrt(square):
-            products = scale * directions.flatten(1)
+            products = scale * directions.reshape(len(directions), -1)
         else:
             products = torch.stack([product(one).flatten() for one in directions])
     return float(value.detach()), _finite(slope.detach().flatten()), _finite(products)

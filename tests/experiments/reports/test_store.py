@@ -2,6 +2,7 @@
 
 import csv
 import re
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -11,9 +12,11 @@ from experiments.ensembles import provenance
 from experiments.reports import stored
 from experiments.reports.document_tables import SPEED_UP, Query, number, table_of
 from experiments.reports.documents import filled, readme
+from experiments.reports.networks import HELD_OUT, _remember, held_out
 from experiments.reports.speed_ups import speed_ups, with_ratios
 from experiments.reports.store import store
-from experiments.runs.records import Files, Log, Outcome, Record, write_outcome
+from experiments.reports.trained_network import Result
+from experiments.runs.records import Files, Log, Outcome, Record, read_outcome, write_outcome
 
 COMMIT = "0123456789abcdef"
 
@@ -76,19 +79,27 @@ def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
 
 def test_networks_have_a_row_per_method(tmp_path, results):
     folder = tmp_path / "runs"
-    write(folder, "cnn", "pooled", 0, [40.0, 9.0, 2.0], each=10)  # the parameter error is divided by 400
-    write(folder, "cnn", "pooled", 1, [40.0, 9.0, 5.0], each=10)  # by 64
+    for run in range(3):
+        write(folder, "cnn", "pooled", run, [40.0, 9.0, 2.0], each=10)
+    with pytest.raises(SystemExit, match=r"held_out.csv has 0 of 3 runs of pooled: call the same `run` again"):
+        store(folder, name="networks")
+    errors = [((40.0, 2.0), (8.0, 0.02)), ((40.0, 5.0), (8.0, 0.125)), ((40.0, 5.0), (8.0, 0.125))]
+    ended = [Result("pooled", run, None, None, 1.0, 20, *pair) for run, pair in enumerate(errors)]
+    _remember(held_out("cnn", ended[:2]), folder / "cnn" / HELD_OUT)
+    _remember(held_out("cnn", ended[1:]), folder / "cnn" / HELD_OUT)
+    files = Files(folder / "cnn" / "pooled", 2)
+    write_outcome(replace(read_outcome(files.outcome), status="failed"), files)
     store(folder, name="networks")
     (row,) = rows(results, "networks")
     assert [float(row[one]) for one in ("renders", "seconds")] == [20.0, 1.0]
-    assert float(row["parameter_divided"]) == (400 + 64) / 2
+    assert float(row["parameter_divided"]) == (400 + 64) / 2  # of the two runs that did not fail
     assert float(row["parameter_divided_worst"]) == 64
     assert float(row["image_divided"]) == (20 + 8) / 2
     assert float(row["image_divided_worst"]) == 8
-    assert (row["reached"], row["runs"], row["n"]) == ("1", "2", "")
+    assert (row["reached"], row["runs"], row["n"]) == ("1", "3", "")
     text = table_of("networks", Query())
     assert "parameter error divided by | at worst" in text
-    assert "1 of 2 (50 %)" in text
+    assert "1 of 3 (33 %)" in text
 
 
 def another_commit(folder, monkeypatch):

@@ -46,10 +46,10 @@ def write(folder, task, method, run, errors, *, each, settings=None):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Evaluations until 99 % of the image error: trust_region 6 and 9, fr22 30 from one of three starts."""
+    """Evaluations until 99 % of the image error: descent 6 and 9, fr22 30 from one of three starts."""
     folder = tmp_path / "runs"
-    write(folder, "bowl", "trust_region", 3, [100.0, 10.0, 1.0, 0.1], each=3)
-    write(folder, "bowl", "trust_region", 4, [100.0, 50.0, 10.0, 1.0], each=3)
+    write(folder, "bowl", "descent", 3, [100.0, 10.0, 1.0, 0.1], each=3)
+    write(folder, "bowl", "descent", 4, [100.0, 50.0, 10.0, 1.0], each=3)
     for run, last in ((3, 0.5), (4, 50.0), (5, 60.0)):
         write(folder, "bowl", "fr22", run, [100.0, last], each=30)
     return folder
@@ -64,7 +64,7 @@ def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
     store(folder, name="bowls")
     there = {(one["method"], one["metric"], one["level"]): one for one in rows(results, "bowls")}
     assert len(there) == 2 * 2 * 3
-    ours, theirs = there["trust_region", "image", "99"], there["fr22", "image", "99"]
+    ours, theirs = there["descent", "image", "99"], there["fr22", "image", "99"]
     assert [float(ours[f"evaluations{end}"]) for end in ("", "_low", "_high")] == [7.5, 6.75, 8.25]
     assert [float(ours[f"seconds{end}"]) for end in ("", "_low", "_high")] == [1.25, 1.125, 1.375]
     assert (ours["reached"], ours["runs"], ours["first_run"], ours["n"]) == ("2", "2", "3", "2")
@@ -178,13 +178,13 @@ def test_a_table_of_fits(folder):
     lines = table_of("bowls", Query()).splitlines()
     assert lines[0] == "| method | what it does | uses | BOWL, n = 2 |"
     cells = {line.split(" | ")[0].strip("| `"): line.split(" | ")[-1].strip(" |") for line in lines[2:4]}
-    assert cells == {"fr22": "- (33 %)", "trust_region": "7.5, 1.25 s"}
+    assert cells == {"fr22": "- (33 %)", "descent": "7.5, 1.25 s"}
     for part in ("2 to 3 starts, from number 3 on, 15 s at most.", "Commit `012345678`", "`python -m experiments run"):
         assert part in lines[-1]
     others = table_of("bowls", Query.of(["level=90", "metric=parameter", "show=evaluations", "methods=fr22"]))
     assert "| 30 (33 %) |" not in others  # one of three is fewer than half
     assert "- (33 %)" in others
-    assert "trust_region" not in others
+    assert "descent" not in others
     assert "- (33 %, 6 to 79 %)" in table_of("bowls", Query.of(["share=interval"]))
 
 
@@ -211,8 +211,8 @@ def test_means_of_ratios():
 def test_the_table_of_speed_ups(folder):
     write(folder, "bowl", "cobyqa", 3, [100.0, 0.05], each=15)
     store(folder, name="bowls")
-    text = table_of(SPEED_UP, Query.of(["of=bowls", "reference=trust_region", "methods=cobyqa"]))
-    # Evaluations of trust_region: image 4.5 (of 3 and 6), 7.5, 9 from one of two; parameters 4.5, 4.5, 7.5.
+    text = table_of(SPEED_UP, Query.of(["of=bowls", "reference=descent", "methods=cobyqa"]))
+    # Evaluations of descent: image 4.5 (of 3 and 6), 7.5, 9 from one of two; parameters 4.5, 4.5, 7.5.
     ratios = [15 / 4.5, 15 / 7.5, 15 / 9, 15 / 4.5, 15 / 4.5, 15 / 7.5]
     cells = [one.strip() for one in text.splitlines()[2].split("|")[1:-1]]
     assert (cells[0], cells[5]) == ("cobyqa", "6")
@@ -229,7 +229,7 @@ def test_studies_are_kept_as_they_are(results):
 
 DOCUMENT = """# Title
 
-There are <!-- value: bowls evaluations task=bowl method=trust_region metric=image level=99 -->?<!-- /value --> of them.
+There are <!-- value: bowls evaluations task=bowl method=descent metric=image level=99 -->?<!-- /value --> of them.
 
 <!-- table: bowls show=evaluations -->
 <!-- end -->
@@ -271,7 +271,7 @@ def test_documents_are_written_and_checked(folder, tmp_path, capsys):
         ("table: nothing", "table must be one that is stored in .*bowls, got nothing"),
         ("table: bowls level=98", "level must be one of 90, 99, 99.9, got 98"),
         ("table: bowls speed=1", "options that this table does not have: speed"),
-        ("table: bowls methods=ours", "methods must be some of fr22, trust_region, got ours"),
+        ("table: bowls methods=ours", "methods must be some of descent, fr22, got ours"),
         ("table: bowls level", "options must be name=value, got level"),
         (f"table: {SPEED_UP} reference=fr22", "must have of=NAME"),
     ],

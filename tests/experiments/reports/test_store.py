@@ -17,6 +17,8 @@ from experiments.reports.speed_ups import speed_ups, with_ratios
 from experiments.reports.store import store
 from experiments.reports.trained_network import Result
 from experiments.runs.records import Files, Log, Outcome, Record, read_outcome, write_outcome
+from experiments.studies.bench import bench
+from experiments.studies.estimators import error
 
 COMMIT = "0123456789abcdef"
 
@@ -221,10 +223,27 @@ def test_the_table_of_speed_ups(folder):
 
 
 def test_studies_are_kept_as_they_are(results):
-    stored.keep([{"problem": "A", "error": 0.123456, "runs twice": 2}, {"problem": "B", "error": 2000.0}], "study")
+    stored.keep(["problem", "error", "repeats"], [["A", 0.123456, 2], ["B", 2000.0, 3]], "study")
     text = table_of("study", Query.of(["columns=problem,error", "problem=B"]))
     assert text.splitlines()[:3] == ["| problem | error |", "| --- | --- |", "| B | 2 000 |"]
     assert "Commit `012345678`" in text
+
+
+def test_a_study_is_refused_before_it_measures(results, monkeypatch):
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": False})
+    for study, given in ((bench, {"repeats": 10**9}), (error, {"runs": 10**9})):
+        with pytest.raises(SystemExit, match="a stored table must be made by the code of a commit"):
+            study(**given, store="study")
+        with pytest.raises(SystemExit, match="name must be a word"):
+            study(**given, store="a study")
+
+
+def test_times_of_bench_are_kept(results):
+    report = bench(repeats=1, sizes=((2, 2),), memory_n=0, store="times")
+    there = rows(results, "times")
+    assert [row["operation"] for row in there] == [one.operation for one in report.timings]
+    assert [float(row["pure torch [us]"]) for row in there] == [round(1e6 * one.torch, 1) for one in report.timings]
+    assert there[0]["commit"] == COMMIT
 
 
 DOCUMENT = """# Title

@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.steihaug import Step
 from torch_zerohess.linalg.subproblem import diagonal_step
-from torch_zerohess.optim.newton_step import NewtonStep, Step
+from torch_zerohess.optim.newton_step import NewtonStep
 from torch_zerohess.optim.second_order import Model, check_positive, check_radius
 
 MOST = 10_000

@@ -6,8 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.linalg.steihaug import steihaug
-from torch_zerohess.optim.newton_step import NewtonStep, Step
+from torch_zerohess.linalg.steihaug import Step, steihaug
+from torch_zerohess.optim.newton_step import NewtonStep
 from torch_zerohess.optim.second_order import Model, check_count, check_not_negative, check_positive, check_radius
 
 

@@ -2,23 +2,16 @@
 
 import math
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.steihaug import Step
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, pair
 
 _ROUNDING = 10.0
 """Units of rounding of the loss below which a decrease cannot be tested."""
-
-
-class Step(NamedTuple):
-    """A step s [N], the decrease -(g.s + s.Hs/2) that the model promises, and why the search for it ended."""
-
-    s: Tensor
-    decrease: float
-    exit: str
 
 
 class NewtonStep(SecondOrder):

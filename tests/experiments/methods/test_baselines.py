@@ -9,11 +9,13 @@ import torch
 
 from experiments.methods import METHODS
 from experiments.methods.adaptive_differences import adapt
-from experiments.methods.baseline_settings import SPACES, TUNED
 from experiments.methods.sampled import Annealing, SampledGradient
+from experiments.methods.settings import SPACES
+from experiments.methods.settings.rivals import TUNED
 from experiments.problems import catalogue
 from experiments.problems.task import Task, Truth, least_squares, uniform
-from experiments.runs.trial import Trial, attempt
+from experiments.runs.attempt import attempt
+from experiments.runs.trial import Trial
 
 BASELINES = [
     *("cma_es", "cma_es_bounded", "cobyqa", "dfo_ls", "bfgs_fd", "lbfgs_fd", "analytic_1", "analytic_2"),
@@ -179,7 +181,7 @@ def test_tuned_settings_are_of_methods_that_apply_and_from_their_space() -> None
             if reason:  # Mitsuba has no variant with derivatives here
                 continue
             for key, value in settings.items():
-                assert value in SPACES.get(method, {}).get(key, (value,))
+                assert value in SPACES[method][key], (name, method, key)
             small = replace(task, evaluations=30)  # enough to see that these are arguments of the method
             outcome = attempt(small, method, 0, lambda trial, m=method, s=settings: METHODS[m].solve(trial, s))
             assert outcome.status != "failed", (name, method, outcome.reason)

@@ -301,8 +301,8 @@ def test_task(name, n) -> None:
         task.picture.target()[:, -1],
     ):
         assert not bool(edge.any())
-    assert METHODS["our_h_local"].applies(task) is None
-    assert "not the vertices of a mesh" in METHODS["our_h_local"].applies(catalogue.load("quad"))
+    assert METHODS["handles_newton"].applies(task) is None
+    assert "not the vertices of a mesh" in METHODS["handles_newton"].applies(catalogue.load("quad"))
 
 
 def test_silhouette_iou_is_that_of_spheres() -> None:
@@ -418,11 +418,11 @@ SHORT = {"levels": (1,), "steps": 6, "samples": 4}
 @pytest.mark.parametrize(
     ("method", "settings", "share"),
     [
-        ("our_g_local", SHORT, 0.95),
-        ("our_h_local", SHORT, 0.95),
-        ("our_g_levels", {**SHORT, "levels": (0,)}, 1.0),
-        ("our_hvpa_levels", {"levels": (0,), "steps": 1, "samples": 24}, 1.0),
-        ("our_g_large_steps", {"steps": 6, "samples": 4}, 1.0),
+        ("handles_adam", SHORT, 0.95),
+        ("handles_newton", SHORT, 0.95),
+        ("levels_adam", {**SHORT, "levels": (0,)}, 1.0),
+        ("levels_newton_cg", {"levels": (0,), "steps": 1, "samples": 24}, 1.0),
+        ("large_steps_adam", {"steps": 6, "samples": 4}, 1.0),
     ],
 )
 def test_a_few_steps_lower_the_error(method, settings, share) -> None:
@@ -437,8 +437,8 @@ def test_a_few_steps_lower_the_error(method, settings, share) -> None:
 def test_colors_are_fitted_with_the_vertices() -> None:
     torch.manual_seed(0)
     task = catalogue.load("meshfit_color")
-    trial = Trial(task, "our_g_local", 1000)
-    METHODS["our_g_local"].solve(trial, {**SHORT, "silhouette": 0.0})
+    trial = Trial(task, "handles_adam", 1000)
+    METHODS["handles_adam"].solve(trial, {**SHORT, "silhouette": 0.0})
     assert trial.rows[-1].image_error < 0.95 * trial.rows[0].image_error
     x = task.mesh.rows(trial.x)
     assert float((x[:, 3:] - 0.5).abs().max()) > 0.01

@@ -36,8 +36,8 @@ def write(folder, task, method, run, errors, *, each, settings=None):
     """A run with these image errors after `each` evaluations and half a second; parameter errors are their squares."""
     files = Files(folder / task / method, run)
     log = Log(files.log)
-    for i, error in enumerate(errors):
-        log(Record(task, method, run, i, 0.5 * i, i * each, None, None, error, error**2))
+    for i, one in enumerate(errors):
+        log(Record(task, method, run, i, 0.5 * i, i * each, None, None, one, one**2))
     log.close()
     n = len(errors) - 1
     x = [] if task.startswith("cnn") else [1.0, 2.0]

@@ -1,6 +1,7 @@
 """`python -m experiments store DIR --name NAME`: the medians of a folder of results as a table that documents quote."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,7 +35,7 @@ def store(
     """
     there = load(folder)
     wanted = chosen("tasks", tasks, list(there.runs)) if tasks else list(there.runs)
-    results = load(folder, wanted)
+    results = _ordered(load(folder, wanted))
     networks = [task for task in wanted if task in NETWORKS]
     if networks and len(networks) < len(wanted):
         raise SystemExit(f"tasks must all be fitted or all train a network, got {', '.join(wanted)}")
@@ -44,6 +45,16 @@ def store(
     whence = stored.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
     table = (trained(results) if networks else fitted(results)).assign(**whence)
     print(stored.write(table[[*(one for one in table if one not in stored.ORIGIN), *stored.ORIGIN]], name))
+
+
+def _ordered(results: Results) -> Results:
+    """Return results with methods in the order of `METHODS`, unknown ones last."""
+    place = {name: k for k, name in enumerate(METHODS)}
+    runs = {
+        task: {name: methods[name] for name in sorted(methods, key=lambda name: place.get(name, len(place)))}
+        for task, methods in results.runs.items()
+    }
+    return replace(results, runs=runs)
 
 
 def _protocol(settings: dict[str, dict[str, Any]], tasks: Sequence[str]) -> dict[str, Any]:

@@ -34,17 +34,31 @@ def read(name: str) -> pd.DataFrame:
 
 def write(table: pd.DataFrame, name: str) -> Path:
     """Write a table, numbers to six digits."""
-    if not name.isidentifier():
-        raise SystemExit(f"name must be a word of letters, digits and underscores, got {name}")
+    _check(name)
     path = path_of(name)
     path.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(path, index=False, float_format=f"%.{_DIGITS}g", lineterminator="\n")
     return path
 
 
-def keep(rows: Sequence[Mapping[str, Any]], name: str) -> Path:
-    """Write the table of a study that this process has made; SystemExit if its code is not that of a commit."""
-    return write(pd.DataFrame(rows).assign(**origin([provenance.this_command()], "this code")), name)
+def keep(headers: Sequence[str], rows: Sequence[Sequence[object]], name: str) -> Path:
+    """Write the table of a study that this process has made; SystemExit as `may_keep`."""
+    return write(pd.DataFrame(rows, columns=list(headers)).assign(**_this_origin()), name)
+
+
+def may_keep(name: str) -> None:
+    """SystemExit if the code of this process is not that of a commit, or the name is none: before it measures."""
+    _check(name)
+    _this_origin()
+
+
+def _this_origin() -> dict[str, str]:
+    return origin([provenance.this_command()], "a stored table")
+
+
+def _check(name: str) -> None:
+    if not name.isidentifier():
+        raise SystemExit(f"name must be a word of letters, digits and underscores, got {name}")
 
 
 def origin(commands: Sequence[Mapping[str, Any]], what: str) -> dict[str, str]:

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from experiments.problems.catalogue import chosen
 from experiments.reports.progress import progress
+from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_curves import Measurement, curve, draw, slope
 from experiments.studies.estimator_methods import METHODS, OURS, Method
@@ -70,6 +71,7 @@ def error(
     budgets: tuple[int, ...] = (32, 128, 512, 2048),
     problems: tuple[str, ...] = tuple(PROBLEMS),
     side: int = 64,
+    store: str | None = None,
 ) -> ErrorReport:
     """Measure the relative RMSE of the estimators against evaluations and seconds, and plot it.
 
@@ -80,11 +82,14 @@ def error(
         budgets: black-box evaluations of one estimate, f(x) included.
         problems: any of box2, box10 and wave10.
         side: pixels along the image side of the BOX tasks.
+        store: name of a table to keep under experiments/results, for the documents.
     """
     smallest = min(budgets, default=0)
     for argument, value, least in (("runs", runs, 2), ("budgets", smallest, 16), ("side", side, 1), ("seed", seed, 0)):
         if value < least:
             raise SystemExit(f"{argument} must be at least {least}, got {value}")
+    if store is not None:
+        may_keep(store)
     names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
     made = [made_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in progress(names, "truth")]
     tallies = [_Tally(one, method, budget) for one in made for method in METHODS for budget in budgets]
@@ -99,8 +104,12 @@ def error(
     (out / "error.json").write_text(json.dumps({**settings, **asdict(report)}, indent=1))
     for against in ("evaluations", "seconds"):
         draw(measurements, made, against, out / f"error_{against}.png")
-    _print(report)
+    headers, rows = _table(report)
+    print(f"Relative RMSE of {report.runs} runs\n\n{table(headers, rows)}\n")
+    _print_checks(report)
     print(f"written to {out}")
+    if store is not None:
+        print(keep(headers, rows, store))
     return report
 
 
@@ -148,11 +157,12 @@ def _ratios(measurements: list[Measurement]) -> list[Ratio]:
     return ratios
 
 
-def _print(report: ErrorReport) -> None:
+def _table(report: ErrorReport) -> tuple[list[str], list[list[object]]]:
+    """Return headers and rows: a row per problem, method and budget."""
     rows: dict[tuple[str, str, int], dict[str, Measurement]] = {}
     for m in report.measurements:
         rows.setdefault((m.problem, m.method, m.budget), {})[m.quantity] = m
-    body = [
+    body: list[list[object]] = [
         [
             problem,
             method,
@@ -163,9 +173,11 @@ def _print(report: ErrorReport) -> None:
         ]
         for (problem, method, budget), found in rows.items()
     ]
-    print(f"Relative RMSE of {report.runs} runs\n")
-    print(table(["problem", "method", "budget", "evaluations", "ms", *QUANTITIES], body))
-    print("\nRelative standard error of the truth\n")
+    return ["problem", "method", "budget", "evaluations", "ms", *QUANTITIES], body
+
+
+def _print_checks(report: ErrorReport) -> None:
+    print("Relative standard error of the truth\n")
     truth = [[name, *errors.values()] for name, errors in report.truth_error.items()]
     print(table(["problem", *QUANTITIES], truth))
     print(f"\nHessian error relative to that of {OURS}\n")

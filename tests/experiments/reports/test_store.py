@@ -2,6 +2,7 @@
 
 import csv
 import re
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -11,9 +12,13 @@ from experiments.ensembles import provenance
 from experiments.reports import stored
 from experiments.reports.document_tables import SPEED_UP, Query, number, table_of
 from experiments.reports.documents import filled, readme
+from experiments.reports.networks import HELD_OUT, _remember, held_out
 from experiments.reports.speed_ups import speed_ups, with_ratios
 from experiments.reports.store import store
-from experiments.runs.records import Files, Log, Outcome, Record, write_outcome
+from experiments.reports.trained_network import Result
+from experiments.runs.records import Files, Log, Outcome, Record, read_outcome, write_outcome
+from experiments.studies.bench import bench
+from experiments.studies.estimators import error
 
 COMMIT = "0123456789abcdef"
 
@@ -31,8 +36,8 @@ def write(folder, task, method, run, errors, *, each, settings=None):
     """A run with these image errors after `each` evaluations and half a second; parameter errors are their squares."""
     files = Files(folder / task / method, run)
     log = Log(files.log)
-    for i, error in enumerate(errors):
-        log(Record(task, method, run, i, 0.5 * i, i * each, None, None, error, error**2))
+    for i, one in enumerate(errors):
+        log(Record(task, method, run, i, 0.5 * i, i * each, None, None, one, one**2))
     log.close()
     n = len(errors) - 1
     x = [] if task.startswith("cnn") else [1.0, 2.0]
@@ -43,10 +48,10 @@ def write(folder, task, method, run, errors, *, each, settings=None):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Evaluations until 99 % of the image error: trust_region 6 and 9, fr22 30 from one of three starts."""
+    """Evaluations until 99 % of the image error: descent 6 and 9, fr22 30 from one of three starts."""
     folder = tmp_path / "runs"
-    write(folder, "bowl", "trust_region", 3, [100.0, 10.0, 1.0, 0.1], each=3)
-    write(folder, "bowl", "trust_region", 4, [100.0, 50.0, 10.0, 1.0], each=3)
+    write(folder, "bowl", "descent", 3, [100.0, 10.0, 1.0, 0.1], each=3)
+    write(folder, "bowl", "descent", 4, [100.0, 50.0, 10.0, 1.0], each=3)
     for run, last in ((3, 0.5), (4, 50.0), (5, 60.0)):
         write(folder, "bowl", "fr22", run, [100.0, last], each=30)
     return folder
@@ -61,7 +66,7 @@ def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
     store(folder, name="bowls")
     there = {(one["method"], one["metric"], one["level"]): one for one in rows(results, "bowls")}
     assert len(there) == 2 * 2 * 3
-    ours, theirs = there["trust_region", "image", "99"], there["fr22", "image", "99"]
+    ours, theirs = there["descent", "image", "99"], there["fr22", "image", "99"]
     assert [float(ours[f"evaluations{end}"]) for end in ("", "_low", "_high")] == [7.5, 6.75, 8.25]
     assert [float(ours[f"seconds{end}"]) for end in ("", "_low", "_high")] == [1.25, 1.125, 1.375]
     assert (ours["reached"], ours["runs"], ours["first_run"], ours["n"]) == ("2", "2", "3", "2")
@@ -76,19 +81,27 @@ def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
 
 def test_networks_have_a_row_per_method(tmp_path, results):
     folder = tmp_path / "runs"
-    write(folder, "cnn", "pooled", 0, [40.0, 9.0, 2.0], each=10)  # the parameter error is divided by 400
-    write(folder, "cnn", "pooled", 1, [40.0, 9.0, 5.0], each=10)  # by 64
+    for run in range(3):
+        write(folder, "cnn", "pooled", run, [40.0, 9.0, 2.0], each=10)
+    with pytest.raises(SystemExit, match=r"held_out.csv has 0 of 3 runs of pooled: call the same `run` again"):
+        store(folder, name="networks")
+    errors = [((40.0, 2.0), (8.0, 0.02)), ((40.0, 5.0), (8.0, 0.125)), ((40.0, 5.0), (8.0, 0.125))]
+    ended = [Result("pooled", run, None, None, 1.0, 20, *pair) for run, pair in enumerate(errors)]
+    _remember(held_out("cnn", ended[:2]), folder / "cnn" / HELD_OUT)
+    _remember(held_out("cnn", ended[1:]), folder / "cnn" / HELD_OUT)
+    files = Files(folder / "cnn" / "pooled", 2)
+    write_outcome(replace(read_outcome(files.outcome), status="failed"), files)
     store(folder, name="networks")
     (row,) = rows(results, "networks")
     assert [float(row[one]) for one in ("renders", "seconds")] == [20.0, 1.0]
-    assert float(row["parameter_divided"]) == (400 + 64) / 2
+    assert float(row["parameter_divided"]) == (400 + 64) / 2  # of the two runs that did not fail
     assert float(row["parameter_divided_worst"]) == 64
     assert float(row["image_divided"]) == (20 + 8) / 2
     assert float(row["image_divided_worst"]) == 8
-    assert (row["reached"], row["runs"], row["n"]) == ("1", "2", "")
+    assert (row["reached"], row["runs"], row["n"]) == ("1", "3", "")
     text = table_of("networks", Query())
     assert "parameter error divided by | at worst" in text
-    assert "1 of 2 (50 %)" in text
+    assert "1 of 3 (33 %)" in text
 
 
 def another_commit(folder, monkeypatch):
@@ -167,13 +180,13 @@ def test_a_table_of_fits(folder):
     lines = table_of("bowls", Query()).splitlines()
     assert lines[0] == "| method | what it does | uses | BOWL, n = 2 |"
     cells = {line.split(" | ")[0].strip("| `"): line.split(" | ")[-1].strip(" |") for line in lines[2:4]}
-    assert cells == {"fr22": "- (33 %)", "trust_region": "7.5, 1.25 s"}
+    assert cells == {"fr22": "- (33 %)", "descent": "7.5, 1.25 s"}
     for part in ("2 to 3 starts, from number 3 on, 15 s at most.", "Commit `012345678`", "`python -m experiments run"):
         assert part in lines[-1]
     others = table_of("bowls", Query.of(["level=90", "metric=parameter", "show=evaluations", "methods=fr22"]))
     assert "| 30 (33 %) |" not in others  # one of three is fewer than half
     assert "- (33 %)" in others
-    assert "trust_region" not in others
+    assert "descent" not in others
     assert "- (33 %, 6 to 79 %)" in table_of("bowls", Query.of(["share=interval"]))
 
 
@@ -200,8 +213,8 @@ def test_means_of_ratios():
 def test_the_table_of_speed_ups(folder):
     write(folder, "bowl", "cobyqa", 3, [100.0, 0.05], each=15)
     store(folder, name="bowls")
-    text = table_of(SPEED_UP, Query.of(["of=bowls", "reference=trust_region", "methods=cobyqa"]))
-    # Evaluations of trust_region: image 4.5 (of 3 and 6), 7.5, 9 from one of two; parameters 4.5, 4.5, 7.5.
+    text = table_of(SPEED_UP, Query.of(["of=bowls", "reference=descent", "methods=cobyqa"]))
+    # Evaluations of descent: image 4.5 (of 3 and 6), 7.5, 9 from one of two; parameters 4.5, 4.5, 7.5.
     ratios = [15 / 4.5, 15 / 7.5, 15 / 9, 15 / 4.5, 15 / 4.5, 15 / 7.5]
     cells = [one.strip() for one in text.splitlines()[2].split("|")[1:-1]]
     assert (cells[0], cells[5]) == ("cobyqa", "6")
@@ -210,15 +223,32 @@ def test_the_table_of_speed_ups(folder):
 
 
 def test_studies_are_kept_as_they_are(results):
-    stored.keep([{"problem": "A", "error": 0.123456, "runs twice": 2}, {"problem": "B", "error": 2000.0}], "study")
+    stored.keep(["problem", "error", "repeats"], [["A", 0.123456, 2], ["B", 2000.0, 3]], "study")
     text = table_of("study", Query.of(["columns=problem,error", "problem=B"]))
     assert text.splitlines()[:3] == ["| problem | error |", "| --- | --- |", "| B | 2 000 |"]
     assert "Commit `012345678`" in text
 
 
+def test_a_study_is_refused_before_it_measures(results, monkeypatch):
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": False})
+    for study, given in ((bench, {"repeats": 10**9}), (error, {"runs": 10**9})):
+        with pytest.raises(SystemExit, match="a stored table must be made by the code of a commit"):
+            study(**given, store="study")
+        with pytest.raises(SystemExit, match="name must be a word"):
+            study(**given, store="a study")
+
+
+def test_times_of_bench_are_kept(results):
+    report = bench(repeats=1, sizes=((2, 2),), memory_n=0, store="times")
+    there = rows(results, "times")
+    assert [row["operation"] for row in there] == [one.operation for one in report.timings]
+    assert [float(row["pure torch [us]"]) for row in there] == [round(1e6 * one.torch, 1) for one in report.timings]
+    assert there[0]["commit"] == COMMIT
+
+
 DOCUMENT = """# Title
 
-There are <!-- value: bowls evaluations task=bowl method=trust_region metric=image level=99 -->?<!-- /value --> of them.
+There are <!-- value: bowls evaluations task=bowl method=descent metric=image level=99 -->?<!-- /value --> of them.
 
 <!-- table: bowls show=evaluations -->
 <!-- end -->
@@ -260,7 +290,7 @@ def test_documents_are_written_and_checked(folder, tmp_path, capsys):
         ("table: nothing", "table must be one that is stored in .*bowls, got nothing"),
         ("table: bowls level=98", "level must be one of 90, 99, 99.9, got 98"),
         ("table: bowls speed=1", "options that this table does not have: speed"),
-        ("table: bowls methods=ours", "methods must be some of fr22, trust_region, got ours"),
+        ("table: bowls methods=ours", "methods must be some of descent, fr22, got ours"),
         ("table: bowls level", "options must be name=value, got level"),
         (f"table: {SPEED_UP} reference=fr22", "must have of=NAME"),
     ],

@@ -37,5 +37,6 @@ METHODS = (
         "ours for images of many parameters: Gauss-Newton on a Jacobian sampled block by block",
         with_settings(block_gauss_newton),
         _applies,
+        uses="image",
     ),
 )

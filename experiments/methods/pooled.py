@@ -181,5 +181,10 @@ def local_entropy(x: Tensor, points: Tensor, losses: Tensor, sigma: float, tempe
 
 
 METHODS = (
-    Method("pooled", "Adam on the local entropy, from a surrogate of the image fitted to all renders", train=pooled),
+    Method(
+        "pooled",
+        "Adam on the local entropy, from a surrogate of the image fitted to all renders",
+        train=pooled,
+        uses="image",
+    ),
 )

@@ -51,8 +51,9 @@ def test_along_the_samples_it_is_renewed_and_across_them_it_stays():
 
 
 def test_samples_that_bounds_have_made_dependent():
+    """Twelve steps in a space of three dimensions."""
     a, before = normal(4, 6), torch.zeros(4, 6)
-    steps = torch.cat([normal(1, 4, seed=1).expand(2, 4), normal(1, 4, seed=2)])
+    steps = normal(12, 3, seed=1) @ normal(3, 4, seed=2)
     after = renewed(before, steps, steps @ a).double()
     torch.testing.assert_close(steps @ after, steps @ a, atol=1e-3, rtol=0)
 

@@ -1,11 +1,10 @@
 """Gauss-Newton for images of many parameters: a smoothed Jacobian that is renewed block by block.
 
-The Jacobian J of the residuals is sampled along orthogonal directions u of length sqrt(n), from r(x + sigma u) - r(x).
-An iteration renews it in `block` of them, J <- J + u (dr/sigma - u J) / n: directions that were not sampled for a while
-keep what was known of them, and a basis is used up before the next one is drawn. Levenberg-Marquardt steps of several
-lengths are then evaluated together, which costs nothing beside the samples, and the best one is taken if it lowers the
-loss. Its length is the trust region of the next iteration, and sigma is a share of it. What the steps have told
-corrects J along them (Broyden 1965).
+The Jacobian J of the residuals r is sampled along orthogonal directions u of length sqrt(n), by r(x + sigma u) - r(x).
+An iteration renews J along `block` n of them, J <- J + u (dr/sigma - u J) / n, and keeps it along the others. All
+directions of a basis are used before the next basis is drawn. Then Levenberg-Marquardt steps of several lengths are
+evaluated together: a few evaluations beside many samples. The best step is taken if it lowers the loss. Its length is
+the trust region of the next iteration; sigma is a share of it. The step also corrects J along itself (Broyden 1965).
 
 `descent` fits one linear model to all evaluations near x, which suits few parameters. That model has as many unknowns
 per pixel as there are parameters: with a thousand of them it steps in the span of a few samples only, or solves for old

@@ -1,22 +1,21 @@
 """Training from all renders so far: a model of the black box's image, and a loss smoothed after an exponential.
 
-A render does not depend on the image that it was made for: it can be compared with every training image. A model of
-the image (`ImageModel`), fitted to all renders, therefore gives the losses of a whole batch at all points that are
-drawn for any of its images, and training takes no more renders for a larger batch or for more steps.
+A render can be compared with every training image, not only with the one that it was made for. So a model of the image
+(`ImageModel`), fitted to all renders, gives the losses of a whole batch at all points drawn for any image of the batch.
+A larger batch and more steps then take no further renders.
 
 Around the prediction x of each image the loss is
 
     F(x) = -sigma^2 log( E exp(-f(x + sigma u) / T) )        (local entropy: Chaudhari et al. 2017, equation 5)
 
-with the black box's loss f and u ~ N(0, I). Smoothing f itself averages a narrow valley away, and a plateau at less
-than the mean loss draws the prediction into it; exp(-f / T) keeps the valley. The gradient x - E[z] under the weights
-N(z; x, sigma) exp(-f(z) / T) leads to the valley from wherever it is sampled. T follows the mean loss around x, so
-that it needs no scale, and vanishes with sigma. Expectations are over the points drawn for the batch, weighted by
-N(z; x, sigma) over the mixture that they come from (Owen and Zhou 2000), normalised.
+with the loss f of the black box and u ~ N(0, I). The mean of f averages a narrow valley away and leads into a plateau
+that is lower than its surroundings; exp(-f / T) keeps the valley. The gradient of F is x - E[z] under the weights
+N(z; x, sigma) exp(-f(z) / T): it leads to the valley as soon as a sample falls into the valley. T is a share of the
+mean loss around x, so it has no scale to choose and vanishes with sigma. Expectations are over the points drawn for the
+batch, with self-normalised weights N(z; x, sigma) / density of the mixture that they come from (Owen and Zhou 2000).
 
-Where the image is linear in x, smoothing does not change it, and its Jacobian J is all there is to know. The loss is
-then measured by its own Hessian, |x - x*|^2 with x* the end of a Newton step with J^T J: convergence does not depend
-on the condition of J.
+Where the image is linear in x, smoothing does not change it, and its Jacobian J says everything. The loss is then
+|x - x*|^2, with x* the end of a Newton step with J^T J: convergence does not depend on the condition of J.
 """
 
 import math

@@ -260,7 +260,8 @@ def _is_mesh(task: Task) -> str | None:
 
 
 def _method(name: str, title: str, solve: Callable[..., None], **fixed: Any) -> Method:
-    return Method(name, title, with_settings(solve, **fixed), _is_mesh, ("scipy",))
+    uses = "image, cameras, triangles" if fixed.get("credit") == "local" else "loss, triangles"
+    return Method(name, title, with_settings(solve, **fixed), _is_mesh, ("scipy",), uses=uses)
 
 
 METHODS = (

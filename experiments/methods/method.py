@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.metadata
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -37,6 +38,8 @@ class Method:
     """Train `trial.encoder`, in the same way; see `experiments.runs.network_trial`. None if the method fits only."""
     trains: Callable[[NetworkTask], str | None] = everywhere
     """None, or why `train` does not apply to a task."""
+    uses: str = "loss"
+    """What it gets besides the start: the loss, the image, derivatives, or more; tables show it."""
 
     def __call__(self, trial: Trial | NetworkTrial, settings: Any) -> object:
         """Work on a trial of either kind."""
@@ -65,7 +68,8 @@ class Method:
     def load(self) -> None:
         """Import the packages, so that the first run does not pay for it."""
         for module, packages in importlib.metadata.packages_distributions().items():
-            if set(packages) & set(self.packages):
+            # A wheel may name a folder that it does not install, as that of botorch does.
+            if set(packages) & set(self.packages) and importlib.util.find_spec(module):
                 importlib.import_module(module)
 
 

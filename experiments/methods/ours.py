@@ -73,9 +73,13 @@ METHODS = (
         "ours: a Gaussian process of the image, under the known loss",
         with_settings(search, engine="gaussian_process"),
         _in_box,
+        uses="image",
     ),
     Method(
-        "descent", "ours: quadratic models of the image, re-using evaluations", with_settings(search, engine="descent")
+        "descent",
+        "ours: quadratic models of the image, re-using evaluations",
+        with_settings(search, engine="descent"),
+        uses="image",
     ),
     Method(
         "gaussian_process_loss",

@@ -10,9 +10,9 @@ from small import BUMP, FAIL_TO_TRAIN, SHIFT, SIZE
 from experiments.ensembles.ensemble import Ensemble
 from experiments.problems.network_task import Size
 from experiments.problems.tasks import cnn
-from experiments.reports import export
+from experiments.reports import onnx_export
 from experiments.reports.networks import conclude, summary
-from experiments.reports.result import Result
+from experiments.reports.trained_network import Result
 from experiments.run import run
 
 
@@ -73,7 +73,7 @@ def test_the_table_has_medians_and_shares():
 
 def test_onnx_predicts_the_same(tmp_path):
     torch.manual_seed(0)
-    difference = export.export(BUMP.encoder(), torch.rand(5, 3, SIZE.film, SIZE.film), tmp_path / "encoder.onnx")
+    difference = onnx_export.export(BUMP.encoder(), torch.rand(5, 3, SIZE.film, SIZE.film), tmp_path / "encoder.onnx")
     assert 0 <= difference < 1e-4
 
 

@@ -20,12 +20,12 @@ from experiments.listing import listing
 from experiments.methods import METHODS
 from experiments.problems.catalogue import FITTING, load
 from experiments.problems.task import Renderer
-from experiments.reports.figures import plot, quartiles, styles_of
-from experiments.reports.measures import described, measures
-from experiments.reports.report import page, report
+from experiments.reports.ensemble_page import page, report
+from experiments.reports.error_curves import plot, quartiles, styles_of
+from experiments.reports.full_setting import Saving, known_saving, line, saving
 from experiments.reports.results import load as load_results
+from experiments.reports.similarity import described, measures
 from experiments.reports.summary import as_csv, as_json, as_text, summarize, table
-from experiments.reports.time_saved import Saving, known_saving, line, saving
 from experiments.run import run
 from experiments.runs.records import Files, Log, Outcome, Record, write_outcome
 
@@ -195,7 +195,7 @@ def test_methods_have_one_style_in_all_figures(folder):
 @pytest.fixture
 def no_curves(monkeypatch):
     """Curves take most of the time of a page."""
-    monkeypatch.setattr("experiments.reports.figures.curves", lambda *_: None)
+    monkeypatch.setattr("experiments.reports.error_curves.curves", lambda *_: None)
 
 
 def test_the_page_needs_nothing_else(folder):
@@ -269,7 +269,7 @@ class Clock:
 def halved(monkeypatch):
     """`bowl` in 3 ms, its full setting in 36 ms with a loss that is larger by a quarter; both load for 100 s."""
     clock = Clock()
-    monkeypatch.setattr("experiments.reports.time_saved.time.perf_counter", lambda: clock.now)
+    monkeypatch.setattr("experiments.reports.full_setting.time.perf_counter", lambda: clock.now)
     whole = replace(TASK, loss=clock.loss(iter([100, 0.036, 0.7, 0.036, 0.036, 0.001, 0.036]), 1.25))
     task = replace(
         TASK,

@@ -10,7 +10,7 @@ from torch import nn
 from torch.func import functional_call
 
 import torch_zerohess as zh
-from truths import Bump, PlaneWave, Quadratic, Truth
+from truths import Bump, ClosedForm, PlaneWave, Quadratic
 
 SIGMA = 0.5
 TRUTHS = {
@@ -22,7 +22,7 @@ TRUTHS = {
 }
 
 
-def smoothed(truth: Truth, y: torch.Tensor) -> torch.Tensor:
+def smoothed(truth: ClosedForm, y: torch.Tensor) -> torch.Tensor:
     """Closed form of a batch y [B, n]."""
     sigma = torch.full((y.shape[-1],), SIGMA, dtype=torch.float64)
     return torch.func.vmap(lambda one: truth.smoothed(one, sigma))(y)

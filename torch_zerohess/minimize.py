@@ -6,7 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluation import BlackBoxCall, checked_input
+from torch_zerohess.estimation.evaluation import BlackBoxCall
+from torch_zerohess.estimation.inputs import checked_input
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.optim.second_order import check_count
 from torch_zerohess.search.space import Bounds

@@ -142,8 +142,8 @@ class _Progress:
 def ordered(jobs: Iterable[Job]) -> list[Job]:
     """Return jobs task by task, since every scene that a process has loaded slows down all of them.
 
-    Those of a task are run by run, so that an ensemble that is stopped has about as many of each method; methods that
-    load another scene come last.
+    The jobs of a task are in the order of their runs, so that an ensemble that is stopped has about as many runs of
+    each method. Methods that load another scene come last.
     """
     position: dict[str, int] = {}
 

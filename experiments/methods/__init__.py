@@ -2,14 +2,17 @@
 
 from experiments.methods import (
     analytic,
+    bayesian,
     block_gauss_newton,
     derivative_free,
+    learned,
     meshes,
     mitsuba,
     ours,
     paper,
     pooled,
     quasi_newton,
+    turbo,
 )
 from experiments.methods.method import Method
 
@@ -17,7 +20,7 @@ METHODS: dict[str, Method] = {
     method.name: method
     for family in (
         *(paper, ours, block_gauss_newton, pooled, derivative_free, quasi_newton),
-        *(analytic, meshes, mitsuba),
+        *(bayesian, turbo, learned, analytic, meshes, mitsuba),
     )
     for method in family.METHODS
 }

@@ -1,4 +1,4 @@
-"""Derivative-free optimizers, what a user would pick instead of ours: CMA-ES, COBYQA and DFO-LS.
+"""Derivative-free optimizers that a user would pick instead of ours: CMA-ES, COBYQA, Py-BOBYQA and DFO-LS.
 
 Each is the implementation that its package ships, with the package's own settings but for the size of the first step,
 which is `Task.sigma` times `scale`. They report the best point that they have evaluated. Methods that choose their
@@ -22,9 +22,8 @@ from experiments.runs.trial import Trial
 Array = NDArray[np.float64]
 MOST = 100
 """Parameters beyond which COBYQA, made for small problems, takes minutes between two evaluations."""
-
 MOST_RESIDUALS = 2000
-"""The same for DFO-LS, which keeps the residuals of n points."""
+"""Parameters beyond which DFO-LS, which keeps the residuals of n points, takes gigabytes."""
 
 
 class Best:
@@ -114,6 +113,27 @@ def dfo_ls(trial: Trial, *, scale: float = 1.0) -> None:
     )
 
 
+def py_bobyqa(trial: Trial, *, scale: float = 1.0, seek_global_minimum: bool = True) -> None:
+    """Py-BOBYQA: quadratic interpolation in a trust region (Cartis, Fiala, Marteau and Roberts 2019).
+
+    With `seek_global_minimum` it starts again with a larger region where the last one has shrunk to nothing (Cartis,
+    Roberts and Sheridan-Methven 2022), which needs bounds.
+    """
+    import pybobyqa
+
+    evaluate, bounds = _one_by_one(trial), trial.task.bounds
+    pybobyqa.solve(
+        evaluate,
+        trial.start.numpy(),
+        bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
+        rhobeg=scale * trial.task.sigma,
+        rhoend=1e-8 * scale * trial.task.sigma,
+        maxfun=trial.task.evaluations,
+        seek_global_minimum=seek_global_minimum and bounds is not None,
+        do_logging=False,
+    )
+
+
 def _one_by_one(trial: Trial) -> Callable[[Array], float]:
     """The loss of one point, reported at once."""
     best = Best(trial)
@@ -130,7 +150,8 @@ def _bounds(task: Task) -> Bounds | None:
     return None if task.bounds is None else Bounds(*(one.numpy() for one in task.bounds))
 
 
-def _is_bounded(task: Task) -> str | None:
+def is_bounded(task: Task) -> str | None:
+    """Say so where a task has no bounds."""
     return "the task has no bounds" if task.bounds is None else None
 
 
@@ -150,10 +171,17 @@ METHODS = (
         "cma_es_bounded",
         "CMA-ES (pycma) with restarts and bounds",
         with_settings(cma_es, bounded=True),
-        _is_bounded,
+        is_bounded,
         ("cma",),
     ),
     Method("cobyqa", "COBYQA (SciPy), quadratic models", with_settings(cobyqa), _is_small, ("scipy",)),
+    Method(
+        "py_bobyqa",
+        "Py-BOBYQA, quadratic models with restarts",
+        with_settings(py_bobyqa),
+        _is_small,
+        ("Py-BOBYQA",),
+    ),
     Method(
         "dfo_ls", "DFO-LS, Gauss-Newton on residuals", with_settings(dfo_ls), _has_residuals, ("DFO-LS",), uses="image"
     ),

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.metadata
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -67,7 +68,8 @@ class Method:
     def load(self) -> None:
         """Import the packages, so that the first run does not pay for it."""
         for module, packages in importlib.metadata.packages_distributions().items():
-            if set(packages) & set(self.packages):
+            # A wheel may name a folder that it does not install, as that of botorch does.
+            if set(packages) & set(self.packages) and importlib.util.find_spec(module):
                 importlib.import_module(module)
 
 

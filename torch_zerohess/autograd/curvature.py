@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.graph import Node
 
 from torch_zerohess.autograd.blackbox import Input
+from torch_zerohess.autograd.transforms import made_by
 
 _DENSE = 10_000
 
@@ -163,7 +164,7 @@ def _entries(node: Node | None) -> list[Tensor]:
         current = stack.pop()
         if current is None:
             continue
-        if isinstance(current, Input._backward_cls):
+        if made_by(current, Input):
             found.append(current.saved_tensors[0])  # type: ignore[attr-defined]
         for following, _ in current.next_functions:
             if following not in seen:

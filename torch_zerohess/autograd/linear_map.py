@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.autograd import transforms
+from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR
 from torch_zerohess.sampling import kernels
-from torch_zerohess.sampling.kernels import Redrawn
-
-Samples = Tensor | Redrawn
+from torch_zerohess.sampling.kernels import Redrawn, Samples
 
 
 def project(u: Samples, t: Tensor, *, zero: bool = False) -> Tensor:
@@ -38,7 +38,7 @@ class _LinearMap(torch.autograd.Function):
     @staticmethod
     def forward(vectors: Tensor, transposed: bool, zero: bool, *parts: Any) -> Tensor:
         u = _unflat(parts)
-        if zero or vectors._is_zerotensor():  # a symbolic zero of forward mode has no memory to read
+        if zero or transforms.is_symbolic_zero(vectors):
             K, n = u.shape[1:] if isinstance(u, Tensor) else (u.K, u.x.shape[1])
             return torch.zeros(*vectors.shape[:2], n if transposed else K, dtype=vectors.dtype, device=vectors.device)
         return kernels.accumulate(u, vectors) if transposed else kernels.project(u, vectors)
@@ -134,9 +134,3 @@ class _NoDerivative(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
         raise ValueError(FIRST_ORDER_ERROR)
-
-
-FIRST_ORDER_ERROR = (
-    "these samples serve first derivatives only (proposal 'fr22', or 'optimal' with order=1): "
-    "use Smoothing(proposal='aggregate', order=2) for Hessians and Hessian-vector products"
-)

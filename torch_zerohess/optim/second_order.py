@@ -105,7 +105,8 @@ class SecondOrder(Optimizer):
     def _restore(self, place: list[Tensor]) -> None:
         """Put the parameters back, to the last bit."""
         with torch.no_grad():
-            torch._foreach_copy_(self._parameters, place)
+            for one, before in zip(self._parameters, place, strict=True):
+                one.copy_(before)
 
 
 def pair(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:

@@ -48,6 +48,10 @@ class Redrawn(NamedTuple):
             yield *place(u, self.x, self.sigma, self.antithetic, self.single, proposal), columns
 
 
+Samples = Tensor | Redrawn
+"""Perturbations [B, K, n], stored or drawn again."""
+
+
 def _compiled(tensor: Tensor) -> bool:
     return extension.available and tensor.device.type == "cpu"
 
@@ -73,7 +77,7 @@ def place(
     return proposals.place(u, x, sigma, antithetic, single, proposal)
 
 
-def project(u: Tensor | Redrawn, t: Tensor) -> Tensor:
+def project(u: Samples, t: Tensor) -> Tensor:
     """Return sum_d u[b, k, d] t[b, m, d] as [B, M, K]: how far every sample lies along each vector."""
     if isinstance(u, Tensor):
         if _compiled(u) and t.shape[1] <= _MANY_VECTORS:
@@ -87,17 +91,17 @@ def project(u: Tensor | Redrawn, t: Tensor) -> Tensor:
     return result
 
 
-def accumulate(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+def accumulate(u: Samples, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, d] as [B, M, n]: the transpose of `project`."""
     return _sums(u, a, squares=False)
 
 
-def accumulate_squares(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+def accumulate_squares(u: Samples, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, d]^2 as [B, M, n]."""
     return _sums(u, a, squares=True)
 
 
-def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+def hessian(u: Samples, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] as [B, M, n, n]."""
     if isinstance(u, Tensor):
         if _compiled(u) and a.shape[1] <= _MANY_VECTORS and u.shape[2] <= _WIDE:
@@ -113,7 +117,7 @@ def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
     return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
 
 
-def _sums(u: Tensor | Redrawn, a: Tensor, squares: bool) -> Tensor:
+def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:
     if isinstance(u, Tensor):
         if _compiled(u) and a.shape[1] <= _MANY_VECTORS:
             return torch.ops.torch_zerohess.accumulate(u.contiguous(), a.contiguous(), squares)

@@ -94,3 +94,6 @@ def random(
     """Independent rows [R, 5] and their u [R, n]."""
     rows = kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device)
     return rows, kernels.draw(rows, n)
+
+
+SAMPLERS = {"random": random, "sobol": sobol, "orthogonal": orthogonal}

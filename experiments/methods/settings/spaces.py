@@ -37,6 +37,23 @@ _SCALE: Space = {"scale": (0.1, 0.25, 0.5, 1.0, 2.0)}
 _DIFFERENCE: Space = {"difference": (1e-6, 1e-4, 1e-2, 0.1, 0.3)}
 _ADAPTIVE: Space = {"samples": (1, 4, 16), "start": (0.1, 1.0), "end": (0.01, 0.1), "steps": (5, 20, 50)}
 _ADJOINT: Space = {"rate": (0.03, 0.1, 0.2, 0.3, 0.5, 1.0), "steps": (50, 100, 300), "fresh": (True, False)}
+_ZEROGRADS: Space = {
+    "pairs": (1, 2, 5),
+    "sigma": ((0.33, 0.33), (0.33, 0.03), (1.0, 0.1), (1.0, 0.03)),
+    "steps": (20, 50, 100, 300),
+    "rate": (0.02, 0.05, 0.1, 0.2),
+    "fit_rate": (1e-3, 3e-3, 1e-2),
+    "fits": (3, 10, 30),
+    "hidden": ((64, 64, 64), (32, 32)),
+}
+_RELAX: Space = {
+    "samples": (2, 4, 8, 16),
+    "sigma": ((1.0, 0.1), (1.0, 0.01), (0.5, 0.03), (0.25, 0.25)),
+    "steps": (20, 50, 100, 300),
+    "rate": (0.03, 0.1, 0.2, 0.4),
+    "fit_rate": (0.01, 0.03, 0.1),
+    "hidden": ((10,), (64,), (10, 10)),
+}
 
 SPACES: Mapping[str, Space] = {
     **dict.fromkeys(("fr22", "our_g"), _ADAM),
@@ -49,6 +66,9 @@ SPACES: Mapping[str, Space] = {
     **dict.fromkeys(("bfgs_fd", "lbfgs_fd"), _DIFFERENCE),
     **dict.fromkeys(("cma_es", "cma_es_bounded", "cobyqa", "dfo_ls"), _SCALE),
     **dict.fromkeys(("mitsuba", "mitsuba_path", "mitsuba_projective"), _ADJOINT),
+    "py_bobyqa": {**_SCALE, "seek_global_minimum": (True, False)},
+    "zerograds": _ZEROGRADS,
+    "relax": _RELAX,
     "analytic_1": {"rate": (0.03, 0.1, 0.3), "steps": (50, 300)},
     "analytic_2": {"radius": (0.5, 1.0, 2.0, 5.0, 100.0), "steps": (3, 10)},
 }

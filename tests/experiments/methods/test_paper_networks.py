@@ -17,7 +17,7 @@ from experiments.runs.network_trial import NetworkTrial
 RENDERS = {"fr22": 2 * 3, "our_g": 2 * 3, "our_h": 4 * 7, "our_hvp": 4 * 7, "our_hvpa": 4 * 3}
 """Of a step: images of a batch, times pairs of samples (two renders each; those of our_h for gradient, Hessian and
 value, of our_hvp for three gradients) and f(x)."""
-POOLED = {"lengths": (1.0,), "temperature": 0.1, "steps": 300, "rank": 64}
+POOLED = {"temperature": 0.1, "steps": 300, "rank": 64}
 
 
 def run(name, task=BUMP, number=0, settings=None):

@@ -1,4 +1,4 @@
-"""Training from all renders so far: the model of the image, the local entropy, and the tasks that need them."""
+"""Training from all renders so far: their surrogate, the local entropy, and the tasks that need them."""
 
 import math
 from dataclasses import replace
@@ -8,13 +8,12 @@ import torch
 from small import BUMP
 
 from experiments.methods import METHODS
-from experiments.methods.image_model import ImageModel
-from experiments.methods.pooled import local_entropy
+from experiments.methods.pooled import Pooled, Renders, local_entropy
 from experiments.problems.network_task import Size
 from experiments.problems.tasks import cnn_texture, cnn_wide
 from experiments.runs.attempt import attempt
 
-QUICK = {"lengths": (0.5,), "temperature": 0.1, "steps": 20, "batch": 4, "draws": 4, "rank": 8, "first": 8, "rows": 10}
+QUICK = {"temperature": 0.1, "steps": 20, "batch": 4, "draws": 4, "rank": 8, "first": 8, "rows": 10}
 
 
 def trained(task, settings, number=0):
@@ -27,43 +26,32 @@ def trained(task, settings, number=0):
     return outcome, trials[0]
 
 
-def test_a_linear_model_of_linear_images_is_exact():
+def test_losses_of_linear_images_and_where_they_vanish():
     generator = torch.Generator().manual_seed(0)
     slope, offset = torch.randn(6, 40, generator=generator), torch.randn(40, generator=generator)
-    points, references = (torch.rand(k, 6, generator=generator) for k in (20, 3))
-    model = ImageModel(references @ slope + offset, None, rank=20, seed=0)
-    model.add(points[:12], points[:12] @ slope + offset)
-    model.add(points[12:], points[12:] @ slope + offset)
-    model.fit()
-    assert model.evaluations == 20
-    x = torch.rand(5, 6, generator=generator)
-    found = model.distances(model(x), torch.arange(3))
-    expected = (((x @ slope)[None] - (references @ slope)[:, None]) ** 2).mean(2)
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
+    points, truth, x = (torch.rand(k, 6, generator=generator) for k in (20, 3, 5))
+    renders = Renders(truth @ slope + offset, Pooled(temperature=1.0, surrogate="linear", rank=20))
+    renders.add(points[:12], points[:12] @ slope + offset)
+    renders.add(points[12:], points[12:] @ slope + offset)
+    renders.fit()
+    assert renders.evaluations == 20
+    expected = (((x @ slope)[None] - (truth @ slope)[[2, 0], None]) ** 2).mean(2)
+    torch.testing.assert_close(renders.losses(x, torch.tensor([2, 0])), expected, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(renders.solutions, truth, rtol=1e-3, atol=1e-3)
 
 
-def test_the_model_keeps_the_latest_evaluations():
-    points = torch.linspace(0, 4, 9)[:, None]
-    model = ImageModel(torch.zeros(1, 3), (1.0,), rank=9, seed=0, capacity=4)
-    model.add(points[:5], torch.full((5, 3), 7.0))
-    model.add(points[5:], points[5:].expand(-1, 3))
-    model.fit()
-    found = model.distances(model(points[5:]), torch.tensor([0]))
-    torch.testing.assert_close(found, points[5:].T.square(), rtol=1e-2, atol=1e-2)
-
-
-def test_kriging_predicts_between_the_images_known():
+def test_losses_between_the_renders_known():
     def images(x):  # a bump at x
         return torch.exp(-0.5 * ((torch.linspace(0, 4, 50) - x) / 0.7) ** 2)
 
     points = torch.linspace(-1, 5, 25)[:, None]
-    targets = torch.tensor([[1.0], [2.6]])
-    model = ImageModel(images(targets), (0.7,), rank=25, seed=0)
-    model.add(points, images(points))
-    model.fit()
-    x = torch.tensor([[0.33], [1.7], [3.9]])
+    targets, x = torch.tensor([[1.0], [2.6]]), torch.tensor([[0.33], [1.7], [3.9]])
+    renders = Renders(images(targets), Pooled(temperature=1.0, rank=25))
+    renders.add(points, images(points))
+    renders.fit()
+    assert renders.solutions is None
     expected = (images(x)[None] - images(targets)[:, None]).square().mean(2)
-    torch.testing.assert_close(model.distances(model(x), torch.arange(2)), expected, rtol=0, atol=2e-3)
+    torch.testing.assert_close(renders.losses(x, torch.arange(2)), expected, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("n", [1, 3])
@@ -143,7 +131,7 @@ def test_a_wide_range_is_learned_where_the_smoothed_loss_has_a_plateau():
             return bar.expand(-1, 3, 16, 16).contiguous()
 
     task = Bar(Size(16, 1, 2, evaluations=600, images=256, held_out=32))
-    settings = {"lengths": (0.5,), "temperature": 0.1, "steps": 300, "rank": 64, "draws": 8}
+    settings = {"temperature": 0.1, "steps": 300, "rank": 64, "draws": 8}
     _, trial = trained(task, settings)
     assert task.parameter_error(trial.encoder) < 0.05 * trial.rows[0].parameter_error
 
@@ -165,16 +153,7 @@ def test_a_texture_is_recovered_from_renders_alone():
             return torch.cat([shown, 0.5 * shown.flip(1)], 1)[:, None, None].expand(-1, 3, 4, -1).contiguous()
 
     task = Contrasts(Size(4, 1, 2, evaluations=40, images=128, held_out=16))
-    settings = {"lengths": None, "temperature": 1.0, "steps": 400, "rate": (1e-2, 1e-3), "rank": 40, "first": 40}
+    settings = {"surrogate": "linear", "temperature": 1.0, "steps": 400, "rate": (1e-2, 1e-3), "rank": 40, "first": 40}
     outcome, trial = trained(task, settings)
     assert outcome.evaluations == 40
     assert task.measured(task.parameter_error(trial.encoder)) > 15.0
-
-
-def test_the_solution_of_a_linear_model():
-    generator = torch.Generator().manual_seed(3)
-    slope, points, truth = (torch.randn(*size, generator=generator) for size in ((5, 30), (12, 5), (4, 5)))
-    model = ImageModel(truth @ slope + 1.0, None, rank=12, seed=0)
-    model.add(points, points @ slope + 1.0)
-    model.fit()
-    torch.testing.assert_close(model.solutions, truth, rtol=1e-3, atol=1e-3)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.interpolate import BSpline
 
-from experiments.methods.block_gauss_newton import METHODS, Jacobian
+from experiments.methods.block_gauss_newton import METHODS
 from experiments.problems import catalogue
 from experiments.problems.scenes.caustic import INDEX, Caustic, basis, refraction
 from experiments.problems.task import Task, Truth, least_squares
@@ -223,26 +223,6 @@ def test_gauss_newton_solves_least_squares() -> None:
     assert outcome.status == "finished"
     assert outcome.evaluations < 120 + 5 * (30 + 7)  # a Jacobian, and a few steps
     np.testing.assert_allclose(outcome.x, best, atol=0.05 * float(best.abs().max()))
-
-
-def test_steps_solve_the_damped_problem_within_their_radii() -> None:
-    generator = torch.Generator().manual_seed(1)
-    jacobian = Jacobian(8, 20, generator)
-    a = torch.randn(8, 20, generator=generator)
-    directions = jacobian.directions(8)
-    torch.testing.assert_close(directions @ directions.mT, torch.eye(8), atol=1e-5, rtol=0)
-    for some in directions.split(3):
-        jacobian.renew(some, some @ a)
-    torch.testing.assert_close(jacobian.values, a, atol=1e-5, rtol=0)
-    r = torch.randn(20, generator=generator)
-    newton = -torch.linalg.lstsq(a.T, r[:, None]).solution[:, 0]
-    radii = torch.tensor([0.1, 0.5, 1.0, 2.0]) * newton.norm()
-    steps = jacobian.steps(r, radii)
-    torch.testing.assert_close(steps[:2].norm(dim=1), radii[:2], rtol=1e-3, atol=0)
-    torch.testing.assert_close(steps[3], newton, rtol=1e-3, atol=1e-4)
-    # On the boundary the gradient is opposite to the step.
-    slope = a @ (r + steps[1] @ a)
-    assert float(torch.cosine_similarity(slope, -steps[1], 0)) > 1 - 1e-4
 
 
 def test_gauss_newton_bends_the_light_within_one_jacobian() -> None:

@@ -237,7 +237,7 @@ def test_no_batch_at_all_raises_and_does_not_end_the_process() -> None:
 
 SAME_ESTIMATES = """
 import torch, torch_zerohess as zh
-from torch_zerohess import extension
+from torch_zerohess.sampling import extension
 for sampler in ("random", "sobol", "orthogonal"):
     x = torch.linspace(-1, 1, 5, dtype=torch.float64)
     e = zh.estimate(lambda z: z.sin().prod(1), x, zh.Smoothing(sigma=0.5, samples=8, sampler=sampler, seed=3))

@@ -1,0 +1,160 @@
+"""ZeroGrads and RELAX on network tasks: the surrogate sees the parameters and the image that they are to explain.
+
+The loss of a prediction depends on the image that it is for, so one surrogate h(z, r) serves all images r: a network of
+the parameters z and of r at 8x8 pixels. ZeroGrads fits it to the losses of the latest batch, RELAX makes it a control
+variate of their score function (see `experiments.methods.learned`). The gradient at the predictions goes on through the
+encoder to its weights, which Adam moves. The papers instead take the weights themselves for the parameters (ZeroGrads:
+35 000 of them) or have no input image (RELAX); sampling 268 000 weights would ignore that the encoder is a white box.
+
+Both methods know the loss alone: no render, no bounds, no derivative of the black box. Sigma is that of the task. Sigma
+and the learning rate of the encoder go down linearly over nine tenths of the evaluations, as for the source's methods.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from experiments.methods.learned_gradients import Function, fit, lax, network, slope
+from experiments.methods.paper_networks import ANNEALED
+from experiments.runs.network_trial import NetworkTrial
+
+SIDE = 8
+"""Pixels along the side of the images that the surrogate sees."""
+
+
+class Surrogate:
+    """A network of parameters and images, and the scales that make its inputs and values about 1.
+
+    Args:
+        trial: the run; parameters are relative to the mean prediction at its start, in units of the first sigma.
+        hidden: widths of the layers.
+        activation: between them.
+    """
+
+    def __init__(self, trial: NetworkTrial, hidden: Sequence[int], activation: type[nn.Module]) -> None:
+        self._trial, self._unit, self._scale = trial, trial.task.sigma[0], 0.0
+        with torch.no_grad():
+            self._centre = trial.encoder(trial.images[:16]).mean(0)
+        self.network = network(trial.task.n + 3 * SIDE**2, hidden, activation, trial.seed).float()
+
+    def of(self, images: Tensor) -> Function:
+        """Return h(z) for parameters z [K, n] of images [K, 3, h, w], one each."""
+        seen = nn.functional.adaptive_avg_pool2d(images, SIDE).flatten(1)
+        return lambda z: self.network(torch.cat([(z - self._centre) / self._unit, seen], 1))
+
+    def loss(self, z: Tensor, images: Tensor) -> tuple[Tensor, float]:
+        """Return the losses [K] over the mean of the first call, and their mean as it is."""
+        losses = self._trial.loss(z, images).float()
+        self._scale = self._scale or float(losses.mean()) or 1.0
+        return losses / self._scale, float(losses.mean())
+
+
+def zerograds(
+    trial: NetworkTrial,
+    *,
+    batch: int = 4,
+    pairs: int = 1,
+    rate: tuple[float, float] = (5e-4, 1e-4),
+    inner: float = 0.1,
+    fit_rate: float = 1e-3,
+    fits: int = 3,
+    hidden: Sequence[int] = (64, 64, 64),
+) -> None:
+    """ZeroGrads: Adam along the gradient of the fitted surrogate at the predictions.
+
+    Args:
+        trial: the run.
+        batch: images of a step.
+        pairs: antithetic pairs per image.
+        rate: first and last learning rate of the encoder.
+        inner: sigma of the kernel that smooths the loss, over that of the samples.
+        fit_rate: learning rate of the surrogate.
+        fits: its steps for every step of the encoder.
+        hidden: widths of its layers, with leaky ReLU.
+    """
+    surrogate = Surrogate(trial, hidden, nn.LeakyReLU)
+    fitted = torch.optim.Adam(surrogate.network.parameters(), lr=fit_rate)
+
+    def gradient(y: Tensor, images: Tensor, sigma: float) -> tuple[Tensor, float]:
+        centres, seen = y.repeat(2 * pairs, 1), images.repeat(2 * pairs, 1, 1, 1)
+        u = torch.randn(pairs * len(y), y.shape[1])
+        z = centres + sigma * torch.cat([u, -u])
+        f, mean = surrogate.loss(z + inner * sigma * torch.randn_like(z), seen)
+        fit(surrogate.of(seen), fitted, z, f, fits)
+        return slope(surrogate.of(images), y), mean
+
+    _train(trial, batch, 2 * pairs, rate, gradient)
+
+
+def relax(
+    trial: NetworkTrial,
+    *,
+    batch: int = 4,
+    samples: int = 2,
+    rate: tuple[float, float] = (5e-4, 1e-4),
+    fit_rate: float = 0.01,
+    hidden: Sequence[int] = (10,),
+) -> None:
+    """RELAX for continuous variables (LAX): Adam along the score function with a learned control variate.
+
+    Args:
+        trial: the run.
+        batch: images of a step.
+        samples: per image.
+        rate: first and last learning rate of the encoder.
+        fit_rate: learning rate of the control variate.
+        hidden: widths of its layers, with tanh.
+    """
+    surrogate = Surrogate(trial, hidden, nn.Tanh)
+    tuned = torch.optim.Adam(surrogate.network.parameters(), lr=fit_rate)
+
+    def gradient(y: Tensor, images: Tensor, sigma: float) -> tuple[Tensor, float]:
+        centres, seen = y.repeat(samples, 1), images.repeat(samples, 1, 1, 1)
+        u = torch.randn_like(centres)
+        f, mean = surrogate.loss(centres + sigma * u, seen)
+        gradients = lax(f, surrogate.of(seen), centres, u, sigma)
+        tuned.zero_grad()
+        (sigma**2 * gradients.square().sum(1).mean()).backward()
+        tuned.step()
+        return gradients.detach().view(samples, *y.shape).mean(0), mean
+
+    _train(trial, batch, samples, rate, gradient)
+
+
+def _train(
+    trial: NetworkTrial,
+    batch: int,
+    renders: int,
+    rate: tuple[float, float],
+    gradient: Callable[[Tensor, Tensor, float], tuple[Tensor, float]],
+) -> None:
+    """Take all steps that the evaluations allow.
+
+    The image error of a row is the mean loss of the samples of the last twentieth of the run, for no renders.
+
+    Args:
+        trial: the run.
+        batch: images of a step.
+        renders: of a step per image.
+        rate: first and last learning rate of the encoder.
+        gradient: predictions [B, n] without a graph, their images and sigma -> the gradient [B, n] of the loss of each,
+            and the mean loss of the samples.
+    """
+    steps = max(1, trial.task.evaluations // (batch * renders))
+    optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=rate[0])
+    losses = deque[float](maxlen=max(1, steps // 20))
+    (first, last), images = trial.task.sigma, trial.images
+    for step in range(steps):
+        share = min(step / (ANNEALED * steps), 1.0)
+        sigma = first + share * (last - first)
+        optimizer.param_groups[0]["lr"] = rate[0] + share * (rate[1] - rate[0])
+        chosen = images[torch.arange(batch * step, batch * (step + 1)) % len(images)]
+        y = trial.encoder(chosen)
+        direction, loss = gradient(y.detach(), chosen, sigma)
+        optimizer.zero_grad()
+        y.backward(direction / batch)
+        optimizer.step()
+        losses.append(loss)
+        trial.report(sigma=sigma, loss=loss, image_error=sum(losses) / len(losses))

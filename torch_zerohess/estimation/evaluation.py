@@ -213,7 +213,7 @@ def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) 
 
 def _tensor(result: Any) -> Tensor:
     try:
-        # Numbers of Python have the precision of float64, not that of torch's default.
+        # A number of Python is float64, whatever the default dtype of torch.
         return torch.as_tensor(result, dtype=torch.float64 if isinstance(result, float) else None)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

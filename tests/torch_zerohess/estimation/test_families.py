@@ -17,7 +17,7 @@ from torch_zerohess.estimation import perturbations
 from torch_zerohess.estimation.perturbations import FAMILIES, draws, perturb, stored
 from torch_zerohess.estimation.standard_error import variance_of_draws
 from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Stein, total
-from torch_zerohess.sampling import kernels
+from torch_zerohess.sampling import kernels, proposals
 from truths import Exponential, deviation, spread, vector
 
 N, B, P = 3, 2, 2
@@ -90,6 +90,19 @@ def test_tensors_are_as_laid_out_and_make_the_same_family(smoothing: zh.Smoothin
         assert described.batched or torch.equal(one[:, 2:], other[:, 2:])
 
 
+@pytest.mark.parametrize(("smoothing", "keep"), CASES)
+def test_points_do_not_depend_on_what_is_stored(smoothing: zh.Smoothing, keep: bool) -> None:
+    assert torch.equal(perturb(X, smoothing, 4, keep).points, perturb(X, smoothing, 4, True).points)
+
+
+def test_the_first_order_draws_no_lobes_of_the_second() -> None:
+    smoothing = S.replace(samples=200, order=1, antithetic=False)
+    kinds = perturb(X, smoothing, 4, False).stein.u.rows[:, 2]
+    assert set(kinds.tolist()) == {proposals.NORMAL, proposals.GRADIENT_LOBE}
+    both = perturb(X, smoothing.replace(order=2), 4, False).stein.u.rows[:, 2]
+    assert {proposals.DIAGONAL_LOBE, proposals.OFF_DIAGONAL_LOBE} < set(both.tolist())
+
+
 @pytest.mark.parametrize("antithetic", [True, False])
 @pytest.mark.parametrize(("samples", "sampler"), [(7, "random"), (32, "sobol"), (7, "orthogonal"), (5, "orthogonal")])
 def test_every_row_belongs_to_one_independent_draw(samples: int, sampler: str, antithetic: bool) -> None:
@@ -114,6 +127,25 @@ def test_the_variance_of_draws_is_the_textbook_formula(monkeypatch: pytest.Monke
         monkeypatch.setattr("torch_zerohess.estimation.standard_error._CHUNK", chunk)
         got = variance_of_draws(stein, "value", f / 18, share, draws(smoothing, N), None)
         close(got, expected.view(1, 1))
+
+
+def test_the_variance_of_optimal_sampling_is_the_textbook_formula_per_element() -> None:
+    """A draw is the pair k, k + 60 of the 6 pairs of one element; its variance is var(draws) / 6."""
+    smoothing, S6 = S.replace(proposal="optimal", samples=6), 6
+    stein, K = perturb(X[:1], smoothing, 4, True).stein, 120
+    f = spread(K, -1.0, 2.0).view(1, 1, K)
+    share = torch.full((1, K), 1 / K, dtype=torch.float64)
+    pairs = (f * stein.weight / 10).view(2, 10, S6).mean(0)  # ten sets: value, three slopes, six second derivatives
+    expected = pairs.var(1) / S6
+    for quantity, elements in (("value", expected[0]), ("gradient", expected[1:4]), ("hessian_diagonal", expected[4:])):
+        got = stein.variance(quantity, f / K, share, draws(smoothing, N), None)[0, 0]
+        close(got, elements[[0, 3, 5]] if quantity == "hessian_diagonal" else elements)  # of 00, 01, 02, 11, 12, 22
+    v = vector(1.0, -2.0, 0.5).view(1, 1, N)
+    upper = torch.zeros(N, N, dtype=torch.float64)
+    upper[tuple(torch.triu_indices(N, N))] = expected[4:]
+    whole = upper + upper.triu(1).mT
+    got = stein.variance("hvp", f / K, share, draws(smoothing, N), v)[0, 0]
+    close(got, whole @ v[0, 0] ** 2)
 
 
 def test_a_point_is_compared_with_all_of_its_perturbations() -> None:

@@ -158,3 +158,11 @@ def test_errors_name_what_is_wrong():
     for make, message in cases:
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_a_dense_matrix_beyond_ten_thousand_parameters_is_refused():
+    x = torch.zeros(10_001, requires_grad=True)
+    operator = zh.CurvatureOperator((x**2).sum(), x)
+    with pytest.raises(ValueError, match="matrix of 10001 squared numbers: use H @ v"):
+        operator.to_dense()
+    torch.testing.assert_close(operator @ torch.ones(10_001), torch.full((10_001,), 2.0))

@@ -166,3 +166,15 @@ def test_a_dense_matrix_beyond_ten_thousand_parameters_is_refused():
     with pytest.raises(ValueError, match="matrix of 10001 squared numbers: use H @ v"):
         operator.to_dense()
     torch.testing.assert_close(operator @ torch.ones(10_001), torch.full((10_001,), 2.0))
+
+
+@pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
+def test_parameters_that_the_loss_does_not_depend_on_have_no_curvature(mode):
+    used, linear, unused = (torch.tensor([1.0, 2.0], requires_grad=True) for _ in range(3))
+    loss = (used**2).sum() + linear.sum()
+    through = [used, linear] if mode == "gauss_newton" else None
+    operator = zh.CurvatureOperator(loss, [used, linear, unused], mode=mode, through=through)
+    assert operator.gradient.tolist() == [2.0, 4.0, 1.0, 1.0, 0.0, 0.0]
+    assert torch.equal(operator.to_dense(), torch.diag(torch.tensor([2.0, 2.0, 0.0, 0.0, 0.0, 0.0])))
+    alone = zh.CurvatureOperator(linear.sum(), linear)  # its gradient has no graph at all
+    assert torch.equal(alone.to_dense(), torch.zeros(2, 2))

@@ -1,4 +1,4 @@
-"""Settings of the rivals, what a user would pick instead of ours.
+"""Settings of the rivals: the methods that a user would pick instead of ours.
 
 Chosen on starts that no table reports (runs from 1000 upward), by the share of runs that reduce the image error by
 99 % and then by the median of their evaluations. All of their space (`experiments.methods.settings.spaces`) was tried

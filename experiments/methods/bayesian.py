@@ -31,7 +31,7 @@ from experiments.methods.method import Method
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
-EVALUATIONS = 100
+EVALUATIONS = 60
 """Evaluations after which both methods end, if not set."""
 MOST = 20
 """Most parameters. Frazier (2018), "A tutorial on Bayesian optimization", gives 20 as the usual limit."""
@@ -196,7 +196,7 @@ def botorch_composite(
         # The acquisition smooths at a fixed scale: in units of the best loss an improvement is between 0 and 1.
         unit = losses.min().clamp_min(torch.finfo(torch.float64).tiny)
 
-        def objective(c: Tensor, _: Tensor | None = None) -> Tensor:
+        def objective(c: Tensor, X: Tensor | None = None) -> Tensor:
             return -components.loss(c) / unit
 
         acquisition = qLogExpectedImprovement(
@@ -270,5 +270,6 @@ METHODS = (
         with_settings(botorch_composite),
         _has_residuals,
         ("botorch",),
+        uses="image",
     ),
 )

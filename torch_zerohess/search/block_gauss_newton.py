@@ -116,8 +116,8 @@ class BlockMethod(Method[BlockProgress]):
             return None
         gradient, hessian = self._derivatives(known)
         sigma, unknown = known.sigma, torch.full_like(known.center, math.inf)
-        gradient, hessian = sigma * gradient.double(), sigma**2 * hessian.double()
-        return LocalModel(known.best.loss, gradient, hessian, None, unknown, unknown.clone()), sigma
+        model = LocalModel(known.best.loss, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
+        return model, sigma
 
     def _sample(self, known: BlockProgress, generator: torch.Generator) -> tuple[BlockProgress, Tensor]:
         """Ask for samples along the next directions, as many as are wanted and left of the basis."""
@@ -135,7 +135,7 @@ class BlockMethod(Method[BlockProgress]):
         """Correct the Jacobian along the samples, the first of which is the start at the beginning."""
         assert evaluated.outputs is not None
         if not len(known.output):
-            first, evaluated = evaluated.outputs[0], evaluated.those(torch.arange(1, len(evaluated)))
+            first, evaluated = evaluated.outputs[0].clone(), evaluated.those(torch.arange(1, len(evaluated)))
             known = replace(
                 known,
                 best=replace(known.best, loss=float(self._loss(first, known.shape))),
@@ -151,7 +151,7 @@ class BlockMethod(Method[BlockProgress]):
         """Ask for steps of all lengths."""
         gradient, hessian = self._derivatives(known)
         radii = gradient.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
-        steps = damped_steps(gradient, hessian, radii).double()
+        steps = damped_steps(gradient, hessian, radii)
         return replace(known, phase="trial"), self._within(known.center + steps)
 
     def _taken(self, known: BlockProgress, evaluated: Evaluated) -> BlockProgress:
@@ -160,7 +160,7 @@ class BlockMethod(Method[BlockProgress]):
         k = int(evaluated.losses.argmin()) if len(evaluated) else -1
         if k >= 0 and float(evaluated.losses[k]) < known.best.loss:
             assert evaluated.outputs is not None
-            point, output = evaluated.points[k], evaluated.outputs[k]
+            point, output = evaluated.points[k].clone(), evaluated.outputs[k].clone()
             step = point - known.center
             radius = float(step.norm()) / math.sqrt(self.settings.n)
             known = replace(
@@ -186,11 +186,14 @@ class BlockMethod(Method[BlockProgress]):
         return replace(known, rounds=rounds, radius=self.radius, wanted=self.settings.n)
 
     def _derivatives(self, known: BlockProgress) -> tuple[Tensor, Tensor]:
-        """Gradient [n] and Gauss-Newton Hessian [n, n] of the loss at the center, float32."""
-        jacobian = known.jacobian
+        """Gradient [n] and Gauss-Newton Hessian [n, n] of the loss at the center, float64."""
+        size = _largest(known.jacobian)
+        jacobian = known.jacobian / size  # squares of float32 do not overflow
         directions = jacobian.view(-1, *known.shape)
         _, slope, bend = loss_derivatives(self._of_output, known.output.view(known.shape), directions)
-        return jacobian @ slope.float(), jacobian @ bend.mT
+        steep, bent = _largest(slope), _largest(bend)
+        gradient, hessian = jacobian @ (slope / steep).float(), jacobian @ (bend / bent).mT
+        return size * steep * gradient.double(), size**2 * bent * hessian.double()
 
     def _of_output(self, output: Tensor) -> Tensor:
         assert self.settings.loss is not None
@@ -276,18 +279,23 @@ def renewed(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
 
 
 def damped_steps(gradient: Tensor, hessian: Tensor, radii: Tensor) -> Tensor:
-    """Return steps s [k, n] that minimise gradient.s + s.hessian s/2 within each of the radii [k].
+    """Return steps s [k, n] that minimise gradient.s + s.hessian s/2 within each of the radii [k], all float64.
 
     s = -(hessian + shift)^-1 gradient (Levenberg-Marquardt), with the shift found by bisection of its logarithm.
-    Negative curvature counts as none.
+    Negative curvature counts as none. Eigenvectors are as exact as the Jacobian is: float32.
     """
-    curvature, vectors = torch.linalg.eigh(hessian)
-    curvature = curvature.clamp_min(0.0)
+    size = _largest(hessian)
+    values, basis = torch.linalg.eigh((hessian / size).float())
+    curvature, vectors = size * values.double().clamp_min(0.0), basis.double()
     slope = vectors.mT @ gradient
-    largest = curvature[-1].clamp_min(torch.finfo(slope.dtype).tiny)
-    low, high = (slope.new_full((len(radii), 1), factor) * largest for factor in _SHIFTS)
+    low, high = (slope.new_full((len(radii), 1), factor * size) for factor in _SHIFTS)
     for _ in range(_BISECTIONS):
         shift = (low * high).sqrt()
         long = (slope / (curvature + shift)).norm(dim=1, keepdim=True) > radii[:, None]
         low, high = torch.where(long, shift, low), torch.where(long, high, shift)
     return -(slope / (curvature + high)) @ vectors.mT
+
+
+def _largest(values: Tensor) -> float:
+    """Largest magnitude, 1 if all are zero."""
+    return float(values.abs().max()) or 1.0

@@ -26,6 +26,7 @@ from torch_zerohess.surrogates.gaussian_process import (
 _LEAST_NOISE = 1e-8
 """Noise below which a covariance of thousands of points is singular in double precision."""
 _ITERATIONS = 20
+"""Of L-BFGS, at most."""
 
 
 class Choice(NamedTuple):
@@ -79,7 +80,7 @@ def most_likely(points: Tensor, change: Tensor, *, anisotropic: bool) -> Choice:
 
 
 def _climb(points: Tensor, change: Tensor, start: Choice, anisotropic: bool) -> Choice:
-    """Improve lengths and noise by L-BFGS; where that fails the start is returned."""
+    """Improve lengths and noise by L-BFGS; return the start if a line search leaves the range of the numbers."""
     logs = torch.cat([start.lengths[: None if anisotropic else 1].log(), points.new_tensor([start.noise]).log()])
     logs.requires_grad_()
 
@@ -96,8 +97,11 @@ def _climb(points: Tensor, change: Tensor, start: Choice, anisotropic: bool) -> 
     optimizer = torch.optim.LBFGS([logs], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
     with torch.no_grad():
         before = float(log_evidence(points, change, start.kernel, *now()))
-    optimizer.step(loss)
-    with torch.no_grad():
-        lengths, noise = now()
-        after = float(log_evidence(points, change, start.kernel, lengths, noise))
+    try:
+        optimizer.step(loss)
+        with torch.no_grad():
+            lengths, noise = now()
+            after = float(log_evidence(points, change, start.kernel, lengths, noise))
+    except RuntimeError:  # the class of what a factorization of infinite numbers raises
+        return start._replace(evidence=before)
     return Choice(start.kernel, lengths, float(noise), after) if after >= before else start._replace(evidence=before)

@@ -68,7 +68,7 @@ def test_the_table_has_medians_and_shares():
     ]
     (row,) = summary(BUMP, results).splitlines()[2:]
     # Roots of the medians 4 and 0.04; quotients 400, 4, 100 and 2, 20, 10.
-    assert row.split() == ["m", "2", "20", "2", "0.2", "100", "10", "2/3", "2/3"]
+    assert row.split() == ["m", "20", "2", "2", "0.2", "100", "4", "10", "2", "2", "of", "3"]
 
 
 def test_onnx_predicts_the_same(tmp_path):

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from searches import TARGET, bowl, points_of, rays, rays_loss, rosenbrock, run, zeros
 
-from torch_zerohess.optim import Descent, GaussianProcessSearch, TrustRegion
+from torch_zerohess.optim import BlockGaussNewton, Descent, GaussianProcessSearch, TrustRegion
 from truths import vector
 
 # Every search with and without a loss; restarts keep it busy.
@@ -19,6 +19,7 @@ SEARCHES = {
     "descent of the output": (Descent, 5, True),
     "process of the loss": (GaussianProcessSearch, 2, False),
     "process of the output": (GaussianProcessSearch, 2, True),
+    "block Gauss-Newton": (BlockGaussNewton, 5, True),
 }
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from torch_zerohess.surrogates import gaussian_process
+from torch_zerohess.surrogates import lengths
 from torch_zerohess.surrogates.gaussian_process import (
     HIGH_NOISES,
     KERNELS,
@@ -112,18 +112,18 @@ def test_the_evidence_is_the_likelihood_and_the_prior_of_the_length():
                 expected = 2 / 5 * log_likelihood(points, change / size, kernel, length, noise)
                 expected += 9 * (math.log(2 * math.pi) + 1) - (math.log(length) / 1.5) ** 2
                 assert float(evidence[len(LENGTHS) * k + i, j]) == pytest.approx(expected, rel=1e-6, abs=1e-6)
-                lengths = torch.full((2,), length, dtype=torch.float64)
-                same = log_evidence(points, change / size, kernel, lengths, torch.tensor(noise).double())
+                same_for_all = torch.full((2,), length, dtype=torch.float64)
+                same = log_evidence(points, change / size, kernel, same_for_all, torch.tensor(noise).double())
                 assert float(same) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
 def test_the_evidence_of_one_length_per_parameter():
-    points, lengths, noise = normal(9, 3), vector(0.5, 1.0, 3.0), torch.tensor(0.01).double()
+    points, each, noise = normal(9, 3), vector(0.5, 1.0, 3.0), torch.tensor(0.01).double()
     change = waves(points) - waves(points).mean(0)
     for kernel in KERNELS:
-        found = log_evidence(points, change, kernel, lengths, noise)
-        expected = 2 / 5 * log_likelihood(points, change, kernel, lengths, 0.01)
-        expected += 9 * (math.log(2 * math.pi) + 1) - float((lengths.log() / 1.5).square().mean())
+        found = log_evidence(points, change, kernel, each, noise)
+        expected = 2 / 5 * log_likelihood(points, change, kernel, each, 0.01)
+        expected += 9 * (math.log(2 * math.pi) + 1) - float((each.log() / 1.5).square().mean())
         assert float(found) == pytest.approx(expected, rel=1e-8)
 
 
@@ -138,7 +138,7 @@ def test_the_entries_with_the_highest_evidence_are_chosen():
 
     every = [(kernel, length, noise) for kernel in KERNELS for length in LENGTHS for noise in noises]
     assert (process.kernel, process.length, process.noise) == max(every, key=lambda one: evidence(*one))
-    assert process.noise in HIGH_NOISES
+    assert process.noise >= 0.1
 
 
 def test_smooth_outputs_get_the_smooth_kernel_and_edges_the_rough_one():
@@ -203,12 +203,12 @@ def test_one_length_per_parameter_is_recovered(kernel):
     """From 30 outputs drawn from a process with known lengths, within 20 % where they are shorter than the range."""
     generator = torch.Generator().manual_seed(0)
     points = 4 * torch.rand(150, 3, generator=generator, dtype=torch.float64)
-    lengths = vector(0.7, 1.5, 3.0)
-    found = most_likely(points, drawn(points, kernel, lengths, 1e-2, 30), anisotropic=True)
+    truth = vector(0.7, 1.5, 3.0)
+    found = most_likely(points, drawn(points, kernel, truth, 1e-2, 30), anisotropic=True)
     assert found.kernel is kernel
-    torch.testing.assert_close(found.lengths, lengths, rtol=0.2, atol=0)
+    torch.testing.assert_close(found.lengths, truth, rtol=0.2, atol=0)
     assert found.noise == pytest.approx(1e-2, rel=0.5)
-    one = most_likely(points, drawn(points, kernel, lengths, 1e-2, 30), anisotropic=False)
+    one = most_likely(points, drawn(points, kernel, truth, 1e-2, 30), anisotropic=False)
     assert torch.equal(one.lengths, one.lengths[:1].expand(3))
     assert one.evidence < found.evidence
 
@@ -221,6 +221,21 @@ def test_a_climb_ends_where_the_evidence_is_flat():
     logs = torch.cat([found.lengths, torch.tensor([found.noise]).double()]).log()
     slope = torch.func.grad(lambda t: log_evidence(points, change, matern, t[:-1].exp(), t[-1].exp()))(logs)
     assert float(slope.abs().max()) < 0.05  # of the log likelihood; a length that is off by a percent tells 2
+
+
+def test_a_climb_that_leaves_the_range_of_the_numbers_is_not_taken(monkeypatch):
+    """The first step of a line search overflows: lengths and noise stay those of the lists."""
+    honest, calls = lengths.log_evidence, []
+
+    def evidence(points, change, kernel, length, noise):
+        calls.append(kernel)
+        return honest(points, change, kernel, length if len(calls) % 3 else 0.0 * length, noise)
+
+    points = 2 * normal(12, 2)
+    monkeypatch.setattr(lengths, "log_evidence", evidence)
+    found = lengths.most_likely(points, waves(points) - waves(points).mean(0), anisotropic=True)
+    assert float(found.lengths[0]) == float(found.lengths[1])
+    assert float(found.lengths[0]) in LENGTHS
 
 
 def anisotropic(z):
@@ -317,9 +332,3 @@ def test_what_cannot_be_fitted_is_refused():
         surrogate.fit(torch.zeros(4, 3), torch.zeros(3, 2))
     with pytest.raises(ValueError, match="capacity must be at least 2, got 1"):
         ProcessSurrogate(capacity=1)
-
-
-def test_the_lists_of_the_search():
-    """The search in a box relies on these: lengths around sigma, exact and noisy outputs apart."""
-    assert gaussian_process.LENGTHS[0] < 0.5 < 2.0 < gaussian_process.LENGTHS[-1]
-    assert max(NOISES) < min(HIGH_NOISES)

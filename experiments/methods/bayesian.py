@@ -196,7 +196,7 @@ def botorch_composite(
         # The acquisition smooths at a fixed scale: in units of the best loss an improvement is between 0 and 1.
         unit = losses.min().clamp_min(torch.finfo(torch.float64).tiny)
 
-        def objective(c: Tensor, _: Tensor | None = None) -> Tensor:
+        def objective(c: Tensor, X: Tensor | None = None) -> Tensor:
             return -components.loss(c) / unit
 
         acquisition = qLogExpectedImprovement(

@@ -1,63 +1,124 @@
-"""Command line of the experiments: `python -m experiments --help`."""
+"""The table of commands, and the command line: `python -m experiments --help`.
 
+A command is loaded when it is called. The list of commands loads none of them: it needs neither torch nor matplotlib.
+"""
+
+import difflib
+import importlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import tyro
-
-import torch_zerohess as zh
-from experiments.listing import list_
-from experiments.reports.figures import plot
-from experiments.reports.gallery import gallery
-from experiments.reports.report import report
-from experiments.reports.summary import table
-from experiments.run import run
-from experiments.studies.bench import bench
-from experiments.studies.caustic import check_caustic
-from experiments.studies.estimators import error
-from experiments.studies.gradients import gradients
-from experiments.studies.losses import losses
-from experiments.studies.nonpsd import nonpsd_error
-from experiments.studies.robustness import robustness
-from experiments.studies.stability import stability
-from experiments.studies.tune import tune
+PROGRAM = "python -m experiments"
 
 
-def doctor() -> None:
-    """Print what this installation can do: extension, devices, Mitsuba variants, versions."""
-    print(zh.doctor())
+@dataclass(frozen=True)
+class Command:
+    """Where the function of a command is, and one line about it."""
+
+    target: str
+    """module:function."""
+    help: str
+    long: bool = False
+    """Whether it takes long, so that a line says at once that it has begun."""
+
+    def load(self) -> Callable[..., Any]:
+        """Import the module and return the function."""
+        module, _, function = self.target.partition(":")
+        found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+        return found
 
 
-COMMANDS: dict[str, Callable[..., Any]] = {
-    "list": list_,
-    "run": run,
-    "table": table,
-    "plot": plot,
-    "report": report,
-    "tune": tune,
-    "error": error,
-    "nonpsd": nonpsd_error,
-    "losses": losses,
-    "gradients": gradients,
-    "robustness": robustness,
-    "gallery": gallery,
-    "caustic": check_caustic,
-    "bench": bench,
-    "stability": stability,
-    "doctor": doctor,
+COMMANDS = {
+    "list": Command("experiments.listing:list_", "tasks, methods, which go together, and what is missing"),
+    "run": Command("experiments.run:run", "run methods on tasks; called again it goes on where it was", long=True),
+    "table": Command("experiments.reports.summary:table", "evaluations, seconds and shares of a folder of results"),
+    "plot": Command("experiments.reports.error_curves:plot", "error curves of a folder of results"),
+    "report": Command("experiments.reports.ensemble_page:report", "one HTML page about a folder of results"),
+    "store": Command("experiments.reports.store:store", "keep the table of a folder of results, and its origin"),
+    "readme": Command("experiments.reports.documents:readme", "write stored tables into the documents, or check them"),
+    "tune": Command("experiments.studies.tune:tune", "search settings of a method, on starts of its own", long=True),
+    "error": Command("experiments.studies.estimators:error", "error of every estimator against evaluations", long=True),
+    "nonpsd": Command("experiments.studies.nonpsd:nonpsd_error", "error of the Hessian where it is indefinite"),
+    "losses": Command("experiments.studies.losses:losses", "a loss inside the black box, or after an image", long=True),
+    "gradients": Command(
+        "experiments.studies.gradients:gradients", "derivatives by the renderer and by sampling", long=True
+    ),
+    "robustness": Command("experiments.studies.robustness:robustness", "other starts, samples and noise", long=True),
+    "gallery": Command("experiments.studies.gallery:gallery", "pictures and animations of all tasks", long=True),
+    "caustic": Command("experiments.studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),
+    "bench": Command("experiments.studies.bench:bench", "time of the extension against pure torch", long=True),
+    "stability": Command("experiments.studies.stability:stability", "extreme cases against closed forms", long=True),
+    "doctor": Command("experiments.commands:doctor", "what this installation can do"),
 }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command that the arguments name, by default those of the process."""
+    name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="python -m experiments", description="Experiments of torch_zerohess."
-        )
+        if name in ("-h", "--help"):
+            print(usage())
+        else:
+            _run(_named(name), rest)
         sys.stdout.flush()
     except BrokenPipeError:  # `| head` has read enough; what is left to flush goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except ImportError as error:
-        raise SystemExit(str(error)) from error
+        raise SystemExit(_needs(name, error)) from error
+
+
+def usage() -> str:
+    """Return the list of commands."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:{width}}  {command.help}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        [
+            f"usage: {PROGRAM} COMMAND [ARGUMENT ...]",
+            "",
+            "Experiments of torch_zerohess.",
+            "",
+            *lines,
+            "",
+            f"{PROGRAM} COMMAND --help: the arguments of a command",
+        ]
+    )
+
+
+def doctor() -> None:
+    """Print what this installation can do: extension, devices, Mitsuba variants, versions."""
+    import torch_zerohess as zh
+
+    print(zh.doctor())
+
+
+def call(name: str, function: Callable[..., Any], arguments: Sequence[str]) -> Any:
+    """Call the function of a command with the values of its arguments; SystemExit says which is wrong."""
+    import tyro
+
+    return tyro.cli(function, prog=f"{PROGRAM} {name}", args=list(arguments))
+
+
+def _run(name: str, arguments: Sequence[str]) -> None:
+    if COMMANDS[name].long:
+        print(f"{name}: loading", file=sys.stderr, flush=True)
+    call(name, COMMANDS[name].load(), arguments)
+
+
+def _named(name: str) -> str:
+    """Return the name of a command; SystemExit names those that are near an unknown one."""
+    if name in COMMANDS:
+        return name
+    near = difflib.get_close_matches(name, COMMANDS, n=2)
+    guess = f" (did you mean {' or '.join(near)}?)" if near else ""
+    raise SystemExit(f"COMMAND must be one of {', '.join(COMMANDS)}, got {name}{guess}")
+
+
+def _needs(name: str, error: ImportError) -> str:
+    """Say what to install; tasks and adapters say so themselves."""
+    if "pip install" in str(error) or error.name is None:
+        return str(error)
+    return f"{name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'"

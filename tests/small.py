@@ -1,14 +1,18 @@
-"""A task and methods for tests of the harness: quick, deterministic, and known to other processes by this module."""
+"""Tasks and methods for tests of the harness: quick, deterministic, and known to other processes by this module."""
 
 import os
 import signal
-import time
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
 from experiments.methods import Method
+from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.task import Output, Picture, Task, Truth
+
+GATE, BEFORE = "TESTS_GATE", 8
+"""An environment variable, and the calls of a gated black box that a process may make before it waits there."""
 
 TARGET = torch.tensor([1.0, -2.0], dtype=torch.float64)
 
@@ -17,9 +21,28 @@ def loss(x):
     return (x - TARGET).square().sum(1)
 
 
-def slow_loss(x):
-    time.sleep(0.2)  # long enough to be killed on a busy machine
+_calls = 0
+
+
+def gate():
+    """Where the environment names a folder, say there that this process has called often enough; wait to be killed."""
+    global _calls
+    _calls += 1
+    folder = os.environ.get(GATE)
+    if folder and _calls > BEFORE:
+        Path(folder, str(os.getpid())).touch()
+        while True:
+            signal.pause()
+
+
+def gated_loss(x):
+    gate()
     return loss(x)
+
+
+def gated_image(x):
+    gate()
+    return image(x)
 
 
 def image(x):
@@ -64,7 +87,55 @@ TASK = Task(
     truth=Truth(image_error, parameter_error),
     picture=Picture(picture, target_picture),
 )
-SLOW = replace(TASK, name="slow", loss=slow_loss)
+GATED = replace(TASK, name="gated", loss=gated_loss, output=replace(TASK.output, image=gated_image))
+
+
+def bump(x):
+    """Images [K, 16, 16, 3] of a column of light at x [K, 1], of 4.5 to 22.5."""
+    place = (x[:, :, None, None] - 4.5) / 18
+    return torch.exp(-0.5 * ((torch.linspace(0, 1, 16)[:, None] - place) / 0.15) ** 2).float().expand(-1, 16, -1, 3)
+
+
+def gated_bump(x):
+    gate()
+    return bump(x)
+
+
+class Bump(NetworkTask):
+    """A network that says where the light is."""
+
+    name = "bump"
+    title = "the place of a column of light"
+    n = 1
+    sigma = (1.0, 0.1)
+    measure = "rms error"
+
+    def encoder(self):
+        return Encoder(self.size, (4.5,), (22.5,))
+
+    def load(self):
+        return bump
+
+    def parameters(self, count, generator, *, held_out):
+        return 11.5 + 4 * torch.rand(count, 1, generator=generator)
+
+    @staticmethod
+    def measured(parameter_error):
+        return parameter_error**0.5
+
+    def caption(self, x):
+        return f"{float(x[0]):.1f}"
+
+
+class GatedBump(Bump):
+    name = "gated_bump"
+
+    def load(self):
+        return gated_bump
+
+
+SIZE = Size(16, 1, 2, evaluations=84, images=12, held_out=4)
+BUMP, GATED_BUMP = Bump(SIZE), GatedBump(SIZE)
 
 
 def search(trial, settings):
@@ -97,6 +168,10 @@ def fail(trial, settings):
     raise ZeroDivisionError("as this method\ndoes")
 
 
+def fail_to_train(trial, settings):
+    raise ZeroDivisionError("as this method does")
+
+
 def crash(trial, settings):
     os.kill(os.getpid(), signal.SIGSEGV)
 
@@ -113,3 +188,20 @@ CRASH = Method("crash", "a crash of the process", crash)
 GIVE_UP = Method("give_up", "stops at once", give_up)
 ELSEWHERE = Method("elsewhere", "for other tasks", halve, applies=lambda task: "not for bowls")
 MISSING = Method("missing", "needs something", halve, packages=("no-such-package",))
+
+
+def shift(trial, settings):
+    """Train the last bias alone: by the sign of the error of one image, for one evaluation each."""
+    bias = trial.encoder.layers[-2].bias
+    while True:
+        for image in trial.images:
+            with torch.no_grad():
+                x = trial.encoder(image[None])
+                step = 0.01 * torch.randn(1)
+                loss = trial.loss(x + step, image[None])
+                bias += step.sign() * (0.5 - loss)
+            trial.report(sigma=0.01, loss=loss, image_error=float(loss))
+
+
+SHIFT = Method("shift", "moves the last bias", train=shift)
+FAIL_TO_TRAIN = Method("fail_to_train", "an exception", train=fail_to_train)

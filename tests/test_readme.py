@@ -1,51 +1,151 @@
-"""The README's code runs, and its commands are those that exist."""
+"""The documents: their code runs, their commands can be called, their tables are those stored, their links lead on."""
 
+import functools
 import re
-import subprocess
-import sys
+import shlex
 from pathlib import Path
+from typing import Any
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+import pytest
+import torch
+
+from experiments.commands import COMMANDS, call
+from experiments.methods import METHODS
+from experiments.problems.catalogue import TASKS, chosen
+from experiments.reports.documents import DOCUMENTS, differences
+
+ROOT = Path(__file__).parents[1]
+TEXTS = {name: (ROOT / name).read_text() for name in DOCUMENTS if (ROOT / name).exists()}
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+COMMAND = re.compile(r"^(?:\S*/)?python3? -m experiments (.*)$")
+SETUP = "python3 -m venv .venv && .venv/bin/pip install"
+FILE = re.compile(r"[\w./-]+\.(?:py|h|cpp|csv|png|webp|toml|md)")
 
 
-def test_nothing_is_left_to_fill_in():
-    assert "@@" not in README
+def blocks(text: str, language: str) -> list[str]:
+    return [content for kind, content in BLOCK.findall(text) if kind == language]
 
 
-def test_python_blocks_run():
-    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert blocks
-    names: dict = {}
-    for block in blocks:  # one after the other, as a reader would
-        exec(compile(block, "README.md", "exec"), names)
-    assert names["fit"].value == 0.0
-    assert names["search"].value < 0.05
-    assert names["found"].value <= 1e-6
-    assert names["found"].evaluations < 100
+def commands(text: str) -> list[str]:
+    """Command lines in blocks of shell, with lines that end in a backslash joined, cut at `&&`."""
+    lines = [line for block in blocks(text, "bash") for line in block.replace("\\\n", " ").splitlines()]
+    return [part.strip() for line in lines for part in line.split("&&") if part.strip()]
+
+
+def prose(text: str) -> str:
+    return BLOCK.sub("", text)
+
+
+def params(found: dict[str, list[str]]) -> list[Any]:
+    return [pytest.param(name, one, id=f"{name}-{k}") for name, many in found.items() for k, one in enumerate(many)]
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_nothing_is_left_to_fill_in(name):
+    assert "@@" not in TEXTS[name]
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_code_runs(name, tmp_path, monkeypatch):
+    """Every block of Python, one after the other, as a reader would."""
+    monkeypatch.chdir(tmp_path)
+    torch.manual_seed(0)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    for block in blocks(TEXTS[name], "python"):
+        exec(compile(block, name, "exec"), names)
+    if name == "README.md":
+        assert names["fit"].value == 0.0
+        assert names["search"].value < 0.05
+        assert names["found"].value <= 1e-6
+        assert names["found"].evaluations < 100
+
+
+CALLS = {name: [match[1] for line in commands(text) if (match := COMMAND.match(line))] for name, text in TEXTS.items()}
+
+
+@pytest.mark.parametrize(("name", "line"), params(CALLS))
+def test_commands_can_be_called(name, line):
+    """They are parsed by the command's own parser, but not run."""
+    command, *arguments = shlex.split(line.partition("#")[0])
+    assert command in COMMANDS
+    function, given = COMMANDS[command].load(), {}
+
+    @functools.wraps(function)
+    def instead(*positional, **keywords):
+        given.update(keywords)
+        given["tasks"] = positional[0] if positional else keywords.get("tasks", ())
+
+    call(command, instead, arguments)
+    if given.get("methods") not in (None, "all"):
+        chosen("methods", given["methods"].split(","), list(METHODS))
+    if given["tasks"] and isinstance(given["tasks"], tuple):
+        chosen("tasks", given["tasks"], list(TASKS))
+
+
+def test_a_wrong_command_would_be_noticed():
+    for wrong in ("run quad --metods cobyqa", "run quad --runs many"):
+        with pytest.raises(SystemExit):
+            test_commands_can_be_called("here", wrong)
+    with pytest.raises(SystemExit, match="methods must be some of"):
+        test_commands_can_be_called("here", "run quad --methods cobyca")
+    with pytest.raises(AssertionError):
+        test_commands_can_be_called("here", "rum quad")
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_commands_named_in_prose_exist(name):
+    named = re.findall(r"python -m experiments (\w+)", TEXTS[name])
+    assert set(named) <= set(COMMANDS)
+
+
+def test_every_command_has_a_row_in_a_table():
+    rows = {one for text in TEXTS.values() for one in re.findall(r"^\| `(\w+)", text, re.MULTILINE)}
+    assert set(COMMANDS) <= rows
 
 
 def test_setup_commands_are_one_line_each():
-    first, second = (block.strip() for block in re.findall(r"```bash\n(.*?)```", README, re.DOTALL))
-    for command in (first, second):
-        assert command.startswith("python3 -m venv .venv && .venv/bin/pip install")
-        assert "\n" not in command
-    assert first.endswith("python -m experiments run cnn --methods our_g,pooled")
-    assert second.endswith("python -m pytest -q")
+    """An empty clone needs one line for the main job and one for the tests."""
+    setups = [block.strip() for block in blocks(TEXTS["README.md"], "bash") if block.startswith("python3 -m venv")]
+    assert len(setups) == 2
+    for setup in setups:
+        assert setup.startswith(SETUP)
+        assert "\n" not in setup
+    main, tests = setups
+    assert main.endswith("python -m experiments run cnn --methods our_g,pooled")
+    assert tests.endswith("python -m pytest -q")
 
 
-def test_every_command_has_help():
-    names = re.findall(r"^\| `(\w+)", README, re.MULTILINE)
-    expected = [
-        *("list", "run", "table", "plot", "report", "tune", "nonpsd", "losses", "gradients", "robustness", "gallery"),
-        *("caustic", "error", "bench", "stability", "doctor"),
-    ]
-    commands = [name for name in names if name in expected]
-    assert commands == expected
-    shown = subprocess.run(
-        [sys.executable, "-m", "experiments", "--help"],
-        cwd=Path(__file__).parent.parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert all(name in shown for name in commands)
+@pytest.mark.parametrize("name", TEXTS)
+def test_tables_are_those_that_are_stored(name):
+    assert differences(TEXTS[name]) == [], "run `python -m experiments readme`"
+
+
+LINKS = {name: re.findall(r"\]\(([^)\s]+)\)", prose(text)) for name, text in TEXTS.items()}
+
+
+@pytest.mark.parametrize(("name", "link"), params(LINKS))
+def test_links_lead_somewhere(name, link):
+    if re.match(r"[a-z]+:", link):
+        return
+    path, _, heading = link.partition("#")
+    target = (ROOT / name).parent / path if path else ROOT / name
+    assert target.exists(), f"{name} links to {link}"
+    if heading:
+        titles = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)
+        assert heading in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+NAMED = {name: sorted(set(FILE.findall(" ".join(re.findall(r"`([^`\n]+)`", prose(t)))))) for name, t in TEXTS.items()}
+MADE = {"errors.png", "predictions.png", "report.html", "index.html"}
+"""What a command writes into a folder of results."""
+
+
+@pytest.mark.parametrize(("name", "file"), params(NAMED))
+def test_named_files_exist(name, file):
+    """A path is from the root or from the document; a bare name is that of a file anywhere in the tree."""
+    if file in MADE or "NAME" in file:
+        return
+    found = [(ROOT / file).exists(), ((ROOT / name).parent / file).exists()]
+    if "/" not in file:
+        found += [any((ROOT / top).rglob(file)) for top in ("torch_zerohess", "experiments", "tests", "csrc")]
+    assert any(found), f"{name} names {file}"

@@ -1,4 +1,4 @@
-"""Minimise a plain function from a start, without a torch model: the trust region with its evaluations done for you."""
+"""Minimise a plain function from a start, without a torch model: `TrustRegion` with its evaluations done for you."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -6,10 +6,12 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluation import BlackBoxCall, checked_input
+from torch_zerohess.estimation.evaluation import BlackBoxCall
+from torch_zerohess.estimation.inputs import checked_input
 from torch_zerohess.evaluators.inline import Evaluator, Inline
-from torch_zerohess.optim import TrustRegion
 from torch_zerohess.optim.second_order import check_count
+from torch_zerohess.search.space import Bounds
+from torch_zerohess.search.trust_region import Engine, TrustRegion
 
 
 @dataclass(frozen=True)
@@ -25,9 +27,9 @@ class Iterate:
 class Minimum:
     """The best point found, and the smoothed function around it.
 
-    gradient [n] and hessian [n, n] are those of the last quadratic model around x, of width `sigma`, on the device and
-    in the type of x; standard_errors has their errors by the names "gradient" and "hessian_diagonal", infinite where
-    the evaluations do not tell. All three are None if too few evaluations lie around x.
+    `gradient` [n] and `hessian` [n, n] come from the last quadratic model around x, of width `sigma`. They are on the
+    device and in the type of x. `standard_errors` has their errors by the names "gradient" and "hessian_diagonal",
+    infinite where the evaluations do not tell. All three are None if too few evaluations lie around x.
     """
 
     x: Tensor
@@ -41,6 +43,8 @@ class Minimum:
     history: list[Iterate] = field(repr=False)
     message: str
     """Why the search ended."""
+    engine: str
+    """Which search it was: "gaussian_process" or "descent"."""
 
 
 def minimize(
@@ -49,9 +53,9 @@ def minimize(
     *,
     sigma: float | Tensor,
     loss: Callable[[Tensor], Tensor] | None = None,
-    bounds: tuple[float | Tensor, float | Tensor] | None = None,
+    bounds: Bounds | None = None,
     max_evaluations: int = 1000,
-    method: str = "trust_region",
+    engine: Engine = "auto",
     vectorized: bool = True,
     evaluator: Evaluator | None = None,
     callback: Callable[[Iterate], object] | None = None,
@@ -70,7 +74,7 @@ def minimize(
             there is one, give it: each evaluation then tells as many equations as the output has numbers.
         bounds: lower and upper, numbers or [n].
         max_evaluations: points that fn may be called with.
-        method: "trust_region".
+        engine: "gaussian_process", "descent", or "auto" to choose by the number of parameters and their bounds.
         vectorized: False for an fn of one point, [n] -> scalar or [*out].
         evaluator: where evaluations run; in this process if None.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
@@ -78,7 +82,8 @@ def minimize(
         target: the search ends when the value is at most this.
         settings: further ones of `TrustRegion`: restarts, tolerance, noise, pool.
 
-    Ctrl-C ends the search and returns the best point so far, and so do `max_evaluations`. An exception of fn passes.
+    Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn
+    is not caught.
 
     Example:
         >>> import torch
@@ -86,10 +91,8 @@ def minimize(
         >>> bool((fit.x - 3).abs().max() < 1e-3), fit.evaluations < 50
         (True, True)
     """
-    if method != "trust_region":
-        raise ValueError(f"method must be 'trust_region', got {method!r}")
     x0 = checked_input(x0)
-    search = TrustRegion(x0, sigma=sigma, bounds=bounds, loss=loss, seed=seed, **settings)
+    search = TrustRegion(x0, sigma=sigma, bounds=bounds, loss=loss, engine=engine, seed=seed, **settings)
     smallest = len(search.ask()) + 1
     if max_evaluations < smallest:
         raise ValueError(
@@ -131,7 +134,7 @@ def _search(
 
 
 def _is_true(answer: object) -> bool:
-    """Whether a callback wants to end; what else it may return, such as the count of what it wrote, does not."""
+    """Whether a callback returned True. Other truthy values, such as the count of bytes it wrote, do not end."""
     return str(getattr(answer, "dtype", type(answer).__name__)) in ("bool", "torch.bool") and bool(answer)
 
 
@@ -146,4 +149,15 @@ def _minimum(search: TrustRegion, history: list[Iterate], message: str) -> Minim
         hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
         slope, bend = model.full_errors()
         errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
-    return Minimum(x, search.value, gradient, hessian, errors, unit.to(x), search.evaluations, history, message)
+    return Minimum(
+        x,
+        search.value,
+        gradient,
+        hessian,
+        errors,
+        unit.to(x),
+        search.evaluations,
+        history,
+        message,
+        search.engine,
+    )

@@ -1,10 +1,11 @@
-"""`command.json` of a folder of results: the commands that made it, on which machine, with which settings."""
+"""`command.json` of a folder of results: the commands that made it, with which code and settings, on which machine."""
 
 import importlib.metadata
 import json
 import os
 import platform
 import shlex
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -12,6 +13,9 @@ from typing import Any
 
 from experiments.runs.records import write
 
+_ROOT = Path(__file__).parents[2]
+_CODE = ("experiments", "torch_zerohess", "csrc", "setup.py", "pyproject.toml", ":(exclude)experiments/results")
+"""What results depend on. Tables stored under `experiments/results` are made from results."""
 _PACKAGES = ("torch", "torch_zerohess", "numpy", "scipy", "cma", "DFO-LS", "mitsuba")
 NAME = "command.json"
 SHARED = ("preset", "variant", "threads")
@@ -46,13 +50,33 @@ def register(folder: Path, settings: dict[str, dict[str, Any]]) -> None:
                     "delete it, or give another folder as --out"
                 )
         made.update(methods)
-    command = {
+    known["commands"].append(this_command())
+    write(folder / NAME, json.dumps(known, indent=1))
+
+
+def this_command() -> dict[str, Any]:
+    """Return the command of this process, when, with which code and on which machine."""
+    return {
         "command": shlex.join(["python", "-m", "experiments", *sys.argv[1:]]),
         "started": time.strftime("%Y-%m-%d %H:%M:%S %Z"),
         "machine": machine(),
+        **code(),
     }
-    known["commands"].append(command)
-    write(folder / NAME, json.dumps(known, indent=1))
+
+
+def code() -> dict[str, Any]:
+    """Return the git `commit` of the code, and whether the code is `clean`: that of the commit; None outside of git."""
+    commit = _git("rev-parse", "HEAD")
+    changes = None if commit is None else _git("status", "--porcelain", "--", *_CODE)
+    return {"commit": commit, "clean": None if changes is None else not changes}
+
+
+def _git(*arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=_ROOT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
 
 
 def machine() -> dict[str, Any]:

@@ -63,7 +63,8 @@ def _is_known(task: Task) -> str | None:
     return "the convolution of the loss is not known" if task.truth.analytic is None else None
 
 
+_EXACT = "loss, its derivatives in closed form"
 METHODS = (
-    Method("analytic_1", "Adam with exact gradients", with_settings(analytic_1), _is_known),
-    Method("analytic_2", "Newton with exact Hessians", with_settings(analytic_2), _is_known),
+    Method("analytic_1", "Adam with exact gradients", with_settings(analytic_1), _is_known, uses=_EXACT),
+    Method("analytic_2", "Newton with exact Hessians", with_settings(analytic_2), _is_known, uses=_EXACT),
 )

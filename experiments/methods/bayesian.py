@@ -31,7 +31,7 @@ from experiments.methods.method import Method
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
-EVALUATIONS = 100
+EVALUATIONS = 60
 """Evaluations after which both methods end, if not set."""
 MOST = 20
 """Most parameters. Frazier (2018), "A tutorial on Bayesian optimization", gives 20 as the usual limit."""
@@ -270,5 +270,6 @@ METHODS = (
         with_settings(botorch_composite),
         _has_residuals,
         ("botorch",),
+        uses="image",
     ),
 )

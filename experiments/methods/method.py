@@ -38,6 +38,8 @@ class Method:
     """Train `trial.encoder`, in the same way; see `experiments.runs.network_trial`. None if the method fits only."""
     trains: Callable[[NetworkTask], str | None] = everywhere
     """None, or why `train` does not apply to a task."""
+    uses: str = "loss"
+    """What it gets besides the start: the loss, the image, derivatives, or more; tables show it."""
 
     def __call__(self, trial: Trial | NetworkTrial, settings: Any) -> object:
         """Work on a trial of either kind."""

@@ -71,6 +71,7 @@ METHODS = (
         _differentiable,
         ("mitsuba",),
         another_scene=True,
+        uses="loss, its derivative by the renderer",
     ),
     Method(
         "mitsuba_path",
@@ -79,6 +80,7 @@ METHODS = (
         _differentiable,
         ("mitsuba",),
         another_scene=True,
+        uses="loss, its derivative by the renderer",
     ),
     Method(
         "mitsuba_projective",
@@ -87,5 +89,6 @@ METHODS = (
         _differentiable,
         ("mitsuba",),
         another_scene=True,
+        uses="loss, its derivative by the renderer",
     ),
 )

@@ -46,7 +46,7 @@ def search(
         sigma=sigma or task.sigma,
         bounds=task.bounds,
         loss=loss,
-        # engine=engine,
+        engine=engine,
         restarts=task.evaluations,  # the harness ends the run
         seed=trial.seed,
     )
@@ -73,9 +73,13 @@ METHODS = (
         "ours: a Gaussian process of the image, under the known loss",
         with_settings(search, engine="gaussian_process"),
         _in_box,
+        uses="image",
     ),
     Method(
-        "descent", "ours: quadratic models of the image, re-using evaluations", with_settings(search, engine="descent")
+        "descent",
+        "ours: quadratic models of the image, re-using evaluations",
+        with_settings(search, engine="descent"),
+        uses="image",
     ),
     Method(
         "gaussian_process_loss",

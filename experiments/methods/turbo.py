@@ -29,7 +29,7 @@ SUCCESSES = 3
 """Successes in a row after which the length is doubled."""
 GAIN = 1e-3
 """An evaluation is a success if it is lower than the best by more than this part of the best."""
-EVALUATIONS = 200
+EVALUATIONS = 100
 """Evaluations after which the method ends, if not set."""
 
 

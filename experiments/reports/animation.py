@@ -11,13 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.methods import Method
-from experiments.methods.settings import settings
 from experiments.problems.rendered import Reference, RenderedTask
 from experiments.problems.task import Task
-from experiments.runs.attempt import attempt
 from experiments.runs.records import Outcome, Record
-from experiments.runs.trial import LIMIT, Trial
 
 _GRID = 61
 """Points along the side of a map of the loss; odd, so that the middle is one of them."""
@@ -62,26 +58,6 @@ def percent(error: float) -> str:
         ('100 %', '1.2 %', '< 0.001 %', '0 %')
     """
     return "< 0.001 %" if 0 < error < 1e-5 else f"{float(f'{100 * error:.2g}'):g} %"
-
-
-def trace(
-    task: Task, method: Method, run: int, limit: float = LIMIT, watch: Callable[[Record], None] | None = None
-) -> Trace:
-    """Run a method on a task, without files, and return all that it reported."""
-    points: list[Tensor] = []
-    trials: list[Trial] = []
-
-    def image_error(x: Tensor) -> float:  # of every row once
-        points.append(x.clone())
-        return task.truth.image_error(x)
-
-    def solve(trial: Trial) -> None:
-        trials.append(trial)
-        method(trial, settings(method.name, task.name))
-
-    noted = dataclasses.replace(task, truth=dataclasses.replace(task.truth, image_error=image_error))
-    outcome = attempt(noted, method.name, run, solve, limit=limit, watch=watch)
-    return Trace(task, method.name, points, trials[-1].rows, outcome)
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,22 @@
 """What came of the runs on a network task: errors and predictions as pictures, a network as ONNX, a table."""
 
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
 import torch
 
 from experiments.problems.network_task import NetworkTask
-from experiments.reports import export, figures, predictions
-from experiments.reports.result import Result
-from experiments.reports.results import load
+from experiments.reports import error_curves, onnx_export, predictions
+from experiments.reports.results import METRICS, load
 from experiments.reports.tables import table
-from experiments.runs.records import Files, Outcome
+from experiments.reports.trained_network import Result
+from experiments.runs.records import Files, Outcome, write
 
 REDUCTION = 100.0
 """A run succeeds if it divides the held-out parameter error by this."""
+HELD_OUT = "held_out.csv"
+"""In the folder of a task: errors of the held-out images, a row per run."""
 
 
 def conclude(task: NetworkTask, outcomes: Sequence[Outcome], out: Path) -> list[Result]:
@@ -37,18 +39,19 @@ def conclude(task: NetworkTask, outcomes: Sequence[Outcome], out: Path) -> list[
     print(f"\n{task.name}: {task.size}; rendering what the networks predict", flush=True)
     task.prepare(ended[0].run)
     results = [_trained(task, one, Files(folder / one.method, one.run).weights) for one in ended]
+    _remember(held_out(task.name, results), folder / HELD_OUT)
     shown = {result.method for result in results}
     runs = {name: mine for name, mine in load(out).runs[task.name].items() if name in shown}
-    figures.curves(task.name, runs, folder / "errors.png")
+    error_curves.curves(task.name, runs, folder / "errors.png")
     first = [result for result in results if result.run == results[0].run]
     predictions.draw(task, first, folder / "predictions.png")
     print("\n" + summary(task, results))
     print(f"\nerrors: {folder / 'errors.png'}\npredictions: {folder / 'predictions.png'}\nlogs: {folder}")
-    if export.missing():
-        print(f"not exported to ONNX: pip install {' '.join(export.missing())}")
+    if onnx_export.missing():
+        print(f"not exported to ONNX: pip install {' '.join(onnx_export.missing())}")
     else:
         path = folder / f"encoder-{first[-1].method}.onnx"
-        difference = export.export(first[-1].encoder, task.held_out[0], path)
+        difference = onnx_export.export(first[-1].encoder, task.held_out[0], path)
         print(f"encoder: {path}, onnxruntime predicts the same parameters to {difference:.1e}")
     return results
 
@@ -62,38 +65,49 @@ def _trained(task: NetworkTask, outcome: Outcome, weights: Path) -> Result:
     return Result(outcome.method, outcome.run, encoder, start, outcome.seconds, outcome.evaluations, image, parameter)
 
 
+def held_out(task: str, results: Sequence[Result]) -> pd.DataFrame:
+    """Return a row per run: renders, seconds, and the errors of held-out images before and after training."""
+    columns = ["task", "method", "run", "renders", "seconds"]
+    columns += [f"{metric}_{when}" for metric in METRICS for when in ("before", "after")]
+    rows = [
+        (task, one.method, one.run, one.evaluations, one.seconds, *one.image_error, *one.parameter_error)
+        for one in results
+    ]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def per_method(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return a row per task and method of `held_out`: medians, errors divided by (also at worst), and successes."""
+    for metric in METRICS:
+        rows = rows.assign(**{f"{metric}_divided": rows[f"{metric}_before"] / rows[f"{metric}_after"]})
+    groups = rows.assign(reached=rows["parameter_divided"] >= REDUCTION).groupby(["task", "method"], sort=False)
+    found = groups[["renders", "seconds", "parameter_before", "parameter_after"]].median()
+    for metric in reversed(METRICS):
+        found[f"{metric}_divided"] = groups[f"{metric}_divided"].median()
+        found[f"{metric}_divided_worst"] = groups[f"{metric}_divided"].min()
+    return found.assign(reached=groups["reached"].sum(), runs=groups.size()).reset_index()
+
+
 def summary(task: NetworkTask, results: Sequence[Result]) -> str:
     """Return a table with a row per method: medians over its runs, and how many succeeded."""
-    rows: list[list[object]] = []
-    for name in dict.fromkeys(result.method for result in results):
-        mine = [result for result in results if result.method == name]
-        parameter, image = ([pair[0] / pair[1] for pair in pairs] for pairs in _errors(mine))
-        rows.append(
-            [
-                name,
-                statistics.median(one.seconds for one in mine),
-                statistics.median(float(one.evaluations) for one in mine),
-                *(statistics.median(task.measured(one.parameter_error[k]) for one in mine) for k in (0, 1)),
-                statistics.median(parameter),
-                statistics.median(image),
-                f"{sum(one >= REDUCTION for one in parameter)}/{len(mine)}",
-                f"{sum(one >= 10.0 for one in image)}/{len(mine)}",
-            ]
-        )
-    headers = [
-        "method",
-        "seconds",
-        "renders",
-        f"{task.measure} before",
-        "after",
-        "parameter error divided by",
-        "image error divided by",
-        f"runs beyond {REDUCTION:.0f}x",
-        "image error -90 %",
+    found = per_method(held_out(task.name, results))
+    rows = [
+        [
+            *(one["method"], one["renders"], one["seconds"]),
+            *(task.measured(one[f"parameter_{when}"]) for when in ("before", "after")),
+            *(one[f"{metric}_divided{worst}"] for metric in reversed(METRICS) for worst in ("", "_worst")),
+            f"{one['reached']} of {one['runs']}",
+        ]
+        for one in found.to_dict("records")
     ]
+    headers = ["method", "renders", "seconds", f"{task.measure} before", "after"]
+    headers += ["parameter error divided by", "at worst", "image error divided by", "at worst", "runs that succeed"]
     return table(headers, rows)
 
 
-def _errors(results: Sequence[Result]) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """Parameter and image errors before and after."""
-    return [one.parameter_error for one in results], [one.image_error for one in results]
+def _remember(rows: pd.DataFrame, path: Path) -> None:
+    """Write the rows of some runs to a file, beside those of other runs."""
+    if path.exists():
+        known = pd.read_csv(path)
+        rows = pd.concat([known, rows]).drop_duplicates(["method", "run"], keep="last")
+    write(path, rows.to_csv(index=False, lineterminator="\n"))

@@ -7,7 +7,7 @@ import matplotlib as mpl
 import torch
 
 from experiments.problems.network_task import NetworkTask
-from experiments.reports.result import Result
+from experiments.reports.trained_network import Result
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt

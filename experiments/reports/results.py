@@ -1,6 +1,5 @@
 """The runs in a folder, as the tables, figures and reports read them."""
 
-import statistics
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -72,8 +71,3 @@ def _folders(folder: Path) -> list[Path]:
 
 def _run(files: Files) -> Run:
     return Run(read_outcome(files.outcome), list(read(files.log)) if files.log.exists() else [])
-
-
-def median(values: Collection[float], runs: int) -> float | None:
-    """Median of what at least half of the runs have; None if fewer have it."""
-    return float(statistics.median(values)) if 2 * len(values) >= runs else None

@@ -2,12 +2,6 @@
 
 A run that failed, stopped or ran out of time before it got there has not got there: it counts in `runs`, not in
 `share`. Medians are over the runs that got there, and there is none if these are fewer than half.
-
-The speed-up in the source's sense is the mean, over tasks, metrics and levels where both have a median, of the seconds
-of a method divided by those of the reference (the source's Table 2 prints these ratios, with OurHVPA as reference).
-The mean over all ratios of that table is 2.99. The source does not say how its headline of 2.71 comes about; of the
-subsets that were tried the mean of FR22, CMA-ES, OurG and Mitsuba without QUAD gives it (125 ratios, 2.707). Ours is
-over all.
 """
 
 import csv
@@ -16,14 +10,16 @@ import json
 import statistics
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from experiments.problems.catalogue import chosen
-from experiments.reports.results import METRICS, Results, Run, load, median
+from experiments.reports.medians import medians, objects, reached
+from experiments.reports.results import METRICS, Results, Run, load
+from experiments.reports.speed_ups import HEADERS, SpeedUp, speed_ups, with_ratios
 from experiments.reports.tables import table as text_table
 from experiments.runs.trial import LEVELS
 
@@ -47,16 +43,6 @@ class Row:
     ratio_seconds: float | None = None
     """To the reference method."""
     ratio_evaluations: float | None = None
-
-
-@dataclass(frozen=True)
-class SpeedUp:
-    """Mean ratio of a method to the reference; `cases` is over how many tasks, metrics and levels."""
-
-    method: str
-    seconds: float | None
-    evaluations: float | None
-    cases: int
 
 
 @dataclass(frozen=True)
@@ -101,65 +87,20 @@ def summarize(results: Results, reference: str | None = None, methods: Collectio
         runs = {task: {m: r for m, r in mine.items() if m in methods} for task, mine in results.runs.items()}
         unfinished = Counter({name: count for name, count in results.unfinished.items() if name in methods})
         results = replace(results, runs={task: mine for task, mine in runs.items() if mine}, unfinished=unfinished)
-    found = {method for runs in results.runs.values() for method in runs}
-    reference = reference or next((name for name in REFERENCES if name in found), None)
-    rows = [row for task in results.runs for row in _rows(task, results, reference)]
-    others = list(dict.fromkeys(row.method for row in rows if row.method != reference))
-    cells = [(task, name, runs) for task, methods in results.runs.items() for name, runs in methods.items()]
+    there = {method for runs in results.runs.values() for method in runs}
+    reference = reference or next((name for name in REFERENCES if name in there), None)
+    cells = [((task, name), runs) for task, methods in results.runs.items() for name, runs in methods.items()]
+    found = medians(reached(cells, ("task", "method")), ("task", "metric", "level", "method"))
+    ratios = with_ratios(found, reference)
+    *speed, mean = speed_ups(ratios, reference)
     return Summary(
         reference,
-        rows,
-        [_speed_up(name, [row for row in rows if row.method == name]) for name in others],
-        _speed_up("all", [row for row in rows if row.method != reference]),
-        [_overhead(*cell) for cell in cells],
-        [failure for cell in cells for failure in _failures(*cell)],
+        [Row(**one) for one in objects(ratios[[field.name for field in fields(Row)]])],
+        speed,
+        mean,
+        [_overhead(*cell, runs) for cell, runs in cells],
+        [failure for cell, runs in cells for failure in _failures(*cell, runs)],
         results.unfinished.total(),
-    )
-
-
-def _rows(task: str, results: Results, reference: str | None) -> Iterator[Row]:
-    for metric in METRICS:
-        for level in LEVELS:
-            found = {name: _row(task, name, metric, level, runs) for name, runs in results.runs[task].items()}
-            best = found.get(reference or "")
-            for row in found.values():
-                yield (
-                    row
-                    if best is None
-                    else replace(
-                        row,
-                        ratio_seconds=_ratio(row.seconds, best.seconds),
-                        ratio_evaluations=_ratio(row.evaluations, best.evaluations),
-                    )
-                )
-
-
-def _row(task: str, method: str, metric: str, level: float, runs: Sequence[Run]) -> Row:
-    reached = [record for run in runs if (record := run.reached(metric, level))]
-    return Row(
-        task,
-        method,
-        metric,
-        level,
-        median([record.seconds for record in reached], len(runs)),
-        median([record.evaluations for record in reached], len(runs)),
-        len(reached) / len(runs),
-        len(runs),
-    )
-
-
-def _ratio(value: float | None, reference: float | None) -> float | None:
-    return value / reference if value is not None and reference else None
-
-
-def _speed_up(method: str, rows: Sequence[Row]) -> SpeedUp:
-    seconds = [row.ratio_seconds for row in rows if row.ratio_seconds is not None]
-    evaluations = [row.ratio_evaluations for row in rows if row.ratio_evaluations is not None]
-    return SpeedUp(
-        method,
-        statistics.mean(seconds) if seconds else None,
-        statistics.mean(evaluations) if evaluations else None,
-        len(evaluations),
     )
 
 
@@ -239,8 +180,7 @@ def _cell(row: Row) -> str:
 
 
 def _speed_up_text(summary: Summary) -> str:
-    rows = [[s.method, s.seconds, s.evaluations, s.cases] for s in (*summary.speed_ups, summary.mean_speed_up)]
-    return text_table(["method", "seconds", "evaluations", "cases"], rows)
+    return text_table(HEADERS, [list(asdict(one).values()) for one in (*summary.speed_ups, summary.mean_speed_up)])
 
 
 def table(

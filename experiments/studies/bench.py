@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.reports.progress import progress
+from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import extension, kernels, proposals
@@ -66,6 +68,7 @@ def bench(
     memory_n: int = 100_000,
     memory_samples: int = 64,
     out: Path | None = None,
+    store: str | None = None,
 ) -> BenchReport:
     """Time estimates, their parts and the autograd layer without a black box, with and without the extension.
 
@@ -75,6 +78,7 @@ def bench(
         memory_n: parameters of the memory measurement; 0 leaves it out.
         memory_samples: its antithetic samples.
         out: JSON file to write.
+        store: name of a table of the times to keep under experiments/results, for the documents.
     """
     smallest = min((number for pair in sizes for number in pair), default=0)
     given = {"repeats": repeats, "sizes": smallest, "memory_samples": memory_samples, "memory_n": memory_n}
@@ -82,26 +86,30 @@ def bench(
         least = 0 if name == "memory_n" else 1
         if value < least:
             raise SystemExit(f"{name} must be at least {least}, got {value}")
+    if store is not None:
+        may_keep(store)
     threads, available = torch.get_num_threads(), extension.available
     torch.set_num_threads(1)
+    timed = [(*size, name, operation) for size in sizes for name, operation in _operations(*size).items()]
     try:
         timings = [
             _timing(name, operation, n, samples, repeats, available)
-            for n, samples in sizes
-            for name, operation in _operations(n, samples).items()
+            for n, samples, name, operation in progress(timed, "timings")
         ]
     finally:
         torch.set_num_threads(threads)
         extension.available = available
     memory = []
     if memory_n:
-        memory = [_memory(name, memory_n, memory_samples) for name in ("stored", "redrawn")]
+        memory = [_memory(name, memory_n, memory_samples) for name in progress(("stored", "redrawn"), "memory")]
     report = BenchReport(timings, memory)
     _print(report)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         rows = [{**asdict(t), "ratio": t.ratio} for t in timings]
         out.write_text(json.dumps({"timings": rows, "memory": [asdict(m) for m in memory]}, indent=1))
+    if store is not None:
+        print(keep(*_table(report), store))
     return report
 
 
@@ -211,13 +219,19 @@ def _status(field: str) -> float:
     return next(float(line.split()[1]) / 1024 for line in lines if line.startswith(f"{field}:"))
 
 
-def _print(report: BenchReport) -> None:
+def _table(report: BenchReport) -> tuple[list[str], list[list[object]]]:
+    """Return headers and rows of the times."""
+
     def micro(seconds: float | None) -> float | None:
         return None if seconds is None else round(1e6 * seconds, 1)
 
-    rows = [[t.operation, t.n, t.samples, micro(t.extension), micro(t.torch), t.ratio] for t in report.timings]
+    headers = ["operation", "parameters", "pairs of samples", "extension [us]", "pure torch [us]", "ratio"]
+    return headers, [[t.operation, t.n, t.samples, micro(t.extension), micro(t.torch), t.ratio] for t in report.timings]
+
+
+def _print(report: BenchReport) -> None:
     print("Median microseconds without the black box, one thread\n")
-    print(table(["operation", "n", "samples", "extension", "pure torch", "ratio"], rows))
+    print(table(*_table(report)))
     if report.memory:
         print("\nMiB of a layer: kept by its graph, and peak of forward, backward and one HVP (float32 points)\n")
         memory = [[m.perturbations, m.n, m.samples, round(m.kept), round(m.peak)] for m in report.memory]

@@ -24,6 +24,7 @@ import torch_zerohess as zh
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import RenderedTask
+from experiments.reports.progress import progress
 from experiments.reports.tables import table
 
 POINTS = {"start": 1.0, "middle": 0.5, "near": 0.1}
@@ -84,7 +85,7 @@ def gradients(
         raise SystemExit(f"step and sigma must be above 0, got {step} and {sigma}")
     torch.set_num_threads(1)
     found: list[GradientError] = []
-    for name in catalogue.chosen("tasks", tasks, list(catalogue.RENDERED)):
+    for name in progress(catalogue.chosen("tasks", tasks, list(catalogue.RENDERED)), "tasks"):
         task = catalogue.load(name, preset, variant)
         assert isinstance(task, RenderedTask)
         reason = task.renderer.no_adjoint()

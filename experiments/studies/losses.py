@@ -12,7 +12,6 @@ mean variance of a pixel under the perturbations. Measured for every loss of `zh
 The truth about a gradient is a far larger sample of scrambled Sobol points; its own error is reported.
 """
 
-import csv
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -22,49 +21,37 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 import torch_zerohess as zh
 from experiments.methods.ours import search
 from experiments.methods.settings import settings
 from experiments.problems.catalogue import FITTING, chosen, fitting
-from experiments.problems.tasks import brdf
-from experiments.reports.results import METRICS, Run, median
+from experiments.reports.medians import medians, objects, reached
+from experiments.reports.progress import progress
+from experiments.reports.results import METRICS, Run
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
 from experiments.runs.run import Finished
 from experiments.runs.trial import Trial, reduced
-from experiments.studies.objectives import FACTORIES, FORMS, Moments, Pictures, normal, pictures_of
+from experiments.studies.loss_objectives import FORMS, Moments, Pictures, normal, pictures_of
+from experiments.studies.loss_sweeps import (
+    POSITIONS,
+    SCALES,
+    SOLUTIONS,
+    Bias,
+    curves_along,
+    draw,
+    line,
+    position_text,
+    write_csv,
+)
 
-SOLUTIONS = {"box2": (0.3, 0.3), "brdf": brdf.TARGET}
-"""Of the tasks that are swept; others are only fitted."""
-POSITIONS = [round(0.05 * i, 2) for i in range(-10, 26)]
-"""Along the line: 0 is the solution, 1 the start of run 0."""
 WHERE = {"start": 1.0, "half way": 0.5, "near": 0.1}
 """Points of the line at which gradients are estimated."""
-SCALES = (1.0, 0.25)
-"""Sigma of the sweeps, in units of the task's."""
 LEVEL = 0.99
 _SCRAMBLES = 4
 _Row = TypeVar("_Row")
-
-
-@dataclass(frozen=True)
-class Bias:
-    """A smoothed objective along the line of a task."""
-
-    task: str
-    sigma: float
-    loss: str
-    form: str
-    """inside: E L(f), or image: L(E f)."""
-    minimum: float
-    """Position where it is smallest; an end of POSITIONS if it still falls there."""
-    fall: float
-    """Slope at the start, towards the solution, over the value there: 0 on a plateau."""
-    values: list[float]
-    """At POSITIONS."""
 
 
 @dataclass(frozen=True)
@@ -139,14 +126,10 @@ def losses(
         )
     shown = {name: pictures_of(fitting(name)) for name in chosen("tasks", tasks, list(FITTING))}
     swept = [one for name, one in shown.items() if name in SOLUTIONS]
-    curves = tqdm([(one, scale * one.task.sigma) for one in swept for scale in SCALES], "curves", disable=None)
+    curves = progress([(one, scale * one.task.sigma) for one in swept for scale in SCALES], "curves")
     report = LossReport(
-        [bias for one, sigma in curves for bias in _sweep(one, sigma, sweep, seed)],
-        [
-            error
-            for one in tqdm(swept, "gradients", disable=None)
-            for error in _gradient_errors(one, samples, runs, truth, seed)
-        ],
+        [bias for one, sigma in curves for bias in curves_along(one, sigma, sweep, seed)],
+        [error for one in progress(swept, "gradients") for error in _gradient_errors(one, samples, runs, truth, seed)],
         [fit for one in shown.values() for fit in _fits(one, runs, evaluations, limit)],
     )
     print(text(report))
@@ -162,7 +145,7 @@ def text(report: LossReport) -> str:
     rows: list[list[object]] = []
     if report.biases:
         for a, b in _pairs(report.biases):
-            minima, falls = [_position(one.minimum) for one in (a, b)], [f"{one.fall:.2f}" for one in (a, b)]
+            minima, falls = [position_text(one.minimum) for one in (a, b)], [f"{one.fall:.2f}" for one in (a, b)]
             rows.append([a.task, f"{a.sigma:g}", a.loss, *minima, *falls])
         headers = ["task", "sigma", "loss", "minimum: inside", "image", "fall at the start: inside", "image"]
         title = "smoothed objectives along the line from the solution (0) through the start (1)"
@@ -189,47 +172,10 @@ def _pairs(rows: Sequence[_Row]) -> Iterator[tuple[_Row, _Row]]:
     return zip(rows[::2], rows[1::2], strict=True)
 
 
-def _line(one: Pictures) -> tuple[Tensor, Tensor]:
-    """Return the solution [n] and the way from there to the start of run 0."""
-    solution = torch.tensor(SOLUTIONS[one.task.name], dtype=torch.float64)
-    return solution, one.task.start(0) - solution
-
-
-def _sweep(one: Pictures, sigma: float, count: int, seed: int) -> Iterator[Bias]:
-    solution, way = _line(one)
-    u = normal(count // 2, one.task.n, seed)  # the same at all positions: the curves are smooth
-    moments = [one.moments(solution + position * way, sigma, u) for position in POSITIONS]
-    curves = {form: torch.stack([one.objective(here, form)[0] for here in moments]) for form in FORMS}
-    for i, name in enumerate(one.losses):
-        for form in FORMS:
-            values = curves[form][:, i].tolist()
-            yield Bias(one.task.name, sigma, name, form, _minimum(values), _fall(values), values)
-
-
-def _minimum(values: Sequence[float]) -> float:
-    """Position of the smallest value, by a parabola through it and its neighbours unless it is an end of the line."""
-    i = values.index(min(values))
-    if i in (0, len(values) - 1):
-        return POSITIONS[i]
-    before, here, after = values[i - 1 : i + 2]
-    bend = before - 2 * here + after
-    shift = 0.5 * (before - after) / bend if bend > 0 else 0.0
-    return POSITIONS[i] + (POSITIONS[1] - POSITIONS[0]) * shift
-
-
-def _position(minimum: float) -> str:
-    return f"{minimum:+.3f}" if POSITIONS[0] < minimum < POSITIONS[-1] else "end"
-
-
-def _fall(values: Sequence[float]) -> float:
-    i = POSITIONS.index(1.0)
-    return (values[i + 1] - values[i - 1]) / (POSITIONS[i + 1] - POSITIONS[i - 1]) / values[i]
-
-
 def _gradient_errors(
     one: Pictures, samples: Sequence[int], runs: int, truth: int, seed: int
 ) -> Iterator[GradientError]:
-    solution, way = _line(one)
+    solution, way = line(one)
     n, sigma = one.task.n, one.task.sigma
     for where, position in WHERE.items():
         x = solution + position * way
@@ -259,14 +205,17 @@ def _fits(one: Pictures, runs: int, evaluations: int, limit: float) -> Iterator[
     for name in one.losses:
         ended: dict[str, list[Run]] = {form: [] for form in FORMS}
         jobs = [(form, run) for form in FORMS for run in range(runs)]
-        for form, run in tqdm(jobs, f"fits of {one.task.name}, {name}", disable=None):
+        for form, run in progress(jobs, f"fits of {one.task.name}, {name}"):
             ended[form].append(_fit(one, name, form, run, evaluations, limit))
+        there = medians(reached([((form,), ended[form]) for form in FORMS], ("form",)), ("form", "metric", "level"))
+        there = there[there["level"] == LEVEL]
         for metric in METRICS:
             for form in FORMS:
-                reached = [record for ended_run in ended[form] if (record := ended_run.reached(metric, LEVEL))]
-                evaluations_to = median([record.evaluations for record in reached], runs)
-                seconds = median([record.seconds for record in reached], runs)
-                yield Fit(one.task.name, name, form, metric, evaluations_to, len(reached) / runs, seconds, runs)
+                (cell,) = objects(there[(there["metric"] == metric) & (there["form"] == form)])
+                yield Fit(
+                    *(one.task.name, name, form, metric),
+                    *(cell["evaluations"], cell["share"], cell["seconds"], cell["runs"]),
+                )
 
 
 def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> Run:
@@ -292,38 +241,6 @@ def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit:
 def _write(report: LossReport, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     (out / "losses.json").write_text(json.dumps({"positions": POSITIONS, **asdict(report)}, indent=1))
-    with (out / "sweep.csv").open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["task", "sigma", "loss", "form", "position", "value"])
-        for bias in report.biases:
-            for position, value in zip(POSITIONS, bias.values, strict=True):
-                rows.writerow([bias.task, bias.sigma, bias.loss, bias.form, position, value])
+    write_csv(report.biases, out / "sweep.csv")
     if report.biases:
-        _plot(report.biases, out / "sweep.png")
-
-
-def _plot(biases: Sequence[Bias], path: Path) -> None:
-    """Draw the objectives of every task and sigma, each in units of its value at the start."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    names = list(FACTORIES)
-    cells = list(dict.fromkeys((bias.task, bias.sigma) for bias in biases))
-    figure, axes = plt.subplots(
-        len(cells), len(names), figsize=(11, 2.6 * len(cells)), layout="constrained", squeeze=False
-    )
-    for bias in biases:
-        axis = axes[cells.index((bias.task, bias.sigma)), names.index(bias.loss)]
-        start = bias.values[POSITIONS.index(1.0)]
-        line = {"inside": "-", "image": "--"}[bias.form]
-        label = {"inside": "E L(f): loss inside", "image": "L(E f): image-valued"}[bias.form]
-        axis.plot(POSITIONS, [value / start for value in bias.values], line, label=label)
-        axis.set_title(f"{bias.task}, sigma {bias.sigma:.3g}, {bias.loss}", fontsize=10)
-        axis.grid(alpha=0.3)
-    for axis in axes[-1]:
-        axis.set_xlabel("position: 0 solution, 1 start")
-    axes[0, 0].legend(frameon=False, fontsize=9)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+        draw(report.biases, out / "sweep.png")

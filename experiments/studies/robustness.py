@@ -6,12 +6,13 @@ same in several sweeps is run once. All errors are those of the unchanged task, 
 """
 
 import csv
-import statistics
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import pandas as pd
 import tyro
 
 from experiments.ensembles.ensemble import Ensemble, ordered
@@ -22,8 +23,9 @@ from experiments.methods.settings import settings as settings_of
 from experiments.problems.catalogue import FITTING, Preset, chosen
 from experiments.problems.variations import Change
 from experiments.problems.variations import load as load_varied
-from experiments.reports import robustness_figure
-from experiments.reports.results import Results, Run, load, median
+from experiments.reports import robustness_curves
+from experiments.reports.medians import medians, objects, reached
+from experiments.reports.results import Results, Run, load
 from experiments.reports.tables import table
 from experiments.runs.trial import LEVELS, LIMIT
 
@@ -163,7 +165,7 @@ def robustness(
         titles = {sweep: SWEEPS[sweep].title for sweep in sweeps}
         for against in ("evaluations", "seconds"):
             path = out / f"{name}-robustness-{against}.png"
-            robustness_figure.draw(name, mine, titles, against, path)
+            robustness_curves.draw(name, mine, titles, against, path)
             print(path)
     return rows
 
@@ -251,22 +253,23 @@ def _text(sweep: str, value: Any) -> str:
 
 def row(cell: Cell, runs: Sequence[Run]) -> Row:
     """Return the medians of the runs of a cell."""
-    reached = [record for run in runs if (record := run.reached("image", LEVEL))]
+    there = medians(reached([((), runs)], ()), ("metric", "level"))
+    first, second = objects(there[(there["metric"] == "image") & there["level"].isin([LEVELS[0], LEVEL])])
     ends = [(run.error("image")[-1], run.records[-1].parameter_error) for run in runs if run.records]
-    image = [error for error, _ in ends if error is not None]
-    parameter = [error**0.5 for _, error in ends if error is not None]
+    errors = pd.DataFrame(ends, columns=["image", "parameter"], dtype=float)
+    image, parameter = errors["image"].median(), errors["parameter"].pow(0.5).median()
     return Row(
         cell.task,
         cell.sweep,
         cell.value,
         cell.method,
         len(runs),
-        sum(run.reached("image", LEVELS[0]) is not None for run in runs) / len(runs),
-        len(reached) / len(runs),
-        median([record.evaluations for record in reached], len(runs)),
-        median([record.seconds for record in reached], len(runs)),
-        statistics.median(image) if image else None,
-        statistics.median(parameter) if parameter else None,
+        first["share"],
+        second["share"],
+        second["evaluations"],
+        second["seconds"],
+        None if math.isnan(image) else float(image),
+        None if math.isnan(parameter) else float(parameter),
     )
 
 

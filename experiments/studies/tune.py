@@ -13,13 +13,13 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from tqdm import tqdm
 
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings, space
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
 from experiments.problems.task import Task
+from experiments.reports.progress import progress
 from experiments.reports.results import Run
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
@@ -106,7 +106,7 @@ def tune(
     choices = space(chosen, loaded.sigma)
     free = dict(_choices(one, list(choices)) for one in over) or choices
     candidates = [current, *({**current, **one} for one in draw(free, trials, seed))]
-    bar = tqdm(candidates, unit=" settings", desc=f"{name} {chosen}", dynamic_ncols=True)
+    bar = progress(candidates, f"settings of {chosen} on {name}")
     scores: list[Score] = []
     try:
         for one in bar:

@@ -12,7 +12,7 @@ from skimage.metrics import structural_similarity
 
 import torch_zerohess as zh
 from experiments.problems.catalogue import load
-from experiments.problems.closed_forms import box2
+from experiments.problems.soft_squares import box2
 from experiments.problems.task import Task
 from experiments.problems.tasks.box2 import fitting
 from experiments.studies.losses import LossReport, losses

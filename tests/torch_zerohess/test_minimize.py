@@ -267,6 +267,18 @@ def test_bounds_are_kept():
     torch.testing.assert_close(fit.x, vector(1.0, -0.5), rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+def test_the_engine_is_chosen_and_may_be_given(bounds):
+    settings = {"bounds": bounds, "sigma": 2.0, "seed": 0, "max_evaluations": 15}
+    auto = zh.minimize(bowl, zeros(), **settings)
+    assert auto.engine == ("descent" if bounds is None else "gaussian_process")
+    given = {engine: zh.minimize(bowl, zeros(), engine=engine, **settings) for engine in {"descent", auto.engine}}
+    for engine, fit in given.items():
+        assert fit.engine == engine
+        same = torch.equal(torch.stack([one.x for one in fit.history]), torch.stack([one.x for one in auto.history]))
+        assert same == (engine == auto.engine)
+
+
 def test_seed():
     settings = {"sigma": 2.0, "max_evaluations": 15}
     first = zh.minimize(bowl, zeros(), seed=3, **settings)
@@ -293,7 +305,7 @@ def test_values_that_are_not_finite_on_the_way():
 @pytest.mark.parametrize(
     ("wrong", "error", "message"),
     [
-        ({"method": "newton"}, ValueError, "method must be 'trust_region', got 'newton'"),
+        ({"engine": "newton"}, ValueError, "engine must be one of .*, got 'newton'"),
         ({"x0": [0.0, 0.0]}, TypeError, "x must be a torch tensor"),
         ({"x0": torch.zeros(2, dtype=torch.int64)}, TypeError, "float32 or float64"),
         ({"x0": torch.zeros(2, 2)}, ValueError, r"x0 must be a tensor \[n\]"),

@@ -1,19 +1,19 @@
 """The drop-in layer: a function that can only be called, as a torch module with derivatives to second order."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import forward_ad
 
-from torch_zerohess.autograd import opaque
-from torch_zerohess.autograd.opaque import Reduction
-from torch_zerohess.estimation.estimate import folded_aux
-from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, checked_input, evaluate_center
+from torch_zerohess.autograd import opaque, transforms
+from torch_zerohess.autograd.linear_map import first_order_only, project
+from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
+from torch_zerohess.estimation.expansion import Expansion
+from torch_zerohess.estimation.inputs import checked_input, folded_aux
 from torch_zerohess.estimation.perturbations import stored
-from torch_zerohess.estimation.stein import Stein
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.smoothing import Smoothing
 
@@ -21,9 +21,9 @@ from torch_zerohess.smoothing import Smoothing
 class BlackBox(nn.Module):
     """A black box, convolved with a Gaussian, as a layer: F(x) = E fn(x + sigma u), u ~ N(0, I).
 
-    One forward call is one batch of evaluations; gradients, Hessians and Hessian-vector products of any transform of
-    torch are taken from that batch. Where no derivative can be asked for (under `torch.no_grad`, or where neither x
-    nor anything before it requires grad), only f(x) is evaluated.
+    One forward call is one batch of evaluations. Gradients, Hessians and Hessian-vector products, by any transform of
+    torch, use that batch. If no derivative can be asked for (under `torch.no_grad`, or if x does not require grad),
+    only f(x) is evaluated.
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out], scalar values (a loss) or tensors (an image). It may use NumPy,
@@ -32,7 +32,7 @@ class BlackBox(nn.Module):
         smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
-        value: "center" returns f(x), "smoothed" the estimate of F(x). The derivatives are those of F in both cases.
+        value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
 
     Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x.
@@ -68,48 +68,47 @@ class BlackBox(nn.Module):
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
         x = checked_input(x)
-        if x.requires_grad and not opaque.transformed(x) and forward_ad._current_level < 0:
+        if x.requires_grad and not transforms.watched(x) and not transforms.forward_mode_active():
             x = Input.apply(x)
         batch = x.shape[:-1]
         flat, others = x.reshape(-1, x.shape[-1]), folded_aux(_without_grad(aux), batch)
-        if self.call.value == "center" and not _differentiated(x):
+        if self.call.value == "center" and not transforms.derivative_possible(x):
             result = self._center(flat.detach(), others)
         else:
-            result = _value(self._evaluate(flat.detach(), others), flat, flat.detach(), self.smoothing, zero=True)
+            result = _value(self._evaluate(flat.detach(), others), flat, flat.detach(), zero=True)
         if torch.compiler.is_compiling() and x.requires_grad:
-            # A compiled backward can be differentiated again in silence, wrongly, unless it has saved an input of the
-            # graph: then torch raises. This term is zero and saves x.
+            # torch differentiates a compiled backward a second time without an error, and gets a wrong number, unless
+            # the backward has saved an input of the graph. This term is zero and saves x: now torch raises.
             result = result + 0.0 * x.sin().sum()
         return result.reshape((*batch, *result.shape[1:]))
 
     def freeze(self, x: Tensor, *aux: Tensor) -> Callable[[Tensor], Tensor]:
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
-        The function re-weights the same evaluations to the density around its argument, so that near x it is the
-        smoothed black box, with derivatives of every order and no further evaluation.
+        The function re-weights the same evaluations to the density around its argument. Near x it estimates the
+        smoothed black box and has derivatives of every order; it makes no further evaluation.
         """
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = x.detach().reshape(-1, n).clone()
-        reduction = self._evaluate(center, folded_aux(_without_grad(aux), batch))
-        smoothing = self.smoothing
+        expansion = self._evaluate(center, folded_aux(_without_grad(aux), batch))
 
         def frozen(z: Tensor) -> Tensor:
-            result = _value(reduction, z.reshape(-1, n), center, smoothing, zero=False)
+            result = _value(expansion, z.reshape(-1, n), center, zero=False)
             return result.reshape((*batch, *result.shape[1:]))
 
         return frozen
 
-    def _evaluate(self, x: Tensor, aux: list[Tensor]) -> Reduction:
+    def _evaluate(self, x: Tensor, aux: list[Tensor]) -> Expansion:
         B, n = x.shape
         keep = torch.compiler.is_compiling() or stored(self.smoothing, B, n)
-        if not opaque.transformed(x):
-            with torch.no_grad():
-                return opaque.evaluate_tensors(self, keep, x, aux)
+        if not transforms.watched(x):
+            return opaque.expand(self, keep, x, aux)
         K = self.smoothing.evaluations(n, center=False)
-        return Reduction(*torch.ops.torch_zerohess.evaluate(self._handle, K, keep, x, aux))
+        tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, x, aux)
+        return Expansion.rebuild(tensors, x, self.smoothing, keep)
 
     def _center(self, x: Tensor, aux: list[Tensor]) -> Tensor:
-        if opaque.transformed(x):
+        if transforms.watched(x):
             result: Tensor = torch.ops.torch_zerohess.evaluate_center(self._handle, x, aux)
             return result
         return evaluate_center(self.call, x, aux).to(x.dtype)
@@ -120,7 +119,7 @@ class BlackBox(nn.Module):
         return self.call.fn
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The settings travel with the state_dict, so that an annealed sigma is resumed."""
+        """Return the settings, so that a state_dict resumes an annealed sigma."""
         return {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -138,7 +137,7 @@ class BlackBox(nn.Module):
 
 
 class Input(torch.autograd.Function):
-    """The identity, which marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
+    """The identity. It marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
 
     @staticmethod
     def forward(x: Tensor) -> Tensor:
@@ -164,7 +163,7 @@ def smooth(
 ) -> Callable[..., Tensor]:
     """Return fn, convolved with a Gaussian, as a differentiable function of a tensor: `BlackBox` without the module.
 
-    Arguments, shapes and errors are those of `BlackBox`.
+    Arguments, shapes and errors: see `BlackBox`.
 
     Example:
         >>> f = smooth(lambda z: (z > 0).double().sum(1), Smoothing(sigma=0.5, samples=4000, seed=0))
@@ -175,46 +174,25 @@ def smooth(
     return BlackBox(fn, smoothing, vectorized=vectorized, evaluator=evaluator, value=value, on_nonfinite=on_nonfinite)
 
 
-def _value(reduction: Reduction, x: Tensor, center: Tensor, smoothing: Smoothing, *, zero: bool) -> Tensor:
-    """The value at x, with a graph: base + sum_k (ratio_k(d) - ratio_k(0)) c_k, d = (x - center) / sigma."""
-    stein: Stein = reduction.stein(smoothing, center)
-    d = (x.double() - center.double()) / reduction.sigma
-    c = reduction.coefficients.flatten(2) if reduction.coefficients.dim() > 2 else reduction.coefficients[..., None]
-    total = (stein.ratio(d, zero=zero)[:, None] @ c)[:, 0]
-    if zero:
-        change = total - total.detach()
-    else:
-        change = total - (stein.ratio(torch.zeros_like(d), zero=True)[:, None] @ c)[:, 0].detach()
-    return (reduction.base + change.reshape(reduction.base.shape)).to(x.dtype)
+def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Tensor:
+    """Return the expansion around `center` at x [B, n], with a graph; `zero` says that x equals `center` in value."""
+    stein, c = expansion.stein, expansion.flat
 
+    def ratios(d: Tensor, zero: bool) -> Tensor:
+        d = first_order_only(d) if stein.first_order else d
+        return (stein.ratio(d, functools.partial(project, zero=zero))[:, None] @ c)[:, 0]
 
-def _differentiated(x: Tensor) -> bool:
-    """Whether anybody may ask for a derivative with respect to x; where in doubt, yes."""
-    forward_mode = forward_ad._current_level >= 0
-    if torch.compiler.is_compiling():
-        return forward_mode or (torch.is_grad_enabled() and x.requires_grad)
-    return torch._C._functorch.maybe_current_level() is not None or _asked_for(x)
+    d = (x.double() - center.double()) / expansion.sigma
+    total = ratios(d, zero)
+    change = total - (total if zero else ratios(torch.zeros_like(d), True)).detach()
+    return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     for number, one in enumerate(aux):
-        if isinstance(one, Tensor) and _asked_for(one):
+        if isinstance(one, Tensor) and transforms.derivative_wanted(one):
             raise ValueError(
                 f"aux[{number}] requires grad, but the black box is differentiated with respect to x alone: "
                 "pass it detached, or as part of x"
             )
     return aux
-
-
-def _asked_for(one: Tensor) -> bool:
-    """Whether a derivative with respect to a tensor is wanted at any level of nested transforms."""
-    if torch.compiler.is_compiling():
-        return torch.is_grad_enabled() and one.requires_grad
-    while True:
-        if one.requires_grad and torch.is_grad_enabled():
-            return True
-        if forward_ad._current_level >= 0 and forward_ad.unpack_dual(one).tangent is not None:
-            return True
-        if not torch._C._functorch.is_functorch_wrapped_tensor(one):
-            return False
-        one = torch._C._functorch.get_unwrapped(one)

@@ -2,18 +2,17 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluation import BlackBoxCall, Evaluations, ValueMode, checked_input, evaluate
+from torch_zerohess.estimation.evaluation import BlackBoxCall, Evaluations, ValueMode, evaluate
+from torch_zerohess.estimation.inputs import checked_input, folded_aux
 from torch_zerohess.estimation.perturbations import draws, stored
-from torch_zerohess.estimation.standard_error import variance
+from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.smoothing import Smoothing
-
-Quantity = Literal["value", "gradient", "hessian_diagonal", "hvp"]
 
 
 class Estimate:
@@ -24,23 +23,21 @@ class Estimate:
 
     def __init__(self, evaluations: Evaluations, batch: torch.Size, x: Tensor, smoothing: Smoothing) -> None:
         self._evaluations, self._batch, self._x, self._smoothing = evaluations, batch, x, smoothing
-        self._out = evaluations.base.shape[1:]
-        self._stein = evaluations.perturbations.stein
-        self._sigma = evaluations.perturbations.sigma
+        expansion = evaluations.expansion
+        self._expansion, self._stein, self._sigma = expansion, expansion.stein, expansion.sigma
 
     @cached_property
     def _a(self) -> Tensor:
-        """Coefficients [B, P, K] with P the flattened output."""
-        c = self._evaluations.coefficients
-        return c.reshape(*c.shape[:2], -1).mT.contiguous()
+        """Coefficients [B, P, K], P outputs."""
+        return self._expansion.flat.mT.contiguous()
 
     def _shaped(self, flat: Tensor, *tail: int) -> Tensor:
-        return flat.reshape((*self._batch, *self._out, *tail)).to(self._x.dtype)
+        return flat.reshape((*self._batch, *self._expansion.base.shape[1:], *tail)).to(self._x.dtype)
 
     @property
     def value(self) -> Tensor:
         """f(x), or the estimate of F(x) where `value="smoothed"`: [*batch, *out]."""
-        return self._shaped(self._evaluations.base)
+        return self._shaped(self._expansion.base)
 
     @cached_property
     def gradient(self) -> Tensor:
@@ -62,9 +59,9 @@ class Estimate:
         return self._shaped(self._stein.hessian(self._a) / (self._sigma[:, None] * self._sigma), n, n)
 
     def standard_error(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
-        """Standard error of an estimate, in its shape, from the spread of its independent draws.
+        """Standard error of an estimate, in the shape of the estimate, from the spread of its independent draws.
 
-        An antithetic pair is one draw; so is a whole scramble of sampler "sobol" and a block of "orthogonal".
+        An antithetic pair is one draw. So are a whole scramble of sampler "sobol" and a block of "orthogonal".
 
         Args:
             quantity: "value" (of the smoothed value), "gradient", "hessian_diagonal" or "hvp".
@@ -73,14 +70,13 @@ class Estimate:
         Raises:
             ValueError: fewer than two independent draws, an unknown quantity, or an "hvp" without v.
         """
-        if quantity not in ("value", "gradient", "hessian_diagonal", "hvp"):
+        if quantity not in get_args(Quantity):
             raise ValueError(f"quantity must be 'value', 'gradient', 'hessian_diagonal' or 'hvp', got {quantity!r}")
         if (quantity == "hvp") != (v is not None):
             raise ValueError("v is the vector of quantity 'hvp': give it there and only there")
         t = None if v is None else self._vector(v)
-        result = variance(
-            self._stein, quantity, self._a, self._evaluations.share, draws(self._smoothing, len(self._sigma)), t
-        ).sqrt()
+        independent = draws(self._smoothing, len(self._sigma))
+        result = self._stein.variance(quantity, self._a, self._evaluations.share, independent, t).sqrt()
         if quantity == "value":
             return self._shaped(result)
         scale = self._sigma**2 if quantity == "hessian_diagonal" else self._sigma
@@ -94,7 +90,7 @@ class Estimate:
     @cached_property
     def points(self) -> Tensor:
         """Every point that was evaluated, [*batch, K, n]; x itself is the last one where f(x) was evaluated."""
-        points = self._evaluations.perturbations.points
+        points = self._evaluations.points
         if self._evaluations.center is not None:
             points = torch.cat([points, self._x.reshape(-1, 1, points.shape[2])], 1)
         return points.reshape((*self._batch, *points.shape[1:]))
@@ -109,7 +105,7 @@ class Estimate:
 
     @property
     def dropped(self) -> int:
-        """Evaluations left out by on_nonfinite="drop"; the other one of an antithetic pair goes with it."""
+        """Evaluations left out by on_nonfinite="drop". Of an antithetic pair both are left out."""
         return self._evaluations.dropped
 
     def _vector(self, v: Tensor) -> Tensor:
@@ -158,15 +154,3 @@ def estimate(
     batch, flat = x.shape[:-1], x.reshape(-1, x.shape[-1])
     keep = stored(smoothing, *flat.shape)
     return Estimate(evaluate(call, flat, folded_aux(aux, batch), smoothing, keep), batch, x, smoothing)
-
-
-def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
-    """Flatten the batch dimensions [*batch, ...] of auxiliary inputs to [B, ...]; checks them."""
-    for number, one in enumerate(aux):
-        if not isinstance(one, Tensor):
-            raise TypeError(f"aux[{number}] must be a tensor [*batch, ...], got {type(one).__name__}")
-        if one.shape[: len(batch)] != batch:
-            raise ValueError(
-                f"aux[{number}] must have the batch dimensions {list(batch)} of x first, got {list(one.shape)}"
-            )
-    return [one.detach().reshape(batch.numel(), *one.shape[len(batch) :]) for one in aux]

@@ -8,8 +8,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.perturbations import Perturbations, draws, perturb
-from torch_zerohess.estimation.stein import Elementwise, Stein, total
+from torch_zerohess.estimation.expansion import Expansion
+from torch_zerohess.estimation.perturbations import draws, perturb
+from torch_zerohess.estimation.stein import Stein, total
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.smoothing import Smoothing
 
@@ -63,35 +64,25 @@ class BlackBoxCall:
 
 @dataclass(frozen=True)
 class Evaluations:
-    """Values at perturbed points, and everything that estimates are made of. B batch, K perturbations, n parameters."""
+    """One call of the black box: its points and values, and the expansion made of them.
 
-    perturbations: Perturbations
+    Shapes: B batch, K perturbations, n parameters.
+    """
+
+    points: Tensor
+    """Perturbed points [B, K, n], in the dtype of x."""
     values: Tensor
-    """[B, K, *out], as the black box returned them; zero where it was dropped."""
+    """Values there, [B, K, *out], as the black box returned them; zero where they were dropped."""
     center: Tensor | None
     """f(x), [B, *out], where it was evaluated."""
-    base: Tensor
-    """What the estimate returns as value, float64 [B, *out]: f(x), or the smoothed value."""
-    coefficients: Tensor
-    """(f_k - baseline) / K, float64 [B, K, *out]."""
     share: Tensor
-    """Weight of each row in a mean, [B, K]: 1/K, or zero where it was dropped and more elsewhere."""
+    """Weight of each row in a mean, [B, K]: 1/K; where rows were dropped, zero for them and more for the others."""
+    expansion: Expansion
 
     @property
     def dropped(self) -> int:
         """Evaluations left out because they, or the other one of their pair, were not finite."""
         return int((self.share == 0).sum())
-
-
-def checked_input(x: Any) -> Tensor:
-    """Return x, or raise if it is not a real floating tensor [*batch, n] with n > 0."""
-    if not isinstance(x, Tensor):
-        raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
-    if x.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
-    if x.dim() == 0 or x.numel() == 0:
-        raise ValueError(f"x must have shape [*batch, n] with n and every batch dimension > 0, got {list(x.shape)}")
-    return x
 
 
 def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Smoothing, keep: bool) -> Evaluations:
@@ -101,34 +92,27 @@ def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Sm
     """
     seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
     perturbations = perturb(x, smoothing, seed, keep)
-    points = perturbations.points
+    points, stein = perturbations.points, perturbations.stein
     B, K, n = points.shape
     with_center = call.value == "center" or smoothing.baseline == "center"
-    if with_center:
-        points = torch.cat([points, x[:, None]], 1)
-    repeated = [one.repeat_interleave(points.shape[1], 0) for one in aux]
+    everywhere = torch.cat([points, x[:, None]], 1) if with_center else points
+    repeated = [one.repeat_interleave(everywhere.shape[1], 0) for one in aux]
     # A copy where there is none yet: the black box may write to its input.
-    flat = points.flatten(0, 1) if with_center else points.flatten(0, 1).clone()
+    flat = everywhere.flatten(0, 1) if with_center else everywhere.flatten(0, 1).clone()
     values = call(flat, repeated).unflatten(0, (B, -1))
-    values, kept = _finite(values, points, call.on_nonfinite, K, smoothing)
+    values, kept = _finite(values, everywhere, call.on_nonfinite, K, smoothing, stein)
     center = values[:, K] if with_center else None
     values = values[:, :K]
     share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
         share = kept / kept.sum(1, keepdim=True).double()
-    baseline, coefficients = _coefficients(values, center, share[..., None], smoothing, n)
+    baseline, coefficients = _coefficients(values.reshape(B, K, -1), center, share[..., None], smoothing, n)
     if call.value == "center" and center is not None:
         base = center.double()
     else:
-        base = _smoothed_value(values, baseline, coefficients, perturbations.stein)
-    return Evaluations(perturbations, values, center, base, coefficients, share)
-
-
-def _smoothed_value(values: Tensor, baseline: Tensor, coefficients: Tensor, stein: Stein) -> Tensor:
-    B, K = coefficients.shape[:2]
-    if isinstance(stein, Elementwise):  # only the value's own rows tell it: the others have another mean
-        return stein.value(values.double().reshape(B, K, -1).mT / K).view_as(baseline)
-    return baseline + stein.value(coefficients.reshape(B, K, -1).mT).view_as(baseline)
+        base = stein.smoothed(values.reshape(B, K, -1), baseline, coefficients.mT).reshape((B, *values.shape[2:]))
+    expansion = Expansion(base, coefficients.reshape(values.shape), perturbations.sigma, stein)
+    return Evaluations(points, values, center, share, expansion)
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -143,18 +127,15 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
 def _coefficients(
     values: Tensor, center: Tensor | None, share: Tensor, smoothing: Smoothing, n: int
 ) -> tuple[Tensor, Tensor]:
-    """Mean baseline [B, *out] and (f - baseline) / K [B, K, *out]; dropped rows weigh nothing, the others more."""
-    B, K = values.shape[:2]
-    f = values.double().reshape(B, K, -1)
+    """Return the mean baseline [B, P] and (f - baseline) * share [B, K, P], for values [B, K, P], share [B, K, 1]."""
+    f = values.double()
     if smoothing.baseline == "none":
-        mean, coefficients = torch.zeros_like(f[:, 0]), f * share
-    elif smoothing.baseline == "center" and center is not None:
-        mean = center.double().reshape(B, -1)
-        coefficients = (f - mean[:, None]) * share
-    else:
-        baseline = _mean_of_others(f, share, draws(smoothing, n))
-        mean, coefficients = total(baseline * share)[:, 0], (f - baseline) * share
-    return mean.reshape((B, *values.shape[2:])), coefficients.reshape(values.shape)
+        return torch.zeros_like(f[:, 0]), f * share
+    if smoothing.baseline == "center" and center is not None:
+        mean = center.double().reshape(len(f), -1)
+        return mean, (f - mean[:, None]) * share
+    baseline = _mean_of_others(f, share, draws(smoothing, n))
+    return total(baseline * share)[:, 0], (f - baseline) * share
 
 
 def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
@@ -182,9 +163,12 @@ def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
 
 
 def _finite(
-    values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing
+    values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing, stein: Stein
 ) -> tuple[Tensor, Tensor | None]:
-    """Treat values [B, E, *out] that are not finite; return them, and which of the K perturbed rows stay if not all."""
+    """Treat values [B, E, *out] that are not finite at points [B, E, n].
+
+    Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
+    """
     bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
     if not bool(bad.any()):
         return values, None
@@ -205,12 +189,16 @@ def _finite(
             f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: fn is not finite "
             "almost everywhere around x"
         )
-    if smoothing.proposal == "optimal" and not bool(kept.all()):
-        raise ValueError("on_nonfinite='drop' cannot re-weight the element-wise sets of proposal 'optimal'")
+    if not stein.droppable:
+        raise ValueError(
+            f"on_nonfinite='drop' cannot re-weight the element-wise sets of proposal {smoothing.proposal!r}: give a "
+            "number to put in place of values that are not finite"
+        )
     return torch.where(bad.reshape(*bad.shape, *[1] * (values.dim() - 2)), 0.0, values), kept
 
 
 def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
+    """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
     if isinstance(rule, str):
         point = points[tuple(where.tolist())]
         text = ", ".join(f"{float(p):.6g}" for p in point[:8]) + (", ..." if len(point) > 8 else "")
@@ -219,12 +207,13 @@ def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) 
         raise ValueError(
             f"fn returned {wrong} at the point [{text}]; choose on_nonfinite='drop' or a number to go on without it"
         )
-    return torch.where(torch.isfinite(values), values, torch.as_tensor(float(rule), dtype=values.dtype))
+    # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
+    return torch.where(torch.isfinite(values), values.double(), float(rule))
 
 
 def _tensor(result: Any) -> Tensor:
     try:
-        # Numbers of Python have the precision of float64, not that of torch's default.
+        # A number of Python is float64, whatever the default dtype of torch.
         return torch.as_tensor(result, dtype=torch.float64 if isinstance(result, float) else None)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

@@ -1,6 +1,6 @@
-"""Stein's identities as sums over samples, one class per family of weights.
+"""Stein's identities as sums over samples: what a family of weights must know.
 
-Every estimate is a weighted sum of black-box values f_k with a kernel in the dimensionless perturbation u_k:
+Every estimate is a weighted sum of black-box values f_k. The weight is a kernel of the dimensionless perturbation u_k:
 
 | | likelihood ratio | element-wise (optimal) | signed lobes (FR22) |
 |---|---|---|---|
@@ -8,157 +8,130 @@ Every estimate is a weighted sum of black-box values f_k with a kernel in the di
 | gradient_i | w_k u_i | sign(u_i) sqrt(2/pi) on the rows of i | sign(u_i) sqrt(2/pi) |
 | Hessian_ij | w_k (u_i u_j - delta_ij) | constant times sign on the rows of ij | none |
 
-`ratio(d)` is the generating function of all three: its value at d = (x - x_0)/sigma = 0 is the kernel of the value, its
-first and second derivative those of gradient and Hessian. For likelihood ratios it is N(z; x) / p(z) itself,
-w exp(u.d - d.d/2), so that derivatives of every order are the estimators of theirs.
+`ratio(d)` generates all kernels of a family. At d = (x - x_0) / sigma = 0 its value is the kernel of the value, its
+first derivative the kernel of the gradient, its second derivative the kernel of the Hessian. For a likelihood ratio it
+is N(z; x) / p(z) = w exp(u.d - d.d/2), so derivatives of every order are estimators.
 
-Shapes: B batch, K samples, M vectors, n parameters; a [B, M, K] are the coefficients, values over K. All float64 and in
-units of sigma: the caller divides by sigma.
+To add a family: write one subclass of `Stein` in a file of its own and name it in `perturbations.FAMILIES`.
+
+Shapes: B batch, K samples, M vectors, n parameters, P outputs. Coefficients a are [B, M, K]. Everything is float64 and
+in units of sigma: the caller divides by sigma.
 """
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.autograd.linear_map import FIRST_ORDER_ERROR, Samples, first_order_only, project
-from torch_zerohess.sampling import kernels
-from torch_zerohess.sampling.kernels import Redrawn
-from torch_zerohess.sampling.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
+from torch_zerohess.sampling.kernels import Samples
+from torch_zerohess.smoothing import Smoothing
 
+Quantity = Literal["value", "gradient", "hessian_diagonal", "hvp"]
+Projection = Callable[[Samples, Tensor], Tensor]
+"""(u [B, K, n] or its recipe, t [B, M, n]) -> [B, M, K], differentiable in t: see `autograd.linear_map.project`."""
+
+FIRST_ORDER_ERROR = (
+    "these samples serve first derivatives only (proposal 'fr22', or 'optimal' with order=1): "
+    "use Smoothing(proposal='aggregate', order=2) for Hessians and Hessian-vector products"
+)
 _BLOCK = 4096
 
 
-@dataclass(frozen=True)
-class LikelihoodRatio:
-    """Samples of a density p with weights N/p, which serve every order at once."""
+class Layout(NamedTuple):
+    """Shape and dtype of a tensor that is yet to be made."""
 
-    u: Samples
-    """[B, K, n], or the recipe to draw it again."""
-    weight: Tensor
-    """N(u) / p(u), [B, K]."""
-
-    def value(self, a: Tensor) -> Tensor:
-        return total((a * self.weight[:, None]).mT)[:, 0]
-
-    def gradient(self, a: Tensor) -> Tensor:
-        return kernels.accumulate(self.u, a * self.weight[:, None])
-
-    def hvp(self, a: Tensor, v: Tensor) -> Tensor:
-        a = a * self.weight[:, None]
-        return kernels.accumulate(self.u, a * kernels.project(self.u, v)) - total(a.mT).mT * v
-
-    def hessian_diagonal(self, a: Tensor) -> Tensor:
-        a = a * self.weight[:, None]
-        return kernels.accumulate_squares(self.u, a) - total(a.mT).mT
-
-    def hessian(self, a: Tensor) -> Tensor:
-        a = a * self.weight[:, None]
-        result = kernels.hessian(self.u, a)
-        result.diagonal(dim1=2, dim2=3).sub_(total(a.mT).mT)
-        return result
-
-    def ratio(self, d: Tensor, *, zero: bool = False) -> Tensor:
-        """Return w exp(u.d - d.d/2), [B, K], differentiable in d [B, n]; `zero` says that d is zero in value."""
-        exponent = project(self.u, d[:, None], zero=zero)[:, 0] - 0.5 * (d * d).sum(1, keepdim=True)
-        return self.weight * exponent.exp()
-
-    def subset(self, index: Tensor) -> "LikelihoodRatio":
-        """Return the draws index [D, r], r rows each, as a batch of B * D estimates."""
-        if isinstance(self.u, Redrawn):
-            S = len(self.u.rows) // len(self.u.x)
-            first = index[:, 0]  # the rows of a drawn pair are s and s + S
-            rows = self.u.rows.view(-1, S, 5)[:, first].reshape(-1, 5)
-            u = self.u._replace(rows=rows, x=self.u.x.repeat_interleave(len(index), 0))
-            return LikelihoodRatio(u, self.weight[:, index].flatten(0, 1))
-        return LikelihoodRatio(self.u[:, index].flatten(0, 1), self.weight[:, index].flatten(0, 1))
+    shape: tuple[int, ...]
+    dtype: torch.dtype = torch.float64
+    batched: bool = True
+    """Whether the first dimension is the batch; if not, the tensor is the same for every point."""
 
 
-@dataclass(frozen=True)
-class Elementwise:
-    """One sample set for the value, for every gradient element and for every Hessian element, with constant weights."""
+class Stein(ABC):
+    """A family of weights for one batch of samples: the sums, and the rules that go with them.
 
-    weight: Tensor
-    """Signed constant weight of each row for its own element, [B, K], the K over the set's own size included."""
-    rows: Tensor
-    """int64 [K, 5]; columns 2 to 4 are the kind of element and its dimensions i <= j."""
-    n: int
-    order: int
-
-    def value(self, a: Tensor) -> Tensor:
-        return (a * self.weight[:, None])[..., self.rows[:, 2] == NORMAL].sum(2)
-
-    def gradient(self, a: Tensor) -> Tensor:
-        chosen = self.rows[:, 2] == GRADIENT_LOBE
-        result = a.new_zeros(*a.shape[:2], self.n)
-        return result.index_add_(2, self.rows[chosen, 3], (a * self.weight[:, None])[..., chosen])
-
-    def hvp(self, a: Tensor, v: Tensor) -> Tensor:
-        return (self.hessian(a) @ v[..., None])[..., 0]
-
-    def hessian_diagonal(self, a: Tensor) -> Tensor:
-        return self.hessian(a).diagonal(dim1=2, dim2=3)
-
-    def hessian(self, a: Tensor) -> Tensor:
-        if self.order == 1:
-            raise ValueError(FIRST_ORDER_ERROR)
-        chosen = (self.rows[:, 2] == DIAGONAL_LOBE) | (self.rows[:, 2] == OFF_DIAGONAL_LOBE)
-        i, j = self.rows[chosen, 3], self.rows[chosen, 4]
-        upper = a.new_zeros(*a.shape[:2], self.n * self.n)
-        upper = upper.index_add_(2, i * self.n + j, (a * self.weight[:, None])[..., chosen])
-        upper = upper.unflatten(2, (self.n, self.n))
-        return upper + upper.triu(1).mT
-
-    def ratio(self, d: Tensor, *, zero: bool = False) -> Tensor:
-        """Return the quadratic in d [B, n] whose derivatives are the kernels, [B, K]."""
-        if self.order == 1:
-            d = first_order_only(d)
-        kind, i, j = self.rows[:, 2], self.rows[:, 3], self.rows[:, 4]
-        d_i, d_j = (d.gather(1, index.expand(len(d), -1)) for index in (i, j))  # its backward has a vmap rule
-        hessian = torch.where(kind == DIAGONAL_LOBE, 0.5, 1.0) * d_i * d_j
-        factor = torch.where(kind == NORMAL, 1.0, torch.where(kind == GRADIENT_LOBE, d_i, hessian))
-        return self.weight * factor
-
-
-@dataclass(frozen=True)
-class SignedLobes:
-    """FR22: all dimensions at once from the signed gradient lobe. First order only, biased for n > 1.
-
-    It smooths the other dimensions with the gradient's lobe instead of the Gaussian (Fischer and Ritschel 2023).
+    A family without second derivatives leaves `hvp`, `hessian_diagonal` and `hessian` as they are here, where they
+    raise, and returns True from `first_order`.
     """
 
-    u: Tensor
-    """sign(u) sqrt(2/pi), [B, K, n]."""
+    droppable: bool = True
+    """Whether the other rows can take over the weight of rows that are dropped."""
 
+    @classmethod
+    @abstractmethod
+    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+        """Draw samples around x [B, n] and return their points [B, K, n], in the dtype of x, and the family.
+
+        sigma: float64 [n]; keep: store the perturbations instead of drawing them again whenever they are needed.
+        """
+
+    @classmethod
+    @abstractmethod
+    def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:
+        """Return what `tensors` of a batch will look like."""
+
+    @abstractmethod
+    def tensors(self) -> list[Tensor]:
+        """Return the tensors that represent this batch, contiguous, for `rebuild`."""
+
+    @classmethod
+    @abstractmethod
+    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> Self:
+        """Return the family that `tensors` were taken from, drawn around x [B, n] with the same sigma and settings."""
+
+    @property
+    def first_order(self) -> bool:
+        """Whether these samples serve first derivatives only."""
+        return False
+
+    @abstractmethod
     def value(self, a: Tensor) -> Tensor:
-        return a.sum(2)
+        """Return the sums of the value, [B, M]."""
 
+    @abstractmethod
     def gradient(self, a: Tensor) -> Tensor:
-        return kernels.accumulate(self.u, a)
+        """Return the sums of the gradient, [B, M, n]."""
 
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
+        """Return the sums of the Hessian times v [B, M, n], [B, M, n]."""
         raise ValueError(FIRST_ORDER_ERROR)
 
     def hessian_diagonal(self, a: Tensor) -> Tensor:
+        """Return the sums of the Hessian's diagonal, [B, M, n]."""
         raise ValueError(FIRST_ORDER_ERROR)
 
     def hessian(self, a: Tensor) -> Tensor:
+        """Return the sums of the Hessian, [B, M, n, n]."""
         raise ValueError(FIRST_ORDER_ERROR)
 
-    def ratio(self, d: Tensor, *, zero: bool = False) -> Tensor:
-        """Return 1 + k.d, [B, K], differentiable once in d [B, n]."""
-        return 1.0 + project(self.u, first_order_only(d)[:, None], zero=zero)[:, 0]
+    @abstractmethod
+    def ratio(self, d: Tensor, project: Projection) -> Tensor:
+        """Return the generating function at d [B, n], [B, K], made of differentiable operations on d."""
 
-    def subset(self, index: Tensor) -> "SignedLobes":
-        """Return the draws index [D, r], r rows each, as a batch of B * D estimates."""
-        return SignedLobes(self.u[:, index].flatten(0, 1))
+    def smoothed(self, values: Tensor, baseline: Tensor, a: Tensor) -> Tensor:
+        """Return the estimate of F(x), [B, P].
+
+        values: f [B, K, P] as the black box returned them; baseline: [B, P]; a: (f - baseline) / K [B, P, K].
+        """
+        return baseline + self.value(a)
+
+    @abstractmethod
+    def variance(
+        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
+    ) -> Tensor:
+        """Return the variance of a sum in its shape: see `standard_error.variance_of_draws` for the arguments."""
+
+    def sums(self, quantity: Quantity, a: Tensor, v: Tensor | None) -> Tensor:
+        """Return the sums of one quantity; v is the vector of "hvp"."""
+        if quantity == "hvp" and v is not None:
+            return self.hvp(a, v)
+        sums = {"value": self.value, "gradient": self.gradient, "hessian_diagonal": self.hessian_diagonal}
+        return sums[quantity](a)
 
 
 def total(a: Tensor) -> Tensor:
-    """Sum [B, K, P] over K to [B, 1, P] block by block: the order of one long sum follows the number of threads."""
+    """Sum [B, K, P] over K to [B, 1, P] in blocks of fixed size: the bits do not follow the number of threads."""
     whole = a.shape[1] // _BLOCK * _BLOCK
     blocks = a[:, :whole].unflatten(1, (-1, _BLOCK)).sum(2).sum(1, keepdim=True)
     return blocks + a[:, whole:].sum(1, keepdim=True)
-
-
-Stein = LikelihoodRatio | Elementwise | SignedLobes

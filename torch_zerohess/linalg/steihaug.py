@@ -2,11 +2,18 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.optim.newton_step import Step
+
+class Step(NamedTuple):
+    """A step s [N], the decrease -(g.s + s.Hs/2) that the quadratic model promises, and why the search for it ended."""
+
+    s: Tensor
+    decrease: float
+    exit: str
 
 
 def steihaug(

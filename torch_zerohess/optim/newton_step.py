@@ -1,24 +1,17 @@
-"""A step that minimises a quadratic model in a trust region, and its test: what `Newton` and `NewtonCG` share."""
+"""A step that minimises a quadratic model in a trust region, and its test: shared by `Newton` and `NewtonCG`."""
 
 import math
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.steihaug import Step
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, pair
 
 _ROUNDING = 10.0
-"""Units of rounding of the loss below which a decrease cannot be tested."""
-
-
-class Step(NamedTuple):
-    """A step s [N], the decrease -(g.s + s.Hs/2) that the model promises, and why the search for it ended."""
-
-    s: Tensor
-    decrease: float
-    exit: str
+"""Smallest predicted decrease that can be tested, in units of rounding of the loss."""
 
 
 class NewtonStep(SecondOrder):
@@ -72,7 +65,7 @@ class NewtonStep(SecondOrder):
         )
 
     def _try(self, s: Tensor, closure: Closure, loss: Tensor) -> float:
-        """Move by s [N] and return by how much the loss fell; the move is taken back where it did not."""
+        """Move by s [N] and return by how much the loss fell; if it did not fall, take the move back."""
         before, actual = self._copy(), math.nan
         self._add(s)
         try:

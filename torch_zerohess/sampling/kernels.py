@@ -1,8 +1,8 @@
 """The operations that the C++ extension speeds up, each beside its literal reference in torch.
 
-A CPU tensor goes to the extension where it was built; any other device, and an installation without a compiler, to the
-reference. Drawn perturbations have the same bits on both ways; sums differ by rounding only, within n units in the
-last place of the sum of magnitudes.
+CPU tensors go to the extension if it was built. Tensors on other devices, and all tensors of an installation without
+a compiler, go to the reference. Both draw the same bits. Their sums of n terms differ by rounding: n units in the last
+place of the sum of magnitudes at most.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch_zerohess.sampling import extension, proposals
 
 _MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
-_WIDE = 64  # likewise for the outer products of a Hessian
+_WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
 _CHUNK = 1 << 22  # elements of drawn rows held at a time
 
 
@@ -36,7 +36,7 @@ class Redrawn(NamedTuple):
         return len(self.rows) // len(self.x) * (2 if self.antithetic else 1)
 
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Yield what `place` returns, for a part of the rows at a time, and which k of the K rows these are."""
+        """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
         B, n = self.x.shape
         S = len(self.rows) // B
         step = max(1, _CHUNK // (B * n))
@@ -46,6 +46,10 @@ class Redrawn(NamedTuple):
             index = torch.arange(first, first + part.shape[1], device=u.device)
             columns = torch.cat([index, index + S]) if self.antithetic else index
             yield *place(u, self.x, self.sigma, self.antithetic, self.single, proposal), columns
+
+
+Samples = Tensor | Redrawn
+"""Perturbations [B, K, n], stored or drawn again."""
 
 
 def _compiled(tensor: Tensor) -> bool:
@@ -73,7 +77,7 @@ def place(
     return proposals.place(u, x, sigma, antithetic, single, proposal)
 
 
-def project(u: Tensor | Redrawn, t: Tensor) -> Tensor:
+def project(u: Samples, t: Tensor) -> Tensor:
     """Return sum_d u[b, k, d] t[b, m, d] as [B, M, K]: how far every sample lies along each vector."""
     if isinstance(u, Tensor):
         if _compiled(u) and t.shape[1] <= _MANY_VECTORS:
@@ -87,17 +91,17 @@ def project(u: Tensor | Redrawn, t: Tensor) -> Tensor:
     return result
 
 
-def accumulate(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+def accumulate(u: Samples, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, d] as [B, M, n]: the transpose of `project`."""
     return _sums(u, a, squares=False)
 
 
-def accumulate_squares(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+def accumulate_squares(u: Samples, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, d]^2 as [B, M, n]."""
     return _sums(u, a, squares=True)
 
 
-def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
+def hessian(u: Samples, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] as [B, M, n, n]."""
     if isinstance(u, Tensor):
         if _compiled(u) and a.shape[1] <= _MANY_VECTORS and u.shape[2] <= _WIDE:
@@ -113,7 +117,7 @@ def hessian(u: Tensor | Redrawn, a: Tensor) -> Tensor:
     return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
 
 
-def _sums(u: Tensor | Redrawn, a: Tensor, squares: bool) -> Tensor:
+def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:
     if isinstance(u, Tensor):
         if _compiled(u) and a.shape[1] <= _MANY_VECTORS:
             return torch.ops.torch_zerohess.accumulate(u.contiguous(), a.contiguous(), squares)

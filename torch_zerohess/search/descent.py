@@ -1,318 +1,261 @@
-"""The search behind `TrustRegion`, in units of sigma: which points next, and what their values tell."""
+"""Descent by quadratic models of the smoothed function in a trust region tied to sigma."""
 
 import math
-from collections.abc import Callable
-from typing import Any, Literal
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.subproblem import ball_step, box_step
+from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.draws import normal, reflect, uniform
+from torch_zerohess.search.loss_step import after_loss
+from torch_zerohess.search.output_step import after_output
+from torch_zerohess.search.protocol import AskTell, Method, Settings
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
 
 _FEW = 2
 """Parameters up to which a full quadratic of the loss takes so few evaluations that an output is not needed."""
-_BATCH = 64
-"""Points asked for at a time, at most."""
-_WIDEST = 1.6
-"""Largest sigma, in units of the first one."""
-_FLAT = 0.03
-"""Relative change of the loss below which a step has stayed on a plateau."""
-_FAITHFUL = 0.25
-"""Misfit of a predicted output up to which the model needs no new evaluations."""
-_TOLERABLE = 5.0
-"""Misfit up to which a step that lowers the loss is itself what the model needs to know."""
-_MISLED = 2.0
-"""Misfit beyond which other steps need more samples than the last time."""
-_RETRIES = 2
-"""Shorter steps tried in a row before samples are drawn."""
-_STALLED = 8
-"""Iterations after which the smoothed loss must have fallen by a twentieth, or sigma shrinks faster."""
+_NEAR = 1e-3
+"""Weight from which an evaluation counts as near."""
+_ENOUGH = 4
+"""Near evaluations, besides the center, that a model needs at least; n if that is less."""
+_SHARPNESS = 0.1
+"""Mean squared distance, in units of sigma^2, within which evaluations weigh the same in a faithful model."""
 _REFUSED = 10
-"""Batches in a row with values that are not finite, after which the search ends."""
-
-Phase = Literal["start", "sample", "trial"]
-
-_STATE = (
-    *("sigma", "evaluations", "iterations", "rounds", "done", "message", "phase", "step"),
-    *("first", "best", "best_sigma", "x", "fx", "lowest", "local", "local_value"),
-    *("_need", "_paired", "_patience", "_refused", "_faithful", "_reach", "_retries", "_misled"),
-)
-"""What changes as the search goes on, besides the model, the pool and the generator."""
+"""Batches in a row with values that are not finite, after which a round ends."""
+_RESTART = 1.5
+"""First sigma of a further round."""
+_AWAY = 2.0
+"""Standard deviation of its start from the first one, where there is no box to draw it from."""
+_WIDENINGS, _WIDENING = 8, 1.5
+"""How often, and by which factor, sigma is widened to find evaluations around the best point."""
 
 
-class Search:
-    """State of a search over z [n], float64, within lower and upper [n]; the first sigma is 1.
+class LocalQuadratics(Method[DescentProgress]):
+    """The method of `Descent`."""
 
-    One iteration is `points`, their evaluation, `take`. See `TrustRegion` for the idea and for the settings.
-    """
+    engine = "descent"
+    progress = DescentProgress
 
-    def __init__(
-        self,
-        start: Tensor,
-        lower: Tensor,
-        upper: Tensor,
-        *,
-        loss: Callable[[Tensor], Tensor] | None,
-        restarts: int,
-        tolerance: float,
-        noise: float,
-        pool: int,
-        generator: torch.Generator,
-    ) -> None:
-        self.n, self.lower, self.upper, self.loss = len(start), lower, upper, loss
-        self.restarts, self.tolerance, self.noise, self.generator = restarts, tolerance, noise, generator
-        self.pool = Pool(self.n, pool, start.device)
-        self.first = self.best = self.local = self.x = self.step = start
-        self.fx = self.lowest = self.local_value = math.inf
-        self.sigma = self.best_sigma = 1.0
-        self.evaluations = self.iterations = self.rounds = 0
-        self.done, self.message = False, ""
-        self.phase: Phase = "start"
-        self.model: LocalModel | None = None
-        self.shape = torch.Size()
-        """Of an output."""
-        self._need, self._paired = 0, False
-        self._patience = self._refused = self._retries = self._misled = 0
-        self._faithful, self._reach = False, 1.0
-        self._followed: list[float] = []
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        self._n = n = settings.n
+        self._follows = settings.loss is not None and n > _FEW
+        self.capacity = settings.pool or _capacity(n, loss_alone=settings.loss is None)
 
-    @property
-    def _follows(self) -> bool:
-        return self.loss is not None and self.n > _FEW
+    def first(self, generator: torch.Generator) -> tuple[DescentProgress, Tensor]:
+        known = self._begun(Best(self.settings.start))
+        return known, self.points(known, generator)
 
-    def go_on(self, pool: Pool, lowest: float, sigma: float) -> None:
-        """Begin with the evaluations of another search, whose best point is the start, with this loss there."""
-        self.pool.add(pool.points, pool.values, None, self.x, 1.0)
-        self.fx = self.lowest = self.local_value = lowest
-        self.sigma, self.phase = sigma, "trial"
-        self._plan()
+    def go_on(self, pool: Pool, best: Best, sigma: float) -> DescentProgress:
+        """Return a round that begins at the best point of another search, with the evaluations of that search."""
+        known = self._begun(best)
+        pool = known.pool.add(pool.points, pool.values, None, best.point, 1.0).latest(self.capacity)
+        return self._planned(replace(known, pool=pool, value=best.loss, sigma=sigma).trying())
 
-    def points(self) -> Tensor:
-        """Draw the next points [K, n]."""
-        if self.phase == "trial":
-            assert self.model is not None
-            return (self.x + self.sigma * self.model.expand(self.step)).clamp(self.lower, self.upper)[None]
-        if self.phase == "start":
-            return torch.cat([self.x[None], self._draw(min(self.n, _BATCH), paired=False)])
-        return self._draw(self._need, self._paired)
+    def next(
+        self, known: DescentProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[DescentProgress, Tensor]:
+        known = self.take(known, evaluated, generator)
+        return known, self.points(known, generator)
 
-    def take(self, points: Tensor, losses: Tensor, outputs: Tensor | None) -> None:
-        """Go on with the losses [K] and outputs [K, m] of points [K, n]."""
-        finite = torch.isfinite(losses)
-        if outputs is not None:
-            finite &= torch.isfinite(outputs).all(1)
-        self.evaluations += len(points)
-        self.pool.add(points[finite], losses[finite], None if outputs is None else outputs[finite], self.x, self.sigma)
-        self._remember(points[finite], losses[finite])
-        self._refused = 0 if bool(finite.all()) else self._refused + 1
-        if self._refused >= _REFUSED:
-            self._refused = 0  # a later round may have started where nothing is finite
-            self._arrive(f"{_REFUSED} batches in a row had values that are not finite", last=self.rounds == 0)
-            return
-        if self.phase == "trial":
-            self.iterations += 1
-            if not bool(finite[0]):
-                self.sigma *= 0.5
-                self._sample(2)
-            elif outputs is not None and self._follows:
-                self._follow(points[0], float(losses[0]), outputs[0])
-            else:
-                self._descend(points[0], float(losses[0]))
+    def take(self, known: DescentProgress, evaluated: Evaluated, generator: torch.Generator) -> DescentProgress:
+        """Return what is known after an evaluation, with a step or the number of samples to ask for next."""
+        known = self._remembered(known, evaluated)
+        if known.refused >= _REFUSED:
+            reason = f"{_REFUSED} batches in a row had values that are not finite"
+            known = replace(known, refused=0)  # a later round may have started where nothing is finite
+            return self._arrived(known, reason, generator, last=known.rounds == 0)
+        loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
+        if known.phase == "trial":
+            known = self._judged(replace(known, iterations=known.iterations + 1), evaluated, loss)
         else:
-            if self.phase == "start":
-                self.fx = float(losses[0]) if bool(finite[0]) else math.inf
-            self.phase = "trial"
-        if self.sigma < self.tolerance:
-            self._arrive(f"sigma fell below {self.tolerance} of the first one")
-        if self.phase == "trial" and not self.done:
-            self._plan()
+            known = replace(known, value=loss if known.phase == "start" else known.value).trying()
+        if known.sigma < self.settings.tolerance:
+            reason = f"sigma fell below {self.settings.tolerance} of the first one"
+            known = self._arrived(known, reason, generator)
+        return self._planned(known) if known.phase == "trial" and not known.done else known
 
-    def model_at_best(self) -> tuple[LocalModel, float] | None:
-        """See `TrustRegion.model_at_best`."""
-        sigma = self.best_sigma
-        for _ in range(8):
-            weights = self.pool.weights(self.best, sigma)
-            near = weights > 1e-3
-            if int(near.sum()) > min(self.n, self.pool.capacity - 2):
-                return self._fit((self.pool.points[near] - self.best) / sigma, near, weights[near]), sigma
-            sigma *= 1.5
+    def points(self, known: DescentProgress, generator: torch.Generator) -> Tensor:
+        """Draw the next points [K, n]."""
+        if known.done:
+            return known.center[None][:0]
+        if known.phase == "trial":
+            assert known.model is not None
+            end = known.center + known.sigma * known.model.expand(known.step)
+            return end.clamp(self.settings.lower, self.settings.upper)[None]
+        if known.phase == "start":
+            around = self._drawn(known, min(self._n, BATCH), generator, paired=False)
+            return torch.cat([known.center[None], around])
+        return self._drawn(known, known.need, generator, paired=known.paired)
+
+    def model_at_best(self, known: DescentProgress) -> tuple[LocalModel, float] | None:
+        best, sigma = known.best.point, known.best.sigma
+        for _ in range(_WIDENINGS):
+            weights = known.pool.weights(best, sigma)
+            near = weights > _NEAR
+            if int(near.sum()) > min(self._n, self.capacity - 2):
+                u = (known.pool.points[near] - best) / sigma
+                return self._fitted(known, u, near, weights[near]), sigma
+            sigma *= _WIDENING
         return None
 
-    def state_dict(self) -> dict[str, Any]:
-        """Tensors, numbers, strings, lists and dicts."""
-        return {
-            **{name: getattr(self, name) for name in _STATE},
-            "followed": list(self._followed),
-            "shape": list(self.shape),
-            "model": None if self.model is None else vars(self.model).copy(),
-            "pool": self.pool.state_dict(),
-            "generator": self.generator.get_state(),
-        }
+    def _begun(self, best: Best) -> DescentProgress:
+        start, pool = best.point, Pool.empty(self._n, best.point.device)
+        return DescentProgress(best=best, lowest=best, center=start, first=start, step=start, pool=pool)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        vars(self).update({name: state[name] for name in _STATE})
-        self._followed, self.shape = list(state["followed"]), torch.Size(state["shape"])
-        self.model = None if state["model"] is None else LocalModel(**state["model"])
-        self.pool.load_state_dict(state["pool"])
-        self.generator.set_state(state["generator"].cpu())
+    # What was evaluated.
+
+    def _remembered(self, known: DescentProgress, evaluated: Evaluated) -> DescentProgress:
+        finite = evaluated.finite
+        new = evaluated.those(finite)
+        pool = known.pool.add(new.points, new.losses, new.outputs, known.center, known.sigma).latest(self.capacity)
+        best, lowest = known.best, known.lowest
+        if len(new):
+            k = int(new.losses.argmin())
+            found = Best(new.points[k], float(new.losses[k]), known.sigma)
+            best, lowest = (found if found.loss < one.loss else one for one in (best, lowest))
+        return replace(
+            known,
+            pool=pool,
+            best=best,
+            lowest=lowest,
+            shape=evaluated.shape,
+            evaluations=known.evaluations + len(evaluated),
+            refused=0 if bool(finite.all()) else known.refused + 1,
+        )
+
+    def _judged(self, known: DescentProgress, evaluated: Evaluated, loss: float) -> DescentProgress:
+        """Decide by the end of a step what to do next."""
+        if loss == math.inf:
+            return replace(known, sigma=0.5 * known.sigma).sampling(2)
+        if evaluated.outputs is not None and self._follows:
+            return after_output(known, evaluated.points[0], loss, evaluated.outputs[0])
+        return after_loss(known, evaluated.points[0], loss, self.settings.noise)
+
+    def _arrived(
+        self, known: DescentProgress, reason: str, generator: torch.Generator, *, last: bool = False
+    ) -> DescentProgress:
+        """End, or start another round: at a random point and around the best one in turn."""
+        settings, rounds = self.settings, known.rounds + 1
+        if last or rounds > settings.restarts:
+            return replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
+        center = known.best.point
+        if rounds % 2 and settings.bounded:
+            center = uniform(generator, settings.lower, settings.upper, 1)[0]
+        elif rounds % 2:
+            center = known.first + _AWAY * normal(generator, center, self._n)
+            center = center.clamp(settings.lower, settings.upper)
+        return replace(
+            known,
+            phase="start",
+            center=center,
+            sigma=_RESTART,
+            rounds=rounds,
+            lowest=Best(center),
+            patience=0,
+            faithful=False,
+            reach=1.0,
+            retries=0,
+            misled=0,
+            recent=(),
+            earlier=math.inf,
+        )
 
     # Samples and steps.
 
-    def _draw(self, count: int, paired: bool) -> Tensor:
-        """Draw about `count` points from N(x, sigma^2), orthogonal in blocks, and mirror them into the bounds."""
-        rows = self._directions((count + 1) // 2 if paired else count)
+    def _drawn(self, known: DescentProgress, count: int, generator: torch.Generator, *, paired: bool) -> Tensor:
+        """Draw about `count` points from N(center, sigma^2), orthogonal in blocks, and mirror them into the bounds."""
+        rows = self._directions(known, (count + 1) // 2 if paired else count, generator)
         u = torch.cat([rows, -rows]) if paired else rows
-        return reflect(self.x + self.sigma * u, self.lower, self.upper)
+        return reflect(known.center + known.sigma * u, self.settings.lower, self.settings.upper)
 
-    def _directions(self, count: int) -> Tensor:
+    def _directions(self, known: DescentProgress, count: int, generator: torch.Generator) -> Tensor:
         """Normal vectors [count, n], orthogonal to each other and, in many dimensions, to what the pool spans."""
-        n = self.n
+        n = self._n
         rows: list[Tensor] = []
-        known = None
-        if n > _BATCH and 1 < len(self.pool) < n:
-            known, _ = torch.linalg.qr(((self.pool.points - self.x) / self.sigma).mT)
+        spanned = None
+        if n > BATCH and 1 < len(known.pool) < n:
+            spanned, _ = torch.linalg.qr(((known.pool.points - known.center) / known.sigma).mT)
         while sum(len(one) for one in rows) < count:
-            room = n if known is None else n - known.shape[1]
-            block = normal(self.generator, self.x, n, min(count, max(room, 1)))
-            if known is not None:
+            room = n if spanned is None else n - spanned.shape[1]
+            block = normal(generator, known.center, n, min(count, max(room, 1)))
+            if spanned is not None:
                 for _ in range(2):  # twice is enough (Kahan)
-                    block = block - known @ (known.mT @ block)
-            known = None
+                    block = block - spanned @ (spanned.mT @ block)
+            spanned = None
             directions, _ = torch.linalg.qr(block)
-            lengths = normal(self.generator, self.x, directions.shape[1], n).norm(dim=1, keepdim=True)
+            lengths = normal(generator, known.center, directions.shape[1], n).norm(dim=1, keepdim=True)
             rows.append(directions.mT * lengths)
         return torch.cat(rows)[:count]
 
-    def _plan(self) -> None:
+    def _planned(self, known: DescentProgress) -> DescentProgress:
         """Fit a model and find its step; where too few evaluations lie near, ask for more first."""
-        weights = self.pool.weights(self.x, self.sigma)
-        if self._faithful:  # the model is about to interpolate: what is nearest counts most
-            distance = ((self.pool.points - self.x) / self.sigma).square().mean(1)
-            weights = weights / (0.1 + distance).square()
-        near = weights > 1e-3
-        if int(near.sum()) < (min(self.n, 4) + 1 if self._need == 0 else 1):
-            self._sample(2)
-            return
-        self._need = 0
-        u, weights = (self.pool.points[near] - self.x) / self.sigma, weights[near]
-        self.model = self._fit(u, near, weights)
-        radius = self._reach * math.sqrt(self.n)
-        lower, upper = (self.lower - self.x) / self.sigma, (self.upper - self.x) / self.sigma
-        if self.model.basis is None:
-            self.step = box_step(self.model.gradient, self.model.hessian, radius, lower, upper)
+        points, center, sigma = known.pool.points, known.center, known.sigma
+        weights = known.pool.weights(center, sigma)
+        if known.faithful:  # the model is about to interpolate: what is nearest counts most
+            distance = ((points - center) / sigma).square().mean(1)
+            weights = weights / (_SHARPNESS + distance).square()
+        near = weights > _NEAR
+        if int(near.sum()) < (min(self._n, _ENOUGH) + 1 if known.need == 0 else 1):
+            return known.sampling(2)
+        model = self._fitted(known, (points[near] - center) / sigma, near, weights[near])
+        radius = known.reach * math.sqrt(self._n)
+        lower, upper = (self.settings.lower - center) / sigma, (self.settings.upper - center) / sigma
+        if model.basis is None:
+            step = box_step(model.gradient, model.hessian, radius, lower, upper)
         else:
-            s = ball_step(self.model.gradient, self.model.hessian, radius)
-            self.step = self.model.reduce(self.model.expand(s).clamp(lower, upper))
+            s = ball_step(model.gradient, model.hessian, radius)
+            step = model.reduce(model.expand(s).clamp(lower, upper))
+        return replace(known, model=model, step=step, need=0)
 
-    def _fit(self, u: Tensor, near: Tensor, weights: Tensor) -> LocalModel:
-        outputs = self.pool.outputs
-        if self.loss is None or outputs is None or not self._follows:
-            return fit_values(u, self.pool.values[near], weights)
-        return fit_outputs(u, outputs[near], weights, self.loss, self.shape)
-
-    # What an evaluated step tells.
-
-    def _descend(self, z: Tensor, fz: float) -> None:
-        """Move to the best point of this round if it lowers the loss; else shrink, or grow on a plateau."""
-        assert self.model is not None
-        length = float(self.step.norm()) / math.sqrt(self.n)
-        slack = 2.0 * self.noise
-        promised = self.model.decrease(self.step)
-        ratio = (self.fx - fz + slack) / (promised + slack) if promised + slack > 0.0 else -math.inf
-        least = min(1e-3 * abs(self.fx), 0.1 * max(promised, 0.0))  # the loss may have a large offset
-        if min(fz, self.local_value) < self.fx - max(least, slack):
-            self._patience = 0
-            if fz <= self.local_value:
-                if length > 0.9 and ratio > 0.5:
-                    self.sigma *= 1.2
-                elif length < 0.4:
-                    self.sigma *= 0.75
-            self.x, self.fx = (z, fz) if fz <= self.local_value else (self.local, self.local_value)
-            if ratio > 0.7 and self.model.rank < self.n:
-                self._sample(min(self.n - self.model.rank, _BATCH), paired=False)
-            else:
-                self.phase = "trial"
-            return
-        if self.model.significance < 0.0 and self._patience < 2:
-            self._patience += self.sigma >= _WIDEST
-            self.sigma = min(1.3 * self.sigma, _WIDEST)
-        else:
-            self.sigma *= 0.75
-        self._sample(min(2**self.rounds, self.n))
-
-    def _follow(self, z: Tensor, fz: float, output: Tensor) -> None:
-        """Move with the minimum of the smoothed output's loss; the worse it was predicted, the more samples."""
-        assert self.model is not None
-        length = float(self.step.norm()) / math.sqrt(self.n)
-        misfit, before = self.model.misfit(self.step, output), self.fx
-        gain = before - fz
-        if self._faithful and gain <= 0.0 and self._retries < _RETRIES:
-            # The model was good so far: a shorter step, from a model that knows this point, is cheaper than samples.
-            self._retries += 1
-            self._reach = 0.4 * length
-            self.sigma *= 0.9
-            self.phase = "trial"
-            return
-        self.x, self.fx, self._retries, self._reach = z, fz, 0, 1.0
-        if misfit < _TOLERABLE and gain > 0.02 * abs(before):
-            self._faithful, self._misled = True, 0
-            if misfit > _FAITHFUL:
-                self.sigma *= _narrowing(length)
-            self.phase = "trial"
-            if misfit < _FAITHFUL and self.model.rank < self.n:
-                self._sample(self.n - self.model.rank, paired=False)
-            return
-        self._faithful = misfit < _FAITHFUL and gain > 0.0
-        self._misled = 0 if misfit < _FAITHFUL else self._misled + (misfit > _MISLED)
-        narrow = _narrowing(length)
-        self._followed.append(self.model.value)
-        recent, earlier = self._followed[-_STALLED:], self._followed[:-_STALLED]
-        if earlier and min(recent) > 0.95 * min(earlier):
-            narrow *= 0.8
-        if abs(gain) < _FLAT * abs(before) and misfit > _FAITHFUL and self._patience < 4:
-            self._patience += 1
-            if self.local_value < 0.9 * before:
-                self.x, self.fx = self.local, self.local_value
-            else:
-                narrow = max(narrow, min(1.3, _WIDEST / self.sigma))
-        self.sigma *= narrow
-        most = 2 * math.ceil(self.n / 2)
-        self._sample(min(2**self._misled, most) if misfit > _MISLED else 2 * math.ceil(self.n / 8))
-
-    def _sample(self, count: int, *, paired: bool = True) -> None:
-        self.phase, self._need = "sample", min(count, _BATCH)
-        self._paired = paired and count > 1
-
-    def _arrive(self, reason: str, *, last: bool = False) -> None:
-        """End, or start another round."""
-        self.rounds += 1
-        if last or self.rounds > self.restarts:
-            self.done, self.message = True, f"{reason}, in round {self.rounds}"
-            return
-        self.sigma = 1.5
-        self.x = self.best
-        if self.rounds % 2:
-            if bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all()):
-                self.x = uniform(self.generator, self.lower, self.upper, 1)[0]
-            else:
-                self.x = (self.first + 2.0 * normal(self.generator, self.x, self.n)).clamp(self.lower, self.upper)
-        self.local_value, self._patience, self._followed, self.phase = math.inf, 0, [], "start"
-        self._faithful, self._reach, self._retries, self._misled = False, 1.0, 0, 0
-
-    def _remember(self, points: Tensor, losses: Tensor) -> None:
-        if not len(losses):
-            return
-        k = int(losses.argmin())
-        value = float(losses[k])
-        if value < self.local_value:
-            self.local, self.local_value = points[k], value
-        if value < self.lowest:
-            self.best, self.lowest, self.best_sigma = points[k], value, self.sigma
+    def _fitted(self, known: DescentProgress, u: Tensor, near: Tensor, weights: Tensor) -> LocalModel:
+        """Fit a model to the evaluations that are near, at u [P, n] with weights [P]."""
+        outputs = known.pool.outputs
+        if self.settings.loss is None or outputs is None or not self._follows:
+            return fit_values(u, known.pool.values[near], weights)
+        return fit_outputs(u, outputs[near], weights, self.settings.loss, known.shape)
 
 
-def _narrowing(length: float) -> float:
-    """Factor for sigma after a step of a length in units of the radius: short steps have found the minimum."""
-    return min(max(0.85 + 0.3 * length, 0.8), 1.05)
+class Descent(AskTell[DescentProgress]):
+    """Second-order descent on a smoothed black box, for any number of parameters, with or without bounds.
+
+    Each iteration fits a quadratic model of the smoothed loss to the pool of past evaluations (`Pool`, `fit_values`;
+    `fit_outputs` if the black box returns a tensor and `loss` is given), minimises it within sigma sqrt(n) of x and
+    within the bounds, and asks for that one point. New samples around x are asked for only where the model has
+    predicted badly. Sigma, and with it the region, grows after a long good step and on a plateau, and shrinks after a
+    short or refused one.
+
+    - With the loss alone or n <= 2, it moves to whatever evaluated point is best.
+    - With an output [K, *out] and a white-box `loss`, every evaluation is many equations: it follows the minimum of
+      loss(E f) while sigma goes to zero, also where the loss itself rises for a while.
+
+    Where sigma is below `tolerance` the search has arrived at a minimum, possibly a local one. It then starts again, in
+    turn from a random point and around the best one, with more samples per iteration, up to `restarts` times.
+
+    Settings are those of `AskTell`. Decreases below twice the `noise` do not count. By default the pool keeps 60 or 6 n
+    evaluations, and enough for a full quadratic of a loss alone up to n = 20.
+
+    Source: Wang, Fischer and Ritschel (2025) for the smoothed second order; evaluations are re-used as in
+    derivative-free least squares (Cartis et al. 2019) and COBYQA.
+
+    Example:
+        >>> search = Descent(torch.tensor([900.0, 850.0]), sigma=500.0, seed=0, restarts=0)
+        >>> while search.evaluations < 9:
+        ...     z = search.ask()
+        ...     search.tell(5 * z[:, 0] ** 2 + 5 * z[:, 1] ** 2 + 7.5 * z[:, 0] * z[:, 1])
+        >>> search.value < 1.0  # of 1.3e7
+        True
+    """
+
+    def _make(self, settings: Settings) -> Method[DescentProgress]:
+        return LocalQuadratics(settings)
+
+
+def _capacity(n: int, *, loss_alone: bool) -> int:
+    """Evaluations to keep: twice what determines the model, within reason."""
+    quadratic = min((n + 1) * (n + 2), 500) if loss_alone else 0
+    return max(60, 6 * n, quadratic)

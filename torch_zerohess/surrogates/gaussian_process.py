@@ -1,9 +1,11 @@
-"""Gaussian process over few parameters whose values are outputs: what is known between evaluations, and how well.
+"""Gaussian process over a few parameters: predicts outputs between evaluations, and how well it knows them.
 
-All elements of an output share one kernel and one variance, so an output is predicted as a sum of known ones, whatever
-its size. The kernel is a constant plus one of `KERNELS`: smooth functions get the Gaussian one, whose smoothed
-derivatives exist in closed form, and renders with hard edges, whose loss has a cusp, the Matern one. Kernel, length and
-noise are those under which the outputs are most likely (Rasmussen and Williams 2006, section 5.4).
+All elements of an output share one kernel and one variance. A predicted output is therefore a weighted sum of known
+outputs, and the weights do not depend on the size of an output. The kernel is a constant plus one of `KERNELS`: the
+Gaussian kernel suits smooth functions, the Matern kernel suits renders with hard edges. Kernel, length and noise are
+those with the highest evidence, the likelihood of the outputs (Rasmussen and Williams 2006, section 5.4).
+
+One length serves all parameters. For one length per parameter divide the points by these lengths (`ProcessSurrogate`).
 """
 
 import math
@@ -16,33 +18,41 @@ from torch import Tensor
 LENGTHS = (0.3, 0.5, 1.0, 2.0, 4.0)
 """Length scales, in units of the points."""
 NOISES = (1e-6, 1e-3, 1e-2)
-"""Variances of an output that the process does not explain, in units of its own."""
+"""Noise, the variance of an output that the process does not explain, in units of the process's own variance."""
 HIGH_NOISES = (0.1, 1.0, 10.0)
-"""The same of outputs that differ from call to call. A few exact ones that vary fast look like that, too."""
-_CONSTANT = 1.0
+"""Noise of outputs that differ from call to call. A few exact outputs that vary fast look noisy, too."""
+CONSTANT = 1.0
+"""Variance of the constant part of the kernel."""
 _SPREAD = 1.5
-"""Standard deviation of the prior over the log of the length."""
+"""Standard deviation of the prior over the log of a length."""
+_FLAT = 1e-14
+"""Change of outputs, relative to their size, that is rounding."""
+_ZERO = 1e-16
+"""Added to squared distances: their root has no derivative at zero, and next to it the kernels' derivatives are lost in
+rounding."""
 
 
 def matern(distance: Tensor) -> Tensor:
-    """Matern kernel of order 3/2: once differentiable."""
+    """Matern kernel of order 3/2: (1 + sqrt(3) d) exp(-sqrt(3) d), once differentiable."""
     scaled = math.sqrt(3.0) * distance
     return (1.0 + scaled) * torch.exp(-scaled)
 
 
 def gaussian(distance: Tensor) -> Tensor:
+    """Gaussian kernel exp(-d^2 / 2), smooth."""
     return torch.exp(-0.5 * distance.square())
 
 
-KERNELS: tuple[Callable[[Tensor], Tensor], ...] = (matern, gaussian)
+Kernel = Callable[[Tensor], Tensor]
+KERNELS: tuple[Kernel, ...] = (matern, gaussian)
 
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """Posterior given outputs [P, m] at points [P, n]; the prediction at x is mean + kernel(x) @ weights."""
+    """Posterior given outputs [P, m] at points [P, n]; the prediction at x is mean + covariance(x) @ weights."""
 
     points: Tensor
-    kernel: Callable[[Tensor], Tensor]
+    kernel: Kernel
     length: float
     mean: Tensor
     """[m]"""
@@ -53,48 +63,114 @@ class GaussianProcess:
     noise: float
     """Variance that the process does not explain, in units of `variance`."""
     factor: Tensor
-    """Cholesky factor of the covariance of the points [P, P]."""
+    """Cholesky factor of the covariance of the points [P, P], with the noise."""
 
     @classmethod
     def fit(cls, points: Tensor, outputs: Tensor, noises: Sequence[float] = NOISES) -> "GaussianProcess":
-        """Choose kernel, length and noise by the evidence, and condition on P >= 2 outputs."""
-        P, m = outputs.shape
+        """Choose kernel, length and noise from their lists by the evidence, and condition on P >= 2 outputs.
+
+        Args:
+            points: [P, n], float64.
+            outputs: [P, m], float64.
+            noises: levels to choose from.
+        """
         mean = outputs.mean(0)
         change = outputs - mean
         scale = float(change.abs().max())
-        flat = scale <= 1e-14 * float(mean.abs().max())
-        unit = change / scale if not flat else torch.zeros_like(change)
-        distance = _distance(points, points)
-        lengths, levels = distance.new_tensor(LENGTHS), distance.new_tensor(noises)
-        scaled = distance / lengths[:, None, None]
-        values, vectors = torch.linalg.eigh(torch.cat([kernel(scaled) for kernel in KERNELS]) + _CONSTANT)
-        power = (vectors * (unit @ unit.mT @ vectors)).sum(1).clamp_min(0.0)
-        spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [kernels x lengths, noises, P]
-        variances = (power[:, None] / spectrum).sum(2) / (P * m) + math.ulp(0.0)
-        evidence = -P * variances.log() - spectrum.log().sum(2)
-        evidence -= (lengths.log() / _SPREAD).square().repeat(len(KERNELS))[:, None]
-        shape, level = divmod(int(evidence.argmax()), len(noises))
-        kernel, length = KERNELS[shape // len(LENGTHS)], LENGTHS[shape % len(LENGTHS)]
-        noise, variance = noises[level], 1.0 if flat else scale**2 * float(variances[shape, level])
-        covariance = kernel(distance / length) + _CONSTANT
-        covariance.diagonal().add_(noise)
-        factor = torch.linalg.cholesky(covariance)
+        flat = scale <= _FLAT * float(mean.abs().max())
+        evidence, variances = grid_evidence(points, torch.zeros_like(change) if flat else change / scale, noises)
+        best = int(evidence.argmax())
+        shape, level = divmod(best, len(noises))
+        kernel, length, noise = KERNELS[shape // len(LENGTHS)], LENGTHS[shape % len(LENGTHS)], noises[level]
+        variance = 1.0 if flat else scale**2 * float(variances.flatten()[best])
+        factor = _factor(_distance(points, points), kernel, length, noise)
         weights = torch.cholesky_inverse(factor) @ change  # of many elements: faster than to solve for each
         return cls(points, kernel, length, mean, weights, variance, noise, factor)
 
+    @classmethod
+    def condition(
+        cls, points: Tensor, outputs: Tensor, kernel: Kernel, length: float, noise: float
+    ) -> "GaussianProcess":
+        """Condition on outputs [P, m] at points [P, n] with a kernel, length and noise that are known.
+
+        The variance is the most likely one.
+        """
+        mean = outputs.mean(0)
+        change = outputs - mean
+        factor = _factor(_distance(points, points), kernel, length, noise)
+        weights = torch.cholesky_solve(change, factor)
+        variance = float((change * weights).sum()) / outputs.numel() or 1.0
+        return cls(points, kernel, length, mean, weights, variance, noise, factor)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Expected outputs [Q, m] at points x [Q, n], with derivatives of every order in x.
+
+        The Matern kernel has no third derivative at the known points; it counts as finite there.
+        """
+        apart = distances if torch.is_grad_enabled() else _distance  # the latter is faster
+        constant = self.mean + CONSTANT * self.weights.sum(0)
+        return constant + self.kernel(apart(x / self.length, self.points / self.length)) @ self.weights
+
     def predict(self, x: Tensor) -> Tensor:
-        """Expected outputs [Q, m] at points x [Q, n]."""
+        """Expected outputs [Q, m] at points x [Q, n], without derivatives."""
         return self.mean + self.covariance(x) @ self.weights
 
     def covariance(self, x: Tensor) -> Tensor:
         """Covariance [Q, P] of points x [Q, n] with the known ones, in units of `variance`."""
-        return self.kernel(_distance(x, self.points) / self.length) + _CONSTANT
+        return self.kernel(_distance(x, self.points) / self.length) + CONSTANT
 
     def uncertainty(self, covariance: Tensor) -> Tensor:
         """Variance [Q] of an element of the output, given `covariance` [Q, P]."""
         known = torch.linalg.solve_triangular(self.factor, covariance.mT, upper=False).square().sum(0)
-        return self.variance * (1.0 + _CONSTANT - known).clamp_min(0.0)
+        return self.variance * (1.0 + CONSTANT - known).clamp_min(0.0)
+
+
+def grid_evidence(points: Tensor, change: Tensor, noises: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Log evidence for every kernel, length and noise of the lists, and the most likely variance for each of them.
+
+    The evidence is 2/m times the log likelihood without its constants, plus 2 times the log prior of the length. (An
+    output counts as one observation: its elements are not independent.)
+
+    Args:
+        points: [P, n].
+        change: outputs [P, m] less their mean, at most 1.
+        noises: levels [N].
+
+    Returns:
+        Two tensors [kernels * lengths, N].
+    """
+    P, m = change.shape
+    lengths, levels = points.new_tensor(LENGTHS), points.new_tensor(noises)
+    scaled = _distance(points, points) / lengths[:, None, None]
+    values, vectors = torch.linalg.eigh(torch.cat([kernel(scaled) for kernel in KERNELS]) + CONSTANT)
+    power = (vectors * (change @ change.mT @ vectors)).sum(1).clamp_min(0.0)
+    spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [kernels x lengths, N, P]
+    variances = (power[:, None] / spectrum).sum(2) / (P * m) + math.ulp(0.0)
+    evidence = -P * variances.log() - spectrum.log().sum(2)
+    evidence -= improbability(lengths).repeat(len(KERNELS))[:, None]
+    return evidence, variances
+
+
+def improbability(lengths: Tensor) -> Tensor:
+    """Minus 2 times the log prior of each length."""
+    return (lengths.log() / _SPREAD).square()
+
+
+def distances(a: Tensor, b: Tensor) -> Tensor:
+    """Distances [A, B] of points a [A, n] and b [B, n], with derivatives of every order that a kernel may multiply."""
+    middle = b.detach().mean(0)
+    a, b = a - middle, b - middle
+    squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
+    rounding = squares.detach().clamp(max=0.0)  # to be positive without a derivative of its own
+    return (squares - rounding + _ZERO).sqrt()
 
 
 def _distance(a: Tensor, b: Tensor) -> Tensor:
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _factor(distance: Tensor, kernel: Kernel, length: float, noise: float) -> Tensor:
+    """Cholesky factor [P, P] of the covariance of points at these distances."""
+    covariance = kernel(distance / length) + CONSTANT
+    covariance.diagonal().add_(noise)
+    return torch.linalg.cholesky(covariance)

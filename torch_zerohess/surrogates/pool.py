@@ -1,86 +1,101 @@
 """Evaluations of earlier iterations, and what each is worth at the current point."""
 
 import math
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 _CAP = 7.4
+"""Largest weight of one evaluation."""
 _FLAT = 4
+"""Number of parameters above which weights are flattened."""
+_CLOSE = 1e-3
+"""Distance from `keep` below which evaluations are not told apart by it."""
 
 
+@dataclass(frozen=True, eq=False)
 class Pool:
-    """Evaluations, the latest or those least alike (`thin`): points [P, n], losses [P] and, if any, outputs [P, m].
+    """Evaluations: points [P, n], losses [P] and, if any, outputs [P, m]. `add`, `latest` and `thin` return a new pool.
 
     Every evaluation keeps the Gaussian it was drawn from. At (x, sigma) its weight is N(z; x, sigma) over the mixture
     of these Gaussians (deterministic-mixture weights: Owen and Zhou 2000, section 2, "balance heuristic"). In n > 4
-    dimensions the ratio is raised to the power 4/n: a regression needs the neighbourhood of x, not an unbiased sum,
-    and ratios of densities in many dimensions leave one point with all the weight.
-
-    Args:
-        n: number of parameters.
-        capacity: evaluations kept.
+    dimensions the ratio is raised to the power 4/n. A regression needs the neighbourhood of x, not an unbiased sum, and
+    in many dimensions the plain ratio leaves one point with all the weight.
     """
 
-    def __init__(self, n: int, capacity: int, device: torch.device | None = None) -> None:
-        self.n, self.capacity = n, capacity
-        empty = torch.empty(0, dtype=torch.float64, device=device)
-        self.points, self.values = empty.reshape(0, n), empty
-        self.outputs: Tensor | None = None
-        self._centers, self._sigmas = empty.reshape(0, n), empty
-        self._origin = torch.empty(0, dtype=torch.long, device=device)
+    points: Tensor
+    values: Tensor
+    outputs: Tensor | None
+    centers: Tensor
+    """Of the Gaussians [G, n]."""
+    sigmas: Tensor
+    """Of the Gaussians [G]."""
+    origin: Tensor
+    """Which Gaussian each evaluation was drawn from [P]."""
+
+    @classmethod
+    def empty(cls, n: int, device: torch.device | None = None) -> "Pool":
+        """Return a pool for n parameters."""
+        none = torch.empty(0, dtype=torch.float64, device=device)
+        return cls(none.reshape(0, n), none, None, none.reshape(0, n), none, none.long())
 
     def __len__(self) -> int:
         return len(self.values)
 
-    def add(self, points: Tensor, values: Tensor, outputs: Tensor | None, center: Tensor, sigma: float) -> None:
-        """Append evaluations drawn from N(center, sigma^2); the oldest ones beyond the capacity are forgotten."""
-        group = torch.full((len(values),), len(self._sigmas), device=points.device)
-        self._centers = torch.cat([self._centers, center[None]])
-        self._sigmas = torch.cat([self._sigmas, self._sigmas.new_tensor([sigma])])
-        keep = self.capacity
-        self._origin = torch.cat([self._origin, group])[-keep:]
-        self.points = torch.cat([self.points, points])[-keep:]
-        self.values = torch.cat([self.values, values])[-keep:]
-        if outputs is not None:
-            self.outputs = outputs if self.outputs is None else torch.cat([self.outputs, outputs])[-keep:]
-        first = int(self._origin.min()) if len(self._origin) else 0
-        self._origin, self._centers, self._sigmas = self._origin - first, self._centers[first:], self._sigmas[first:]
+    def add(self, points: Tensor, values: Tensor, outputs: Tensor | None, center: Tensor, sigma: float) -> "Pool":
+        """Append evaluations [K, n], [K] and [K, m] that were drawn from N(center, sigma^2)."""
+        group = torch.full((len(values),), len(self.sigmas), device=points.device)
+        if outputs is not None and self.outputs is not None:
+            outputs = torch.cat([self.outputs, outputs])
+        return Pool(
+            torch.cat([self.points, points]),
+            torch.cat([self.values, values]),
+            self.outputs if outputs is None else outputs,
+            torch.cat([self.centers, center[None]]),
+            torch.cat([self.sigmas, self.sigmas.new_tensor([sigma])]),
+            torch.cat([self.origin, group]),
+        )
 
-    def thin(self, keep: Tensor) -> None:
-        """Where the pool is full, forget the worse of the two evaluations that are most alike, not that at keep [n].
+    def latest(self, count: int) -> "Pool":
+        """Keep the latest `count` evaluations."""
+        origin = self.origin[-count:]
+        first = int(origin.min()) if len(origin) else 0
+        outputs = None if self.outputs is None else self.outputs[-count:]
+        return Pool(
+            self.points[-count:],
+            self.values[-count:],
+            outputs,
+            self.centers[first:],
+            self.sigmas[first:],
+            origin - first,
+        )
 
-        Alike are those that are near each other for their distance from there: what is left covers the space, and more
-        densely around keep, where the latest evaluations would not.
+    def thin(self, keep: Tensor) -> "Pool":
+        """Find the two points closest to each other relative to their distance from `keep` [n]; drop the worse one.
+
+        The worse one has the higher loss; the point at `keep` itself stays. What remains covers the space, more densely
+        around `keep`. The latest evaluations alone would not.
         """
-        if len(self) < self.capacity:
-            return
         distance = torch.cdist(self.points, self.points, compute_mode="donot_use_mm_for_euclid_dist")
-        away = (self.points - keep).norm(dim=1) + 1e-3
-        alike = (distance / (away[:, None] + away)).fill_diagonal_(math.inf)
-        pair = divmod(int(alike.argmin()), len(self))
-        k = max(pair, key=lambda i: (not torch.equal(self.points[i], keep), float(self.values[i])))
-        rest = torch.arange(len(self), device=self.points.device) != k
-        self.points, self.values = self.points[rest], self.values[rest]
-        self.outputs = None if self.outputs is None else self.outputs[rest]
-        groups, self._origin = torch.unique(self._origin[rest], return_inverse=True)
-        self._centers, self._sigmas = self._centers[groups], self._sigmas[groups]
+        away = (self.points - keep).norm(dim=1) + _CLOSE
+        relative = (distance / (away[:, None] + away)).fill_diagonal_(math.inf)
+        pair = divmod(int(relative.argmin()), len(self))
+        worse = max(pair, key=lambda i: (not torch.equal(self.points[i], keep), float(self.values[i])))
+        rest = torch.arange(len(self), device=self.points.device) != worse
+        outputs = None if self.outputs is None else self.outputs[rest]
+        groups, origin = torch.unique(self.origin[rest], return_inverse=True)
+        return Pool(self.points[rest], self.values[rest], outputs, self.centers[groups], self.sigmas[groups], origin)
 
     def weights(self, x: Tensor, sigma: float) -> Tensor:
-        """Weights [P] at most 7.4 for a fit around x [n]; 1 for an evaluation at x itself."""
+        """Weights [P] for a fit around x [n], at most 7.4; 1 for an evaluation at x itself."""
         if not len(self):
             return self.values
+        n = self.points.shape[1]
         here = ((self.points - x) / sigma).square().sum(1)
-        target = -0.5 * here - self.n * math.log(sigma)
-        distance = torch.cdist(self.points, self._centers, compute_mode="donot_use_mm_for_euclid_dist")
-        share = torch.bincount(self._origin, minlength=len(self._sigmas)).double() / len(self)
-        each = share.log() - 0.5 * (distance / self._sigmas).square() - self.n * self._sigmas.log()
-        ratio = (target - torch.logsumexp(each, 1)) * min(1.0, _FLAT / self.n)
+        target = -0.5 * here - n * math.log(sigma)
+        distance = torch.cdist(self.points, self.centers, compute_mode="donot_use_mm_for_euclid_dist")
+        share = torch.bincount(self.origin, minlength=len(self.sigmas)).double() / len(self)
+        each = share.log() - 0.5 * (distance / self.sigmas).square() - n * self.sigmas.log()
+        ratio = (target - torch.logsumexp(each, 1)) * min(1.0, _FLAT / n)
         return torch.where(here == 0, 1.0, ratio.exp().clamp(max=_CAP))
-
-    def state_dict(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("n", "capacity")}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)

@@ -219,7 +219,10 @@ def _reduced(u: Tensor) -> tuple[Tensor | None, Tensor]:
 def loss_derivatives(
     loss: Callable[[Tensor], Tensor], output: Tensor, directions: Tensor
 ) -> tuple[float, Tensor, Tensor]:
-    """Return loss, its gradient [m] and its Hessian times directions [r, *out], [r, m], at an output [*out]."""
+    """Return loss, its gradient [m] and its Hessian times directions [r, *out], [r, m], at an output [*out].
+
+    The products have the type of the directions.
+    """
     with torch.enable_grad():
         y = output.detach().requires_grad_(True)
         value = loss(y)
@@ -227,20 +230,24 @@ def loss_derivatives(
             raise ValueError("loss must be differentiable by torch, got a value that does not depend on its output")
         (slope,) = torch.autograd.grad(value, y, create_graph=True)
         if not slope.requires_grad:
-            return float(value.detach()), _finite(slope.detach().flatten()), torch.zeros_like(directions).flatten(1)
+            return (
+                float(value.detach()),
+                _finite(slope.detach().flatten()),
+                torch.zeros_like(directions.reshape(len(directions), -1)),
+            )
 
         def product(direction: Tensor) -> Tensor:
             return torch.autograd.grad(slope, y, direction, retain_graph=True, materialize_grads=True)[0]
 
         # A generic combination of directions is an eigenvector only if all of them are, with the same eigenvalue.
         generic = torch.cos(torch.arange(1.0, len(directions) + 1.0)).to(directions)
-        probe = torch.tensordot(generic, directions, dims=1)
+        probe = torch.tensordot(generic, directions, dims=1).to(y)
         image, square = product(probe), float(probe.square().sum())
         scale = float((image * probe).sum()) / square if square > 0.0 else 0.0
         if float((image - scale * probe).norm()) <= 1e-12 * abs(scale) * math.sqrt(square):
-            products = scale * directions.flatten(1)
+            products = scale * directions.reshape(len(directions), -1)
         else:
-            products = torch.stack([product(one).flatten() for one in directions])
+            products = torch.stack([product(one.to(y)).flatten() for one in directions]).to(directions)
     return float(value.detach()), _finite(slope.detach().flatten()), _finite(products)
 
 

@@ -19,11 +19,11 @@ QUAD, BOX2, BOX10, BRDF, NONPSD and TEXTURE, on BRDF again after a look at the r
 
 _POOLED: dict[str, dict[str, Any]] = {
     # By hand, without a command.
-    "cnn": {"lengths": (0.5,), "temperature": 0.1, "steps": 1500, "rank": 64},
-    "cnn_wide": {"lengths": (0.5,), "temperature": 0.1, "steps": 1500, "rank": 64},
-    "cnn5": {"lengths": (1.25, 0.6, 10.0, 10.0, 10.0), "temperature": 0.03},
+    "cnn": {"temperature": 0.1, "steps": 1500, "rank": 64},
+    "cnn_wide": {"temperature": 0.1, "steps": 1500, "rank": 64},
+    "cnn5": {"temperature": 0.03},
     "cnn_texture": {
-        "lengths": None,
+        "surrogate": "linear",
         "temperature": 1.0,
         "steps": 900,
         "rank": 1100,
@@ -32,4 +32,5 @@ _POOLED: dict[str, dict[str, Any]] = {
     },
 }
 POOLED = {task: {"pooled": one} for task, one in _POOLED.items()}
-"""Lengths of the image model and temperature of the local entropy: prior knowledge of each task."""
+"""Prior knowledge of each task: the temperature of the local entropy, the number of steps, the rank of its images, and
+that the image of cnn_texture is linear in the texture."""

@@ -20,16 +20,6 @@ Source = Literal["pymeshfix", "procedural"]
 
 CELL = 1 / 40
 """Side of a grid cell, in heights of the bunny."""
-_SCALARS = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
 
 
 def bunny_surface() -> tuple[Surface, Source]:
@@ -63,38 +53,14 @@ def _unit_height(vertices: Array) -> Array:
 
 
 def read_ply(path: Path) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Vertices [m, 3] and triangles [k, 3] of a binary PLY file with elements vertex and face, in this order.
+    """Return vertices [m, 3] and triangles [k, 3] of a PLY file, in the order of the file.
 
-    Unlike Mitsuba's reader it passes over header lines it does not know (`obj_info`).
-
-    Raises:
-        ValueError: the file is not such a PLY, or has polygons of more than three corners.
+    Read by trimesh, because Mitsuba's reader refuses the header of the scan (`obj_info`).
     """
-    data = path.read_bytes()
-    head, mark, body = data.partition(b"end_header\n")
-    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    form = next((line[1] for line in lines if line[:1] == ["format"]), None)
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(form or "")
-    if not mark or lines[:1] != [["ply"]] or order is None:
-        raise ValueError(f"path must be a binary PLY file, got {path} with format {form}")
-    elements: list[tuple[str, int, list[list[str]]]] = []
-    for line in lines:
-        if line[:1] == ["element"]:
-            elements.append((line[1], int(line[2]), []))
-        elif line[:1] == ["property"]:
-            elements[-1][2].append(line[1:])
-    if [name for name, _, _ in elements] != ["vertex", "face"] or [one[0] for one in elements[1][2]] != ["list"]:
-        raise ValueError(f"path must be a PLY file of vertices and then faces with one list each, got {path}")
-    (_, count, scalars), (_, triangles, ((_, length, index, _),)) = elements
-    vertex = np.dtype([(name, order + _SCALARS[kind]) for kind, name in scalars])
-    face = np.dtype([("corners", order + _SCALARS[length]), ("index", order + _SCALARS[index], (3,))])
-    if len(body) != count * vertex.itemsize + triangles * face.itemsize:
-        raise ValueError(f"path must be a PLY file of triangles of the stated length, got {path}, {len(body)} bytes")
-    rows = np.frombuffer(body, vertex, count)
-    faces = np.frombuffer(body, face, triangles, count * vertex.itemsize)
-    if not (faces["corners"] == 3).all():
-        raise ValueError(f"path must be a PLY file of triangles, got {path} with faces of other sizes")
-    return np.stack([rows[axis] for axis in "xyz"], -1).astype(np.float64), faces["index"].astype(np.int64)
+    import trimesh
+
+    mesh = trimesh.load_mesh(path, process=False)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
 def cluster(vertices: Array, faces: npt.NDArray[np.integer], cell: float) -> tuple[Array, npt.NDArray[np.int64]]:

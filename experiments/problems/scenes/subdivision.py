@@ -3,6 +3,8 @@
 One step splits every triangle into four. A new vertex is 3/8 of the two ends of its edge and 1/8 of the two corners
 that face it; an old one with k neighbours is (1 - k b) of itself and b of each, b = (5/8 - (3/8 + cos(2 pi / k) / 4)^2)
 / k. A displacement of one coarse vertex becomes a bump over its neighbourhood, twice differentiable almost everywhere.
+
+trimesh subdivides positions (a test compares) but does not return the matrix, whose columns are the bumps.
 """
 
 import numpy as np

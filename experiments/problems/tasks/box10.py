@@ -16,7 +16,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from experiments.problems.closed_forms import box10
+from experiments.problems.soft_squares import box10
 from experiments.problems.task import Task
 from experiments.problems.tasks.box2 import fitting
 

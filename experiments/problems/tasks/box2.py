@@ -15,7 +15,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from experiments.problems.closed_forms import BoxTask, box2
+from experiments.problems.soft_squares import BoxTask, box2
 from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
 
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 from scipy.interpolate import BSpline
 
-from experiments.methods.gauss_newton import METHODS, Jacobian
+from experiments.methods.block_gauss_newton import METHODS
 from experiments.problems import catalogue
 from experiments.problems.scenes.caustic import INDEX, Caustic, basis, refraction
 from experiments.problems.task import Task, Truth, least_squares
 from experiments.problems.tasks import caustic
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, read
-from experiments.runs.trial import attempt
 from experiments.studies.caustic import check, check_caustic, correlation
 
 PATCHES = 29
@@ -219,30 +219,10 @@ def linear(n: int, m: int) -> tuple[Task, torch.Tensor]:
 def test_gauss_newton_solves_least_squares() -> None:
     (method,) = METHODS
     task, best = linear(120, 300)
-    outcome = attempt(task, "gauss_newton", 0, lambda trial: method.solve(trial, None))
+    outcome = attempt(task, "block_gauss_newton", 0, lambda trial: method.solve(trial, None))
     assert outcome.status == "finished"
     assert outcome.evaluations < 120 + 5 * (30 + 7)  # a Jacobian, and a few steps
     np.testing.assert_allclose(outcome.x, best, atol=0.05 * float(best.abs().max()))
-
-
-def test_steps_solve_the_damped_problem_within_their_radii() -> None:
-    generator = torch.Generator().manual_seed(1)
-    jacobian = Jacobian(8, 20, generator)
-    a = torch.randn(8, 20, generator=generator)
-    directions = jacobian.directions(8)
-    torch.testing.assert_close(directions @ directions.mT, torch.eye(8), atol=1e-5, rtol=0)
-    for some in directions.split(3):
-        jacobian.renew(some, some @ a)
-    torch.testing.assert_close(jacobian.values, a, atol=1e-5, rtol=0)
-    r = torch.randn(20, generator=generator)
-    newton = -torch.linalg.lstsq(a.T, r[:, None]).solution[:, 0]
-    radii = torch.tensor([0.1, 0.5, 1.0, 2.0]) * newton.norm()
-    steps = jacobian.steps(r, radii)
-    torch.testing.assert_close(steps[:2].norm(dim=1), radii[:2], rtol=1e-3, atol=0)
-    torch.testing.assert_close(steps[3], newton, rtol=1e-3, atol=1e-4)
-    # On the boundary the gradient is opposite to the step.
-    slope = a @ (r + steps[1] @ a)
-    assert float(torch.cosine_similarity(slope, -steps[1], 0)) > 1 - 1e-4
 
 
 def test_gauss_newton_bends_the_light_within_one_jacobian() -> None:
@@ -250,7 +230,7 @@ def test_gauss_newton_bends_the_light_within_one_jacobian() -> None:
     assert method.applies(TASK) is None
     assert "100 parameters" in method.applies(catalogue.load("box10"))
     task = replace(TASK, evaluations=1 + 1024 + 6)
-    outcome = attempt(task, "gauss_newton", 1000, lambda trial: method.solve(trial, None))
+    outcome = attempt(task, "block_gauss_newton", 1000, lambda trial: method.solve(trial, None))
     assert outcome.evaluations == 1031
     error = task.truth.image_error
     assert error(torch.tensor(outcome.x).double()) < 0.6 * error(task.start(1000))
@@ -271,10 +251,10 @@ def test_particle_tracer_sees_the_same_light() -> None:
 
 def test_check_reads_a_run(tmp_path, capsys) -> None:
     x = 1e3 * quadratic(0.1)
-    attempt(TASK, "gauss_newton", 0, lambda trial: trial.report(x), tmp_path)
+    attempt(TASK, "block_gauss_newton", 0, lambda trial: trial.report(x), tmp_path)
     same = check_caustic(tmp_path, spp=20)
     assert f"particle tracer {same:.4f}" in capsys.readouterr().out
     assert same > 0.5
-    assert (tmp_path / "caustic-gauss_newton-0.png").stat().st_size > 1000
-    with pytest.raises(SystemExit, match="run 5 of gauss_newton on caustic"):
+    assert (tmp_path / "caustic-block_gauss_newton-0.png").stat().st_size > 1000
+    with pytest.raises(SystemExit, match="run 5 of block_gauss_newton on caustic"):
         check_caustic(tmp_path, run=5)

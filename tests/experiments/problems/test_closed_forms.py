@@ -1,13 +1,14 @@
-"""The closed forms of truths.py against quadrature: the only place where a truth is itself under test."""
+"""The closed forms against quadrature: the only place where a truth is itself under test."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from scipy import integrate, stats
 
-from truths import Step, spread, truths, vector
+from truths import Bump, ClosedForm, Exponential, PlaneWave, Step, spread, truths, vector
 
 SMOOTH = ["quadratic", "wave", "exponential", "bump", "image"]
 NODES = 60
@@ -24,7 +25,28 @@ def gauss_hermite(n: int) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("n", [1, 2])
 @pytest.mark.parametrize("name", SMOOTH)
 def test_smooth_functions_against_gauss_hermite(name: str, n: int) -> None:
-    truth, x, sigma = truths(n)[name], spread(n, -0.5, 0.8), spread(n, 0.2, 0.9)
+    check(truths(n)[name], n)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        PlaneWave(vector(1.0, -0.7), 0.3, 0.9, vector(0.2, -0.4)),
+        Exponential(vector(0.3, -0.5), vector(0.7, 0.1)),
+        Bump(vector(0.8, 1.5), vector(-0.3, 0.2)),
+    ],
+    ids=lambda form: type(form).__name__,
+)
+def test_an_origin_moves_the_function(form: ClosedForm) -> None:
+    check(form, 2)
+    still = replace(form, origin=0.0)
+    at = spread(6, -1.0, 1.0).view(3, 2)
+    torch.testing.assert_close(form(at), still(at - form.origin))
+
+
+def check(truth: ClosedForm, n: int) -> None:
+    """Compare with Gauss-Hermite quadrature of f and of Stein's identities."""
+    x, sigma = spread(n, -0.5, 0.8), spread(n, 0.2, 0.9)
     u, w = gauss_hermite(n)
     f = truth.f(x + sigma * u)
     kernel = u[:, :, None] * u[:, None, :] - torch.eye(n, dtype=torch.float64)
@@ -34,6 +56,8 @@ def test_smooth_functions_against_gauss_hermite(name: str, n: int) -> None:
     torch.testing.assert_close(truth.value(x, sigma), value, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(truth.gradient(x, sigma), gradient, rtol=1e-11, atol=1e-11)
     torch.testing.assert_close(truth.hessian(x, sigma), hessian, rtol=1e-10, atol=1e-10)
+    if value.ndim == 0:
+        torch.testing.assert_close(truth.hvp(x, sigma, x), hessian @ x, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("x", [-1.0, 0.1, 0.4])
@@ -67,3 +91,9 @@ def test_image_is_its_parts_in_order() -> None:
     parts = [part.f(z) for part in image.parts]
     assert image.f(z).shape == (4, 2, 2)
     assert torch.equal(image.f(z), torch.stack([torch.stack(parts[:2], 1), torch.stack(parts[2:], 1)], 1))
+
+
+def test_f_is_rounded_to_the_type_of_its_points() -> None:
+    wave, z = PlaneWave(vector(0.9, -1.3)), spread(8, -1.0, 1.0).view(4, 2)
+    assert wave(z.float()).dtype == torch.float64
+    assert torch.equal(wave.f(z.float()), wave(z.float()).float())

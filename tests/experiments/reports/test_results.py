@@ -20,12 +20,12 @@ from experiments.listing import listing
 from experiments.methods import METHODS
 from experiments.problems.catalogue import FITTING, load
 from experiments.problems.task import Renderer
-from experiments.reports.figures import plot, quartiles, styles_of
-from experiments.reports.measures import described, measures
-from experiments.reports.report import page, report
+from experiments.reports.ensemble_page import page, report
+from experiments.reports.error_curves import plot, quartiles, styles_of
+from experiments.reports.full_setting import Saving, known_saving, line, saving
 from experiments.reports.results import load as load_results
+from experiments.reports.similarity import described, measures
 from experiments.reports.summary import as_csv, as_json, as_text, summarize, table
-from experiments.reports.time_saved import Saving, known_saving, line, saving
 from experiments.run import run
 from experiments.runs.records import Files, Log, Outcome, Record, write_outcome
 
@@ -50,9 +50,9 @@ def write(folder, method, run, errors, *, each, status="finished", reason="both 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Every row takes half a second, and 3 evaluations with trust_region, 30 with our_g."""
-    write(tmp_path, "trust_region", 0, [100.0, 10.0, 1.0, 0.1], each=3)
-    write(tmp_path, "trust_region", 1, [200.0, 200.0, 2.0, 0.2], each=3)
+    """Every row takes half a second, and 3 evaluations with gaussian_process, 30 with our_g."""
+    write(tmp_path, "gaussian_process", 0, [100.0, 10.0, 1.0, 0.1], each=3)
+    write(tmp_path, "gaussian_process", 1, [200.0, 200.0, 2.0, 0.2], each=3)
     write(tmp_path, "our_g", 0, [100.0, 10.0, 5.0, 1.0], each=30, status="time limit", reason="more than 600 s")
     write(tmp_path, "our_g", 1, [200.0, None, 20.0, 200.0], each=30, status="failed", reason="ValueError: no")
     write(tmp_path, "our_g", 2, [300.0, 300.0, 300.0, 30.0], each=30, status="failed", reason="ValueError: no")
@@ -66,7 +66,7 @@ def cells(folder, method):
 
 
 def test_medians_are_over_the_runs_that_got_there(folder):
-    assert cells(folder, "trust_region") == {
+    assert cells(folder, "gaussian_process") == {
         ("image", 0.9): (4.5, 0.75, 1.0),  # after rows 1 and 2
         ("image", 0.99): (6.0, 1.0, 1.0),
         ("image", 0.999): (9.0, 1.5, 1.0),
@@ -86,7 +86,7 @@ def test_medians_are_over_the_runs_that_got_there(folder):
 
 def test_ratios_are_to_the_reference(folder):
     summary = summarize(load_results(folder))
-    assert summary.reference == "trust_region"
+    assert summary.reference == "gaussian_process"
     ratios = {(r.metric, r.level): (r.ratio_evaluations, r.ratio_seconds) for r in summary.rows if r.method == "our_g"}
     assert ratios == {
         ("image", 0.9): (60 / 4.5, 1 / 0.75),
@@ -114,7 +114,7 @@ def test_overhead_failures_and_unfinished_runs(folder):
     }
     assert summary.unfinished == 1
     assert summarize(load_results(folder), methods=["our_g"]).unfinished == 1
-    assert summarize(load_results(folder), methods=["trust_region"]).unfinished == 0
+    assert summarize(load_results(folder), methods=["gaussian_process"]).unfinished == 0
 
 
 def test_the_reference_is_the_best_that_there_is(tmp_path):
@@ -138,7 +138,7 @@ def test_the_reference_and_the_methods_can_be_chosen(folder, capsys):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"reference": "ours"}, "reference must be some of our_g, trust_region, got ours"),
+        ({"reference": "ours"}, "reference must be some of gaussian_process, our_g, got ours"),
         ({"methods": "our_h"}, "our_g"),
     ],
 )
@@ -188,14 +188,14 @@ def test_methods_have_one_style_in_all_figures(folder):
     (folder / "quad").mkdir()
     (folder / "quad_cobyqa").rename(folder / "quad" / "cobyqa")
     chosen = styles_of(load_results(folder))
-    assert list(chosen) == ["cobyqa", "our_g", "trust_region"]
+    assert list(chosen) == ["cobyqa", "gaussian_process", "our_g"]
     assert len({(style["color"], style["linestyle"]) for style in chosen.values()}) == 3
 
 
 @pytest.fixture
 def no_curves(monkeypatch):
     """Curves take most of the time of a page."""
-    monkeypatch.setattr("experiments.reports.figures.curves", lambda *_: None)
+    monkeypatch.setattr("experiments.reports.error_curves.curves", lambda *_: None)
 
 
 def test_the_page_needs_nothing_else(folder):
@@ -213,7 +213,7 @@ def test_the_page_needs_nothing_else(folder):
     assert np.array_equal(result, target)  # the runs above end at the solution
     pixels = np.round(255 * TASK.picture.of(TASK.start(0)).numpy())
     assert np.array_equal(np.round(255 * start[..., 0]), pixels)
-    for part in ("60 1s 100%", "ValueError: no", "trust_region", TASK.title, "not shown: 1"):
+    for part in ("60 1s 100%", "ValueError: no", "gaussian_process", TASK.title, "not shown: 1"):
         assert part in text
     assert "Left out" not in text
 
@@ -226,7 +226,7 @@ def test_pictures_say_how_far_they_are_from_the_target(folder, no_curves):
     assert captions == {
         "start": f"PSNR {decibels:.1f} dB",  # too small for a window of SSIM
         "our_g": "PSNR inf dB",
-        "trust_region": "PSNR inf dB",
+        "gaussian_process": "PSNR inf dB",
         "target": "",
     }
     truth = replace(TASK.truth, measures=lambda x: {"distance": float(x[0] - TARGET[0])})
@@ -235,8 +235,8 @@ def test_pictures_say_how_far_they_are_from_the_target(folder, no_curves):
     assert "PSNR" not in text
     assert re.findall(r"<b>([^<]*)</b><br>(distance [^<]*)<", text) == [
         ("start", f"distance {float(TASK.start(0)[0] - TARGET[0]):.3g}"),
+        ("gaussian_process", "distance 0"),
         ("our_g", "distance 0"),
-        ("trust_region", "distance 0"),
     ]
 
 
@@ -269,7 +269,7 @@ class Clock:
 def halved(monkeypatch):
     """`bowl` in 3 ms, its full setting in 36 ms with a loss that is larger by a quarter; both load for 100 s."""
     clock = Clock()
-    monkeypatch.setattr("experiments.reports.time_saved.time.perf_counter", lambda: clock.now)
+    monkeypatch.setattr("experiments.reports.full_setting.time.perf_counter", lambda: clock.now)
     whole = replace(TASK, loss=clock.loss(iter([100, 0.036, 0.7, 0.036, 0.036, 0.001, 0.036]), 1.25))
     task = replace(
         TASK,
@@ -389,10 +389,10 @@ def test_list_names_everything():
 
 
 def test_list_says_what_is_missing(monkeypatch):
-    def load_without(name, preset="fast"):
+    def load_without(name, *given):
         if name == "quad":
             raise ImportError("task quad needs something", name="something")
-        return load(name, preset)
+        return load(name, *given)
 
     monkeypatch.setattr("experiments.problems.catalogue.load", load_without)
     assert re.search(r"^quad +task quad needs something$", listing(), re.MULTILINE)
@@ -406,7 +406,7 @@ def test_list_says_what_is_missing(monkeypatch):
         ({"tasks": ("quad",), "methods": "cma"}, r"methods must be some of .* got cma \(did you mean cma_es"),
         ({"tasks": ("quad",), "runs": 0}, "runs must be at least 1, got 0"),
         ({"tasks": ("quad",), "jobs": -1}, "jobs must be at least 1, got -1"),
-        ({"tasks": ("cnn",), "methods": "cma_es"}, "methods must be some of fr22, .* got cma_es"),
+        ({"tasks": ("cnn",), "methods": "cma_es"}, "no method of this command can be run on these tasks"),
         ({"tasks": ("quad", "cnn"), "threads": 0}, "threads must be at least 1, got 0"),
         ({"tasks": ("cnn",), "seed": -1}, "seed must be at least 0, got -1"),
         (
@@ -420,31 +420,34 @@ def test_wrong_arguments_are_named(arguments, message, tmp_path):
         run(arguments.pop("tasks"), out=tmp_path, **arguments)
 
 
-@pytest.fixture
-def trained(monkeypatch):
-    """What would have been trained: tasks and methods."""
-    calls = []
-
-    def train_all(kind, preset, methods, *_):
-        calls.append((kind.name, [method.name for method in methods]))
-
-    monkeypatch.setattr("experiments.ensembles.run_training.train_all", train_all)
-    return calls
-
-
-def test_tasks_that_no_method_goes_with_are_left_out(tmp_path, capsys, trained):
-    run(("quad", "cnn"), methods="pooled,dfo_ls", out=tmp_path)
-    assert trained == [("cnn", ["pooled"])]
-    assert re.search("^quad is left out: pooled: trains networks only; dfo_ls: ", capsys.readouterr().out, re.MULTILINE)
-    assert not list(tmp_path.iterdir())
-    run(("cnn", "quad"), methods="cobyqa", runs=1, out=tmp_path)
+def test_tasks_that_no_method_goes_with_are_left_out(tmp_path, capsys):
+    run(("cnn", "quad"), methods="cobyqa,dfo_ls", runs=1, out=tmp_path)
     printed = capsys.readouterr().out
-    assert "cnn is left out: methods must be some of fr22, " in printed
-    assert "got cobyqa" in printed
-    assert "1 of 1 runs have ended" in printed
-    run(("cnn", "cnn_texture"), methods="our_g,our_hvp", out=tmp_path)
-    assert trained[1:] == [("cnn", ["our_g", "our_hvp"]), ("cnn_texture", ["our_g"])]
-    assert "our_hvp is left out on cnn_texture: methods must be some of fr22, " in capsys.readouterr().out
+    for said in (
+        "cobyqa is left out on cnn: trains no networks",
+        "dfo_ls is left out on cnn: trains no networks",
+        "dfo_ls is left out on quad: the black box returns no residuals",
+        "1 of 1 runs have ended",
+    ):
+        assert said in printed
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["quad"]
+
+
+def test_networks_and_fits_are_run_by_one_command(tmp_path, capsys, monkeypatch):
+    planned = []
+
+    def plan(ensemble, tasks, methods):
+        planned.append((ensemble.runs, ensemble.network_runs, ensemble.threads, tasks, methods))
+        raise SystemExit("planned")
+
+    monkeypatch.setattr("experiments.ensembles.ensemble.Ensemble.plan", plan)
+    for given in ({}, {"runs": 3, "seed": 2, "threads": 4}):
+        with pytest.raises(SystemExit, match="planned"):
+            run(("quad", "cnn"), methods="our_g", out=tmp_path, **given)
+    assert planned == [
+        (range(20), range(1), None, ["quad", "cnn"], ["our_g"]),
+        (range(2, 5), range(2, 5), 4, ["quad", "cnn"], ["our_g"]),
+    ]
 
 
 def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path):

@@ -16,8 +16,9 @@ from experiments.problems.variations import Change, from_srgb, jpeg, varied
 from experiments.problems.variations import load as load_varied
 from experiments.reports.results import Run, load
 from experiments.reports.summary import summarize
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Outcome, Record
-from experiments.runs.trial import Trial, attempt
+from experiments.runs.trial import Trial
 from experiments.studies.robustness import Cell, robustness, row
 
 SOLUTION = torch.tensor([0.25, -0.5], dtype=torch.float64)
@@ -241,7 +242,7 @@ def test_command(tmp_path: Path, capsys):
     def command():
         return robustness(
             ("box2",),
-            methods="trust_region,our_hvpa",
+            methods="gaussian_process,our_hvpa",
             over=("pairs=6,2", "spp=0.5"),
             runs=1,
             evaluations=200,
@@ -250,7 +251,7 @@ def test_command(tmp_path: Path, capsys):
 
     rows = command()
     printed = capsys.readouterr().out
-    assert "trust_region has no number of pairs on box2" in printed
+    assert "gaussian_process has no number of pairs on box2" in printed
     assert "our_hvpa, spp = 0.5x is left out on box2: " in printed
     assert [(one.sweep, one.value, one.method) for one in rows] == [
         ("pairs", "6", "our_hvpa"),

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch_zerohess import Smoothing, estimate
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels
-from truths import Exponential, Image, PlaneWave, Quadratic, Truth, deviation, spread, truths, vector
+from truths import ClosedForm, Exponential, Image, PlaneWave, Quadratic, deviation, spread, truths, vector
 
 PROPOSALS = {
     "aggregate": ["random", "sobol", "orthogonal"],
@@ -35,11 +35,11 @@ SCALAR = PlaneWave(vector(0.9, -1.3), 0.4)
 TENSOR = Image((SCALAR, Exponential(vector(0.5, 0.3)), truths(2)["bump"], truths(2)["quadratic"]))
 
 
-def replicates(truth: Truth, x: Tensor, smoothing: Smoothing, R: int, **keywords):
+def replicates(truth: ClosedForm, x: Tensor, smoothing: Smoothing, R: int, **keywords):
     return estimate(truth.f, x.expand(R, -1), smoothing, value="smoothed", **keywords)
 
 
-def check(truth: Truth, x: Tensor, smoothing: Smoothing, R: int, rounding: float = 0.0) -> None:
+def check(truth: ClosedForm, x: Tensor, smoothing: Smoothing, R: int, rounding: float = 0.0) -> None:
     """z-test of every quantity the samples serve."""
     at, sigma = x.double(), smoothing.sigma_vector(len(x), x.device)
     got = replicates(truth, x, smoothing, R)
@@ -56,7 +56,7 @@ def check(truth: Truth, x: Tensor, smoothing: Smoothing, R: int, rounding: float
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize(("proposal", "sampler", "baseline", "antithetic"), [c for c in GRID if c[0] != "fr22"])
 def test_unbiased(
-    proposal: str, sampler: str, baseline: str, antithetic: bool, dtype: torch.dtype, truth: Truth
+    proposal: str, sampler: str, baseline: str, antithetic: bool, dtype: torch.dtype, truth: ClosedForm
 ) -> None:
     smoothing = Smoothing(
         sigma=vector(0.6, 0.4), samples=4, proposal=proposal, sampler=sampler, baseline=baseline,

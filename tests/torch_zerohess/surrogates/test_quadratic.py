@@ -1,4 +1,4 @@
-"""Pool weights against the balance heuristic; local models against quadratics, quadrature and torch.func."""
+"""Local models against quadratics, quadrature and torch.func."""
 
 import math
 
@@ -6,96 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import fit_outputs, fit_values, loss_derivatives
 from truths import vector
 
 
 def normal(generator, *shape):
     return torch.randn(*shape, dtype=torch.float64, generator=generator)
-
-
-def filled_pool(n, batches=3, capacity=100, size=4):
-    """A pool, and the batches it was filled with: points, values, centre, sigma."""
-    generator = torch.Generator().manual_seed(n)
-    pool, drawn = Pool(n, capacity), []
-    for k in range(batches):
-        center, sigma = normal(generator, n), 0.5 + 0.4 * k
-        points = center + sigma * normal(generator, size + k, n)
-        drawn.append((points, points.sum(1), center, sigma))
-        pool.add(points, points.sum(1), None, center, sigma)
-    return pool, drawn
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_weights_are_the_balance_heuristic(n):
-    """Density of N(x, sigma^2) over the mixture of what was drawn, in proportion to how many; at most 7.4."""
-    pool, drawn = filled_pool(n)
-    x, sigma = torch.full((n,), 0.3, dtype=torch.float64), 0.8
-
-    def density(z, center, width):
-        return math.exp(-0.5 * float((z - center).square().sum()) / width**2) / (width * math.sqrt(2 * math.pi)) ** n
-
-    total = sum(len(points) for points, *_ in drawn)
-    expected = [
-        min(density(z, x, sigma) / sum(len(p) / total * density(z, c, s) for p, _, c, s in drawn), 7.4)
-        for points, *_ in drawn
-        for z in points
-    ]
-    torch.testing.assert_close(pool.weights(x, sigma), vector(*expected), rtol=1e-10, atol=0)
-
-
-def test_weights_of_one_gaussian_at_itself_are_one():
-    pool, drawn = filled_pool(3, batches=1)
-    torch.testing.assert_close(pool.weights(drawn[0][2], drawn[0][3]), torch.ones(4, dtype=torch.float64))
-
-
-def test_a_point_at_x_itself_weighs_one():
-    pool, drawn = filled_pool(2)
-    assert float(pool.weights(drawn[1][0][2], 0.01)[4 + 2]) == 1.0
-
-
-def test_the_oldest_are_forgotten():
-    pool, drawn = filled_pool(2, batches=5, capacity=9)
-    every = torch.cat([points for points, *_ in drawn])
-    assert torch.equal(pool.points, every[-9:])
-    assert torch.equal(pool.values, every[-9:].sum(1))
-    fresh = Pool(2, 9)  # what has been forgotten leaves no trace: eight of the last batch, one of the one before
-    fresh.add(drawn[3][0][-1:], drawn[3][1][-1:], None, *drawn[3][2:])
-    fresh.add(*drawn[4][:2], None, *drawn[4][2:])
-    x = vector(0.1, 0.2)
-    torch.testing.assert_close(pool.weights(x, 0.7), fresh.weights(x, 0.7), rtol=1e-13, atol=0)
-
-
-def test_a_batch_without_values_changes_no_weight():
-    pool, _ = filled_pool(2)
-    before = pool.weights(vector(0.1, 0.2), 0.7)
-    pool.add(torch.zeros(0, 2, dtype=torch.float64), vector(), None, vector(5.0, 5.0), 0.1)
-    torch.testing.assert_close(pool.weights(vector(0.1, 0.2), 0.7), before, rtol=1e-13, atol=0)
-
-
-def test_a_thousand_dimensions():
-    pool, drawn = filled_pool(1000)
-    for sigma in (1e-3, 1.0, 1e3):
-        weights = pool.weights(drawn[0][2], sigma)
-        assert bool(torch.isfinite(weights).all())
-        assert float(weights.max()) <= 7.4
-    assert Pool(1000, 60).weights(drawn[0][2], 1.0).shape == (0,)
-
-
-def test_outputs_go_with_their_points_and_the_state_comes_back():
-    pool, generator = Pool(2, 5), torch.Generator().manual_seed(0)
-    for _ in range(3):
-        points = normal(generator, 3, 2)
-        pool.add(points, points.sum(1), points.repeat(1, 3), points[0], 1.0)
-    assert pool.outputs is not None
-    assert torch.equal(pool.outputs, pool.points.repeat(1, 3))
-    copy = Pool(2, 5)
-    copy.load_state_dict(pool.state_dict())
-    for one in (pool, copy):
-        one.add(vector(1.0, 2.0)[None], vector(3.0), vector(1.0, 2.0)[None].repeat(1, 3), vector(0.0, 0.0), 2.0)
-    assert torch.equal(copy.points, pool.points)
-    assert torch.equal(copy.weights(vector(0.5, 0.5), 0.9), pool.weights(vector(0.5, 0.5), 0.9))
 
 
 def random_quadratic(n, generator):

@@ -5,10 +5,10 @@ experiments with a caustic and with two mirrors (figures 9, 12 and 13 of the sou
 task. Tasks that are not pictures are shown as a map of their loss if they have two parameters.
 """
 
+import dataclasses
 import itertools
 import math
 import shutil
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,18 +16,24 @@ from typing import Annotated
 
 import torch
 import tyro
+from torch import Tensor
 from tqdm import tqdm
 
 from experiments.ensembles.provenance import machine
-from experiments.methods import METHODS
+from experiments.methods import METHODS, Method
+from experiments.methods.settings import settings
 from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, Preset, chosen
-from experiments.reports import gallery_figures
-from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together, trace
+from experiments.problems.task import Task
+from experiments.reports import supplement_figures
+from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
 from experiments.reports.html_page import html_page, html_table, html_text
-from experiments.reports.measures import described, measures
+from experiments.reports.progress import REFRESH, progress
+from experiments.reports.similarity import described, measures
 from experiments.reports.tables import table
+from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
+from experiments.runs.trial import LIMIT, Trial
 
 METHOD = "gaussian_process"
 OWN = {
@@ -40,8 +46,6 @@ OTHER = "cma_es_bounded"
 """The method that figure 12 compares with, as the source does."""
 HEIGHTS = 192, 128
 """Of the pictures of an animation, about: one task, several together."""
-_REFRESH = 0.2 if sys.stderr.isatty() else 30.0
-"""Seconds between two changes of the progress bar."""
 
 Shown = tuple[Trace, Look]
 
@@ -98,7 +102,7 @@ def _traces(
     names: Sequence[str], method: str | None, run: int, limit: float, preset: Preset, variant: str
 ) -> list[Shown]:
     shown = []
-    bar = tqdm(names, unit=" tasks", dynamic_ncols=True)
+    bar = progress(names, "tasks")
     for name in bar:
         bar.set_description(name)
         try:
@@ -115,13 +119,33 @@ def _traces(
     return shown
 
 
+def trace(
+    task: Task, method: Method, run: int, limit: float = LIMIT, watch: Callable[[Record], None] | None = None
+) -> Trace:
+    """Run a method on a task, without files, and return all that it reported."""
+    points: list[Tensor] = []
+    trials: list[Trial] = []
+
+    def image_error(x: Tensor) -> float:  # of every row once
+        points.append(x.clone())
+        return task.truth.image_error(x)
+
+    def solve(trial: Trial) -> None:
+        trials.append(trial)
+        method(trial, settings(method.name, task.name))
+
+    noted = dataclasses.replace(task, truth=dataclasses.replace(task.truth, image_error=image_error))
+    outcome = attempt(noted, method.name, run, solve, limit=limit, watch=watch)
+    return Trace(task, method.name, points, trials[-1].rows, outcome)
+
+
 def _watch(bar: tqdm) -> Callable[[Record], None]:
     """Return what shows the last row of a run in a bar, some times a second."""
     drawn = 0.0
 
     def watch(record: Record) -> None:
         nonlocal drawn
-        if time.monotonic() - drawn > _REFRESH:
+        if time.monotonic() - drawn > REFRESH:
             error = math.nan if record.image_error is None else record.image_error
             bar.set_postfix_str(f"{record.evaluations} evaluations, error {error:.3g}")
             drawn = time.monotonic()
@@ -132,8 +156,8 @@ def _watch(bar: tqdm) -> Callable[[Record], None]:
 def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> list[Path]:
     """Write figure 9, and 12 and 13 if their tasks are there."""
     files = [out / "figure9.png"]
-    stills = [(found, finer(found.task, seen)) for found, seen in tqdm(shown, desc="stills", unit=" tasks")]
-    gallery_figures.overview(stills, files[0])
+    stills = [(found, finer(found.task, seen)) for found, seen in progress(shown, "stills")]
+    supplement_figures.overview(stills, files[0])
     for found, seen in stills:
         if found.task.name == "caustic":
             other = METHODS[OTHER]
@@ -142,10 +166,10 @@ def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> l
                 with tqdm(desc=f"caustic {OTHER}", bar_format="{desc}: [{elapsed}{postfix}]") as bar:
                     more = trace(found.task, other, found.outcome.run, limit, _watch(bar))
             files.append(out / "figure12.png")
-            gallery_figures.caustic(found, seen, more, files[-1])
+            supplement_figures.caustic(found, seen, more, files[-1])
         if found.task.name == "mirror":
             files.append(out / "figure13.png")
-            gallery_figures.mirrors(found, seen, gallery_figures.mirrors_from_outside(variant), files[-1])
+            supplement_figures.mirrors(found, seen, supplement_figures.mirrors_from_outside(variant), files[-1])
     return files
 
 
@@ -153,7 +177,7 @@ def _animations(shown: Sequence[Shown], out: Path, count: int) -> list[Path]:
     """Write one per task, and one of all rendered tasks together."""
     files = []
     small = []
-    for found, seen in tqdm(shown, desc="animations", unit=" tasks", dynamic_ncols=True):
+    for found, seen in progress(shown, "animations"):
         rows = shown_rows(found, count)
         files.append(save(frames(found, seen, rows, HEIGHTS[0]), out / found.task.name))
         if found.task.name in RENDERED:

@@ -1,23 +1,22 @@
-"""Runs of the harness: what is counted and logged, how they end, and that a kill changes nothing."""
+"""Runs of fitting tasks: what is counted and logged, how they end, and that a kill changes nothing."""
 
-import json
+import importlib.util
 import os
 import random
-import signal
-import subprocess
 import sys
-import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from small import CRASH, ELSEWHERE, FAIL, GIVE_UP, HALVE, MISSING, SEARCH, SLOW, TARGET, TASK, search
+from small import FAIL, GIVE_UP, HALVE, TARGET, TASK, search
 
-from experiments.ensembles.ensemble import Ensemble
+from experiments.runs import journal
+from experiments.runs.attempt import attempt
 from experiments.runs.journal import BusyError, Journal
 from experiments.runs.records import Files, read, read_outcome
-from experiments.runs.trial import Finished, Trial, attempt
+from experiments.runs.run import Finished
+from experiments.runs.trial import Trial
 
 
 def rows(path):
@@ -54,17 +53,33 @@ def test_rows_have_errors_that_cost_nothing():
     assert second.parameter_error == pytest.approx(float((trial.start - 0.5 - TARGET).square().sum()))
 
 
-def test_time_for_errors_is_not_counted():
-    def slow(x):
-        time.sleep(0.05)
-        return 1.0
+class Clock:
+    """Seconds that pass only when someone says so."""
 
-    trial = Trial(replace(TASK, truth=replace(TASK.truth, image_error=slow)), "any", 0)
-    for _ in range(4):
+    def __init__(self, monkeypatch):
+        self.now = 0.0
+        monkeypatch.setattr("experiments.runs.recorder.time.perf_counter", lambda: self.now)
+
+    def slow(self, seconds, fn):
+        """Return the function, which takes so many seconds."""
+
+        def wait(x):
+            self.now += seconds
+            return fn(x)
+
+        return wait
+
+
+def test_time_for_errors_is_not_counted(monkeypatch):
+    clock = Clock(monkeypatch)
+    truth = replace(TASK.truth, image_error=clock.slow(100.0, TASK.truth.image_error))
+    trial = Trial(replace(TASK, loss=clock.slow(0.5, TASK.loss), truth=truth), "any", 0)
+    for _ in range(3):
         trial.loss(torch.zeros(1, 2))
+        clock.now += 0.25  # of the method
         trial.report(trial.start)
-    assert trial.seconds < 0.05
-    assert [a.seconds < b.seconds for a, b in zip(trial.rows, trial.rows[1:], strict=False)] == [True] * 4
+    assert [row.seconds for row in trial.rows] == [0.0, 0.75, 1.5, 2.25]
+    assert (trial.seconds, trial.black_box_seconds) == (2.25, 1.5)
 
 
 @pytest.mark.parametrize("points", [torch.zeros(2), torch.zeros(4, 3)])
@@ -117,11 +132,16 @@ def test_precision_asks_for_more():
     assert 1e-6 / 4 < distance <= 1e-6
 
 
-def test_time_limit():
-    outcome = attempt(SLOW, "search", 0, solve, limit=0.25)
-    assert (outcome.status, outcome.reason) == ("time limit", "more than 0.25 s")
-    assert 0.25 < outcome.seconds < 1
-    assert 0.3 < outcome.black_box_seconds < outcome.seconds
+def test_time_limit(monkeypatch):
+    clock = Clock(monkeypatch)
+    slow = replace(
+        TASK,
+        loss=clock.slow(0.2, TASK.loss),
+        output=replace(TASK.output, image=clock.slow(0.2, TASK.output.image)),
+    )
+    outcome = attempt(slow, "search", 0, solve, limit=0.5)
+    assert (outcome.status, outcome.reason) == ("time limit", "more than 0.5 s")
+    assert outcome.seconds == outcome.black_box_seconds == pytest.approx(0.6)
 
 
 class Snapshots:
@@ -241,162 +261,26 @@ def test_a_journal_is_written_by_one_process(tmp_path):
     Journal(tmp_path / "a.journal").delete()
 
 
-def ensemble(folder, runs=2, **changes):
-    return Ensemble(folder, range(runs), **changes)
-
-
-def logs(folder):
-    return {str(path.relative_to(folder)): rows(path) for path in sorted(folder.glob("*/*/*.jsonl"))}
-
-
-@pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("results")
-    one = ensemble(folder)
-    outcomes = one.run(one.plan([TASK], [SEARCH, HALVE, FAIL, CRASH, GIVE_UP]))
-    return folder, {(o.method, o.run): o for o in outcomes}
-
-
-def test_results_do_not_depend_on_the_number_of_processes(results, tmp_path):
-    two = ensemble(tmp_path, jobs=2)
-    outcomes = two.run(two.plan([TASK], [SEARCH, HALVE, FAIL]))
-    assert logs(tmp_path).items() <= logs(results[0]).items()
-    same = {"seconds": 0, "black_box_seconds": 0, "traceback": None}
-    assert len(outcomes) == 6
-    for outcome in outcomes:
-        assert replace(outcome, **same) == replace(results[1][outcome.method, outcome.run], **same)
-
-
-def test_results_do_not_depend_on_processes(results, tmp_path):
-    for run in range(2):
-        attempt(TASK, "search", run, solve, tmp_path)
-    assert logs(tmp_path).items() <= logs(results[0]).items()
-
-
-def test_methods_that_fail_are_outcomes(results):
-    reasons = {name: (o.status, o.reason) for (name, run), o in results[1].items() if run == 1}
-    assert reasons["fail"] == ("failed", "ZeroDivisionError: as this method")
-    assert reasons["crash"] == ("failed", "its process ended with SIGSEGV")
-    assert reasons["give_up"] == ("stopped", "the method ended by itself")
-    assert reasons["halve"][0] == "finished"
-
-
-def test_finished_runs_are_not_run_twice(results, capsys):
-    before = {path: path.stat().st_mtime_ns for path in results[0].glob("*/*/*.json*")}
-    again = ensemble(results[0], runs=2)
-    assert len(again.run(again.plan([TASK], [SEARCH, HALVE]))) == 4
-    assert {path: path.stat().st_mtime_ns for path in results[0].glob("*/*/*.json*")} == before
-
-
-def test_jobs_are_task_by_task_and_what_loads_another_scene_comes_last(tmp_path):
-    other, derivative = replace(TASK, name="other"), replace(HALVE, name="derivative", another_scene=True)
-    jobs = ensemble(tmp_path).plan([TASK, other], [derivative, SEARCH, HALVE])
-    one = [("search", 0), ("halve", 0), ("search", 1), ("halve", 1), ("derivative", 0), ("derivative", 1)]
-    assert [(job.task_name, job.method_name, job.run) for job in jobs] == [
-        (task, *rest) for task in (TASK.name, "other") for rest in one
-    ]
-
-
-def test_other_settings_are_refused(results):
-    with pytest.raises(SystemExit, match=r"halve was made with preset = fast \(now paper\), limit = 600.0 \(now 5\)"):
-        ensemble(results[0], preset="paper", limit=5).plan([TASK], [HALVE])
-    with pytest.raises(SystemExit, match=r"evaluations = 400 \(now 401\)"):
-        ensemble(results[0]).plan([replace(TASK, evaluations=401)], [HALVE])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"preset": "paper"}, r"halve was made with preset = fast \(now paper\); delete it"),
-        ({"variant": "scalar_rgb"}, r"halve was made with variant = auto \(now scalar_rgb\); delete it"),
-    ],
-)
-def test_one_table_has_one_preset_and_one_renderer(tmp_path, changes, message):
-    one = ensemble(tmp_path)
-    one.run(one.plan([TASK], [HALVE]))
-    with pytest.raises(SystemExit, match=message):
-        ensemble(tmp_path, **changes).plan([TASK], [SEARCH])
-    ensemble(tmp_path, limit=5).plan([TASK], [SEARCH])  # a method may have its own time
-
-
-def test_the_folder_says_how_it_was_made(results):
-    known = json.loads((results[0] / "command.json").read_text())
-    assert known["commands"][0]["command"].startswith("python -m experiments")
-    assert known["commands"][0]["machine"].keys() >= {"processor", "cores", "system", "python", "torch"}
-    assert known["settings"]["bowl"]["halve"]["level"] == 0.999
-    assert results[1]["halve", 0].settings == known["settings"]["bowl"]["halve"]
-
-
-def test_methods_that_cannot_be_run_are_left_out(tmp_path, capsys):
-    jobs = ensemble(tmp_path).plan([TASK], [HALVE, ELSEWHERE, MISSING])
-    assert {job.method_name for job in jobs} == {"halve"}
-    printed = capsys.readouterr().out
-    assert "elsewhere is left out on bowl: not for bowls" in printed
-    assert "missing is left out on bowl: needs pip install no-such-package" in printed
-    with pytest.raises(SystemExit, match="no method"):
-        ensemble(tmp_path).plan([TASK], [ELSEWHERE])
-
-
-def test_runs_have_numbers_and_come_in_turn(tmp_path):
-    jobs = Ensemble(tmp_path, range(5, 8)).plan([TASK], [HALVE, GIVE_UP])
-    assert [(job.run, job.method_name) for job in jobs] == [(r, m) for r in (5, 6, 7) for m in ("halve", "give_up")]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"runs": range(0)}, "runs must be at least 1, got 0"),
-        ({"runs": range(-1, 2)}, "seed must be at least 0, got -1"),
-        ({"runs": range(2), "jobs": 0}, "jobs must be at least 1, got 0"),
-        ({"runs": range(2), "limit": 0.0}, "limit must be a positive number of seconds, got 0"),
-    ],
-)
-def test_settings_of_an_ensemble_are_checked(tmp_path, changes, message):
-    with pytest.raises(SystemExit, match=message):
-        Ensemble(folder=tmp_path, **changes)
-
-
-ENSEMBLE = """
-import sys
-from pathlib import Path
-from small import SEARCH, SLOW
-from experiments.ensembles.ensemble import Ensemble
-
-if __name__ == "__main__":
-    ensemble = Ensemble(Path(sys.argv[1]), range(2), jobs=2)
-    print(len(ensemble.run(ensemble.plan([SLOW], [SEARCH]))))
-"""
-
-
-@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGINT])
-def test_a_killed_ensemble_goes_on(tmp_path, by):
-    """All processes end with the one that is killed, and starting it again gives the rows of one that was not."""
-    root = Path(__file__).parents[3]
-    script, folder = tmp_path / "script.py", tmp_path / "out"
-    script.write_text(f"import sys\nsys.path[:0] = [{str(root)!r}, {str(root / 'tests')!r}]\n{ENSEMBLE}")
-    command = [sys.executable, str(script), str(folder)]
-    killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    files = [Files(folder / "slow" / "search", run) for run in range(2)]
-    until = time.monotonic() + 60
-    while not any(one.log.exists() and len(rows(one.log)) > 8 for one in files):
-        assert killed.poll() is None
-        assert time.monotonic() < until
-        time.sleep(0.01)
-    killed.send_signal(by)
-    killed.wait(20)
-    time.sleep(1.0)
-    files = [one for one in files if one.log.exists()]
-    for one in files:  # the workers have ended: nobody holds the journals
-        Journal(one.journal).close()
-        assert not one.outcome.exists()
-    left = [one.log.read_bytes() for one in files]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "2"
-    for one, before in zip(files, left, strict=True):
-        assert one.log.read_bytes().startswith(before[: before.rfind(b"\n") + 1])
-        whole = Trial(TASK, "search", one.run)
-        torch.manual_seed(whole.seed)
-        with pytest.raises(Finished):
-            solve(whole)
-        expected = [asdict(replace(record, task="slow", seconds=0.0)) for record in whole.rows]
-        assert [asdict(record) for record in rows(one.log)] == expected
+def test_without_locks_a_journal_is_replayed_and_deleted(tmp_path, monkeypatch):
+    """As on a system that has no fcntl."""
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    spec = importlib.util.spec_from_file_location("journal_without_locks", journal.__file__)
+    other = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, other)  # dataclasses look there
+    spec.loader.exec_module(other)
+    path, points = tmp_path / "a.journal", torch.tensor([[1.0, 2.0]])
+    one = other.Journal(path)
+    assert one.replay(points) is None
+    one.append(points, torch.tensor([3.0]), 0.5, 0.25)
+    again = other.Journal(path)  # nobody keeps a second one out
+    entry = again.replay(points)
+    assert (entry.values.tolist(), entry.seconds, entry.black_box_seconds) == ([3.0], 0.5, 0.25)
+    third = other.Journal(path)
+    with pytest.raises(other.DivergedError):
+        third.replay(points + 1)
+    third.close()
+    one.close()
+    again.delete()
+    assert not path.exists()
+    with pytest.raises(ValueError, match="closed"):
+        again.append(points, torch.tensor([3.0]), 0.5, 0.25)

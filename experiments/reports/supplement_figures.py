@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from experiments.reports.animation import Look, Trace, pixels
-from experiments.reports.figures import plain_ticks
+from experiments.reports.error_curves import plain_ticks
 from experiments.runs.trial import LEVELS
 
 mpl.use("Agg")

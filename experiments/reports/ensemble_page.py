@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,13 +16,14 @@ from experiments.ensembles.provenance import flat, read_command
 from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING
 from experiments.problems.task import Task
-from experiments.reports import figures
+from experiments.reports import error_curves
 from experiments.reports.animation import pixels
+from experiments.reports.full_setting import known_saving, line
 from experiments.reports.html_page import html_page, html_table, html_text
-from experiments.reports.measures import described, measures
 from experiments.reports.results import Run, load
+from experiments.reports.similarity import described, measures
+from experiments.reports.speed_ups import HEADERS
 from experiments.reports.summary import Summary, summarize, task_table
-from experiments.reports.time_saved import known_saving, line
 
 _STYLE = """
 figure { width: 170px; margin: .3em } figcaption { text-align: center; overflow-wrap: anywhere }
@@ -54,7 +56,7 @@ def report(
 def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
     """Return the page; `tasks` are those that have no name, for their pictures."""
     results, known = load(folder), read_command(folder)
-    summary, chosen = summarize(results), figures.styles_of(results)
+    summary, chosen = summarize(results), error_curves.styles_of(results)
     parts = [_commands(known["commands"])]
     if summary.reference and summary.speed_ups:
         parts.append(_speed_ups(summary))
@@ -90,11 +92,11 @@ def _commands(commands: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _speed_ups(summary: Summary) -> str:
-    rows = [[s.method, s.seconds, s.evaluations, s.cases] for s in (*summary.speed_ups, summary.mean_speed_up)]
+    rows = [list(asdict(one).values()) for one in (*summary.speed_ups, summary.mean_speed_up)]
     return (
         f"<h2>Mean ratio to {html_text(summary.reference)}</h2><p>Seconds and evaluations of a method divided by "
         f"those of {html_text(summary.reference)}, averaged over the tasks, errors and levels that both reach.</p>"
-        + html_table(["method", "seconds", "evaluations", "cases"], rows)
+        + html_table(HEADERS, rows)
     )
 
 
@@ -117,9 +119,9 @@ def _tables(summary: Summary, task: str) -> str:
     return found
 
 
-def _curves(name: str, methods: dict[str, list[Run]], chosen: Mapping[str, figures.Style]) -> str:
+def _curves(name: str, methods: dict[str, list[Run]], chosen: Mapping[str, error_curves.Style]) -> str:
     image = io.BytesIO()
-    figures.curves(name, methods, image, chosen)
+    error_curves.curves(name, methods, image, chosen)
     return f"<img class='curves' alt='error curves of {html_text(name)}' src='{_embedded(image.getvalue())}'>"
 
 

@@ -4,14 +4,12 @@ import pytest
 import torch
 
 from torch_zerohess import minimize
-from torch_zerohess.optim import TrustRegion
-from torch_zerohess.search.loss_search import LossSearch
+from torch_zerohess.optim import GaussianProcessSearch
 from truths import vector
 
 
 def search_for(f, x0, evaluations, **settings):
-    search = TrustRegion(x0, **{"restarts": 100, **settings})
-    assert isinstance(search._search, LossSearch)
+    search = GaussianProcessSearch(x0, **{"restarts": 100, **settings})
     while search.evaluations < evaluations and not search.done:
         search.tell(f(search.ask()))
     return search
@@ -86,9 +84,9 @@ def test_holes_and_penalties_are_avoided():
 
     search = search_for(broken, vector(-2.0, 2.0), 80, sigma=1.0, bounds=(-3.0, 3.0), seed=0)
     assert torch.allclose(search.x, vector(0.2, 0.1), atol=1e-4)
-    process = search._search
-    assert torch.isfinite(process.pool.values).all()
-    assert len(process._holes)
+    progress = search.state_dict()["progress"]
+    assert torch.isfinite(progress["pool"]["values"]).all()
+    assert len(progress["holes"])
 
 
 def test_derivatives_at_the_minimum_are_those_of_the_loss():
@@ -101,24 +99,6 @@ def test_derivatives_at_the_minimum_are_those_of_the_loss():
     fit = minimize(bowl, vector(2.0, 2.0), sigma=1.0, bounds=(-3.0, 3.0), max_evaluations=60, seed=0)
     assert torch.allclose(fit.hessian, hessian, rtol=1e-3, atol=1e-3)
     assert float(fit.gradient.abs().max()) < 1e-3
-
-
-def test_it_resumes_exactly_while_the_process_and_while_quadratics_search():
-    def make():
-        return TrustRegion(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0), restarts=100, seed=3)
-
-    search, quadratics = make(), set()
-    for _ in range(60):
-        points = search.ask()
-        other = make()
-        other.load_state_dict(search.state_dict())
-        quadratics.add(other._search._close is not None)
-        assert torch.equal(other.ask(), points)
-        search.tell(well(points))
-        other.tell(well(points))
-        assert torch.equal(other.ask(), search.ask())
-        assert (other.value, other.evaluations) == (search.value, search.evaluations)
-    assert quadratics == {True, False}
 
 
 def test_noise_is_averaged():

@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.task import Task
 from experiments.problems.tasks import caustic, quad
-from experiments.reports import animation, gallery_figures
+from experiments.reports import animation, supplement_figures
 from experiments.reports.animation import (
     Look,
     Trace,
@@ -23,10 +23,9 @@ from experiments.reports.animation import (
     shown_rows,
     tile,
     together,
-    trace,
 )
-from experiments.reports.gallery import gallery
 from experiments.runs.records import Outcome, Record
+from experiments.studies.gallery import gallery, trace
 
 ENDED = Outcome("t", "m", 0, "stopped", "", 1.0, 1.0, 10, 0, [])
 
@@ -201,7 +200,7 @@ def test_overviews_go_on_in_another_row(tmp_path):
     seen = Look(small.picture, small.picture(small.TARGET))
     sizes = []
     for count in (5, 9):
-        gallery_figures.overview([(found, seen)] * count, tmp_path / "figure9.png")
+        supplement_figures.overview([(found, seen)] * count, tmp_path / "figure9.png")
         with Image.open(tmp_path / "figure9.png") as image:
             sizes.append(image.size)
     assert sizes[1] == (sizes[0][0], 2 * sizes[0][1])  # 5 across, and 5 + 4
@@ -211,7 +210,7 @@ def test_figure_of_the_caustic(tmp_path):
     task: Task = caustic.task()
     flat = torch.zeros(task.n).double()
     found = made([task.start(0), flat, 0.5 * task.start(0)], [0, 3, 9], task)
-    gallery_figures.caustic(found, look(task, flat), replace(found, method="other"), tmp_path / "figure12.png")
+    supplement_figures.caustic(found, look(task, flat), replace(found, method="other"), tmp_path / "figure12.png")
     with Image.open(tmp_path / "figure12.png") as image:
         assert image.width > 2 * image.height
 
@@ -221,7 +220,7 @@ def test_figure_of_a_run_that_ended_before_its_first_report(tmp_path):
     start, end = task.start(0), 0.5 * task.start(0)
     seen, ended = look(task, start), made([start], task=task)
     for other in (None, made([start, end], task=task)):
-        gallery_figures.caustic(ended, seen, other, tmp_path / "figure12.png")
+        supplement_figures.caustic(ended, seen, other, tmp_path / "figure12.png")
         with Image.open(tmp_path / "figure12.png") as image:
             assert image.width > 0
 
@@ -229,14 +228,14 @@ def test_figure_of_a_run_that_ended_before_its_first_report(tmp_path):
 def test_the_surface_of_the_caustic():
     # B-splines sum to 1, and uniform ones of a linear sequence are linear.
     torch.testing.assert_close(
-        gallery_figures._surface(torch.full((1024,), 3.0).double()), 3 * torch.ones(128, 128).double()
+        supplement_figures._surface(torch.full((1024,), 3.0).double()), 3 * torch.ones(128, 128).double()
     )
-    ramp = gallery_figures._surface(torch.arange(32.0).double().repeat(32))
+    ramp = supplement_figures._surface(torch.arange(32.0).double().repeat(32))
     torch.testing.assert_close(ramp[5], torch.linspace(1, 30, 128).double())
 
 
 def test_mirrors_from_outside():
-    image = gallery_figures.mirrors_from_outside("scalar_rgb", film=(48, 36), spp=4)
+    image = supplement_figures.mirrors_from_outside("scalar_rgb", film=(48, 36), spp=4)
     red = (image[..., 0] > 2 * image[..., 1]).nonzero()
     # The eye is up on the left, and the line leads from there to the bunny at the right.
     assert len(red) > 10
@@ -274,7 +273,7 @@ def test_wrong_arguments(tmp_path, wrong, message):
 
 
 def test_nothing_to_show(tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.reports.gallery.look", lambda task, start: None)
+    monkeypatch.setattr("experiments.studies.gallery.look", lambda task, start: None)
     with pytest.raises(SystemExit, match="no task"):
         gallery(tmp_path, tasks=("quad",))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 
-from experiments.reports import figures
+from experiments.reports import error_curves
 from experiments.reports.results import Run
 from experiments.runs.trial import LEVELS
 
@@ -52,9 +52,9 @@ def _axis(axis: mpl.axes.Axes, values: Sequence[tuple[str, list[Run]]], against:
     axis.set(xscale="log", yscale="log")
     for k, (value, runs) in enumerate(values):
         style = {"color": colors(0.9 * k / max(len(values) - 1, 1)), "linestyle": _LINES[k % len(_LINES)]}
-        figures.band(axis, runs, "image", against, value, style)
+        error_curves.band(axis, runs, "image", against, value, style)
     if values:
-        figures.plain_ticks(axis)
+        error_curves.plain_ticks(axis)
     for level in LEVELS:
         axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
     axis.grid(which="major", alpha=0.3)

@@ -1,0 +1,235 @@
+"""Stored tables as Markdown, under headers that need no explanation, with where they come from below."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pandas as pd
+
+from experiments.reports import stored
+from experiments.reports.speed_ups import HEADERS, speed_ups, with_ratios
+
+SPEED_UP = "speed_up"
+"""The name of the table that is computed from others."""
+
+
+@dataclass
+class Query:
+    """The options of a mark; what a table does not know is an error."""
+
+    options: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, words: Sequence[str]) -> "Query":
+        """Return the options of `name=value` words."""
+        pairs = [word.partition("=") for word in words]
+        wrong = [word for word, (_, equals, value) in zip(words, pairs, strict=True) if not (equals and value)]
+        if wrong:
+            raise SystemExit(f"options must be name=value, got {' '.join(wrong)}")
+        return cls({name: value for name, _, value in pairs})
+
+    def take(self, name: str, default: str, allowed: Sequence[str] = ()) -> str:
+        """Return an option, which is then used."""
+        value = self.options.pop(name, default)
+        if allowed and value not in allowed:
+            raise SystemExit(f"{name} must be one of {', '.join(allowed)}, got {value}")
+        return value
+
+    def names(self, name: str, there: Sequence[str]) -> list[str]:
+        """Return the names of an option, or all that there are; SystemExit if one is not there."""
+        found = [one for one in self.take(name, "").split(",") if one] or list(there)
+        missing = [one for one in found if one not in there]
+        if missing:
+            raise SystemExit(f"{name} must be some of {', '.join(there)}, got {', '.join(missing)}")
+        return found
+
+    def end(self) -> None:
+        """SystemExit if an option was not used."""
+        if self.options:
+            raise SystemExit(f"options that this table does not have: {', '.join(self.options)}")
+
+
+def table_of(name: str, query: Query) -> str:
+    """Return a stored table as Markdown, with a line below it: runs, commit, machine and command."""
+    if name == SPEED_UP:
+        return _speed_up(query)
+    table = stored.read(name)
+    if {"metric", "level"} <= set(table):
+        return _fitted(table, query)
+    if "parameter_divided" in table:
+        return _trained(table, query)
+    columns = query.names("columns", [one for one in table if one not in stored.ORIGIN])
+    rows = _where(table, query)
+    return markdown(columns, rows[columns].to_numpy().tolist()) + _origin(rows)
+
+
+def rows_of(name: str, query: Query) -> pd.DataFrame:
+    """Return the rows of a stored table that have all values of a query."""
+    if name == SPEED_UP:
+        method = query.take("method", "all")
+        table = _ratios(query)
+        return table[table["method"] == method]
+    return _where(stored.read(name), query)
+
+
+def markdown(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a Markdown table, numbers to three digits."""
+    lines = [headers, ["---"] * len(headers), *([number(value) for value in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def number(value: object) -> str:
+    """Return a value as text: numbers to three digits, from a thousand on as integers; nothing where there is none.
+
+    Example:
+        >>> number(12.3456), number(81540.0), number(0.00012), number("text")
+        ('12.3', '81 540', '0.00012', 'text')
+    """
+    if value is None or (isinstance(value, float) and value != value):
+        return ""
+    if isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool)):
+        return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1000 else f"{float(f'{value:.3g}'):g}"
+    return str(value)
+
+
+def percent(share: float) -> str:
+    """Return a share as text: `95 %`."""
+    return f"{100 * share:.0f} %"
+
+
+def _where(table: pd.DataFrame, query: Query) -> pd.DataFrame:
+    """Return the rows that have all values of a query, as text or as numbers."""
+    for column, value in query.options.items():
+        if column not in table:
+            raise SystemExit(f"columns are {', '.join(map(str, table))}, got {column}")
+        same = table[column].astype(str) == value
+        if pd.api.types.is_numeric_dtype(table[column]):
+            same = table[column] == float(value)
+        table = table[same]
+    query.options = {}
+    if table.empty:
+        raise SystemExit("no row of the table has these values")
+    return table
+
+
+def _selected(table: pd.DataFrame, query: Query) -> tuple[pd.DataFrame, list[str], list[str]]:
+    """Return the rows of the tasks and methods of a query, in their order, and these."""
+    tasks = query.names("tasks", list(table["task"].unique()))
+    table = table[table["task"].isin(tasks)]
+    methods = query.names("methods", list(table["method"].unique()))
+    order = {"task": tasks, "method": methods}
+    table = table[table["method"].isin(methods)]
+    return table.sort_values(["task", "method"], key=lambda one: one.map(order[str(one.name)].index)), tasks, methods
+
+
+def _fitted(table: pd.DataFrame, query: Query) -> str:
+    """Rows are methods, columns tasks: evaluations and seconds until an error is reduced, and the share of starts."""
+    table, tasks, methods = _selected(table, query)
+    metric = query.take("metric", "image", ("image", "parameter"))
+    level = query.take("level", "99", ("90", "99", "99.9"))
+    show = query.take("show", "both", ("both", "evaluations", "seconds"))
+    interval = query.take("share", "plain", ("plain", "interval")) == "interval"
+    query.end()
+    table = table[(table["metric"] == metric) & (table["level"] == float(level))]
+    cells = {(row["task"], row["method"]): _cell(row, show, interval) for row in table.to_dict("records")}
+    about = table.drop_duplicates("method").set_index("method")
+    sizes = table.drop_duplicates("task").set_index("task")["n"]
+    headers = ["method", "what it does", "uses", *(_heading(task, sizes[task]) for task in tasks)]
+    rows = [
+        [f"`{one}`", about["title"][one], about["uses"][one], *(cells.get((task, one), "") for task in tasks)]
+        for one in methods
+    ]
+    what = {"both": "evaluations, seconds", "evaluations": "evaluations", "seconds": "seconds"}[show]
+    note = f"Median {what} until the {metric} error is reduced by {level} %"
+    note += ", of the starts that get there; in brackets the share of starts that get there, if not all do"
+    note += " (95 % interval)." if interval else "."
+    return markdown(headers, rows) + _origin(table, note)
+
+
+def _heading(task: str, n: float) -> str:
+    return task.upper() if n != n else f"{task.upper()}, n = {n:.0f}"
+
+
+def _cell(row: dict[Any, Any], show: str, interval: bool) -> str:
+    """A dash where fewer than half of the starts get there."""
+    share = ""
+    if row["reached"] < row["runs"]:
+        share = percent(row["share"])
+        if interval:
+            share += f", {100 * row['share_low']:.0f} to {percent(row['share_high'])}"
+        share = f" ({share})"
+    if row["evaluations"] != row["evaluations"]:
+        return "-" + share
+    shown = {"evaluations": number(row["evaluations"]), "seconds": f"{number(row['seconds'])} s"}
+    return ", ".join(shown[one] for one in shown if show in ("both", one)) + share
+
+
+_TRAINED = {
+    "task": "task",
+    "method": "method",
+    "title": "what it does",
+    "uses": "uses",
+    "renders": "renders",
+    "seconds": "seconds",
+    "parameter_divided": "parameter error divided by",
+    "parameter_divided_worst": "at worst",
+    "image_divided": "image error divided by",
+    "image_divided_worst": "at worst",
+}
+
+
+def _trained(table: pd.DataFrame, query: Query) -> str:
+    table, *_ = _selected(table, query)
+    query.end()
+    rows = []
+    for row in table.to_dict("records"):
+        start = [row["task"].upper(), f"`{row['method']}`"]
+        rest = [row[name] for name in list(_TRAINED)[2:]]
+        rows.append([*start, *rest, f"{row['reached']} of {row['runs']} ({percent(row['share'])})"])
+    headers = [*_TRAINED.values(), "runs that succeed"]
+    note = "Medians over runs. Errors are mean squares of held-out images. A run succeeds if it divides the parameter "
+    return markdown(headers, rows) + _origin(table, note + "error by 100.")
+
+
+def _ratios(query: Query) -> pd.DataFrame:
+    """Return a row per method with its mean ratios to the reference, under `speed_up`'s own column names."""
+    names = query.take("of", "")
+    if not names:
+        raise SystemExit(f"{SPEED_UP} must have of=NAME,NAME: tables of fits")
+    table = pd.concat([stored.read(name) for name in names.split(",")], ignore_index=True)
+    reference = query.names("reference", list(table["method"].unique()))[0]
+    if "methods" in query.options:
+        query.options["methods"] += f",{reference}"
+    table, *_ = _selected(table, query)
+    query.end()
+    found = pd.DataFrame(speed_ups(with_ratios(table, reference), reference))
+    return found.assign(reference=reference, **{one: _only(table, one) for one in stored.ORIGIN})
+
+
+def _only(table: pd.DataFrame, column: str) -> str:
+    """Return the values of a column as one text."""
+    return "; ".join(dict.fromkeys(number(one) for one in table[column]))
+
+
+def _speed_up(query: Query) -> str:
+    table = _ratios(query)
+    reference = table["reference"].iloc[0]
+    rows = table[["method", "seconds", "seconds_geometric", "evaluations", "evaluations_geometric", "cases"]]
+    note = f"Median seconds and evaluations of a method divided by those of `{reference}`: means over all tasks, "
+    note += "errors and levels that both reach."
+    return markdown(HEADERS, rows.to_numpy().tolist()) + _origin(table, note)
+
+
+def _origin(table: pd.DataFrame, note: str = "") -> str:
+    """Return the line below a table."""
+    parts = [note] if note else []
+    if "runs" in table:
+        counts = sorted({int(one) for one in table["runs"]})
+        starts = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        limit = _only(table, "limit")
+        end = f", {limit} s at most." if limit else "."
+        parts.append(f"{starts} starts, from number {_only(table, 'first_run')} on{end}")
+    commits = ", ".join(f"`{one[:9]}`" for one in dict.fromkeys(table["commit"]))
+    parts.append(f"Commit {commits}, {_only(table, 'date')}, {_only(table, 'machine')}.")
+    parts += [f"`{one}`" for one in dict.fromkeys("; ".join(dict.fromkeys(table["command"])).split("; "))]
+    return "\n\n" + " ".join(parts)

@@ -1,0 +1,123 @@
+"""`python -m experiments store DIR --name NAME`: the medians of a folder of results as a table that documents quote."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import pandas as pd
+import tyro
+
+from experiments.ensembles.provenance import read_command
+from experiments.methods import METHODS
+from experiments.problems.catalogue import NETWORKS, chosen
+from experiments.reports import stored
+from experiments.reports.medians import medians, reached
+from experiments.reports.networks import HELD_OUT, per_method
+from experiments.reports.results import Results, Run, load
+
+
+def store(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
+    /,
+    name: str,
+    tasks: tuple[str, ...] = (),
+) -> None:
+    """Write the medians of a folder of results, with their origin, to experiments/results/NAME.csv.
+
+    A fitting task has a row per method, error and level. A task that trains a network has a row per method. Refused if
+    the runs are of several commits, of code with changes, of several machines, presets or limits, or not finished.
+
+    Args:
+        folder: written by `run` or `robustness`.
+        name: of the table.
+        tasks: only these; all of the folder if not given.
+    """
+    there = load(folder)
+    wanted = chosen("tasks", tasks, list(there.runs)) if tasks else list(there.runs)
+    results = _ordered(load(folder, wanted))
+    networks = [task for task in wanted if task in NETWORKS]
+    if networks and len(networks) < len(wanted):
+        raise SystemExit(f"tasks must all be fitted or all train a network, got {', '.join(wanted)}")
+    if count := results.unfinished.total():
+        raise SystemExit(f"{count} runs in {folder} are unfinished: the same `run` goes on with them")
+    known = read_command(folder)
+    whence = stored.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
+    table = (trained(results) if networks else fitted(results)).assign(**whence)
+    print(stored.write(table[[*(one for one in table if one not in stored.ORIGIN), *stored.ORIGIN]], name))
+
+
+def _ordered(results: Results) -> Results:
+    """Return results with methods in the order of `METHODS`, unknown ones last."""
+    place = {name: k for k, name in enumerate(METHODS)}
+    runs = {
+        task: {name: methods[name] for name in sorted(methods, key=lambda name: place.get(name, len(place)))}
+        for task, methods in results.runs.items()
+    }
+    return replace(results, runs=runs)
+
+
+def _protocol(settings: dict[str, dict[str, Any]], tasks: Sequence[str]) -> dict[str, Any]:
+    """Return the preset and the limit of seconds that all runs have in common."""
+    found = {}
+    for name in ("preset", "limit"):
+        values = {str(one.get(name)): one.get(name) for task in tasks for one in settings.get(task, {}).values()}
+        if len(values) > 1:
+            raise SystemExit(f"runs of one table must have one {name}, got {', '.join(sorted(values))}")
+        found[name] = next(iter(values.values()), None)
+    return found
+
+
+def fitted(results: Results) -> pd.DataFrame:
+    """Return a row per task, method, error and level."""
+    cells = [((task, method), runs) for task, methods in results.runs.items() for method, runs in methods.items()]
+    found = medians(reached(cells, ("task", "method")), ("task", "method", "metric", "level"))
+    found["level"] = (100 * found["level"]).round(6)
+    about = pd.DataFrame([_about(task, method, runs) for (task, method), runs in cells])
+    measures = [f"{one}{end}" for one in ("evaluations", "seconds") for end in ("", "_low", "_high")]
+    shares = with_intervals(found)
+    return about.merge(shares, on=["task", "method"])[[*about, "metric", "level", *measures, *_SHARES]]
+
+
+def trained(results: Results) -> pd.DataFrame:
+    """Return a row per task and method: how far errors of held-out images went down, at the median and at worst.
+
+    A run that failed counts in `runs` alone.
+    """
+    rows = []
+    for task, methods in results.runs.items():
+        path = results.folder / task / HELD_OUT
+        known = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["method", "run"])
+        for method, runs in methods.items():
+            ended = [run.outcome.run for run in runs if run.outcome.status != "failed"]
+            mine = known[(known["method"] == method) & known["run"].isin(ended)]
+            if len(mine) < len(ended) or not ended:
+                raise SystemExit(f"{path} has {len(mine)} of {len(ended)} runs of {method}: call the same `run` again")
+            (found,) = per_method(mine).to_dict("records")
+            rows.append(_about(task, method, runs) | found | {"runs": len(runs), "share": found["reached"] / len(runs)})
+    table = with_intervals(pd.DataFrame(rows)).drop(columns=["parameter_before", "parameter_after"])
+    return table[[*(name for name in table if name not in _SHARES), *_SHARES]]
+
+
+_SHARES = ["reached", "runs", "share", "share_low", "share_high"]
+
+
+def with_intervals(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with the 95 % interval of every share, by Wilson (1927)."""
+    from scipy.stats import binomtest
+
+    pairs = zip(table["reached"], table["runs"], strict=True)
+    intervals = [binomtest(int(there), int(runs)).proportion_ci(method="wilson") for there, runs in pairs]
+    return table.assign(share_low=[one.low for one in intervals], share_high=[one.high for one in intervals])
+
+
+def _about(task: str, method: str, runs: Sequence[Run]) -> dict[str, Any]:
+    known = METHODS.get(method)
+    return {
+        "task": task,
+        "n": len(runs[0].outcome.x) or None,
+        "method": method,
+        "title": known.title if known else "",
+        "uses": known.uses if known else "",
+        "first_run": min(run.outcome.run for run in runs),
+    }

@@ -1,0 +1,103 @@
+"""Error of the estimators against evaluations or seconds, as log-log curves with fitted slopes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import torch
+
+from experiments.studies.estimator_methods import METHODS, OURS, Method
+from experiments.studies.estimator_problems import QUANTITIES, Problem
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.ticker import NullFormatter
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Relative RMSE of one quantity, with its own standard error, at the median seconds and evaluations of one run."""
+
+    problem: str
+    method: str
+    budget: int
+    evaluations: int
+    seconds: float
+    quantity: str
+    rmse: float
+    rmse_error: float
+
+
+def curve(
+    measurements: Sequence[Measurement], problem: str, method: str, quantity: str, against: str
+) -> tuple[list[float], list[float]]:
+    """Return evaluations (or seconds) and errors, in order of the budget; each number of evaluations once."""
+    chosen = [m for m in measurements if (m.problem, m.method, m.quantity) == (problem, method, quantity)]
+    once = {m.evaluations: m for m in reversed(chosen)}
+    chosen = [m for m in chosen if once[m.evaluations] is m]
+    return [float(getattr(m, against)) for m in chosen], [m.rmse for m in chosen]
+
+
+def slope(x: Sequence[float], y: Sequence[float]) -> float:
+    """Slope of the straight line through log y over log x; NaN with fewer than two points."""
+    if len(x) < 2 or min(y) <= 0:
+        return math.nan
+    a, b = (torch.tensor(values, dtype=torch.float64).log() for values in (x, y))
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b / (a @ a))
+
+
+def _style(method: Method) -> dict[str, Any]:
+    """Colour says where points come from, the line what is subtracted, the marker how points depend on each other."""
+    colors = {"aggregate": "#c1272d", "gaussian": "#1f6fb4", "optimal": "#2b2b2b", "uniform": "#e08a1e"}
+    lines = {"center": "-", "mean": "--", "none": ":"}
+    markers = {"random": "o", "sobol": "s", "orthogonal": "^"}
+    style: dict[str, Any] = {
+        "color": colors[method.proposal],
+        "linestyle": lines[method.baseline],
+        "marker": markers[method.sampler] if method.antithetic else "x",
+        "markersize": 4,
+        "linewidth": 2.6 if method.name == OURS else 1.3,
+    }
+    if method.difference:
+        style |= {"color": "#2e8b57", "marker": "d" if method.difference == "common" else "D"}
+        style["linestyle"] = "-" if method.difference == "common" else ":"
+    return style
+
+
+def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], against: str, path: Path) -> None:
+    """Draw a row per problem and a column per quantity; against: evaluations or seconds."""
+    budgets = sorted({m.budget for m in measurements})
+    titles = {"value": "value", "gradient": "gradient", "hessian": "Hessian", "hvp": "Hessian-vector product"}
+    figure, axes = plt.subplots(len(problems), 4, figsize=(22, 6.2 * len(problems)), squeeze=False)
+    for row, problem in zip(axes, problems, strict=True):
+        for axis, quantity in zip(row, QUANTITIES, strict=True):
+            for method in METHODS:
+                x, y = curve(measurements, problem.name, method.name, quantity, against)
+                if x:
+                    fitted = slope(x, y)
+                    label = method.name if math.isnan(fitted) else f"{method.name} ({fitted:+.2f})"
+                    axis.plot(x, y, label=label, **_style(method))
+            axis.set(xscale="log", yscale="log", xlabel=against)
+            if against == "evaluations":
+                axis.set_xticks(budgets, [str(budget) for budget in budgets])
+            axis.xaxis.set_minor_formatter(NullFormatter())
+            axis.yaxis.set_minor_formatter(NullFormatter())
+            axis.set_title(f"{problem.name} (n = {len(problem.x)}): {titles[quantity]}")
+            axis.axhline(1, color="0.6", linewidth=0.8, zorder=0)
+            axis.grid(which="major", color="0.9")
+            axis.spines[["top", "right"]].set_visible(False)
+            axis.legend(
+                fontsize=7, ncols=2, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), handlelength=3
+            )
+        row[0].set_ylabel("relative RMSE")
+    figure.suptitle(
+        f"Error of the estimators against {against} (slope of the log-log fit in parentheses)", fontsize=15, y=0.995
+    )
+    height = len(problems)  # fixed margins: leaving room for the legends automatically takes ten times as long
+    figure.subplots_adjust(0.03, 0.32 / height, 0.99, 1 - 0.13 / height, wspace=0.14, hspace=0.55)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)

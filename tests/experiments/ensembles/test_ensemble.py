@@ -1,0 +1,221 @@
+"""Ensembles: the order of their jobs, what they refuse, and that neither processes nor a kill change their rows."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from small import BUMP, CRASH, ELSEWHERE, FAIL, GATE, GIVE_UP, HALVE, MISSING, SEARCH, SHIFT, TASK, search
+
+from experiments.ensembles.ensemble import Ensemble
+from experiments.methods import METHODS
+from experiments.runs.attempt import attempt
+from experiments.runs.journal import Journal
+from experiments.runs.records import Files, read
+
+
+def rows(path):
+    """Records of a log without their times."""
+    return [replace(record, seconds=0.0) for record in read(path)]
+
+
+def solve(trial):
+    return search(trial, {})
+
+
+def ensemble(folder, runs=2, **changes):
+    return Ensemble(folder, range(runs), **changes)
+
+
+def logs(folder):
+    return {str(path.relative_to(folder)): rows(path) for path in sorted(folder.glob("*/*/*.jsonl"))}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    one = ensemble(folder)
+    outcomes = one.run(one.plan([TASK], [SEARCH, HALVE, FAIL, CRASH, GIVE_UP]))
+    return folder, {(o.method, o.run): o for o in outcomes}
+
+
+def test_results_do_not_depend_on_the_number_of_processes(results, tmp_path):
+    two = ensemble(tmp_path, jobs=2)
+    outcomes = two.run(two.plan([TASK], [SEARCH, HALVE, FAIL]))
+    assert logs(tmp_path).items() <= logs(results[0]).items()
+    same = {"seconds": 0, "black_box_seconds": 0, "traceback": None}
+    assert len(outcomes) == 6
+    for outcome in outcomes:
+        assert replace(outcome, **same) == replace(results[1][outcome.method, outcome.run], **same)
+
+
+def test_results_do_not_depend_on_processes(results, tmp_path):
+    for run in range(2):
+        attempt(TASK, "search", run, solve, tmp_path)
+    assert logs(tmp_path).items() <= logs(results[0]).items()
+
+
+def test_methods_that_fail_are_outcomes(results):
+    reasons = {name: (o.status, o.reason) for (name, run), o in results[1].items() if run == 1}
+    assert reasons["fail"] == ("failed", "ZeroDivisionError: as this method")
+    assert reasons["crash"] == ("failed", "its process ended with SIGSEGV")
+    assert reasons["give_up"] == ("stopped", "the method ended by itself")
+    assert reasons["halve"][0] == "finished"
+
+
+def test_finished_runs_are_not_run_twice(results, capsys):
+    before = {path: path.stat().st_mtime_ns for path in results[0].glob("*/*/*.json*")}
+    again = ensemble(results[0], runs=2)
+    assert len(again.run(again.plan([TASK], [SEARCH, HALVE]))) == 4
+    assert {path: path.stat().st_mtime_ns for path in results[0].glob("*/*/*.json*")} == before
+
+
+def test_jobs_are_task_by_task_and_what_loads_another_scene_comes_last(tmp_path):
+    other, derivative = replace(TASK, name="other"), replace(HALVE, name="derivative", another_scene=True)
+    jobs = ensemble(tmp_path).plan([TASK, other], [derivative, SEARCH, HALVE])
+    one = [("search", 0), ("halve", 0), ("search", 1), ("halve", 1), ("derivative", 0), ("derivative", 1)]
+    assert [(job.task_name, job.method_name, job.run) for job in jobs] == [
+        (task, *rest) for task in (TASK.name, "other") for rest in one
+    ]
+
+
+def test_other_settings_are_refused(results):
+    with pytest.raises(SystemExit, match=r"halve was made with preset = fast \(now paper\), limit = 600.0 \(now 5\)"):
+        ensemble(results[0], preset="paper", limit=5).plan([TASK], [HALVE])
+    with pytest.raises(SystemExit, match=r"evaluations = 400 \(now 401\)"):
+        ensemble(results[0]).plan([replace(TASK, evaluations=401)], [HALVE])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"preset": "paper"}, r"halve was made with preset = fast \(now paper\); delete it"),
+        ({"variant": "scalar_rgb"}, r"halve was made with variant = auto \(now scalar_rgb\); delete it"),
+    ],
+)
+def test_one_table_has_one_preset_and_one_renderer(tmp_path, changes, message):
+    one = ensemble(tmp_path)
+    one.run(one.plan([TASK], [HALVE]))
+    with pytest.raises(SystemExit, match=message):
+        ensemble(tmp_path, **changes).plan([TASK], [SEARCH])
+    ensemble(tmp_path, limit=5).plan([TASK], [SEARCH])  # a method may have its own time
+
+
+def test_the_folder_says_how_it_was_made(results):
+    known = json.loads((results[0] / "command.json").read_text())
+    assert known["commands"][0]["command"].startswith("python -m experiments")
+    assert known["commands"][0]["machine"].keys() >= {"processor", "cores", "system", "python", "torch"}
+    assert known["settings"]["bowl"]["halve"]["level"] == 0.999
+    assert results[1]["halve", 0].settings == known["settings"]["bowl"]["halve"]
+
+
+def test_methods_that_cannot_be_run_are_left_out(tmp_path, capsys):
+    jobs = ensemble(tmp_path).plan([TASK], [HALVE, ELSEWHERE, MISSING])
+    assert {job.method_name for job in jobs} == {"halve"}
+    printed = capsys.readouterr().out
+    assert "elsewhere is left out on bowl: not for bowls" in printed
+    assert "missing is left out on bowl: needs pip install no-such-package" in printed
+    with pytest.raises(SystemExit, match="no method"):
+        ensemble(tmp_path).plan([TASK], [ELSEWHERE])
+
+
+def test_runs_have_numbers_and_come_in_turn(tmp_path):
+    jobs = Ensemble(tmp_path, range(5, 8)).plan([TASK], [HALVE, GIVE_UP])
+    assert [(job.run, job.method_name) for job in jobs] == [(r, m) for r in (5, 6, 7) for m in ("halve", "give_up")]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"runs": range(0)}, "runs must be at least 1, got 0"),
+        ({"runs": range(-1, 2)}, "seed must be at least 0, got -1"),
+        ({"runs": range(2), "jobs": 0}, "jobs must be at least 1, got 0"),
+        ({"runs": range(2), "limit": 0.0}, "limit must be a positive number of seconds, got 0"),
+    ],
+)
+def test_settings_of_an_ensemble_are_checked(tmp_path, changes, message):
+    with pytest.raises(SystemExit, match=message):
+        Ensemble(folder=tmp_path, **changes)
+
+
+ENSEMBLE = """
+import sys
+from pathlib import Path
+from small import GATED, GATED_BUMP, SEARCH
+from experiments.ensembles.ensemble import Ensemble
+
+if __name__ == "__main__":
+    ensemble = Ensemble(Path(sys.argv[1]), range(2), jobs=2)
+    plan = {"search": ([GATED], [SEARCH]), "our_g": ([GATED_BUMP], ["our_g"])}
+    print(len(ensemble.run(ensemble.plan(*plan[sys.argv[2]]))))
+"""
+
+
+@pytest.mark.parametrize(
+    ("by", "method", "task"),
+    [(signal.SIGKILL, "search", TASK), (signal.SIGINT, "search", TASK), (signal.SIGKILL, "our_g", BUMP)],
+    ids=["SIGKILL", "SIGINT", "network"],
+)
+def test_a_killed_ensemble_goes_on(tmp_path, by, method, task):
+    """All processes end with the one that is killed, and starting it again gives the rows of one that was not."""
+    root = Path(__file__).parents[3]
+    script, folder, gate = tmp_path / "script.py", tmp_path / "out", tmp_path / "gate"
+    gate.mkdir()
+    script.write_text(f"import sys\nsys.path[:0] = [{str(root)!r}, {str(root / 'tests')!r}]\n{ENSEMBLE}")
+    command = [sys.executable, str(script), str(folder), method]
+    gated = {**os.environ, GATE: str(gate)}
+    with subprocess.Popen(command, env=gated, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as killed:
+        while len(list(gate.iterdir())) < 2:  # until both workers wait in the black box
+            assert killed.poll() is None
+            time.sleep(0.01)
+        killed.send_signal(by)
+        assert killed.stdout is not None
+        assert killed.stdout.read() == b""  # to the end: no process holds the pipe any more
+    files = [Files(folder / f"gated{'_bump' if method == 'our_g' else ''}" / method, run) for run in range(2)]
+    left = []
+    for one in files:
+        Journal(one.journal).close()  # nobody holds it
+        assert not one.outcome.exists()
+        left.append(one.log.read_bytes())
+        assert left[-1].count(b"\n") > 4
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "2"
+    for one, before in zip(files, left, strict=True):
+        assert one.log.read_bytes().startswith(before[: before.rfind(b"\n") + 1])
+        whole = tmp_path / "whole"
+        known = {"search": SEARCH, "our_g": METHODS["our_g"]}[method]
+        attempt(task, method, one.run, lambda trial, known=known: known(trial, {}), whole)
+        expected = rows(Files(whole / task.name / method, one.run).log)
+        assert [replace(row, task=task.name) for row in rows(one.log)] == expected
+        assert one.weights.exists() == (method == "our_g")
+
+
+def test_network_tasks_are_run_in_the_same_plan(tmp_path, capsys):
+    one = Ensemble(tmp_path, range(3), network_runs=range(1))
+    jobs = one.plan([TASK, BUMP], [HALVE, SHIFT])
+    assert [(job.task_name, job.method_name, job.run) for job in jobs] == [
+        ("bowl", "halve", 0),
+        ("bowl", "halve", 1),
+        ("bowl", "halve", 2),
+        ("bump", "shift", 0),
+    ]
+    printed = capsys.readouterr().out
+    assert "shift is left out on bowl: trains networks only" in printed
+    assert "halve is left out on bump: trains no networks" in printed
+    outcomes = one.run(jobs)
+    assert [(each.status, each.reason) for each in outcomes[2:]] == [
+        ("finished", "both errors reduced by 99.9 %"),
+        ("stopped", "evaluations used up"),
+    ]
+    assert (tmp_path / "bump" / "shift" / "0.pt").exists()
+
+
+def test_the_first_progress_of_a_network_is_that_of_its_images(tmp_path, capsys):
+    one = Ensemble(tmp_path, range(1))
+    one.run(one.plan([BUMP], [SHIFT]))
+    assert "bump shift 0: 0 of 16 images rendered" in capsys.readouterr().err

@@ -1,0 +1,101 @@
+"""The source's methods on network tasks: costs, annealing, repetition, and that they learn."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from small import BUMP, SIZE, Bump
+
+from experiments.methods import METHODS
+from experiments.problems import catalogue
+from experiments.problems.network_task import Size
+from experiments.runs.attempt import attempt
+from experiments.runs.network_trial import NetworkTrial
+
+RENDERS = {"fr22": 2 * 3, "our_g": 2 * 3, "our_h": 4 * 7, "our_hvp": 4 * 7, "our_hvpa": 4 * 3}
+"""Of a step: images of a batch, times pairs of samples (two renders each; those of our_h for gradient, Hessian and
+value, of our_hvp for three gradients) and f(x)."""
+POOLED = {"temperature": 0.1, "steps": 300, "rank": 64}
+
+
+def run(name, task=BUMP, number=0, settings=None):
+    trials = []
+    outcome = attempt(task, name, number, lambda trial: (trials.append(trial), METHODS[name](trial, settings or {}))[1])
+    assert outcome.status == "stopped", outcome.traceback
+    return outcome, trials[0]
+
+
+@pytest.mark.parametrize("name", RENDERS)
+def test_every_method_trains_within_its_budget(name):
+    outcome, trial = run(name)
+    assert [row.evaluations for row in trial.rows] == list(range(0, SIZE.evaluations + 1, RENDERS[name]))
+    assert outcome.evaluations == trial.rows[-1].evaluations
+    assert SIZE.evaluations - outcome.evaluations < RENDERS[name]
+    for row in trial.rows:
+        assert math.isfinite(row.parameter_error)
+        assert math.isfinite(row.image_error)
+    start = BUMP.encoders(0)[1]
+    for a, b in zip(trial.encoder.parameters(), start.parameters(), strict=True):
+        assert not torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", RENDERS)
+def test_a_run_repeats_itself(name):
+    first, second = ([replace(row, seconds=0.0) for row in run(name, number=3)[1].rows] for _ in range(2))
+    assert first == second
+
+
+def test_sigma_and_the_step_go_down():
+    """With one image per step, Adam moves every weight by about its rate: the first steps are the longest."""
+    size = replace(SIZE, evaluations=3 * 100)
+    weights = []
+
+    class Noted(Bump):
+        def parameter_error(self, encoder):
+            weights.append(torch.cat([p.detach().flatten().clone() for p in encoder.parameters()]))
+            return super().parameter_error(encoder)
+
+    _, trial = run("our_g", Noted(size), settings={"batch": 1, "rate": (1e-3, 1e-5)})
+    sigmas = [row.sigma for row in trial.rows[1:]]
+    assert sigmas[0] == Bump.sigma[0]
+    assert sigmas[90:] == pytest.approx([Bump.sigma[1]] * 10)
+    falls = [a - b for a, b in itertools.pairwise(sigmas[:90])]
+    assert falls == pytest.approx([(Bump.sigma[0] - Bump.sigma[1]) / 90] * 89)
+    moves = [float((b - a).abs().max()) for a, b in itertools.pairwise(weights)]
+    assert moves[0] == pytest.approx(1e-3, rel=0.01)  # the first step of Adam is its rate
+    assert max(moves[90:]) < 2e-5 * 5
+
+
+def test_the_image_error_of_a_row_is_the_mean_of_the_last_twentieth():
+    _, trial = run("our_g", Bump(replace(SIZE, evaluations=6 * 60)))
+    losses = [row.loss for row in trial.rows[1:]]
+    assert [row.image_error for row in trial.rows[3:]] == pytest.approx([sum(losses[k : k + 3]) / 3 for k in range(58)])
+
+
+@pytest.mark.parametrize("name", ["our_g", "our_hvpa", "pooled"])
+def test_methods_learn(name):
+    """Each divides the parameter error by ten."""
+    task = Bump(Size(16, 1, 2, evaluations=1500, images=256, held_out=32))
+    _, trial = run(name, task, settings=POOLED if name == "pooled" else {})
+    assert task.parameter_error(trial.encoder) < 0.1 * trial.rows[0].parameter_error
+    assert task.image_error(trial.encoder) < 0.2 * trial.rows[0].image_error
+
+
+def test_where_methods_apply():
+    known = {
+        name: [method for method in (*RENDERS, "pooled") if METHODS[method].unusable(catalogue.load(name)) is None]
+        for name in catalogue.NETWORKS
+    }
+    most = [*RENDERS, "pooled"]
+    assert known == {
+        "cnn": most,
+        "cnn_wide": most,
+        "cnn5": [name for name in most if name != "our_hvp"],
+        "cnn_texture": ["fr22", "our_g", "pooled"],
+    }
+    assert METHODS["pooled"].unusable(catalogue.load("quad")) == "trains networks only"
+    assert METHODS["cobyqa"].unusable(BUMP) == "trains no networks"
+    with pytest.raises(AssertionError, match="cobyqa trains no networks"):
+        METHODS["cobyqa"](NetworkTrial(BUMP, "cobyqa", 0), {})

@@ -1,0 +1,316 @@
+"""Tables that are stored, and the documents that quote them, against numbers computed by hand."""
+
+import csv
+import re
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from experiments.ensembles import provenance
+from experiments.reports import stored
+from experiments.reports.document_tables import SPEED_UP, Query, number, table_of
+from experiments.reports.documents import filled, readme
+from experiments.reports.networks import HELD_OUT, _remember, held_out
+from experiments.reports.speed_ups import speed_ups, with_ratios
+from experiments.reports.store import store
+from experiments.reports.trained_network import Result
+from experiments.runs.records import Files, Log, Outcome, Record, read_outcome, write_outcome
+from experiments.studies.bench import bench
+from experiments.studies.estimators import error
+
+COMMIT = "0123456789abcdef"
+
+
+@pytest.fixture(autouse=True)
+def results(tmp_path, monkeypatch):
+    """An empty folder for stored tables, and code that is that of a commit."""
+    monkeypatch.setattr(stored, "RESULTS", tmp_path / "stored")
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": True})
+    monkeypatch.setattr("sys.argv", ["experiments", "run", "bowl", "--limit", "15"])
+    return tmp_path / "stored"
+
+
+def write(folder, task, method, run, errors, *, each, settings=None):
+    """A run with these image errors after `each` evaluations and half a second; parameter errors are their squares."""
+    files = Files(folder / task / method, run)
+    log = Log(files.log)
+    for i, one in enumerate(errors):
+        log(Record(task, method, run, i, 0.5 * i, i * each, None, None, one, one**2))
+    log.close()
+    n = len(errors) - 1
+    x = [] if task.startswith("cnn") else [1.0, 2.0]
+    write_outcome(Outcome(task, method, run, "stopped", "", 0.5 * n, 0.4 * n, n * each, n, x), files)
+    one = {"preset": "fast", "limit": 15.0, **(settings or {})}
+    provenance.register(folder, {task: {method: one}})
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Evaluations until 99 % of the image error: descent 6 and 9, fr22 30 from one of three starts."""
+    folder = tmp_path / "runs"
+    write(folder, "bowl", "descent", 3, [100.0, 10.0, 1.0, 0.1], each=3)
+    write(folder, "bowl", "descent", 4, [100.0, 50.0, 10.0, 1.0], each=3)
+    for run, last in ((3, 0.5), (4, 50.0), (5, 60.0)):
+        write(folder, "bowl", "fr22", run, [100.0, last], each=30)
+    return folder
+
+
+def rows(results, name):
+    with (results / f"{name}.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
+    store(folder, name="bowls")
+    there = {(one["method"], one["metric"], one["level"]): one for one in rows(results, "bowls")}
+    assert len(there) == 2 * 2 * 3
+    ours, theirs = there["descent", "image", "99"], there["fr22", "image", "99"]
+    assert [float(ours[f"evaluations{end}"]) for end in ("", "_low", "_high")] == [7.5, 6.75, 8.25]
+    assert [float(ours[f"seconds{end}"]) for end in ("", "_low", "_high")] == [1.25, 1.125, 1.375]
+    assert (ours["reached"], ours["runs"], ours["first_run"], ours["n"]) == ("2", "2", "3", "2")
+    assert (ours["preset"], ours["limit"], ours["commit"]) == ("fast", "15", COMMIT)
+    assert ours["command"] == "python -m experiments run bowl --limit 15"
+    assert ours["machine"]
+    assert (theirs["evaluations"], theirs["seconds"], theirs["reached"]) == ("", "", "1")
+    interval = binomtest(1, 3).proportion_ci(method="wilson")
+    assert float(theirs["share_low"]) == pytest.approx(interval.low, rel=1e-5)
+    assert float(theirs["share_high"]) == pytest.approx(interval.high, rel=1e-5)
+
+
+def test_networks_have_a_row_per_method(tmp_path, results):
+    folder = tmp_path / "runs"
+    for run in range(3):
+        write(folder, "cnn", "pooled", run, [40.0, 9.0, 2.0], each=10)
+    with pytest.raises(SystemExit, match=r"held_out.csv has 0 of 3 runs of pooled: call the same `run` again"):
+        store(folder, name="networks")
+    errors = [((40.0, 2.0), (8.0, 0.02)), ((40.0, 5.0), (8.0, 0.125)), ((40.0, 5.0), (8.0, 0.125))]
+    ended = [Result("pooled", run, None, None, 1.0, 20, *pair) for run, pair in enumerate(errors)]
+    _remember(held_out("cnn", ended[:2]), folder / "cnn" / HELD_OUT)
+    _remember(held_out("cnn", ended[1:]), folder / "cnn" / HELD_OUT)
+    files = Files(folder / "cnn" / "pooled", 2)
+    write_outcome(replace(read_outcome(files.outcome), status="failed"), files)
+    store(folder, name="networks")
+    (row,) = rows(results, "networks")
+    assert [float(row[one]) for one in ("renders", "seconds")] == [20.0, 1.0]
+    assert float(row["parameter_divided"]) == (400 + 64) / 2  # of the two runs that did not fail
+    assert float(row["parameter_divided_worst"]) == 64
+    assert float(row["image_divided"]) == (20 + 8) / 2
+    assert float(row["image_divided_worst"]) == 8
+    assert (row["reached"], row["runs"], row["n"]) == ("1", "3", "")
+    text = table_of("networks", Query())
+    assert "parameter error divided by | at worst" in text
+    assert "1 of 3 (33 %)" in text
+
+
+def another_commit(folder, monkeypatch):
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": "fedcba", "clean": True})
+    write(folder, "bowl", "our_g", 3, [1.0, 0.1], each=1)
+
+
+def changed_code(folder, monkeypatch):
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": False})
+    write(folder, "bowl", "our_g", 3, [1.0, 0.1], each=1)
+
+
+def no_commit(folder, monkeypatch):
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": None, "clean": None})
+    write(folder, "bowl", "our_g", 3, [1.0, 0.1], each=1)
+
+
+def another_machine(folder, monkeypatch):
+    monkeypatch.setattr(provenance, "machine", lambda: {"processor": "abacus", "cores": 10})
+    write(folder, "bowl", "our_g", 3, [1.0, 0.1], each=1)
+
+
+def another_limit(folder, monkeypatch):
+    write(folder, "bowl", "our_g", 3, [1.0, 0.1], each=1, settings={"limit": 60.0})
+
+
+def another_preset(folder, monkeypatch):
+    write(folder, "quad", "our_g", 3, [1.0, 0.1], each=1, settings={"preset": "paper"})
+
+
+def a_network(folder, monkeypatch):
+    write(folder, "cnn", "our_g", 3, [1.0, 0.1], each=1)
+
+
+def an_unfinished_run(folder, monkeypatch):
+    Files(folder / "bowl" / "our_g", 3).journal.parent.mkdir()
+    Files(folder / "bowl" / "our_g", 3).journal.touch()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (another_commit, "must be of one commit, got 012345678, fedcba"),
+        (changed_code, "code with changes"),
+        (no_commit, "must be made in a git repository"),
+        (another_machine, "must be made on one machine, got .*abacus, 10 cores"),
+        (another_limit, "must have one limit, got 15.0, 60.0"),
+        (another_preset, "must have one preset, got fast, paper"),
+        (a_network, "tasks must all be fitted or all train a network, got bowl, cnn"),
+        (an_unfinished_run, "1 runs in .* are unfinished"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(folder, results, monkeypatch, spoil, message):
+    spoil(folder, monkeypatch)
+    with pytest.raises(SystemExit, match=message):
+        store(folder, name="bowls")
+    assert not results.exists()
+
+
+def test_some_tasks_of_a_folder(folder, results):
+    write(folder, "cnn", "our_g", 3, [1.0, 0.1], each=1, settings={"preset": "paper"})
+    store(folder, name="bowls", tasks=("bowl",))
+    assert {one["task"] for one in rows(results, "bowls")} == {"bowl"}
+    with pytest.raises(SystemExit, match="name must be a word"):
+        store(folder, name="../bowls", tasks=("bowl",))
+
+
+def test_code_is_that_of_the_commit():
+    """Outside of the fixture: what git says about this repository."""
+    assert re.fullmatch("[0-9a-f]{40}", provenance._git("rev-parse", "HEAD") or "")
+    assert provenance._git("no-such-command") is None
+
+
+def test_a_table_of_fits(folder):
+    store(folder, name="bowls")
+    lines = table_of("bowls", Query()).splitlines()
+    assert lines[0] == "| method | what it does | uses | BOWL, n = 2 |"
+    cells = {line.split(" | ")[0].strip("| `"): line.split(" | ")[-1].strip(" |") for line in lines[2:4]}
+    assert cells == {"fr22": "- (33 %)", "descent": "7.5, 1.25 s"}
+    for part in ("2 to 3 starts, from number 3 on, 15 s at most.", "Commit `012345678`", "`python -m experiments run"):
+        assert part in lines[-1]
+    others = table_of("bowls", Query.of(["level=90", "metric=parameter", "show=evaluations", "methods=fr22"]))
+    assert "| 30 (33 %) |" not in others  # one of three is fewer than half
+    assert "- (33 %)" in others
+    assert "descent" not in others
+    assert "- (33 %, 6 to 79 %)" in table_of("bowls", Query.of(["share=interval"]))
+
+
+def test_means_of_ratios():
+    """Two tasks, one level: ratios of seconds 2 and 8, of evaluations 1 and 4."""
+    table = pd.DataFrame(
+        [
+            ("a", "image", 99, "ours", 10.0, 1.0),
+            ("a", "image", 99, "theirs", 10.0, 2.0),
+            ("b", "image", 99, "ours", 10.0, 1.0),
+            ("b", "image", 99, "theirs", 40.0, 8.0),
+            ("c", "image", 99, "ours", float("nan"), float("nan")),
+            ("c", "image", 99, "theirs", 5.0, 5.0),
+        ],
+        columns=["task", "metric", "level", "method", "evaluations", "seconds"],
+    )
+    theirs, together = speed_ups(with_ratios(table, "ours"), "ours")
+    assert (theirs.seconds, theirs.evaluations, theirs.cases) == (5.0, 2.5, 2)
+    assert theirs.seconds_geometric == pytest.approx(4.0)
+    assert theirs.evaluations_geometric == pytest.approx(2.0)
+    assert (theirs.method, together.method, together.seconds) == ("theirs", "all", 5.0)
+
+
+def test_the_table_of_speed_ups(folder):
+    write(folder, "bowl", "cobyqa", 3, [100.0, 0.05], each=15)
+    store(folder, name="bowls")
+    text = table_of(SPEED_UP, Query.of(["of=bowls", "reference=descent", "methods=cobyqa"]))
+    # Evaluations of descent: image 4.5 (of 3 and 6), 7.5, 9 from one of two; parameters 4.5, 4.5, 7.5.
+    ratios = [15 / 4.5, 15 / 7.5, 15 / 9, 15 / 4.5, 15 / 4.5, 15 / 7.5]
+    cells = [one.strip() for one in text.splitlines()[2].split("|")[1:-1]]
+    assert (cells[0], cells[5]) == ("cobyqa", "6")
+    assert cells[3] == number(sum(ratios) / 6)
+    assert "fr22" not in text
+
+
+def test_studies_are_kept_as_they_are(results):
+    stored.keep(["problem", "error", "repeats"], [["A", 0.123456, 2], ["B", 2000.0, 3]], "study")
+    text = table_of("study", Query.of(["columns=problem,error", "problem=B"]))
+    assert text.splitlines()[:3] == ["| problem | error |", "| --- | --- |", "| B | 2 000 |"]
+    assert "Commit `012345678`" in text
+
+
+def test_a_study_is_refused_before_it_measures(results, monkeypatch):
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": False})
+    for study, given in ((bench, {"repeats": 10**9}), (error, {"runs": 10**9})):
+        with pytest.raises(SystemExit, match="a stored table must be made by the code of a commit"):
+            study(**given, store="study")
+        with pytest.raises(SystemExit, match="name must be a word"):
+            study(**given, store="a study")
+
+
+def test_times_of_bench_are_kept(results):
+    report = bench(repeats=1, sizes=((2, 2),), memory_n=0, store="times")
+    there = rows(results, "times")
+    assert [row["operation"] for row in there] == [one.operation for one in report.timings]
+    assert [float(row["pure torch [us]"]) for row in there] == [round(1e6 * one.torch, 1) for one in report.timings]
+    assert there[0]["commit"] == COMMIT
+
+
+DOCUMENT = """# Title
+
+There are <!-- value: bowls evaluations task=bowl method=descent metric=image level=99 -->?<!-- /value --> of them.
+
+<!-- table: bowls show=evaluations -->
+<!-- end -->
+
+`<!-- value: in code -->x<!-- /value -->`
+
+```
+<!-- table: in code -->
+<!-- end -->
+```
+"""
+
+
+def test_documents_are_written_and_checked(folder, tmp_path, capsys):
+    store(folder, name="bowls")
+    path = tmp_path / "page.md"
+    path.write_text(DOCUMENT)
+    with pytest.raises(
+        SystemExit, match=r"page.md: <!-- table: bowls show=evaluations -->(.|\n)*page.md: <!-- value: bowls"
+    ):
+        readme((path,), check=True)
+    assert path.read_text() == DOCUMENT
+    readme((path,))
+    text = path.read_text()
+    assert "level=99 -->7.5<!-- /value --> of them" in text
+    assert table_of("bowls", Query.of(["show=evaluations"])) in text
+    assert text.endswith(DOCUMENT[DOCUMENT.index("`<!-- value: in code") :])
+    assert filled(text) == text
+    readme((path,), check=True)
+    path.write_text(text.replace("7.5", "7.4", 1))
+    with pytest.raises(SystemExit, match="value: bowls"):
+        readme((path,), check=True)
+    assert "as it should be" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("mark", "message"),
+    [
+        ("table: nothing", "table must be one that is stored in .*bowls, got nothing"),
+        ("table: bowls level=98", "level must be one of 90, 99, 99.9, got 98"),
+        ("table: bowls speed=1", "options that this table does not have: speed"),
+        ("table: bowls methods=ours", "methods must be some of fr22, descent, got ours"),
+        ("table: bowls level", "options must be name=value, got level"),
+        (f"table: {SPEED_UP} reference=fr22", "must have of=NAME"),
+    ],
+)
+def test_wrong_marks_are_named(folder, mark, message):
+    store(folder, name="bowls")
+    with pytest.raises(SystemExit, match=message):
+        filled(f"<!-- {mark} -->\n<!-- end -->\n")
+
+
+@pytest.mark.parametrize(
+    ("mark", "message"),
+    [
+        ("bowls seconds method=fr22", "must name a column and one row"),
+        ("bowls speed task=bowl", "must name a column and one row"),
+        ("bowls seconds taste=sweet", "columns are task, .*got taste"),
+        ("bowls seconds method=ours", "no row of the table"),
+    ],
+)
+def test_wrong_values_are_named(folder, mark, message):
+    store(folder, name="bowls")
+    with pytest.raises(SystemExit, match=message):
+        filled(f"<!-- value: {mark} -->1<!-- /value -->")

@@ -1,0 +1,61 @@
+"""The cost of the package, run small: both paths are timed, and perturbations that are drawn again are not kept."""
+
+import json
+
+import pytest
+import torch
+
+from experiments.studies.bench import BenchReport, bench
+from torch_zerohess.sampling import extension
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"repeats": 0}, "repeats must be at least 1, got 0"),
+        ({"sizes": ((2, 8), (4, 0))}, "sizes must be at least 1, got 0"),
+        ({"memory_n": -1}, "memory_n must be at least 0, got -1"),
+        ({"memory_samples": 0}, "memory_samples must be at least 1, got 0"),
+    ],
+)
+def test_wrong_arguments_of_bench_are_named(wrong, message) -> None:
+    with pytest.raises(SystemExit, match=message):
+        bench(**wrong)
+
+
+@pytest.fixture(scope="module")
+def costs(tmp_path_factory) -> BenchReport:
+    out = tmp_path_factory.mktemp("bench") / "bench.json"
+    before, threads = extension.available, torch.get_num_threads()
+    result = bench(repeats=2, sizes=((2, 8), (256, 32)), memory_n=100_000, memory_samples=32, out=out)
+    assert (extension.available, torch.get_num_threads()) == (before, threads)
+    assert len(json.loads(out.read_text())["timings"]) == len(result.timings)
+    return result
+
+
+def test_both_paths_are_timed(costs) -> None:
+    assert all(t.torch > 0 for t in costs.timings)
+    assert all((t.extension is not None) == extension.available for t in costs.timings)
+
+
+def test_the_extension_draws_faster(costs) -> None:
+    for name in ("draw", "value + gradient + HVP"):
+        assert all(t.ratio > 2 for t in costs.timings if t.operation == name)
+
+
+def test_bench_without_the_extension(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(extension, "available", False)
+    (timing,) = (
+        t for t in bench(repeats=1, sizes=((2, 2),), memory_n=0).timings if t.operation == "value + gradient + HVP"
+    )
+    assert timing.extension is None
+    assert timing.ratio is None
+    assert timing.torch > 0
+    assert "pure torch" in capsys.readouterr().out
+
+
+def test_redrawn_perturbations_are_not_kept(costs) -> None:
+    stored, redrawn = costs.memory
+    perturbations = 2 * 32 * 100_000 * 8 / 2**20  # MiB
+    assert stored.kept - redrawn.kept > 0.7 * perturbations
+    assert redrawn.kept < 0.5 * perturbations

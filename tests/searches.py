@@ -1,0 +1,83 @@
+"""Black boxes with known minima for tests of searches, and how to run one."""
+
+import math
+
+import torch
+
+from truths import vector
+
+TARGET = vector(3.0, -1.0)
+
+
+def zeros(n, dtype=torch.float64):
+    return torch.zeros(n, dtype=dtype)
+
+
+def bowl(z):
+    """A quadratic of condition 10 with minimum 0 at (3, -1, 3, -1, ...)."""
+    z = z.double()
+    center = TARGET.repeat(z.shape[1])[: z.shape[1]]
+    return ((z - center) ** 2 * torch.linspace(1, 10, z.shape[1], dtype=torch.float64)).sum(1)
+
+
+def rosenbrock(z):
+    """A curved valley with minimum 0 at (1, 1, ...)."""
+    if z.shape[1] == 1:
+        return (1 - z[:, 0]) ** 2
+    return ((1 - z[:, :-1]) ** 2 + 10 * (z[:, 1:] - z[:, :-1] ** 2) ** 2).sum(1)
+
+
+def plateau(z):
+    """Constant but for a hole of radius 1."""
+    return (z.square().sum(1) - 1).clamp_max(0.0)
+
+
+def rays(z):
+    """An output [2, 3] that is not linear; the same as a target only at 1."""
+    k = torch.arange(1, 7, dtype=z.dtype)
+    powers = z[:, None, :] * (1 + (torch.outer(k, torch.arange(1, z.shape[1] + 1, dtype=z.dtype)) % 5))
+    return (powers.sum(2) + torch.sin(0.3 * powers).sum(2)).unflatten(1, (2, 3))
+
+
+def rays_loss(n, dtype=torch.float64):
+    """The loss of an output of `rays` for n parameters, 0 at 1."""
+    target = rays(torch.ones(1, n, dtype=dtype))[0]
+    return lambda output: (output - target).square().mean()
+
+
+def waves(x):
+    """Smooth outputs [K, 5] of points [K, n]."""
+    k = torch.arange(1, 6, dtype=torch.float64)
+    return torch.sin(0.4 * k * x.sum(1, keepdim=True)) + 0.2 * k * x[:, :1]
+
+
+def bar(z):
+    """A picture [K, 40] with hard edges: a bar that is where z [K, 1] says, and nothing beyond the picture."""
+    return ((torch.linspace(-6, 6, 40, dtype=torch.float64) - z[:, :1]).abs() < 1.0).double()
+
+
+def bump(x):
+    """A smooth picture [K, 40]: a bump that is where x [K, 1] says."""
+    return torch.exp(-0.5 * ((torch.linspace(-6, 6, 40, dtype=torch.float64) - x[:, :1]) / 0.7).square())
+
+
+def misfit(f, solution):
+    """The mean square of an output of f against the one at the solution."""
+    target = f(solution[None])[0]
+    return lambda y: (y - target).square().mean()
+
+
+def run(search, f, evaluations, target=-math.inf):
+    """Search until so many evaluations, or the target value."""
+    while not search.done and search.evaluations < evaluations and search.value > target:
+        search.tell(f(search.ask(evaluations - search.evaluations)))
+    return search
+
+
+def points_of(search, f, evaluations):
+    """The points that a search asks for."""
+    asked = []
+    while not search.done and search.evaluations < evaluations:
+        asked.append(search.ask(evaluations - search.evaluations))
+        search.tell(f(asked[-1]))
+    return torch.cat(asked)

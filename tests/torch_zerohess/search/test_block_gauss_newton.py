@@ -1,0 +1,302 @@
+"""Block Gauss-Newton: the Jacobian, its steps, and problems whose solution is known in closed form."""
+
+import io
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.search.block_gauss_newton import LENGTHS, damped_steps, renewed
+from truths import vector
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def square(target):
+    return lambda y: (y - target).square().mean()
+
+
+def solve(search, f, most):
+    """Evaluate until the search has used `most` evaluations, and return the losses after each batch."""
+    losses = []
+    while not search.done and search.evaluations < most:
+        search.tell(f(search.ask(most - search.evaluations)))
+        losses.append(search.value)
+    return losses
+
+
+def test_a_jacobian_is_known_after_a_basis_of_samples():
+    a, basis = normal(8, 20), torch.linalg.qr(normal(8, 8, seed=1))[0]
+    jacobian = torch.zeros(8, 20)
+    for steps in (0.3 * basis).split(3):
+        jacobian = renewed(jacobian, steps, steps @ a)
+    torch.testing.assert_close(jacobian, a.float(), atol=1e-4, rtol=0)
+
+
+def test_along_the_samples_it_is_renewed_and_across_them_it_stays():
+    before, a, steps = normal(8, 20).float(), normal(8, 20, seed=1), 0.1 * normal(3, 8, seed=2)
+    after = renewed(before, steps, steps @ a).double()
+    torch.testing.assert_close(steps @ after, steps @ a, atol=1e-4, rtol=0)
+    across = torch.linalg.qr(steps.mT, mode="complete")[0][:, 3:].mT
+    torch.testing.assert_close(across @ after, across @ before.double(), atol=1e-4, rtol=0)
+    # Broyden's formula for a single step, and nothing from a step of no length.
+    one, change = steps[:1], normal(1, 20, seed=3)
+    broyden = before.double() + one.mT @ (change - one @ before.double()) / one.square().sum()
+    torch.testing.assert_close(renewed(before, one, change).double(), broyden, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(renewed(before, 0.0 * one, 0.0 * change), before)
+
+
+def test_samples_that_bounds_have_made_dependent():
+    a, before = normal(4, 6), torch.zeros(4, 6)
+    steps = torch.cat([normal(1, 4, seed=1).expand(2, 4), normal(1, 4, seed=2)])
+    after = renewed(before, steps, steps @ a).double()
+    torch.testing.assert_close(steps @ after, steps @ a, atol=1e-3, rtol=0)
+
+
+def test_steps_solve_the_damped_problem_within_their_radii():
+    a, r = normal(8, 20), normal(20, seed=1)
+    gradient, hessian = a @ r, a @ a.mT
+    newton = -torch.linalg.lstsq(a.T, r[:, None]).solution[:, 0]
+    radii = vector(0.1, 0.5, 1.0, 2.0) * newton.norm()
+    steps = damped_steps(gradient, hessian, radii)
+    torch.testing.assert_close(steps[:2].norm(dim=1), radii[:2], rtol=1e-3, atol=0)
+    torch.testing.assert_close(steps[3], newton, rtol=1e-3, atol=1e-4)
+    # On the boundary the gradient at the end of the step is opposite to the step.
+    slope = gradient + hessian @ steps[1]
+    assert float(torch.cosine_similarity(slope, -steps[1], 0)) > 1 - 1e-4
+
+
+def test_a_step_is_short_enough_whatever_the_scales():
+    """A radius of a millionth and of a million times the Newton step."""
+    a, r = normal(5, 9), normal(9, seed=1)
+    newton = torch.linalg.lstsq(a.T, r[:, None]).solution.norm()
+    short, long = damped_steps(a @ r, a @ a.mT, vector(1e-6, 1e6) * newton)
+    torch.testing.assert_close(short.norm(), 1e-6 * newton, rtol=1e-3, atol=0)
+    torch.testing.assert_close(long.norm(), newton, rtol=1e-3, atol=0)
+
+
+def test_negative_curvature_counts_as_none():
+    (step,) = damped_steps(vector(1.0, 1.0), torch.diag(vector(1.0, -5.0)), vector(2.0))
+    assert float(step.norm()) == pytest.approx(2.0, rel=1e-3)
+    assert float(step[1]) < 0.0
+
+
+@pytest.mark.parametrize(("n", "m"), [(40, 100), (40, 25)])
+def test_linear_least_squares_take_one_jacobian_and_one_step(n, m):
+    """Also where fewer outputs than parameters leave the solution open, and at any distance within the longest step."""
+    a, b = normal(n, m) / math.sqrt(n), normal(m, seed=1)
+    lowest = float((torch.linalg.lstsq(a.mT, b[:, None]).solution[:, 0] @ a - b).square().mean())
+    search = zh.optim.BlockGaussNewton(torch.zeros(n).double(), sigma=8.0, loss=square(b), seed=0)
+    assert search.ask().shape == (1 + n, n)
+    solve(search, lambda x: x @ a, 1 + n + len(LENGTHS))
+    assert search.evaluations == 1 + n + len(LENGTHS)
+    assert search.iterations == 1
+    assert search.value - lowest < 1e-5 * float(b.square().mean())
+
+
+def test_the_curvature_of_any_loss_is_used():
+    """A convex loss whose Hessian is no multiple of the identity: with it one step suffices, without it none does."""
+    n, m = 20, 30
+    a, b, w = normal(n, m) / math.sqrt(n), normal(m, seed=1), torch.logspace(-3, 3, m, dtype=torch.float64)
+    best = torch.linalg.lstsq(w.sqrt()[:, None] * a.mT, (w.sqrt() * b)[:, None]).solution[:, 0]
+
+    def loss(y):
+        return (w * (y - b).square()).sum() / 2
+
+    search = zh.optim.BlockGaussNewton(torch.zeros(n).double(), sigma=10.0, loss=loss, seed=0)
+    solve(search, lambda x: x @ a, 1 + n + len(LENGTHS))
+    lowest, first = float(loss(best @ a)), float(loss(torch.zeros(m)))
+    assert search.value - lowest < 1e-3 * (first - lowest)
+
+
+def bent(n, m, seed=0):
+    """A black box [K, n] -> [K, m] that is far from linear, and a point."""
+    a = normal(n, m, seed=seed) / math.sqrt(n)
+    return (lambda x: torch.sin(x @ a) + 0.5 * x @ a), 0.7 * normal(n, seed=seed + 1)
+
+
+def test_a_bent_black_box_takes_few_blocks():
+    f, truth = bent(60, 120)
+    search = zh.optim.BlockGaussNewton(torch.zeros(60).double(), sigma=1.0, loss=square(f(truth[None])[0]), seed=0)
+    losses = solve(search, f, 61 + 12 * (15 + 6))
+    assert all(later <= earlier for earlier, later in pairwise(losses))
+    assert search.value < 1e-4 * losses[0]
+    torch.testing.assert_close(search.x, truth, atol=0.05, rtol=0)
+
+
+def test_a_block_costs_a_quarter_of_the_parameters_and_steps():
+    f, truth = bent(60, 120)
+    search = zh.optim.BlockGaussNewton(torch.zeros(60).double(), sigma=1.0, loss=square(f(truth[None])[0]), seed=0)
+    sizes = []
+    for _ in range(10):
+        points = search.ask()
+        sizes.append(len(points))
+        search.tell(f(points))
+    assert sizes == [61, 6, 15, 6, 15, 6, 15, 6, 15, 6]
+
+
+def test_directions_of_one_basis_are_orthogonal_and_as_far_as_sigma_says():
+    search = zh.optim.BlockGaussNewton(
+        torch.zeros(12).double(), sigma=2.0, loss=lambda y: y.square().mean(), share=0.2, block=0.5, seed=0
+    )
+    points = search.ask()[1:]
+    length = 2.0 * 0.5 * 0.2 * math.sqrt(12)
+    torch.testing.assert_close(points @ points.mT, length**2 * torch.eye(12).double(), atol=1e-5, rtol=0)
+    assert search.sigma == pytest.approx(0.1)
+
+
+def test_it_stays_within_the_bounds_and_solves_there():
+    """The solution has half of its parameters at their bounds."""
+    n, m = 30, 60
+    a = torch.linalg.qr(normal(m, n))[0].mT
+    wanted = torch.linspace(-1, 1, n, dtype=torch.float64) * 1.5
+    search = zh.optim.BlockGaussNewton(
+        torch.full((n,), 0.74).double(), sigma=0.5, bounds=(-0.75, 0.75), loss=square(wanted @ a), seed=0
+    )
+
+    def f(x):
+        assert float(x.abs().max()) <= 0.75
+        return x @ a
+
+    solve(search, f, 400)
+    torch.testing.assert_close(search.x, wanted.clamp(-0.75, 0.75), atol=0.02, rtol=0)
+
+
+def test_a_start_in_a_corner_is_sampled_away_from_it():
+    """Both signs of a direction leave the box in some parameters; together the samples still determine the slopes."""
+    n = 6
+    a = normal(n, 10)
+    search = zh.optim.BlockGaussNewton(
+        torch.ones(n).double(), sigma=0.2, bounds=(-1.0, 1.0), loss=square(torch.zeros(10)), seed=0
+    )
+    points = search.ask()
+    assert float((points[1:] - 1.0).norm(dim=1).min()) > 0.3 * 0.2 * 0.05 * math.sqrt(n)
+    solve(search, lambda x: x @ a, 200)
+    assert search.value < 1e-4 * float((torch.ones(n).double() @ a).square().mean())
+
+
+def test_where_no_step_lowers_the_loss_the_radius_shrinks_until_it_arrives():
+    search = zh.optim.BlockGaussNewton(
+        torch.zeros(4).double(), sigma=1.0, loss=lambda y: y.square().mean(), restarts=1, tolerance=0.05, seed=0
+    )
+    sigmas, rounds = [], []
+    while not search.done:
+        search.tell(search.ask() + torch.tensor([0.0, 1.0, 2.0, 3.0]) * 0.0)  # zero at the start: the minimum
+        sigmas.append(search.sigma)
+        rounds.append(search.rounds)
+    assert search.rounds == 2
+    assert search.value == 0.0
+    assert "below 0.05 of sigma, 2 times" in search.message
+    # 0.5 x 0.4^3 < 0.05: three refusals, and again from the first radius with a whole basis.
+    once = [0.05, 0.02, 0.02, 0.008, 0.008, 0.05]
+    assert sigmas[:6] == pytest.approx(once)
+    assert search.iterations == 6
+    with pytest.raises(RuntimeError, match="the search is done"):
+        search.ask()
+
+
+def test_values_that_are_not_finite_are_passed_over():
+    f, truth = bent(30, 60)
+
+    def hole(x):
+        y = f(x)
+        y[::7] = math.nan
+        return torch.where(x[:, :1] > 1.0, math.inf, y)
+
+    start = torch.zeros(30).double()
+    search = zh.optim.BlockGaussNewton(start, sigma=1.0, loss=square(f(truth[None])[0]), seed=0)
+    search.tell(f(search.ask()))
+    solve(search, hole, 400)
+    assert search.value < 1e-2 * float(f(truth[None]).square().mean())
+
+
+def test_it_ends_where_nothing_is_finite():
+    search = zh.optim.BlockGaussNewton(torch.zeros(5).double(), sigma=1.0, loss=torch.sum, seed=0)
+    search.tell(search.ask())
+    batches = 0
+    while not search.done:
+        search.tell(torch.full((len(search.ask()), 5), math.nan))
+        batches += 1
+    assert batches == 10
+    assert "10 batches in a row had no finite value" in search.message
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 5])
+def test_a_search_goes_on_from_its_state(after):
+    f, truth = bent(20, 40)
+    loss = square(f(truth[None])[0])
+
+    def new():
+        return zh.optim.BlockGaussNewton(torch.zeros(20).double(), sigma=1.0, loss=loss, seed=3)
+
+    search, other = new(), new()
+    for _ in range(after):
+        search.tell(f(search.ask()))
+    file = io.BytesIO()
+    torch.save(search.state_dict(), file)
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    for _ in range(6):
+        assert torch.equal(search.ask(), other.ask())
+        search.tell(f(search.ask()))
+        other.tell(f(other.ask()))
+    assert torch.equal(search.x, other.x)
+    assert search.value == other.value
+
+
+def test_asking_changes_nothing_and_a_limit_leaves_the_rest_for_later():
+    f, truth = bent(20, 40)
+    search = zh.optim.BlockGaussNewton(torch.zeros(20).double(), sigma=1.0, loss=square(f(truth[None])[0]), seed=0)
+    assert torch.equal(search.ask(), search.ask())
+    first, asked = search.ask(), []
+    for _ in range(7):
+        asked.append(search.ask(3))
+        search.tell(f(asked[-1]))
+    # The samples that a limit left out come in the next batches: the same 21 points in the end.
+    torch.testing.assert_close(torch.cat(asked), first)
+    assert search.evaluations == 21
+    assert len(search.ask()) == len(LENGTHS)
+
+
+def test_single_precision_and_units_per_parameter():
+    """The same search in other units: parameters a hundred times larger with a sigma a hundred times larger."""
+    f, truth = bent(20, 40)
+    units = torch.logspace(-2, 2, 20)
+    loss = square(f(truth[None])[0])
+    search = zh.optim.BlockGaussNewton(torch.zeros(20), sigma=units, loss=loss, seed=0)
+    assert search.ask().dtype == torch.float32
+    solve(search, lambda x: f((x / units).double()), 300)
+    torch.testing.assert_close((search.x / units).double(), truth, atol=0.05, rtol=0)
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e25])
+def test_outputs_of_any_size(scale):
+    f, truth = bent(20, 40)
+    target = scale * f(truth[None])[0]
+    search = zh.optim.BlockGaussNewton(torch.zeros(20).double(), sigma=1.0, loss=square(target), seed=0)
+    solve(search, lambda x: scale * f(x), 300)
+    torch.testing.assert_close(search.x, truth, atol=0.05, rtol=0)
+
+
+def test_the_model_at_the_best_point_is_gauss_newton():
+    f, truth = bent(10, 30)
+    target = f(truth[None])[0]
+    search = zh.optim.BlockGaussNewton(torch.zeros(10).double(), sigma=0.5, loss=square(target), seed=0)
+    assert search.model_at_best() is None
+    solve(search, f, 250)
+    model, sigma = search.model_at_best()
+    J = torch.func.jacrev(lambda x: f(x[None])[0])(search.x)
+    torch.testing.assert_close(model.full_hessian() / (0.5 * sigma) ** 2, 2 / 30 * J.mT @ J, rtol=0.1, atol=0.01)
+
+
+def test_what_cannot_be_searched_is_refused():
+    start = torch.zeros(3).double()
+    for name, value in (("radius", 0.0), ("share", 2.0), ("block", -0.1), ("radius", math.inf)):
+        with pytest.raises(ValueError, match=f"{name} must be above 0"):
+            zh.optim.BlockGaussNewton(start, sigma=1.0, loss=torch.sum, **{name: value})
+    with pytest.raises(ValueError, match="loss must be a function of one output, got None"):
+        zh.optim.BlockGaussNewton(start, sigma=1.0, loss=None)

@@ -1,0 +1,229 @@
+"""Descent on functions with known minima, and past values that are not finite."""
+
+import math
+
+import pytest
+import torch
+from searches import TARGET, bowl, plateau, rays, rays_loss, rosenbrock, run, zeros
+
+from torch_zerohess.optim import Descent, TrustRegion
+from truths import vector
+
+# Functions with known minima.
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("n", "evaluations"), [(1, 12), (2, 25), (10, 250)])
+def test_quadratics(n, evaluations, seed):
+    """In 10 dimensions with a pool that holds as many evaluations as a quadratic has coefficients, and more."""
+    search = run(Descent(zeros(n), sigma=2.0, pool=200, seed=seed), bowl, evaluations)
+    assert search.value == float(bowl(search.x[None]))
+    assert search.value < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("n", "evaluations", "reached"), [(1, 12, 1e-6), (2, 200, 1e-3), (10, 1500, 0.5)])
+def test_rosenbrock(n, evaluations, reached, seed):
+    start = torch.full((n,), -1.2, dtype=torch.float64)
+    search = run(Descent(start, sigma=0.5, seed=seed, restarts=0), rosenbrock, evaluations)
+    assert search.value < reached * float(rosenbrock(start[None]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_leaves_a_plateau(seed):
+    """Starts where the function is exactly constant, sigma reaches the hole: it is found and its bottom too."""
+    search = run(Descent(vector(2.0, 1.0), sigma=1.5, seed=seed), plateau, 120)
+    assert search.value < -0.99
+
+
+def test_sigma_grows_on_a_plateau():
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    run(search, lambda z: torch.full((len(z),), 0.1), 5)
+    assert search.sigma > 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("n", "evaluations"), [(1, 30), (2, 60), (5, 120), (10, 250)])
+def test_an_output_and_a_loss(n, evaluations, seed):
+    loss = rays_loss(n)
+    start = float(loss(rays(torch.zeros(1, n, dtype=torch.float64))[0]))
+    search = run(Descent(zeros(n), sigma=1.0, loss=loss, seed=seed), rays, evaluations)
+    assert search.value == float(loss(rays(search.x[None])[0]))
+    assert search.value < 1e-3 * start
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise(seed):
+    """Noise of 0.1 on a bowl, told so: where it goes is within a few times the noise of the minimum."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def f(z):
+        return bowl(z) + 0.1 * torch.randn(len(z), generator=generator, dtype=torch.float64)
+
+    search = run(Descent(zeros(2), sigma=2.0, noise=0.1, seed=seed), f, 150)
+    assert float(bowl(search.x[None])) < 0.5
+
+
+def test_the_first_round_ends_by_itself():
+    search = run(Descent(zeros(2), sigma=2.0, seed=0, restarts=0), bowl, 500)
+    assert search.done
+    assert search.rounds == 1
+    assert search.evaluations < 100
+    assert "sigma fell below" in search.message
+    with pytest.raises(RuntimeError, match="done"):
+        search.ask()
+
+
+def test_a_loss_that_is_not_finite_at_the_smoothed_output():
+    """The logarithm of an output that is positive wherever it is evaluated, its linear model is not."""
+    search = Descent(zeros(4), sigma=2.0, seed=0, loss=lambda y: (y + 1e-3).log().sum().square())
+    run(search, lambda z: (z - 1) ** 2, 60)
+    assert math.isfinite(search.value)
+    norm = Descent(zeros(4), sigma=1.0, seed=0, loss=lambda y: (y - 1).norm())
+    run(norm, lambda z: torch.ones(len(z), 3).double(), 40)
+    assert norm.value == 0.0
+
+
+@pytest.mark.parametrize(("n", "with_image"), [(10_000, False), (2000, True)])
+def test_many_parameters(n, with_image):
+    """A few iterations, downhill."""
+    f = (lambda z: z[:, :300].reshape(-1, 3, 10, 10)) if with_image else (lambda z: z.square().mean(1))
+    loss = (lambda y: y.square().mean()) if with_image else None
+    search = Descent(torch.ones(n, dtype=torch.float64), sigma=0.5, loss=loss, seed=0)
+    run(search, f, 150)
+    assert search.value < 1.0
+
+
+def test_the_minimum_on_a_bound():
+    search = run(Descent(zeros(2), sigma=1.0, bounds=(-2.0, vector(1.0, 5.0)), seed=0), bowl, 80)
+    torch.testing.assert_close(search.x, vector(1.0, -1.0), rtol=0, atol=1e-3)
+
+
+# The same of both engines: they take a finite box or none.
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6, -1e6])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_offset_of_the_loss(offset, seed):
+    """With restarts, as by default: a curved valley is followed to its end under any offset."""
+    start = vector(-1.2, -1.2)
+    search = run(TrustRegion(start, sigma=0.5, seed=seed), lambda z: rosenbrock(z) + offset, 200)
+    assert float(rosenbrock(search.x[None])) < 1e-3 * float(rosenbrock(start[None]))
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+@pytest.mark.parametrize("offset", [1e2, 1e6, -1e6])
+def test_an_offset_takes_no_more_evaluations(offset, bounds):
+    """Of a convex loss, in the first round, unless its decrease is lost in the rounding of the offset."""
+    counts = []
+    for added in (0.0, offset):
+        search = TrustRegion(zeros(3), sigma=2.0, seed=0, restarts=0, bounds=bounds)
+        while not search.done and float(bowl(search.x[None])) > 1e-3:
+            search.tell(bowl(search.ask()) + added)
+        assert float(bowl(search.x[None])) <= 1e-3
+        counts.append(search.evaluations)
+    assert counts[1] <= 1.3 * counts[0]
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+@pytest.mark.parametrize("size", [1e-300, 1e-160, 1e160, 1e300])
+def test_the_scale_of_the_loss(size, bounds):
+    search = run(TrustRegion(zeros(2), sigma=2.0, seed=0, bounds=bounds), lambda z: size * bowl(z), 60)
+    assert float(bowl(search.x[None])) < 1e-6
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+def test_networks_as_losses(bounds):
+    """With weights that require grad, and without a second derivative."""
+    linear = torch.nn.Linear(3, 1).double()
+    weights = linear.weight.detach()[0]
+
+    def loss(y):
+        return linear(y)[0]
+
+    search = TrustRegion(zeros(2), sigma=1.0, loss=loss, seed=0, bounds=bounds)
+    run(search, lambda z: torch.stack([bowl(z), 2 * bowl(z), 3 * bowl(z)], 1) * weights.sign(), 60)
+    assert float(bowl(search.x[None])) < 1e-3
+    assert linear.weight.grad is None
+
+
+# Values that are not finite.
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("output", [False, True])
+def test_a_wall_of_values_that_are_not_finite(wrong, output):
+    """Beyond z_0 = 2 there is nothing; the minimum in front of it is at (2, -1)."""
+
+    def f(z):
+        values = torch.where(z[:, :1] > 2.0, wrong, (z - TARGET) * vector(1.0, 3.0))
+        return values if output else values.square().sum(1)
+
+    loss = (lambda y: y.square().sum()) if output else None
+    search = run(Descent(zeros(2), sigma=1.0, loss=loss, seed=0), f, 80)
+    assert math.isfinite(search.value)
+    assert float(search.x[0]) <= 2.0
+    assert search.value < 3.0  # 18 at the start, 1 at best
+
+
+def test_a_refused_step_is_shortened():
+    search = Descent(zeros(1), sigma=1.0, seed=0)
+    search.tell((search.ask()[:, 0] - 5) ** 2)
+    sigma = search.sigma
+    search.ask()
+    search.tell(vector(math.nan))
+    assert search.sigma == 0.5 * sigma
+    assert float(search.center) == 0.0
+
+
+def test_finite_only_at_the_start():
+    def f(z):
+        return torch.where(z.square().sum(1) > 0, math.nan, 4.0)
+
+    search = run(Descent(zeros(2), sigma=1.0, seed=0), f, 10_000)
+    assert search.done
+    assert search.evaluations < 1000
+    assert torch.equal(search.x, zeros(2))
+    assert search.value == 4.0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_half_of_the_values_missing(seed):
+    generator = torch.Generator().manual_seed(seed)
+    search = Descent(zeros(2), sigma=2.0, seed=seed)
+    while not search.done and search.evaluations < 150:
+        values = bowl(search.ask())
+        lost = torch.rand(len(values), generator=generator) < 0.5
+        lost[0] &= search.evaluations > 0
+        search.tell(torch.where(lost, math.nan, values))
+    assert math.isfinite(search.value)
+    assert search.value == float(bowl(search.x[None]))
+
+
+def test_rounds_that_start_where_nothing_is_finite():
+    """Finite in a hundredth of the box: the search ends with what it has found there."""
+    for seed in range(5):
+        search = Descent(zeros(2), sigma=2.0, bounds=(-100.0, 100.0), seed=seed)
+        run(search, lambda z: torch.where(z.abs().amax(1) > 10, math.nan, bowl(z)), 400)
+        assert search.value < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_hopeless_round_is_not_the_last_one(seed):
+    search = Descent(zeros(2), sigma=1.0, seed=seed)
+    run(search, lambda z: torch.where(z[:, 0] > 1.2, math.nan, bowl(z)), 10_000)
+    assert search.rounds == 11
+
+
+def test_a_round_whose_start_is_not_finite_goes_on_to_what_is():
+    search = Descent(zeros(2), sigma=2.0, seed=0)
+    while search.rounds == 0:
+        search.tell(bowl(search.ask()))
+    values = bowl(search.ask())
+    start = search.center
+    assert not torch.equal(start, search.x)
+    values[0] = math.nan
+    search.tell(values)
+    while search.rounds == 1 and torch.equal(search.center, start):
+        search.tell(bowl(search.ask()))
+    assert search.rounds == 1  # it has moved before sigma has shrunk to nothing

@@ -1,0 +1,467 @@
+"""Ask and tell, the same for every search: what is asked for, what is refused, what resumes."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from searches import TARGET, bowl, points_of, rays, rays_loss, rosenbrock, run, zeros
+
+from torch_zerohess.optim import BlockGaussNewton, Descent, GaussianProcessSearch, TrustRegion
+from truths import vector
+
+# Every search with and without a loss; restarts keep it busy.
+SEARCHES = {
+    "descent of the loss": (Descent, 3, False),
+    "descent of the output": (Descent, 5, True),
+    "process of the loss": (GaussianProcessSearch, 2, False),
+    "process of the output": (GaussianProcessSearch, 2, True),
+    "block Gauss-Newton": (BlockGaussNewton, 5, True),
+}
+
+
+def make(name, *, seed=0, loss=None, **changes):
+    """Returns the search of this name."""
+    kind, n, with_loss = SEARCHES[name]
+    chosen = (loss or rays_loss(n)) if with_loss else None
+    return kind(
+        zeros(n), **{"sigma": 1.0, "bounds": (-3.0, 4.0), "restarts": 1000, "seed": seed, **changes}, loss=chosen
+    )
+
+
+def black_box(name):
+    return rays if SEARCHES[name][2] else rosenbrock
+
+
+def same(a, b):
+    """Whether two states are equal to the last bit."""
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return type(a) is type(b) and a == b
+
+
+every_search = pytest.mark.parametrize("name", SEARCHES)
+
+
+# What is asked for.
+
+
+@every_search
+def test_asking_changes_nothing(name):
+    search, f = make(name), black_box(name)
+    for _ in range(40):
+        before = search.state_dict()
+        points = search.ask()
+        assert torch.equal(search.ask(), points)
+        assert torch.equal(search.ask(1), points[:1])
+        assert torch.equal(search.ask(), points)
+        assert same(search.state_dict(), before)
+        search.tell(f(points))
+        assert not same(search.state_dict(), before)
+
+
+@every_search
+def test_looking_at_the_model_changes_nothing(name):
+    search, f = make(name), black_box(name)
+    for _ in range(30):
+        before = search.state_dict()
+        search.model_at_best()
+        assert same(search.state_dict(), before)
+        search.tell(f(search.ask()))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    st.integers(1, 4),
+    st.integers(0, 10**6),
+    st.sampled_from([torch.float32, torch.float64]),
+    st.floats(-3, 3),
+    st.floats(-3, 1),
+    st.booleans(),
+    st.sampled_from([Descent, GaussianProcessSearch]),
+)
+def test_never_outside_of_the_bounds(n, seed, dtype, size, narrow, with_loss, kind):
+    """Boxes of any size around points of any size; the bounds are float64, and none of them need be a float32."""
+    generator = torch.Generator().manual_seed(seed)
+    x0 = (10**size * torch.randn(n, generator=generator, dtype=torch.float64)).to(dtype)
+    width = 10 ** (size + narrow)
+    lower, upper = torch.rand(2, n, generator=generator, dtype=torch.float64) * width + 0.01 * width
+    lower, upper = x0.double() - lower, x0.double() + upper
+    sigma = width * float(0.05 + 2 * torch.rand((), generator=generator))
+    search = kind(x0, sigma=sigma, bounds=(lower, upper), seed=seed, loss=torch.sum if with_loss else None, restarts=3)
+
+    def f(z):
+        assert z.dtype == dtype
+        assert bool((z.double() >= lower).all())
+        assert bool((z.double() <= upper).all())
+        values = ((z.double() - upper) / width).sum(1) + torch.sin(3 * z.double() / width).prod(1)
+        return values[:, None].expand(-1, 2) if with_loss else values
+
+    run(search, f, 40)
+    for z in (search.x, search.center):
+        f(z[None])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bounds_are_kept_to_the_last_bit(dtype):
+    """Minima in corners of 100 random boxes; (bound / sigma) sigma is not always the bound."""
+    generator = torch.Generator().manual_seed(0)
+    at_bounds = 0
+    for seed in range(100):
+        lower, width, sigma, side = torch.rand(4, 4, generator=generator, dtype=torch.float64) + 0.1
+        upper = lower + width
+        side = torch.where(side > 0.6, 1.0, -1.0)
+        search = Descent((lower + upper).to(dtype) / 2, sigma=sigma, bounds=(lower, upper), seed=seed)
+
+        def f(z, side=side):
+            return (z.double() * side).sum(1)
+
+        for z in points_of(search, f, 12).double():
+            assert bool((z >= lower).all())
+            assert bool((z <= upper).all())
+            at_bounds += int(((z - lower).abs() < 1e-6).sum() + ((z - upper).abs() < 1e-6).sum())
+        assert bool((search.x.double() >= lower).all())
+        assert bool((search.x.double() <= upper).all())
+    assert at_bounds > 1000
+
+
+def test_asking_for_fewer():
+    search, other = Descent(zeros(5), sigma=1.0, seed=0), Descent(zeros(5), sigma=1.0, seed=0)
+    every = search.ask()
+    assert len(every) == 6
+    torch.testing.assert_close(every[0], zeros(5))
+    assert torch.equal(search.ask(2), every[:2])
+    with pytest.raises(ValueError, match=r"values must have shape \[2\]"):
+        search.tell(bowl(every))
+    search.tell(bowl(every[:2]))  # the others are given up
+    assert search.evaluations == 2
+    other.ask(2)
+    other.tell(bowl(every[:2]))
+    assert same(search.state_dict(), other.state_dict())
+    with pytest.raises(ValueError, match="limit must be at least 1, got 0"):
+        search.ask(0)
+    assert run(search, bowl, 37).evaluations == 37
+
+
+@every_search
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_types(name, dtype):
+    kind, n, with_loss = SEARCHES[name]
+    loss = rays_loss(n) if with_loss else None
+    search = kind(zeros(n, dtype), sigma=1.0, bounds=(-3.0, 4.0), loss=loss, restarts=1000, seed=0)
+    start = black_box(name)(zeros(n)[None])[0]
+    run(search, lambda z: black_box(name)(z).to(dtype), 60)
+    for z in (search.x, search.center, search.ask()):
+        assert z.dtype == dtype
+        assert not z.requires_grad
+    assert search.value < 0.1 * float(loss(start) if with_loss else start)
+
+
+def test_what_is_rounded_is_what_is_known():
+    """Next to the resolution of float32 the model is of the points that were evaluated, not of those meant."""
+    x0 = torch.full((1,), 1e4, dtype=torch.float32)
+    search = Descent(x0, sigma=3e-3, seed=0, restarts=0)
+    run(search, lambda z: (z.double() - 10000.006).square().sum(1), 12)
+    found = search.model_at_best()
+    assert found is not None
+    model, sigma = found
+    assert float(model.full_hessian()) / (sigma * 3e-3) ** 2 == pytest.approx(2.0, rel=1e-2)
+
+
+@every_search
+def test_the_callers_tensors_are_not_held(name):
+    kind, n, with_loss = SEARCHES[name]
+    x0 = zeros(n)
+    search = kind(x0, sigma=1.0, bounds=(-3.0, 4.0), loss=rays_loss(n) if with_loss else None, seed=0)
+    x0 += 5
+    asked = search.ask()
+    torch.testing.assert_close(asked[0], zeros(n))
+    asked += 7
+    torch.testing.assert_close(search.ask()[0], zeros(n))
+    values = black_box(name)(search.ask())
+    search.tell(values)
+    before = search.value
+    values.fill_(math.nan)
+    assert search.value == before
+    run(search, black_box(name), 20)
+    assert math.isfinite(search.value)
+
+
+# Seeds.
+
+
+@every_search
+def test_the_same_seed_gives_the_same_points_whatever_the_global_generator(name):
+    f = black_box(name)
+    torch.manual_seed(1)
+    one = points_of(make(name, seed=5), f, 40)
+    torch.manual_seed(2)
+    before = torch.get_rng_state()
+    two = points_of(make(name, seed=5), f, 40)
+    assert torch.equal(one, two)
+    assert torch.equal(before, torch.get_rng_state())
+    assert not torch.equal(one, points_of(make(name, seed=6), f, 40))
+
+
+def test_without_a_seed_the_global_generator_decides():
+    results = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        results.append(points_of(Descent(zeros(3), sigma=1.0), rosenbrock, 30))
+    assert torch.equal(results[0], results[1])
+    assert not torch.equal(results[0], results[2])
+
+
+def test_a_sigma_per_parameter_is_a_change_of_units():
+    """By powers of two, so that no bit is lost."""
+    units = vector(2.0**-20, 1.0, 2.0**30)
+    for kind in (Descent, GaussianProcessSearch):
+        plain = points_of(kind(zeros(3), sigma=1.0, bounds=(-2.0, 3.0), seed=0), rosenbrock, 60)
+        scaled = kind(zeros(3), sigma=units, bounds=(-2.0 * units, 3.0 * units), seed=0)
+        assert torch.equal(points_of(scaled, lambda z: rosenbrock(z / units), 60), plain * units)
+
+
+# State.
+
+
+def saved(state):
+    """The state after it was written to a file and read."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=True)
+
+
+@every_search
+def test_it_resumes_bit_by_bit_at_every_step(name):
+    search, f = make(name, seed=3, tolerance=0.2), black_box(name)
+    for _ in range(120):
+        copy = make(name, seed=99, tolerance=0.2)
+        copy.load_state_dict(saved(search.state_dict()))
+        assert same(copy.state_dict(), search.state_dict())
+        points = search.ask()
+        assert torch.equal(copy.ask(), points)
+        values = f(points)
+        search.tell(values)
+        copy.tell(values)
+        assert same(copy.state_dict(), search.state_dict())
+        assert torch.equal(copy.x, search.x)
+        assert torch.equal(copy.center, search.center)
+        for number in ("value", "sigma", "evaluations", "iterations", "rounds", "done", "message"):
+            assert getattr(copy, number) == getattr(search, number)
+    assert search.rounds > 0  # at an arrival, too
+
+
+def test_points_may_be_evaluated_before_the_search_is_loaded():
+    search, copy = make("process of the loss"), make("process of the loss")
+    points = search.ask()
+    copy.load_state_dict(search.state_dict())
+    copy.tell(rosenbrock(points))
+    search.tell(rosenbrock(points))
+    assert same(copy.state_dict(), search.state_dict())
+
+
+def test_a_state_is_not_changed_by_the_search_it_came_from():
+    name = "descent of the output"
+    search, f = run(make(name), black_box(name), 30), black_box(name)
+    state = search.state_dict()
+    first = points_of(search, f, 80)
+    copy = make(name, seed=1)
+    for _ in range(2):
+        copy.load_state_dict(state)
+        assert torch.equal(points_of(copy, f, 80), first)
+
+
+def test_the_settings_stay_those_of_the_search_that_loads():
+    search = run(Descent(zeros(2), sigma=1.0, pool=60, seed=0), bowl, 40)
+    copy = Descent(zeros(2), sigma=1.0, pool=5, seed=0)
+    copy.load_state_dict(search.state_dict())
+    copy.tell(bowl(copy.ask()))
+    assert len(copy.state_dict()["progress"]["pool"]["values"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("n", "changes", "message"),
+    [
+        (3, {}, "2 parameters, got one with 3"),
+        (2, {"sigma": 2.0}, r"sigma = \[1.0, 1.0\], got \[2.0, 2.0\]"),
+        (2, {"bounds": (-5.0, 5.0)}, "by descent of the loss, got one by gaussian_process of the loss"),
+        (2, {"loss": torch.sum}, "by descent of the loss, got one by descent of the output"),
+    ],
+)
+def test_a_state_of_another_search(n, changes, message):
+    search, other = TrustRegion(zeros(2), sigma=1.0, seed=0), TrustRegion(zeros(n), **{"sigma": 1.0, **changes})
+    asked = search.ask()
+    with pytest.raises(ValueError, match=message):
+        search.load_state_dict(other.state_dict())
+    assert torch.equal(search.ask(), asked)
+
+
+# What is refused.
+
+SETTINGS = [
+    ({"x0": torch.zeros(2, 2)}, r"x0 must be a tensor \[n\]"),
+    ({"x0": torch.zeros(0)}, r"x0 must be a tensor \[n\]"),
+    ({"x0": torch.zeros(2, dtype=torch.int64)}, "float32 or float64"),
+    ({"x0": torch.zeros(2, dtype=torch.float16)}, "float32 or float64"),
+    ({"x0": [0.0, 0.0]}, "float32 or float64"),
+    ({"x0": vector(0.0, math.nan)}, "x0 must be finite"),
+    ({"sigma": 0.0}, "sigma must be positive and finite"),
+    ({"sigma": -1.0}, "sigma must be positive and finite"),
+    ({"sigma": math.inf}, "sigma must be positive and finite"),
+    ({"sigma": math.nan}, "sigma must be positive and finite"),
+    ({"sigma": vector(1.0, 0.0)}, "sigma must be positive and finite"),
+    ({"sigma": torch.ones(3)}, "one value or one per parameter"),
+    ({"x0": torch.full((2,), 1e4), "sigma": 1e-5, "bounds": (0.0, 1e5)}, "sigma must be large enough to change x0"),
+    ({"bounds": (1.0, -1.0)}, "lower < upper, got 1.0 and -1.0 at index 0"),
+    ({"bounds": (vector(-1.0, 2.0), 1.0)}, "lower < upper, got 2.0 and 1.0 at index 1"),
+    ({"bounds": (math.nan, 1.0)}, "lower < upper"),
+    ({"bounds": (0.0, 0.0)}, "lower < upper"),
+    ({"bounds": (torch.zeros(3), 1.0)}, r"lower bound must be a number or \[2\], got shape \[3\]"),
+    ({"bounds": (-1.0, 1.0, 2.0)}, "got 3 entries"),
+    ({"bounds": (0.5, 1.0)}, "x0 must be within the bounds, got 0.0 at index 0"),
+    ({"bounds": (-1.0, vector(1.0, -0.5))}, "got 0.0 at index 1"),
+    ({"restarts": -1}, "restarts must be finite and at least 0, got -1"),
+    ({"noise": -1.0}, "noise must be finite and at least 0"),
+    ({"noise": math.nan}, "noise must be finite and at least 0"),
+    ({"tolerance": 0.0}, "tolerance must be between 0 and 1"),
+    ({"pool": 2}, "pool must be at least 4, got 2"),
+]
+
+
+@pytest.mark.parametrize("kind", [Descent, GaussianProcessSearch, TrustRegion])
+@pytest.mark.parametrize(("wrong", "message"), SETTINGS)
+def test_settings_out_of_range(kind, wrong, message):
+    settings = {"x0": zeros(2), "sigma": 1.0, "bounds": (-1.0, 1.0), **wrong}
+    with pytest.raises(ValueError, match=message):
+        kind(settings.pop("x0"), **settings)
+
+
+@every_search
+def test_a_loss_that_raises_once_changes_nothing(name):
+    """The loss fails in each of its calls of a step in turn, also in those that plan the next points."""
+    n, with_loss = SEARCHES[name][1:]
+    countdown = math.inf
+
+    def failing(value):
+        nonlocal countdown
+        countdown -= 1
+        if countdown == 0:
+            countdown = math.inf
+            raise ZeroDivisionError("in the loss")
+        return value
+
+    loss = rays_loss(n)
+    search = make(name, loss=lambda y: loss(failing(y)))
+    other, failures = make(name), 0
+    for _ in range(15):
+        points = search.ask()
+        values, before = black_box(name)(points), search.state_dict()
+        for call in range(1, 1000):
+            countdown = call
+            try:
+                search.tell(values)
+            except ZeroDivisionError:
+                assert same(search.state_dict(), before)
+                failures += 1
+            else:
+                break
+        countdown = math.inf
+        other.ask()
+        other.tell(values)
+        assert same(search.state_dict(), other.state_dict())
+    assert failures >= (30 if with_loss else 0)
+
+
+def test_values_that_cannot_be_taken_change_nothing():
+    loss, wrong = rays_loss(3), None
+
+    def switch(output):
+        return loss(output) if wrong is None else wrong(output)
+
+    search = Descent(zeros(3), sigma=1.0, loss=switch, seed=0)
+    for _ in range(12):
+        points, before = search.ask(), search.state_dict()
+        values = rays(points)
+        for bad in (values[:-1], torch.cat([values, values]), values[0, 0, 0]):
+            with pytest.raises(ValueError, match="values must have shape"):
+                search.tell(bad)
+        if search.evaluations:
+            with pytest.raises(ValueError, match=r"outputs \[2, 3\] as before"):
+                search.tell(values.flatten(1))
+        for wrong, error, message in (  # noqa: B007
+            (lambda y: y, ValueError, r"loss must return a scalar, got shape \[2, 3\]"),
+            (lambda y: 1.0, TypeError, "loss must return a tensor"),
+            (lambda y: loss(y.detach()), ValueError, "loss must be differentiable"),
+        ):
+            with pytest.raises(error, match=message):
+                search.tell(values)
+        wrong = None
+        assert same(search.state_dict(), before)
+        search.tell(values)
+
+
+def test_values_before_points():
+    search = Descent(zeros(3), sigma=1.0, seed=0)
+    with pytest.raises(RuntimeError, match="ask for points"):
+        search.tell(vector(1.0))
+    points = search.ask()
+    search.tell(bowl(points))
+    with pytest.raises(RuntimeError, match="ask for points"):
+        search.tell(bowl(points))
+
+
+def test_losses_of_a_wrong_shape():
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    search.ask()
+    for wrong in (torch.zeros(2), torch.zeros(3, 1), torch.tensor(0.0)):
+        with pytest.raises(ValueError, match=r"values must have shape \[3\]"):
+            search.tell(wrong)
+    search.tell([1.0, 2.0, 3.0])
+    assert search.value == 1.0
+    search.ask()
+    search.tell(np.array([0.5]))
+    assert search.value == 0.5
+
+
+def test_an_output_that_is_a_number():
+    search = Descent(zeros(3), sigma=2.0, loss=lambda y: y.square(), seed=0)
+    run(search, lambda z: (z - TARGET.repeat(2)[:3]).sum(1), 20)
+    assert search.value < 1e-6
+
+
+@every_search
+def test_not_finite_at_the_start(name):
+    search, f = make(name), black_box(name)
+    before = search.state_dict()
+    values = f(search.ask())
+    values[0] = math.nan
+    with pytest.raises(ValueError, match="not finite at the start x0: nan"):
+        search.tell(values)
+    assert same(search.state_dict(), before)
+    search.tell(f(search.ask()))
+    assert search.evaluations == len(values)
+
+
+@every_search
+def test_a_search_that_is_done_asks_for_nothing(name):
+    search = run(make(name, restarts=0), black_box(name), 1000)
+    assert search.done
+    assert search.message
+    with pytest.raises(RuntimeError, match="the search is done: "):
+        search.ask()
+    with pytest.raises(RuntimeError, match="ask for points"):
+        search.tell(vector(1.0))
+    copy = make(name, restarts=0)
+    copy.load_state_dict(saved(search.state_dict()))
+    assert copy.done
+    assert torch.equal(copy.x, search.x)
+    with pytest.raises(RuntimeError, match="ask for points"):
+        copy.tell(vector(1.0))

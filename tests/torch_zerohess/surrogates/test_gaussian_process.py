@@ -1,0 +1,334 @@
+"""Gaussian process: posterior, evidence and derivatives against their textbook formulas."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+from torch_zerohess.surrogates import lengths
+from torch_zerohess.surrogates.gaussian_process import (
+    HIGH_NOISES,
+    KERNELS,
+    LENGTHS,
+    NOISES,
+    GaussianProcess,
+    gaussian,
+    grid_evidence,
+    matern,
+)
+from torch_zerohess.surrogates.lengths import log_evidence, most_likely
+from torch_zerohess.surrogates.process import ProcessSurrogate
+from truths import vector
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def waves(x):
+    """Smooth outputs [K, 5] of points [K, n]."""
+    k = torch.arange(1, 6, dtype=torch.float64)
+    return torch.sin(0.4 * k * x.sum(1, keepdim=True)) + 0.2 * k * x[:, :1]
+
+
+def bar(z):
+    """A picture [K, 40] with hard edges: a bar that is where z [K, 1] says, and nothing beyond the picture."""
+    return ((torch.linspace(-6, 6, 40, dtype=torch.float64) - z[:, :1]).abs() < 1.0).double()
+
+
+def by_hand(kernel, a, b):
+    """Covariance [A, B] in units of the variance, with all differences written out."""
+    return kernel((a[:, None] - b[None]).norm(dim=2)) + 1.0
+
+
+def drawn(points, kernel, lengths, noise, m, seed=0):
+    """Outputs [P, m] drawn from the process with unit variance."""
+    scaled = points / lengths
+    covariance = by_hand(kernel, scaled, scaled) + noise * torch.eye(len(points), dtype=torch.float64)
+    return torch.linalg.cholesky(covariance) @ normal(len(points), m, seed=seed)
+
+
+def test_kernels_are_their_textbook_formulas():
+    d = torch.tensor([0.0, 0.5, 2.0], dtype=torch.float64)
+    expected = [(1 + math.sqrt(3) * x) * math.exp(-math.sqrt(3) * x) for x in d.tolist()]
+    assert torch.allclose(matern(d), vector(*expected), rtol=1e-14)
+    assert torch.allclose(gaussian(d), vector(*[math.exp(-(x**2) / 2) for x in d.tolist()]), rtol=1e-14)
+
+
+@pytest.mark.parametrize("how", ["chosen", "given"])
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_posterior_is_the_conditional_of_the_joint_normal_distribution(n, how):
+    points, x = 2 * normal(12, n), 2 * normal(7, n, seed=1)
+    outputs = waves(points)
+    if how == "chosen":
+        process = GaussianProcess.fit(points, outputs)
+    else:
+        process = GaussianProcess.condition(points, outputs, matern, 1.7, 0.01)
+        assert (process.kernel, process.length, process.noise) == (matern, 1.7, 0.01)
+    scaled, at = points / process.length, x / process.length
+    K = by_hand(process.kernel, scaled, scaled) + process.noise * torch.eye(12, dtype=torch.float64)
+    inverse = torch.linalg.inv(K)
+    cross = by_hand(process.kernel, at, scaled)
+    change = outputs - outputs.mean(0)
+    expected = outputs.mean(0) + cross @ inverse @ change
+    spread = by_hand(process.kernel, at, at).diagonal() - (cross @ inverse @ cross.mT).diagonal()
+    c = process.covariance(x)
+    torch.testing.assert_close(process.predict(x), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(process(x), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(process.mean + c @ process.weights, expected, atol=1e-6, rtol=0)
+    # The most likely variance is the mean square of the whitened outputs.
+    assert process.variance == pytest.approx(float((change * (inverse @ change)).mean()), rel=1e-6)
+    torch.testing.assert_close(process.uncertainty(c), process.variance * spread, atol=1e-6 * process.variance, rtol=0)
+
+
+def test_known_points_are_predicted_and_certain():
+    points = torch.linspace(-3, 3, 15, dtype=torch.float64)[:, None] * vector(1.0, 0.5)
+    process = GaussianProcess.fit(points, waves(points))
+    c = process.covariance(points)
+    assert torch.allclose(process.mean + c @ process.weights, waves(points), atol=1e-3)
+    assert float(process.uncertainty(c).max()) < 1e-3 * process.variance
+    far = process.uncertainty(process.covariance(torch.full((1, 2), 1e3, dtype=torch.float64)))
+    assert float(far) > 0.9 * process.variance
+
+
+def log_likelihood(points, change, kernel, lengths, noise):
+    """Log likelihood over all elements at the most likely variance, from torch's normal distribution."""
+    scaled = points / lengths
+    K = by_hand(kernel, scaled, scaled) + noise * torch.eye(len(points), dtype=torch.float64)
+    variance = float((change * torch.linalg.solve(K, change)).mean())
+    return float(MultivariateNormal(torch.zeros(len(points)).double(), variance * K).log_prob(change.mT).sum())
+
+
+def test_the_evidence_is_the_likelihood_and_the_prior_of_the_length():
+    """2/m log likelihood + P (log 2 pi + 1) - (log length / 1.5)^2, for every entry of the lists."""
+    points, noises = 1.5 * normal(9, 2), NOISES + HIGH_NOISES
+    change = waves(points) - waves(points).mean(0)
+    evidence, _ = grid_evidence(points, change / change.abs().max(), noises)
+    size = float(change.abs().max())
+    for k, kernel in enumerate(KERNELS):
+        for i, length in enumerate(LENGTHS):
+            for j, noise in enumerate(noises):
+                expected = 2 / 5 * log_likelihood(points, change / size, kernel, length, noise)
+                expected += 9 * (math.log(2 * math.pi) + 1) - (math.log(length) / 1.5) ** 2
+                assert float(evidence[len(LENGTHS) * k + i, j]) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+                same_for_all = torch.full((2,), length, dtype=torch.float64)
+                same = log_evidence(points, change / size, kernel, same_for_all, torch.tensor(noise).double())
+                assert float(same) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+def test_the_evidence_of_one_length_per_parameter():
+    points, each, noise = normal(9, 3), vector(0.5, 1.0, 3.0), torch.tensor(0.01).double()
+    change = waves(points) - waves(points).mean(0)
+    for kernel in KERNELS:
+        found = log_evidence(points, change, kernel, each, noise)
+        expected = 2 / 5 * log_likelihood(points, change, kernel, each, 0.01)
+        expected += 9 * (math.log(2 * math.pi) + 1) - float((each.log() / 1.5).square().mean())
+        assert float(found) == pytest.approx(expected, rel=1e-8)
+
+
+def test_the_entries_with_the_highest_evidence_are_chosen():
+    points, noises = 2 * normal(20, 1), NOISES + HIGH_NOISES
+    outputs = waves(points) + normal(20, 5, seed=4)
+    process = GaussianProcess.fit(points, outputs, noises)
+    change = outputs - outputs.mean(0)
+
+    def evidence(kernel, length, noise):
+        return 2 / 5 * log_likelihood(points, change, kernel, length, noise) - (math.log(length) / 1.5) ** 2
+
+    every = [(kernel, length, noise) for kernel in KERNELS for length in LENGTHS for noise in noises]
+    assert (process.kernel, process.length, process.noise) == max(every, key=lambda one: evidence(*one))
+    assert process.noise >= 0.1
+
+
+def test_smooth_outputs_get_the_smooth_kernel_and_edges_the_rough_one():
+    grid = torch.linspace(-4, 4, 25, dtype=torch.float64)[:, None]
+    assert GaussianProcess.fit(grid, waves(grid)).kernel is gaussian
+    assert GaussianProcess.fit(grid, bar(grid)).kernel is matern
+
+
+def test_outputs_that_do_not_change_are_predicted_as_they_are():
+    points = normal(6, 2)
+    for value in (0.0, 3.0):
+        outputs = torch.full((6, 4), value).double()
+        outputs[0] += 1e-16 * value  # rounding
+        process = GaussianProcess.fit(points, outputs)
+        assert process.variance == 1.0
+        torch.testing.assert_close(process.predict(normal(3, 2, seed=1)), torch.full((3, 4), value).double())
+
+
+def test_more_is_predicted_of_a_smooth_output_than_of_its_loss():
+    points, x = torch.linspace(-3, 3, 9, dtype=torch.float64)[:, None], normal(20, 1, seed=2)
+    target = waves(torch.ones(1, 1, dtype=torch.float64))[0]
+    output, loss = GaussianProcess.fit(points, waves(points)), (waves(points) - target).square().mean(1, keepdim=True)
+    alone = GaussianProcess.fit(points, loss)
+    truth = (waves(x) - target).square().mean(1)
+    through = (output.predict(x) - target).square().mean(1)
+    assert float((through - truth).abs().mean()) < float((alone.predict(x)[:, 0] - truth).abs().mean())
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_derivatives_are_those_of_the_formula(kernel):
+    """The kernels' derivatives written out: d/dd matern = -3 d exp(-sqrt(3) d), d/dd gaussian = -d exp(-d^2/2)."""
+    points = 2 * normal(8, 3)
+    process = GaussianProcess.condition(points, waves(points), kernel, 1.3, 1e-3)
+    x = torch.cat([normal(4, 3, seed=5), points[:2]])
+    step = (x[:, None] - points) / 1.3
+    d = step.norm(dim=2)
+    decay = (math.sqrt(3.0) * d).neg().exp() if kernel is matern else (-0.5 * d.square()).exp()
+    factor = 3.0 if kernel is matern else 1.0
+    slope = torch.einsum("qp,qpi,pm->qmi", -factor * decay, step / 1.3, process.weights)
+    found = torch.func.vmap(torch.func.jacrev(lambda one: process(one[None])[0]))(x)
+    torch.testing.assert_close(found, slope, atol=1e-9, rtol=1e-9)
+    forward = torch.func.vmap(torch.func.jacfwd(lambda one: process(one[None])[0]))(x)
+    torch.testing.assert_close(forward, slope, atol=1e-9, rtol=1e-9)
+    # d2/dx2 = factor/l^2 decay (c v v' - I) with v the step and c = sqrt(3)/d for the Matern kernel, 1 for the other.
+    ratio = math.sqrt(3.0) / d.clamp_min(1e-12) if kernel is matern else torch.ones_like(d)
+    bend = ratio[..., None, None] * step[..., :, None] * step[..., None, :] - torch.eye(3).double()
+    second = torch.einsum("qp,qpij,pm->qmij", factor * decay / 1.3**2, bend, process.weights)
+    hessian = torch.func.vmap(torch.func.hessian(lambda one: process(one[None])[0]))(x)
+    torch.testing.assert_close(hessian, second, atol=1e-6, rtol=1e-6)
+
+
+def test_distances_far_from_the_origin_are_exact():
+    points = normal(10, 2)
+    far = GaussianProcess.condition(points + 1e7, waves(points), matern, 1.0, 1e-3)
+    near = GaussianProcess.condition(points, waves(points), matern, 1.0, 1e-3)
+    x = normal(5, 2, seed=1)
+    torch.testing.assert_close(far(x + 1e7), near(x), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_one_length_per_parameter_is_recovered(kernel):
+    """From 30 outputs drawn from a process with known lengths, within 20 % where they are shorter than the range."""
+    generator = torch.Generator().manual_seed(0)
+    points = 4 * torch.rand(150, 3, generator=generator, dtype=torch.float64)
+    truth = vector(0.7, 1.5, 3.0)
+    found = most_likely(points, drawn(points, kernel, truth, 1e-2, 30), anisotropic=True)
+    assert found.kernel is kernel
+    torch.testing.assert_close(found.lengths, truth, rtol=0.2, atol=0)
+    assert found.noise == pytest.approx(1e-2, rel=0.5)
+    one = most_likely(points, drawn(points, kernel, truth, 1e-2, 30), anisotropic=False)
+    assert torch.equal(one.lengths, one.lengths[:1].expand(3))
+    assert one.evidence < found.evidence
+
+
+def test_a_climb_ends_where_the_evidence_is_flat():
+    points = 4 * torch.rand(60, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    change = drawn(points, matern, vector(0.7, 2.0), 1e-2, 30)
+    found = most_likely(points, change, anisotropic=True)
+    change = change / change.abs().max()
+    logs = torch.cat([found.lengths, torch.tensor([found.noise]).double()]).log()
+    slope = torch.func.grad(lambda t: log_evidence(points, change, matern, t[:-1].exp(), t[-1].exp()))(logs)
+    assert float(slope.abs().max()) < 0.05  # of the log likelihood; a length that is off by a percent tells 2
+
+
+def test_a_climb_that_leaves_the_range_of_the_numbers_is_not_taken(monkeypatch):
+    """The first step of a line search overflows: lengths and noise stay those of the lists."""
+    honest, calls = lengths.log_evidence, []
+
+    def evidence(points, change, kernel, length, noise):
+        calls.append(kernel)
+        return honest(points, change, kernel, length if len(calls) % 3 else 0.0 * length, noise)
+
+    points = 2 * normal(12, 2)
+    monkeypatch.setattr(lengths, "log_evidence", evidence)
+    found = lengths.most_likely(points, waves(points) - waves(points).mean(0), anisotropic=True)
+    assert float(found.lengths[0]) == float(found.lengths[1])
+    assert float(found.lengths[0]) in LENGTHS
+
+
+def anisotropic(z):
+    """Pictures [K, 2, 6]: fast in the first parameter, slow in the second, the third does nothing."""
+    k = torch.arange(1, 13, dtype=z.dtype) / 12
+    return (torch.sin(8 * k * z[:, :1]) + torch.cos(k * z[:, 1:2] + 1.0)).unflatten(1, (2, 6))
+
+
+def pictures(P, dtype=torch.float64, seed=0):
+    units = torch.tensor([1.0, 100.0, 0.01], dtype=dtype)
+    z = torch.rand(P, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    return z * units, anisotropic(z)
+
+
+def test_a_surrogate_in_any_units():
+    points, outputs = pictures(250)
+    surrogate = ProcessSurrogate()
+    surrogate.fit(points, outputs)
+    short, long, none = (surrogate.lengths / points.std(0)).tolist()
+    assert short < 0.5 * long < 0.5 * none
+    z, truth = pictures(20, seed=1)
+    assert surrogate(z).shape == (20, 2, 6)
+    torch.testing.assert_close(surrogate(z), truth, atol=2e-3, rtol=0)
+    # All points are used, also those that lengths were not chosen from.
+    torch.testing.assert_close(surrogate(points), outputs, atol=1e-3, rtol=0)
+    assert float(surrogate.uncertainty(points).max()) < 1e-3 * float(surrogate.uncertainty(1e3 * points).min())
+
+
+def test_float32_is_computed_in_float64():
+    points, outputs = pictures(100, torch.float32)
+    surrogate, exact = ProcessSurrogate(), ProcessSurrogate()
+    surrogate.fit(points, outputs)
+    exact.fit(points.double(), outputs.double())
+    z, _ = pictures(20, torch.float32, seed=1)
+    assert surrogate(z).dtype == torch.float32
+    torch.testing.assert_close(surrogate(z), exact(z.double()).float(), atol=1e-6, rtol=0)
+    z.requires_grad_()
+    surrogate(z).sum().backward()
+    assert z.grad is not None
+    assert z.grad.dtype == torch.float32
+
+
+def test_the_latest_points_are_kept():
+    points = torch.linspace(0, 4, 9)[:, None]
+    outputs = torch.cat([torch.full((5, 3), 7.0), points[5:].expand(-1, 3)])
+    surrogate = ProcessSurrogate(capacity=4)
+    surrogate.fit(points, outputs)
+    torch.testing.assert_close(surrogate(points[5:]), outputs[5:], rtol=1e-2, atol=1e-2)
+    assert len(surrogate.process.points) == 4
+
+
+def test_a_parameter_that_does_not_vary_and_outputs_that_do_not():
+    points = torch.tensor([[0.0, 3.0], [1.0, 3.0], [2.0, 3.0]])
+    surrogate = ProcessSurrogate()
+    surrogate.fit(points, torch.ones(3, 4))
+    torch.testing.assert_close(surrogate(points + 0.3), torch.ones(3, 4))
+    surrogate.fit(points, points[:, :1])
+    torch.testing.assert_close(surrogate(points), points[:, :1], atol=0.05, rtol=0)
+
+
+def test_many_parameters_share_one_length():
+    points = normal(60, 11) * torch.linspace(1, 3, 11)
+    surrogate = ProcessSurrogate()
+    surrogate.fit(points, waves(points))
+    ratio = surrogate.lengths / points.std(0)
+    torch.testing.assert_close(ratio, ratio[:1].expand(11))
+    surrogate.fit(points[:, :10], waves(points[:, :10]))
+    assert float((surrogate.lengths / points[:, :10].std(0)).std()) > 1e-3
+
+
+def test_points_that_come_twice_can_be_fitted():
+    points = torch.linspace(0, 3, 40, dtype=torch.float64)[:, None].repeat(50, 1)
+    surrogate = ProcessSurrogate()
+    surrogate.fit(points, points)
+    torch.testing.assert_close(surrogate(points[:40]), points[:40], atol=1e-3, rtol=0)
+
+
+def test_noise_is_averaged():
+    points = 3 * torch.rand(400, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    surrogate = ProcessSurrogate()
+    surrogate.fit(points, torch.sin(points) + 0.5 * normal(400, 1, seed=6))
+    z = torch.linspace(0.2, 2.8, 20, dtype=torch.float64)[:, None]
+    assert float((surrogate(z) - torch.sin(z)).square().mean().sqrt()) < 0.1
+    assert math.sqrt(surrogate.process.noise * surrogate.process.variance) == pytest.approx(0.5, rel=0.15)
+
+
+def test_what_cannot_be_fitted_is_refused():
+    surrogate = ProcessSurrogate()
+    with pytest.raises(RuntimeError, match="fit the surrogate"):
+        surrogate(torch.zeros(1, 1))
+    with pytest.raises(ValueError, match=r"points must be \[P, n\] with P >= 2, got \[1, 3\]"):
+        surrogate.fit(torch.zeros(1, 3), torch.zeros(1, 1))
+    with pytest.raises(ValueError, match=r"outputs must be \[4, \*out\], one per point, got \[3, 2\]"):
+        surrogate.fit(torch.zeros(4, 3), torch.zeros(3, 2))
+    with pytest.raises(ValueError, match="capacity must be at least 2, got 1"):
+        ProcessSurrogate(capacity=1)

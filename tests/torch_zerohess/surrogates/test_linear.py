@@ -1,0 +1,89 @@
+"""The linear surrogate against the map that it is fitted to."""
+
+import pytest
+import torch
+
+from torch_zerohess.surrogates.linear import LinearSurrogate
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+SLOPE, OFFSET = normal(6, 10, seed=1), normal(10, seed=2)
+
+
+def images(x):
+    return (x @ SLOPE + OFFSET).unflatten(-1, (2, 5))
+
+
+@pytest.mark.parametrize("P", [7, 8, 50])
+def test_an_affine_map_is_exact(P):
+    points, z = normal(P, 6) + 3.0, normal(5, 6, seed=3)
+    model = LinearSurrogate()
+    model.fit(points, images(points))
+    torch.testing.assert_close(model(z), images(z), atol=1e-6, rtol=0)
+    jacobian = torch.func.jacrev(lambda x: model(x[None])[0].flatten())(z[0])
+    torch.testing.assert_close(jacobian, SLOPE.mT, atol=1e-6, rtol=0)
+
+
+def test_with_fewer_points_than_parameters_the_slope_has_the_least_norm():
+    points, z = normal(4, 6), normal(5, 6, seed=3)
+    outputs = images(points).flatten(1)
+    model = LinearSurrogate()
+    model.fit(points, outputs)
+    middle, mean = points.mean(0), outputs.mean(0)
+    expected = mean + (z - middle) @ torch.linalg.pinv(points - middle) @ (outputs - mean)
+    torch.testing.assert_close(model(z), expected, atol=1e-6, rtol=0)
+
+
+def test_noise_is_averaged_by_least_squares():
+    points = normal(40, 6)
+    outputs = images(points).flatten(1) + 0.1 * normal(40, 10, seed=4)
+    model = LinearSurrogate()
+    model.fit(points, outputs)
+    design = torch.cat([torch.ones(40, 1).double(), points], 1)
+    expected = design @ torch.linalg.lstsq(design, outputs).solution
+    torch.testing.assert_close(model(points), expected, atol=1e-6, rtol=0)
+
+
+def test_inverting_finds_the_points():
+    points, truth = normal(12, 6) + 3.0, normal(4, 6, seed=5) + 3.0
+    model = LinearSurrogate()
+    model.fit(points, images(points))
+    torch.testing.assert_close(model.invert(images(truth)), truth, atol=1e-3, rtol=0)
+
+
+def test_contrasts_of_one_to_a_hundred_are_inverted():
+    """The weakest parameter changes the image a hundredth as much as the strongest."""
+    contrast = torch.logspace(-2, 0, 6, dtype=torch.float64)
+    points, truth = normal(12, 6), normal(4, 6, seed=5)
+    model = LinearSurrogate()
+    model.fit(points, images(points * contrast))
+    torch.testing.assert_close(model.invert(images(truth * contrast)), truth, atol=0.05, rtol=0)
+
+
+def test_a_parameter_that_is_not_seen_stays_at_the_mean():
+    points = normal(12, 6) + 3.0
+    hidden = points.clone()
+    hidden[:, 2] = 0.0
+    model = LinearSurrogate()
+    model.fit(points, images(hidden))
+    found = model.invert(images(hidden[:1]))[0]
+    assert float(found[2]) == pytest.approx(float(points[:, 2].mean()), abs=1e-3)
+    torch.testing.assert_close(found[[0, 1, 3, 4, 5]], points[0, [0, 1, 3, 4, 5]], atol=1e-3, rtol=0)
+
+
+def test_types_capacity_and_outputs_that_do_not_change():
+    points = normal(12, 6).float()
+    model = LinearSurrogate(capacity=8)
+    outputs = images(points.double()).float()
+    outputs[:4] = 1e3
+    model.fit(points, outputs)
+    assert model(points).dtype == torch.float32
+    torch.testing.assert_close(model(points[4:]), outputs[4:], atol=1e-4, rtol=0)
+    model.fit(points[:1].expand(3, 6), torch.ones(3, 2))
+    torch.testing.assert_close(model(points), torch.ones(12, 2))
+    assert bool(torch.isfinite(model.invert(torch.ones(1, 2))).all())
+    with pytest.raises(ValueError, match="capacity must be at least 2, got 1"):
+        LinearSurrogate(capacity=1)

@@ -1,0 +1,98 @@
+"""Questions about torch's transforms that have no public answer: the only file with private names of torch.
+
+All of these names were tried with torch 2.15. If a version of torch drops one, it is replaced here and nowhere else.
+
+| question | private name | why no public name serves |
+|---|---|---|
+| is a functorch transform active | `torch._C._functorch.maybe_current_level` | `torch.func` does not tell |
+| what is inside a functorch wrapper | `torch._C._functorch.get_unwrapped`, `is_functorch_wrapped_tensor` |
+`torch.func.debug_unwrap` skips all levels at once |
+| is a forward-mode level open | `forward_ad._current_level` | `forward_ad.unpack_dual` answers for one tensor only |
+| is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
+| may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
+`torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
+| real tensors in a fake kernel | `torch._subclasses.fake_tensor.unset_fake_temporarily` | none exists |
+| is a tensor a symbolic zero | `Tensor._is_zerotensor` | none exists |
+| which function made this node | `Function._backward_cls` | `Node.name()` is a string that other functions may share |
+"""
+
+from contextlib import AbstractContextManager
+from typing import cast
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.autograd.graph import Node
+
+
+def transform_active() -> bool:
+    """Whether a transform of `torch.func` is active: grad, vjp, jvp, vmap, or one composed of these."""
+    return torch._C._functorch.maybe_current_level() is not None
+
+
+def forward_mode_active() -> bool:
+    """Whether a level of forward-mode differentiation is open, so that a tensor may carry a tangent."""
+    return forward_ad._current_level >= 0
+
+
+def watched(x: Tensor) -> bool:
+    """Whether operations on x are transformed, traced or dispatched to Python, so that values are not to be looked at.
+
+    It asks for `torch.compile`, for transforms of `torch.func`, for dispatch modes (fake tensors, tracers) and for
+    subclasses of Tensor.
+    """
+    return (
+        torch.compiler.is_compiling()
+        or transform_active()
+        or torch._C._len_torch_dispatch_stack() > 0
+        or type(x) not in (Tensor, torch.nn.Parameter)
+    )
+
+
+def derivative_wanted(x: Tensor) -> bool:
+    """Whether a derivative with respect to x is recorded, at any level of nested transforms."""
+    if torch.compiler.is_compiling():
+        return torch.is_grad_enabled() and x.requires_grad
+    while True:
+        if x.requires_grad and torch.is_grad_enabled():
+            return True
+        if forward_mode_active() and forward_ad.unpack_dual(x).tangent is not None:
+            return True
+        if not torch._C._functorch.is_functorch_wrapped_tensor(x):
+            return False
+        x = torch._C._functorch.get_unwrapped(x)
+
+
+def derivative_possible(x: Tensor) -> bool:
+    """Whether anybody may ask for a derivative with respect to x; where in doubt, yes."""
+    if torch.compiler.is_compiling():
+        return forward_mode_active() or derivative_wanted(x)
+    return transform_active() or derivative_wanted(x)
+
+
+def random_numbers_allowed() -> AbstractContextManager[None]:
+    """Allow random numbers under the vmap that `torch.autograd.functional` uses for a forward-mode Jacobian.
+
+    That vmap maps over tangents only, but it forbids random numbers in everything below.
+    """
+    return cast("AbstractContextManager[None]", torch._C._ExcludeDispatchKeyGuard(_VMAP_MODE))
+
+
+_VMAP_MODE = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("VmapMode"))  # type: ignore[arg-type]
+
+
+def real_tensors() -> AbstractContextManager[None]:
+    """Compute with real tensors inside a fake kernel."""
+    from torch._subclasses.fake_tensor import unset_fake_temporarily  # loaded late: slow to import
+
+    return cast("AbstractContextManager[None]", unset_fake_temporarily())
+
+
+def is_symbolic_zero(x: Tensor) -> bool:
+    """Whether x is a zero of forward mode that has a shape, but no memory to read."""
+    return x._is_zerotensor()
+
+
+def made_by(node: Node | None, function: type[torch.autograd.Function]) -> bool:
+    """Whether a node of the graph is the backward of `function`."""
+    return isinstance(node, function._backward_cls)

@@ -1,0 +1,130 @@
+"""Optimal sampling: every element of value, gradient and Hessian has its own samples, with weights of one magnitude."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Stein
+from torch_zerohess.sampling import kernels, proposals
+from torch_zerohess.sampling.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
+from torch_zerohess.smoothing import Smoothing
+
+_MOST_OPTIMAL = 1_000_000
+"""Evaluations beyond which a batch is refused: their number grows with the square of n."""
+
+
+@dataclass(frozen=True)
+class Elementwise(Stein):
+    """Proposal "optimal"."""
+
+    weight: Tensor
+    """[B, K]: the signed constant of a row's own element, times the number of sets, so that sums over K are means."""
+    rows: Tensor
+    """int64 [K, 5]; columns 2 to 4 are the kind of element and its dimensions i <= j."""
+    n: int
+    order: int
+
+    droppable = False
+
+    @classmethod
+    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+        """See `Stein.draw`; ValueError if more than a million evaluations would be needed."""
+        B, n = x.shape
+        evaluations = B * smoothing.evaluations(n, center=False)
+        if evaluations > _MOST_OPTIMAL:
+            raise ValueError(
+                f"proposal 'optimal' would need {evaluations} evaluations for {B} x {n} parameters and samples="
+                f"{smoothing.samples}, at most {_MOST_OPTIMAL} are allowed: use proposal 'aggregate'"
+            )
+        elements = proposals.element_rows(seed, 0, smoothing.samples, n, smoothing.order).to(x.device)
+        rows = elements.repeat(B, 1)
+        rows[:, 1] = torch.arange(len(rows), device=x.device)
+        points, u, _ = kernels.place(
+            kernels.draw(rows, n),
+            x.double().contiguous(),
+            sigma,
+            smoothing.antithetic,
+            x.dtype == torch.float32,
+            proposals.GAUSSIAN,
+        )
+        elements = elements.repeat(1 + smoothing.antithetic, 1)
+        weight = proposals.element_weights(u, elements) * smoothing.groups(n)
+        return points, cls(weight, elements, n, smoothing.order)
+
+    @classmethod
+    def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:
+        return [Layout((B, K)), Layout((K, 5), torch.int64, batched=False)]
+
+    def tensors(self) -> list[Tensor]:
+        """Weights and rows."""
+        return [self.weight, self.rows]
+
+    @classmethod
+    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> Self:
+        weight, rows = tensors
+        return cls(weight, rows, x.shape[1], smoothing.order)
+
+    @property
+    def first_order(self) -> bool:
+        return self.order == 1
+
+    def value(self, a: Tensor) -> Tensor:
+        return (a * self.weight[:, None])[..., self.rows[:, 2] == NORMAL].sum(2)
+
+    def gradient(self, a: Tensor) -> Tensor:
+        chosen = self.rows[:, 2] == GRADIENT_LOBE
+        result = a.new_zeros(*a.shape[:2], self.n)
+        return result.index_add_(2, self.rows[chosen, 3], (a * self.weight[:, None])[..., chosen])
+
+    def hvp(self, a: Tensor, v: Tensor) -> Tensor:
+        return (self.hessian(a) @ v[..., None])[..., 0]
+
+    def hessian_diagonal(self, a: Tensor) -> Tensor:
+        return self.hessian(a).diagonal(dim1=2, dim2=3)
+
+    def hessian(self, a: Tensor) -> Tensor:
+        if self.first_order:
+            raise ValueError(FIRST_ORDER_ERROR)
+        chosen = (self.rows[:, 2] == DIAGONAL_LOBE) | (self.rows[:, 2] == OFF_DIAGONAL_LOBE)
+        i, j = self.rows[chosen, 3], self.rows[chosen, 4]
+        upper = a.new_zeros(*a.shape[:2], self.n * self.n)
+        upper = upper.index_add_(2, i * self.n + j, (a * self.weight[:, None])[..., chosen])
+        upper = upper.unflatten(2, (self.n, self.n))
+        return upper + upper.triu(1).mT
+
+    def ratio(self, d: Tensor, project: Projection) -> Tensor:
+        """Return the quadratic in d [B, n] whose derivatives are the kernels, [B, K]."""
+        kind, i, j = self.rows[:, 2], self.rows[:, 3], self.rows[:, 4]
+        d_i, d_j = (d.gather(1, index.expand(len(d), -1)) for index in (i, j))  # its backward has a vmap rule
+        hessian = torch.where(kind == DIAGONAL_LOBE, 0.5, 1.0) * d_i * d_j
+        factor = torch.where(kind == NORMAL, 1.0, torch.where(kind == GRADIENT_LOBE, d_i, hessian))
+        return self.weight * factor
+
+    def smoothed(self, values: Tensor, baseline: Tensor, a: Tensor) -> Tensor:
+        """Only the rows of the value estimate F(x): the mean of the others differs from it."""
+        return self.value(values.double().mT / values.shape[1])
+
+    def variance(
+        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
+    ) -> Tensor:
+        """Spread of the draws of each element, which are the only ones that estimate it.
+
+        Raises ValueError if an element has one sample.
+        """
+        index = draws[0].to(a.device)
+        S = int((self.rows[index[:, 0], 2] == NORMAL).sum())
+        if S < 2:
+            raise ValueError("a standard error of proposal 'optimal' needs at least 2 samples per element, got 1")
+        y = (a * self.weight[:, None])[:, :, index].sum(3)  # one number per draw
+        plain = Elementwise(torch.ones_like(y[:, 0]), self.rows[index[:, 0]], self.n, self.order)
+
+        def spread(sum_: Tensor, squares: Tensor) -> Tensor:
+            return (squares - sum_**2 / S) * (S / (S - 1))
+
+        if quantity == "hvp" and v is not None:
+            elements = spread(plain.hessian(y), plain.hessian(y * y))
+            return (elements @ (v * v)[..., None])[..., 0]
+        return spread(plain.sums(quantity, y, None), plain.sums(quantity, y * y, None))

@@ -1,0 +1,52 @@
+"""The smoothed function near x, as one batch of evaluations tells it: what estimates and the layer are made of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torch_zerohess.estimation.perturbations import FAMILIES
+from torch_zerohess.estimation.stein import Layout, Stein
+from torch_zerohess.smoothing import Smoothing
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """F(x + sigma d) = base + sum_k (ratio_k(d) - ratio_k(0)) c_k.
+
+    The derivatives at d = 0 are the Stein sums of the coefficients c. `Estimate` computes these sums, and the layer
+    differentiates the formula. Shapes: B batch, K samples, n parameters.
+    """
+
+    base: Tensor
+    """f(x) or the smoothed value, float64 [B, *out]"""
+    coefficients: Tensor
+    """c = (f_k - baseline) / K, float64 [B, K, *out]"""
+    sigma: Tensor
+    """float64 [n]"""
+    stein: Stein
+
+    @property
+    def flat(self) -> Tensor:
+        """The coefficients with one dimension of outputs, [B, K, P]."""
+        B, K = self.coefficients.shape[:2]
+        return self.coefficients.reshape(B, K, -1)
+
+    def tensors(self) -> list[Tensor]:
+        """Return the tensors that represent the expansion, for `rebuild`; `base` and `sigma` are copies.
+
+        Those two may share memory with values or settings, which outputs of an operator of torch must not.
+        """
+        return [self.base.clone(), self.coefficients, self.sigma.clone(), *self.stein.tensors()]
+
+    @classmethod
+    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, smoothing: Smoothing, keep: bool) -> "Expansion":
+        """Return the expansion around x [B, n] that `tensors` were taken from; keep: see `perturb`."""
+        base, coefficients, sigma, *rest = tensors
+        return cls(base, coefficients, sigma, FAMILIES[smoothing.proposal].rebuild(rest, x, sigma, smoothing, keep))
+
+    @staticmethod
+    def layout(smoothing: Smoothing, B: int, K: int, n: int, out: Sequence[int], keep: bool) -> list[Layout]:
+        """Return what `tensors` of a batch will look like, for outputs of shape `out`."""
+        family = FAMILIES[smoothing.proposal].layout(smoothing, B, K, n, keep)
+        return [Layout((B, *out)), Layout((B, K, *out)), Layout((n,), batched=False), *family]

@@ -1,0 +1,29 @@
+"""Checks of what the caller passes: the point x, and auxiliary inputs of the black box."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def checked_input(x: Any) -> Tensor:
+    """Return x, or raise TypeError or ValueError if it is not a real floating tensor [*batch, n] with n > 0."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
+    if x.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
+    if x.dim() == 0 or x.numel() == 0:
+        raise ValueError(f"x must have shape [*batch, n] with n and every batch dimension > 0, got {list(x.shape)}")
+    return x
+
+
+def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
+    """Return auxiliary inputs [*batch, ...] as [B, ...], detached, or raise TypeError or ValueError."""
+    for number, one in enumerate(aux):
+        if not isinstance(one, Tensor):
+            raise TypeError(f"aux[{number}] must be a tensor [*batch, ...], got {type(one).__name__}")
+        if one.shape[: len(batch)] != batch:
+            raise ValueError(
+                f"aux[{number}] must have the batch dimensions {list(batch)} of x first, got {list(one.shape)}"
+            )
+    return [one.detach().reshape(batch.numel(), *one.shape[len(batch) :]) for one in aux]

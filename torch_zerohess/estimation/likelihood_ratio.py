@@ -1,0 +1,116 @@
+"""Weights N/p of samples from a density p: one set of samples serves value, gradient, Hessian and every product."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.estimation.standard_error import variance_of_draws
+from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Stein, total
+from torch_zerohess.sampling import kernels, proposals, samplers
+from torch_zerohess.sampling.kernels import Redrawn, Samples
+from torch_zerohess.smoothing import Smoothing
+
+
+@dataclass(frozen=True)
+class LikelihoodRatio(Stein):
+    """Proposals "aggregate", "gaussian" and "uniform"."""
+
+    u: Samples
+    """[B, K, n], or the recipe to draw it again."""
+    weight: Tensor
+    """N(u) / p(u), [B, K]."""
+
+    @classmethod
+    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+        """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as weights of "uniform" can."""
+        B, n = x.shape
+        density, single, x64 = _density(smoothing), x.dtype == torch.float32, x.double().contiguous()
+        if _kept(smoothing, keep):
+            _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
+            points, u, weight = kernels.place(drawn, x64, sigma, smoothing.antithetic, single, density)
+            made = cls(u, weight)
+        else:  # of the K rows only the points exist at once
+            rows = kernels.pick_rows(seed, 0, B * smoothing.samples, n, density, x.device)
+            recipe = Redrawn(rows, x64, sigma, smoothing.antithetic, single)
+            points, weight = x.new_empty(B, recipe.K, n), x64.new_empty(B, recipe.K)
+            for part, _, part_weight, columns in recipe.chunks(density):
+                points[:, columns], weight[:, columns] = part, part_weight
+            made = cls(recipe, weight)
+        if bool((weight == 0).all(1).any()):
+            raise ValueError(
+                f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"
+            )
+        return points, made
+
+    @classmethod
+    def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:
+        S = K // (1 + smoothing.antithetic)
+        first = Layout((B, K, n)) if _kept(smoothing, keep) else Layout((B, S, 5), torch.int64)
+        return [first, Layout((B, K))]
+
+    def tensors(self) -> list[Tensor]:
+        """Perturbations, or the rows of their recipe [B, S, 5]; weights."""
+        first = self.u if isinstance(self.u, Tensor) else self.u.rows.view(len(self.weight), -1, 5)
+        return [first, self.weight]
+
+    @classmethod
+    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> Self:
+        first, weight = tensors
+        if _kept(smoothing, keep):
+            return cls(first, weight)
+        single = x.dtype == torch.float32
+        return cls(Redrawn(first.flatten(0, 1), x.detach().double(), sigma, smoothing.antithetic, single), weight)
+
+    def value(self, a: Tensor) -> Tensor:
+        return total((a * self.weight[:, None]).mT)[:, 0]
+
+    def gradient(self, a: Tensor) -> Tensor:
+        return kernels.accumulate(self.u, a * self.weight[:, None])
+
+    def hvp(self, a: Tensor, v: Tensor) -> Tensor:
+        a = a * self.weight[:, None]
+        return kernels.accumulate(self.u, a * kernels.project(self.u, v)) - total(a.mT).mT * v
+
+    def hessian_diagonal(self, a: Tensor) -> Tensor:
+        a = a * self.weight[:, None]
+        return kernels.accumulate_squares(self.u, a) - total(a.mT).mT
+
+    def hessian(self, a: Tensor) -> Tensor:
+        a = a * self.weight[:, None]
+        result = kernels.hessian(self.u, a)
+        result.diagonal(dim1=2, dim2=3).sub_(total(a.mT).mT)
+        return result
+
+    def ratio(self, d: Tensor, project: Projection) -> Tensor:
+        """Return w exp(u.d - d.d/2), [B, K]."""
+        exponent = project(self.u, d[:, None])[:, 0] - 0.5 * (d * d).sum(1, keepdim=True)
+        return self.weight * exponent.exp()
+
+    def subset(self, index: Tensor) -> "LikelihoodRatio":
+        """Return the draws index [D, r], of r rows each, as a batch of B * D estimates."""
+        if isinstance(self.u, Redrawn):
+            S = len(self.u.rows) // len(self.u.x)
+            first = index[:, 0]  # the rows of a drawn pair are s and s + S
+            rows = self.u.rows.view(-1, S, 5)[:, first].reshape(-1, 5)
+            u = self.u._replace(rows=rows, x=self.u.x.repeat_interleave(len(index), 0))
+            return LikelihoodRatio(u, self.weight[:, index].flatten(0, 1))
+        return LikelihoodRatio(self.u[:, index].flatten(0, 1), self.weight[:, index].flatten(0, 1))
+
+    def variance(
+        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
+    ) -> Tensor:
+        return variance_of_draws(self, quantity, a, share, draws, v)
+
+
+def _kept(smoothing: Smoothing, keep: bool) -> bool:
+    """Only independent rows can be drawn again one by one."""
+    return keep or smoothing.sampler != "random"
+
+
+def _density(smoothing: Smoothing) -> int:
+    if smoothing.proposal == "aggregate":
+        return proposals.FIRST_ORDER if smoothing.order == 1 else proposals.SECOND_ORDER
+    return {"gaussian": proposals.GAUSSIAN, "uniform": proposals.UNIFORM}[smoothing.proposal]

@@ -1,0 +1,45 @@
+"""Where in a box a model is lowest, and where a process knows least: the best of many random candidates."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.draws import normal, uniform
+from torch_zerohess.surrogates.gaussian_process import GaussianProcess
+
+_SCALES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
+"""Distances of candidates from the best point."""
+_CANDIDATES = 24
+"""At each of these distances; four times as many all over the box."""
+_REFINEMENTS = 6
+"""Further sets of candidates around the best one,"""
+_WIDTH, _NARROWING = 0.3, 0.4
+"""at this distance, which shrinks by this factor where none is better."""
+
+
+def lowest(
+    model: Callable[[Tensor], Tensor], best: Tensor, lower: Tensor, upper: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Return a point [n] of the box where the model, [Q, n] -> [Q], is low: near `best`, or anywhere."""
+    n = len(best)
+    near = [best + scale * normal(generator, lower, _CANDIDATES, n) for scale in _SCALES]
+    candidates = torch.cat([*near, uniform(generator, lower, upper, 4 * _CANDIDATES)]).clamp(lower, upper)
+    scores = model(candidates)
+    k, width = int(scores.argmin()), _WIDTH
+    x, score = candidates[k], float(scores[k])
+    for _ in range(_REFINEMENTS):
+        candidates = (x + width * normal(generator, lower, 2 * _CANDIDATES, n)).clamp(lower, upper)
+        scores = model(candidates)
+        k = int(scores.argmin())
+        if float(scores[k]) < score:
+            x, score = candidates[k], float(scores[k])
+        else:
+            width *= _NARROWING
+    return x
+
+
+def least_known(process: GaussianProcess, lower: Tensor, upper: Tensor, generator: torch.Generator) -> Tensor:
+    """Return a point [n] of the box where the process is uncertain."""
+    spots = uniform(generator, lower, upper, 4 * _CANDIDATES)
+    return spots[int(process.uncertainty(process.covariance(spots)).argmax())]

@@ -1,0 +1,66 @@
+"""Optimistic loss of predicted outputs: where a search by a Gaussian process looks next."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.surrogates.gaussian_process import GaussianProcess
+from torch_zerohess.surrogates.quadratic import loss_derivatives
+
+_ERROR = 0.1
+"""Error of the expansion, relative to the predicted change of the loss, up to which it is true."""
+
+
+class LossModel:
+    """Optimistic loss of the outputs that a process predicts, from a quadratic expansion of the loss L at one output.
+
+    An output [m] that is off by s standard deviations v^1/2 in its worst direction has the loss
+    L - s |grad L| (m v)^1/2 + s^2 tr(L'') v / 2. For a mean square that is (L^1/2 - s v^1/2)^2.
+
+    Args:
+        process: of the output.
+        output: [m], where the loss is expanded.
+        loss: of an output of the given `shape`.
+        shape: [*out].
+        optimism: s.
+    """
+
+    def __init__(
+        self,
+        process: GaussianProcess,
+        output: Tensor,
+        loss: Callable[[Tensor], Tensor],
+        shape: torch.Size,
+        optimism: float,
+    ) -> None:
+        self.process, self.optimism, m = process, optimism, len(output)
+        directions = torch.cat([(process.mean - output)[None], process.weights])
+        self.value, slope, bend = loss_derivatives(loss, output.view(shape), directions.view(-1, *shape))
+        self.slope, self.bend = directions @ slope, directions @ bend.mT
+        self.steepness = float(slope.square().sum()), bend @ slope, bend @ bend.mT
+        self.elements = m
+        size = float(directions.square().sum())
+        self.trace = m * max(float(self.bend.diagonal().sum()), 0.0) / size if size > 0.0 else 0.0
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Optimistic losses [Q] of points [Q, n]."""
+        covariance = self.process.covariance(x)
+        c = torch.cat([covariance.new_ones(len(x), 1), covariance], 1)
+        variance = self.process.uncertainty(covariance)
+        constant, linear, square = self.steepness
+        steepness = (constant + 2.0 * c @ linear + ((c @ square) * c).sum(1)).clamp_min(0.0).sqrt()
+        # No prediction lies below the lowest value of the loss along the way: the parabola is cut at its vertex.
+        reach = self.optimism * variance.sqrt() * math.sqrt(self.elements)
+        if self.trace > 0.0:
+            reach = torch.minimum(reach, steepness * self.elements / self.trace)
+        return self._loss(c) - reach * steepness + 0.5 * self.trace / self.elements * reach.square()
+
+    def is_true(self, x: Tensor, loss: float) -> bool:
+        """Whether the expansion predicts `loss`, the loss of the predicted output at x [n]."""
+        c = torch.cat([x.new_ones(1, 1), self.process.covariance(x[None])], 1)
+        return abs(float(self._loss(c)[0]) - loss) <= _ERROR * abs(loss - self.value) + 1e-12 * abs(loss)
+
+    def _loss(self, c: Tensor) -> Tensor:
+        return self.value + c @ self.slope + 0.5 * ((c @ self.bend) * c).sum(1)

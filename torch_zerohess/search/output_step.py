@@ -1,0 +1,78 @@
+"""What an evaluated step tells a descent that has a model of the output: follow its minimum, and sample where it erred.
+
+The search moves with the minimum of loss(E f), the loss of the smoothed output, also where the loss itself rises for a
+while, and sigma goes to zero. The worse the output of a step was predicted, the more samples the next step gets.
+"""
+
+import math
+from dataclasses import replace
+
+from torch import Tensor
+
+from torch_zerohess.search.descent_progress import WIDEST, DescentProgress
+
+_FAITHFUL = 0.25
+"""Misfit of a predicted output up to which the model needs no new evaluations."""
+_TOLERABLE = 5.0
+"""Misfit up to which a step that lowers the loss is itself what the model needs to know."""
+_GAIN = 0.02
+"""Part of the loss by which such a step lowers it."""
+_MISLED = 2.0
+"""Misfit beyond which the next step needs more samples than the last one."""
+_RETRIES = 2
+"""Shorter steps tried in a row before samples are drawn."""
+_SHORTER, _RETRY = 0.4, 0.9
+"""Length of such a step in units of the one before, and its factor for sigma."""
+_STALLED = 8
+"""Steps in which the smoothed loss must have fallen"""
+_FALL, _HURRY = 0.95, 0.8
+"""to this part of what it was, or sigma shrinks by another factor."""
+_FLAT = 0.03
+"""Relative change of the loss below which a step has stayed on a plateau."""
+_PLATEAU, _PATIENCE = 1.3, 4
+"""On a plateau sigma grows by this factor, this often,"""
+_BETTER = 0.9
+"""unless the best point of the round has less than this part of the loss: then the search returns to it."""
+
+
+def after_output(known: DescentProgress, point: Tensor, loss: float, output: Tensor) -> DescentProgress:
+    """Return what is known after the output [m] and its loss at the end [n] of a step, and what to do next."""
+    model, length, before = known.model, known.length, known.value
+    assert model is not None
+    misfit, gain = model.misfit(known.step, output), before - loss
+    if known.faithful and gain <= 0.0 and known.retries < _RETRIES:
+        # The model was good so far: a shorter step, from a model that knows this point, is cheaper than samples.
+        retries, sigma = known.retries + 1, _RETRY * known.sigma
+        return replace(known, retries=retries, reach=_SHORTER * length, sigma=sigma).trying()
+    known = replace(known, center=point, value=loss, retries=0, reach=1.0)
+    if misfit < _TOLERABLE and gain > _GAIN * abs(before):
+        sigma = known.sigma * _narrowing(length) if misfit > _FAITHFUL else known.sigma
+        known = replace(known, faithful=True, misled=0, sigma=sigma)
+        unknown = known.n - model.rank
+        return known.sampling(unknown, paired=False) if misfit < _FAITHFUL and unknown else known.trying()
+    misled = 0 if misfit < _FAITHFUL else known.misled + (misfit > _MISLED)
+    known = replace(known, faithful=misfit < _FAITHFUL and gain > 0.0, misled=misled)
+    known = _followed(known, model.value)
+    narrow = _narrowing(length)
+    if min(known.recent) > _FALL * known.earlier:
+        narrow *= _HURRY
+    if abs(gain) < _FLAT * abs(before) and misfit > _FAITHFUL and known.patience < _PATIENCE:
+        known = replace(known, patience=known.patience + 1)
+        if known.lowest.loss < _BETTER * before:
+            known = replace(known, center=known.lowest.point, value=known.lowest.loss)
+        else:
+            narrow = max(narrow, min(_PLATEAU, WIDEST / known.sigma))
+    known = replace(known, sigma=narrow * known.sigma)
+    some, most = 2 * math.ceil(known.n / 8), 2 * math.ceil(known.n / 2)
+    return known.sampling(min(2**known.misled, most) if misfit > _MISLED else some)
+
+
+def _followed(known: DescentProgress, smoothed: float) -> DescentProgress:
+    """Note a smoothed loss."""
+    every, late = (*known.recent, smoothed), -_STALLED
+    return replace(known, recent=every[late:], earlier=min([known.earlier, *every[:late]]))
+
+
+def _narrowing(length: float) -> float:
+    """Factor for sigma after a step of a length in units of the radius: short steps have found the minimum."""
+    return min(max(0.85 + 0.3 * length, 0.8), 1.05)

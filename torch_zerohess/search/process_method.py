@@ -1,0 +1,243 @@
+"""Steps by a Gaussian process in a finite box: what `GaussianProcessSearch` does for an output and for a loss alone.
+
+The process predicts the output anywhere in the box from all evaluations. The next point is the one with the lowest loss
+among the outputs that lie within `_OPTIMISM` standard deviations of the prediction (Bayesian optimization of a
+composite function: Astudillo and Frazier 2019). Where that point is known already, the search evaluates the point that
+is known least, so it leaves local minima and plateaus.
+
+If the black box is noisy, the best point is the one whose *predicted* output has the lowest loss. Noise in outputs is
+detected by the evidence; noise in a plain loss is declared with `noise`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.candidates import least_known, lowest
+from torch_zerohess.search.draws import normal, reflect
+from torch_zerohess.search.loss_model import LossModel
+from torch_zerohess.search.process_progress import ProcessProgress
+from torch_zerohess.search.protocol import Method, Settings
+from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
+from torch_zerohess.surrogates.pool import Pool
+from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
+
+APART = 0.05
+"""Distance from a minimum that is known to the last digit within which the process has nothing to add."""
+_OPTIMISM = 0.3
+"""Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
+_EXPLORING = 2.0
+"""The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
+_SAME = 1e-4
+"""Distance below which a point is known already."""
+_SETTLED = 3
+"""Steps in a row that stay within the tolerance of the best point: the search has arrived."""
+_REFUSED = 10
+"""Batches in a row with values that are not finite, after which the search ends."""
+_TELLING = 10
+"""Evaluations over n + 1 from which high noise is told from fast variation."""
+_PROPORTION = 1e3
+"""Losses are cut above the lowest one plus this times the distance of the median from it."""
+_EXPANSIONS = 3
+"""Expansions of the loss around predicted minima, until one predicts the loss there. If none does, the process is one
+of the loss itself from then on."""
+_POOL = 60
+"""Evaluations kept."""
+_NEAR, _WIDENING, _WIDEST = 1e-3, 1.5, 10.0
+"""Weight from which an evaluation counts as near the best point; sigma is widened by the factor up to the last one."""
+
+Q = TypeVar("Q", bound=ProcessProgress)
+
+
+class ProcessMethod(Method[Q]):
+    """A process of the output if there is a loss, otherwise of the loss. Bounds are finite."""
+
+    engine = "gaussian_process"
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        n = settings.n
+        self.capacity = max(settings.pool or _POOL, 2 * n + 2)  # at least the start, its samples and steps
+
+    def take(self, known: Q, evaluated: Evaluated) -> Q:
+        """Return what is known after an evaluation."""
+        finite, trial = evaluated.finite, known.phase == "trial"
+        known = replace(
+            known,
+            shape=evaluated.shape,
+            evaluations=known.evaluations + len(evaluated),
+            iterations=known.iterations + trial,
+            refused=0 if bool(finite.all()) else known.refused + 1,
+        )
+        if known.refused >= _REFUSED:
+            return replace(known, done=True, message=f"{_REFUSED} batches in a row had values that are not finite")
+        known = self.avoiding(self.remembered(known, evaluated.those(finite)), evaluated.points[~finite])
+        known = self._settled(known) if trial else known
+        return replace(known, center=evaluated.points[-1], phase="trial")
+
+    def points(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
+        """Draw the next points [K, n]. What the process says about noise is known afterwards, too."""
+        best, settings = known.best.point, self.settings
+        if known.done:
+            return known, best[None][:0]
+        if known.phase == "start":
+            return known, torch.cat([best[None], self._around(best, generator)])
+        if len(known.pool) < 2:
+            return known, self._around(best, generator)
+        known, process, x = (self._through_output if known.expands else self._from_losses)(known, generator)
+        best = known.best.point
+        # A process of the loss has less to go by: after an arrival it looks where it knows least.
+        explores = known.exploring > 0 and not known.expands
+        moved = math.inf if explores else float((x - best).norm()) / math.sqrt(settings.n)
+        same = torch.equal(x, best) or float((process.points - x).norm(dim=1).min()) < _SAME
+        if explores or same:
+            x = least_known(process, settings.lower, settings.upper, generator)
+        return replace(known, moved=moved), x[None]
+
+    def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
+        pool, best, sigma = known.pool, known.best.point, known.best.sigma
+        while len(pool) and sigma < _WIDEST:
+            weights = torch.exp(-0.5 * ((pool.points - best) / sigma).square().sum(1))
+            near = weights > _NEAR
+            if int(near.sum()) > min(self.settings.n, self.capacity - 2):
+                u = (pool.points[near] - best) / sigma
+                if self.settings.loss is None or pool.outputs is None:
+                    return fit_values(u, pool.values[near], weights[near]), sigma
+                return fit_outputs(u, pool.outputs[near], weights[near], self.settings.loss, known.shape), sigma
+            sigma *= _WIDENING
+        return None
+
+    def begun(self) -> dict[str, Any]:
+        """Return the fields of a progress before anything was evaluated."""
+        start = self.settings.start
+        return {
+            "best": Best(start),
+            "record": Best(start),
+            "center": start,
+            "pool": Pool.empty(len(start), start.device),
+            "expands": self.settings.loss is not None,
+            "holes": start[None][:0],
+            "solved": torch.full_like(start, math.inf),
+        }
+
+    # What was evaluated.
+
+    def remembered(self, known: Q, new: Evaluated) -> Q:
+        """Add evaluations with finite values to the pool."""
+        if not len(new):
+            return known
+        best = known.best.point
+        pool = known.pool.thin(best) if len(known.pool) >= self.capacity and not known.noisy else known.pool
+        known = replace(known, pool=pool.add(new.points, new.losses, new.outputs, best, 1.0).latest(self.capacity))
+        k = int(new.losses.argmin())
+        if float(new.losses[k]) >= known.record.loss:
+            return known
+        record = Best(new.points[k], float(new.losses[k]), max(known.sigma, self.settings.tolerance))
+        return replace(known, record=record, best=known.best if known.noisy else record)
+
+    def avoiding(self, known: Q, holes: Tensor) -> Q:
+        """Note points [K, n] whose values are not finite."""
+        return replace(known, holes=torch.cat([known.holes, holes])[-self.capacity :])
+
+    def arrived(self, known: Q, reason: str) -> Q:
+        """End, or explore."""
+        known = replace(known, settled=0, exploring=2 * self.settings.n, rounds=known.rounds + 1)
+        if known.rounds > self.settings.restarts:
+            return replace(known, done=True, message=f"{reason}, {known.rounds} times")
+        return known
+
+    def _settled(self, known: Q) -> Q:
+        """Arrive where step after step stays at the best point."""
+        tolerance = self.settings.tolerance
+        known = replace(
+            known,
+            sigma=min(max(known.moved, 1e-2 * tolerance), 1.0),
+            exploring=max(known.exploring - 1, 0),
+            settled=known.settled + 1 if known.moved < tolerance else 0,
+        )
+        if known.settled < _SETTLED:
+            return known
+        return self.arrived(known, f"{_SETTLED} steps in a row were below {tolerance} of sigma")
+
+    # Where to look next.
+
+    def _around(self, x: Tensor, generator: torch.Generator) -> Tensor:
+        """Draw n orthogonal steps of length sqrt(n), mirrored into the box."""
+        n = len(x)
+        directions, _ = torch.linalg.qr(normal(generator, x, n, n))
+        return reflect(x + math.sqrt(n) * directions.mT, self.settings.lower, self.settings.upper)
+
+    @torch.no_grad()
+    def _through_output(self, known: Q, generator: torch.Generator) -> tuple[Q, GaussianProcess, Tensor]:
+        """Predict the output, expand the loss, and return the point [n] that is lowest."""
+        loss, pool, shape = self.settings.loss, known.pool, known.shape
+        assert loss is not None
+        assert pool.outputs is not None
+        known, process = self._fitted(known, pool.outputs)
+        optimism = _EXPLORING if known.exploring else _OPTIMISM
+        outputs, values = pool.outputs, pool.values
+        if known.noisy:
+            outputs = process.predict(pool.points)
+            values = torch.stack([loss(one.view(shape)).double().reshape(()) for one in outputs])
+            values = values.nan_to_num(nan=math.inf, neginf=math.inf)
+            known = self._judged(known, values)
+        output = outputs[int(values.argmin())]
+        for _ in range(_EXPANSIONS):
+            model = LossModel(process, output, loss, shape, optimism)
+            x = self._lowest(known, model, generator)
+            output = process.predict(x[None])[0]
+            if model.is_true(x, float(loss(output.view(shape)))):
+                return known, process, x
+        return self._from_losses(replace(known, expands=False), generator)
+
+    def _from_losses(self, known: Q, generator: torch.Generator) -> tuple[Q, GaussianProcess, Tensor]:
+        """Predict the loss, and return the point [n] that is lowest."""
+        values = known.pool.values
+        least, middle = float(values.min()), float(values.median())
+        if middle > least:  # what is out of all proportion, such as a penalty, says no more than that it is high
+            values = values.clamp(max=least + _PROPORTION * (middle - least))
+        spread = float(values.max()) - least or 1.0
+        values = (values - least) / spread  # their squares do not overflow
+        known, process = self._fitted(known, values[:, None])
+        if known.noisy:
+            values = process.predict(known.pool.points)[:, 0]
+            known = self._judged(known, values * spread + least)
+        model = LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
+        return known, process, self._lowest(known, model, generator)
+
+    def _fitted(self, known: Q, outputs: Tensor) -> tuple[Q, GaussianProcess]:
+        """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again.
+
+        Where an output was not finite it is taken to be as the one with the highest loss. A loss alone says too little
+        to tell noise from ripples: it is noisy if `noise` says so.
+        """
+        pool, n = known.pool, self.settings.n
+        worst = outputs[int(pool.values.argmax())]
+        points = torch.cat([pool.points, known.holes])
+        outputs = torch.cat([outputs, worst.expand(len(known.holes), -1)])
+        declared = self.settings.noise > 0.0
+        detects = self.settings.loss is not None and len(pool) >= min(_TELLING * (n + 1), self.capacity)
+        process = GaussianProcess.fit(points, outputs, NOISES + HIGH_NOISES if declared or detects else NOISES)
+        noisy = declared or process.noise >= HIGH_NOISES[0]
+        best = known.record if known.noisy and not noisy else known.best
+        return replace(known, noisy=noisy, best=best), process
+
+    def _judged(self, known: Q, values: Tensor) -> Q:
+        """Make the point of the pool with the lowest of values [P] the best one."""
+        k = int(values.argmin())
+        if not math.isfinite(values[k]):
+            return known
+        sigma = max(known.sigma, self.settings.tolerance)
+        return replace(known, best=Best(known.pool.points[k], float(values[k]), sigma))
+
+    def _lowest(self, known: Q, model: Callable[[Tensor], Tensor], generator: torch.Generator) -> Tensor:
+        """Return the point [n] where the model is lowest; near a minimum that is solved, the minimum itself."""
+        best = known.best.point
+        x = lowest(model, best, self.settings.lower, self.settings.upper, generator)
+        solved = torch.equal(known.solved, best) and float((x - best).norm()) < APART
+        return best if solved else x

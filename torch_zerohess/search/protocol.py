@@ -1,0 +1,278 @@
+"""Ask and tell, the same for every search: what is checked, what is told, what is saved.
+
+A search is a `Method`: settings that never change, and a pure step from what it knows (`Progress`) and what was
+evaluated (`Evaluated`) to what it knows next and the points to evaluate next. `AskTell` puts the public classes around
+it. `tell` computes the whole next `State` and assigns it at the end, so a search is as it was if anything raises; `ask`
+only reads the state.
+
+To add a search: a subclass of `Progress` with its fields, a subclass of `Method` with its step, and a subclass of
+`AskTell` that makes the method.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.space import Bounds, Space, check_start
+from torch_zerohess.search.state import Evaluated, P, State, plain, restored
+from torch_zerohess.surrogates.quadratic import LocalModel
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """What a search is given, in units of its first sigma. See `AskTell` for the meaning."""
+
+    start: Tensor
+    """[n], float64."""
+    lower: Tensor
+    """[n], float64."""
+    upper: Tensor
+    loss: Callable[[Tensor], Tensor] | None
+    restarts: int
+    tolerance: float
+    noise: float
+    pool: int | None
+
+    @property
+    def n(self) -> int:
+        """Number of parameters."""
+        return len(self.start)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether every bound is finite."""
+        return bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())
+
+
+class Method(ABC, Generic[P]):
+    """A search as settings and a pure step.
+
+    Nothing in it changes, and nothing in a `Progress` that it was given. All randomness is drawn from the generator.
+    Both `first` and `next` return points [K, n] within the bounds, at least one unless the search is done.
+    """
+
+    engine: ClassVar[str]
+    """Name for a reader."""
+    progress: type[P]
+    """Class of what it knows."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+
+    @abstractmethod
+    def first(self, generator: torch.Generator) -> tuple[P, Tensor]:
+        """Return what is known at the beginning, and the first points [K, n], the start before all others."""
+
+    @abstractmethod
+    def next(self, known: P, evaluated: Evaluated, generator: torch.Generator) -> tuple[P, Tensor]:
+        """Return what is known after an evaluation, and the next points [K, n]."""
+
+    @abstractmethod
+    def model_at_best(self, known: P) -> tuple[LocalModel, float] | None:
+        """Return a quadratic model around the best point and its sigma, or None if too little is known there."""
+
+
+class AskTell(ABC, Generic[P]):
+    """A search whose evaluations the caller owns: `ask` for points, evaluate them, `tell` their values.
+
+    Args:
+        x0: start [n], float32 or float64, within the bounds.
+        sigma: smoothing at the start, in units of the parameters: of the order of the distance to the solution.
+            One value, or one per parameter [n] where they have different units.
+        bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
+        loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch: `.double()`
+            networks in it. None if the black box returns the loss.
+        restarts: how often to go on after the search has arrived at a minimum. 0 for a local search.
+        tolerance: length, in units of the first sigma, below which the search has arrived.
+        noise: standard deviation of repeated losses at one point, if it is known.
+        pool: evaluations kept; a default by the number of parameters if None.
+        seed: of the samples; from torch's global generator if None.
+
+    Raises ValueError for settings out of range.
+    """
+
+    def __init__(
+        self,
+        x0: Tensor,
+        *,
+        sigma: float | Tensor,
+        bounds: Bounds | None = None,
+        loss: Callable[[Tensor], Tensor] | None = None,
+        restarts: int = 10,
+        tolerance: float = 1e-2,
+        noise: float = 0.0,
+        pool: int | None = None,
+        seed: int | None = None,
+    ) -> None:
+        check_start(x0)
+        for name, value in (("restarts", restarts), ("noise", noise)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be finite and at least 0, got {value}")
+        if not 0.0 < tolerance < 1.0:
+            raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
+        if pool is not None and pool < 4:
+            raise ValueError(f"pool must be at least 4, got {pool}")
+        self._space = space = Space.checked(x0, sigma, bounds)
+        start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
+        self._method = self._make(Settings(start, lower, upper, loss, restarts, tolerance, float(noise), pool))
+        generator = torch.Generator()
+        generator.manual_seed(int(torch.randint(2**63 - 1, ())) if seed is None else seed)
+        self._state = self._after(*self._method.first(generator), generator)
+        self._given = 0
+        """How many of the points asked for are out for evaluation: bookkeeping between the two calls, not state."""
+
+    @abstractmethod
+    def _make(self, settings: Settings) -> Method[P]:
+        """Return the method that searches with these settings. ValueError if it cannot."""
+
+    @property
+    def engine(self) -> str:
+        """Which search it is: "gaussian_process", "descent", ..."""
+        return self._method.engine
+
+    @property
+    def x(self) -> Tensor:
+        """The best point so far [n]."""
+        return self._space.parameters(self._state.progress.best.point)
+
+    @property
+    def value(self) -> float:
+        """The loss there; infinite before the first `tell`."""
+        return self._state.progress.best.loss
+
+    @property
+    def center(self) -> Tensor:
+        """Where the search is now [n], not always its best point."""
+        return self._space.parameters(self._state.progress.center)
+
+    @property
+    def sigma(self) -> float:
+        """Current smoothing, in units of the first one."""
+        return self._state.progress.sigma
+
+    @property
+    def unit(self) -> Tensor:
+        """The first sigma per parameter [n]: what `sigma` and `LocalModel` are in units of."""
+        return self._space.unit
+
+    @property
+    def evaluations(self) -> int:
+        """Values told so far."""
+        return self._state.progress.evaluations
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried so far."""
+        return self._state.progress.iterations
+
+    @property
+    def rounds(self) -> int:
+        """Times the search has arrived."""
+        return self._state.progress.rounds
+
+    @property
+    def done(self) -> bool:
+        """Whether there is nothing more to ask."""
+        return self._state.progress.done
+
+    @property
+    def message(self) -> str:
+        """Why the search is done."""
+        return self._state.progress.message
+
+    def model_at_best(self) -> tuple[LocalModel, float] | None:
+        """A quadratic model around `x` and its sigma: that at which x was found, or wider if few evaluations are near.
+
+        None before the first `tell`, or if no evaluations near x are kept.
+        """
+        return self._method.model_at_best(self._state.progress)
+
+    def ask(self, limit: int | None = None) -> Tensor:
+        """Return the next points to evaluate [K, n], at most `limit` of them; the same ones until they are told.
+
+        ValueError for a limit below 1, RuntimeError if the search is done.
+        """
+        if limit is not None and limit < 1:
+            raise ValueError(f"limit must be at least 1, got {limit}")
+        if self.done:
+            raise RuntimeError(f"the search is done: {self.message}")
+        points = self._state.asked[:limit]
+        self._given = len(points)
+        return self._space.parameters(points)
+
+    def tell(self, values: Any) -> None:
+        """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
+
+        Points whose values are not finite are avoided. Raises ValueError for a wrong shape, or if the start itself has
+        no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
+        raises. The search is then as before, and the same values can be told again.
+        """
+        if not self._given:
+            raise RuntimeError("ask for points before telling their values")
+        evaluated = self._evaluated(values, self._state.asked[: self._given])
+        if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
+            raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
+        generator = torch.Generator()
+        generator.set_state(self._state.random)
+        self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
+        self._given = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a search with the same settings needs to go on exactly as this one would.
+
+        Tensors, numbers, strings, lists and dicts: `torch.save`, and `torch.load` with weights_only=True.
+        """
+        return {"search": self._kind, "unit": self.unit, **plain(self._state)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a `state_dict`; the settings and the loss stay those given here.
+
+        ValueError if these do not go with it: another search, other parameters or another sigma.
+        """
+        unit, device = state["unit"].to(self.unit), self.unit.device
+        if len(unit) != self._method.settings.n:
+            raise ValueError(f"state must be of a search with {len(self.unit)} parameters, got one with {len(unit)}")
+        if not bool((unit == self.unit).all()):
+            raise ValueError(f"state must be of a search with sigma = {self.unit.tolist()}, got {unit.tolist()}")
+        if state["search"] != self._kind:
+            raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
+        progress = restored(self._method.progress, state["progress"], device)
+        self._state = State(progress, state["asked"].to(device), state["random"].cpu())
+        self._given = len(self._state.asked)  # they may have been evaluated before the search was saved
+
+    @property
+    def _kind(self) -> str:
+        return f"{self.engine} of {'the loss' if self._method.settings.loss is None else 'the output'}"
+
+    def _after(self, progress: P, asked: Tensor, generator: torch.Generator) -> State[P]:
+        return State(progress, self._space.rounded(asked), generator.get_state())
+
+    def _evaluated(self, values: Any, points: Tensor) -> Evaluated:
+        """Return what was told as losses and outputs."""
+        loss, shape = self._method.settings.loss, self._state.progress.shape
+        values = torch.as_tensor(values).detach().to(self.unit.device)
+        if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
+            wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
+            raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
+        values = values.double()
+        if loss is None:
+            return Evaluated(points, values)
+        if shape and values.shape[1:] != shape:
+            raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
+        with torch.no_grad():
+            losses = [loss(one) for one in values]
+        if not all(isinstance(one, Tensor) for one in losses):
+            raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")
+        if any(one.numel() != 1 for one in losses):
+            raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
+        return Evaluated(
+            points,
+            torch.stack([one.double().reshape(()) for one in losses]),
+            values.reshape(len(values), -1),
+            values.shape[1:],
+        )

@@ -1,0 +1,108 @@
+"""What a search knows, as frozen dataclasses, and the plain dictionaries that `state_dict` makes of them."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar, get_args, get_type_hints
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+_SCALAR = torch.Size()
+
+
+@dataclass(frozen=True, eq=False)
+class Best:
+    """The best point [n], its loss, and the sigma at which it was found."""
+
+    point: Tensor
+    loss: float = math.inf
+    sigma: float = 1.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Progress:
+    """What a search knows after the values that it was told. A search adds its own fields in a subclass.
+
+    Points are coordinates [n], float64, in units of the first sigma (`Space`).
+    """
+
+    best: Best
+    center: Tensor
+    """Where the search is now [n]."""
+    sigma: float = 1.0
+    evaluations: int = 0
+    iterations: int = 0
+    """Steps tried."""
+    rounds: int = 0
+    """Times the search has arrived."""
+    done: bool = False
+    message: str = ""
+    """Why the search is done."""
+    shape: torch.Size = _SCALAR
+    """Of an output, [*out]; empty before the first one and where the black box returns the loss."""
+
+
+P = TypeVar("P", bound=Progress)
+
+
+@dataclass(frozen=True, eq=False)
+class State(Generic[P]):
+    """Everything that changes while a search goes on. `tell` replaces it as a whole."""
+
+    progress: P
+    asked: Tensor
+    """Points [K, n] that are to be evaluated; none when the search is done."""
+    random: Tensor
+    """State of the random generator, after `asked` was drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """Points [K, n] that the search asked for, and what the caller told about them."""
+
+    points: Tensor
+    losses: Tensor
+    """[K]"""
+    outputs: Tensor | None = None
+    """[K, m], outputs [K, *out] in a row; None where the black box returns the loss."""
+    shape: torch.Size = _SCALAR
+    """Of an output, [*out]."""
+
+    def __len__(self) -> int:
+        return len(self.losses)
+
+    @property
+    def finite(self) -> Tensor:
+        """Which of the points have finite values [K]."""
+        finite = torch.isfinite(self.losses)
+        return finite if self.outputs is None else finite & torch.isfinite(self.outputs).all(1)
+
+    def those(self, which: Tensor) -> "Evaluated":
+        """The ones that `which` [K] selects."""
+        outputs = None if self.outputs is None else self.outputs[which]
+        return Evaluated(self.points[which], self.losses[which], outputs, self.shape)
+
+
+def plain(value: Any) -> Any:
+    """Return a dataclass as a dictionary of tensors, numbers, strings, lists and such dictionaries."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return [plain(one) for one in value] if isinstance(value, tuple) else value
+
+
+def restored(kind: type[T], data: dict[str, Any], device: torch.device) -> T:
+    """Return the dataclass of which `plain` made `data`, with its tensors on the device."""
+    hints = get_type_hints(kind)
+    names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    return kind(**{name: _restored(hints[name], data[name], device) for name in names})
+
+
+def _restored(hint: Any, value: Any, device: torch.device) -> Any:
+    if isinstance(value, dict):
+        (kind,) = (one for one in (hint, *get_args(hint)) if dataclasses.is_dataclass(one))
+        return restored(kind, value, device)  # type: ignore[arg-type]
+    if isinstance(value, list):
+        return torch.Size(value) if hint is torch.Size else tuple(value)
+    return value.to(device) if isinstance(value, Tensor) else value

@@ -1,0 +1,67 @@
+"""Linear surrogate: an affine map, for hundreds or thousands of parameters."""
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.surrogates.surrogate import checked
+
+_RIDGE = 1e-9
+"""Added to the squares of the points, in units of their mean: enough to be solvable."""
+_INVERSE_RIDGE = 1e-6
+"""The same of the slopes, when outputs are inverted."""
+
+
+class LinearSurrogate:
+    """Affine map from parameters [n] to outputs [*out], a `Surrogate`.
+
+    The slope is the least-squares slope of least norm: with fewer points than parameters the map is constant in the
+    directions that the points do not span.
+
+    Args:
+        capacity: points that are used, the latest ones.
+
+    Example:
+        >>> surrogate = LinearSurrogate()
+        >>> surrogate.fit(torch.eye(3), torch.tensor([[1.0], [2.0], [4.0]]))
+        >>> [round(one, 4) for one in surrogate(torch.tensor([[1.0, 0.0, 0.0], [1.0, 1.0, -1.0]])).flatten().tolist()]
+        [1.0, -1.0]
+    """
+
+    def __init__(self, *, capacity: int = 4000) -> None:
+        if capacity < 2:
+            raise ValueError(f"capacity must be at least 2, got {capacity}")
+        self.capacity = capacity
+        self._middle = self._mean = self._slope = torch.empty(0)
+        self._shape = torch.Size()
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
+        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        self._shape = outputs.shape[1:]
+        z, y = points.double(), outputs.flatten(1).double()
+        self._middle, self._mean = z.mean(0), y.mean(0)
+        z, y = z - self._middle, y - self._mean
+        if len(z) > z.shape[1]:
+            self._slope = _solve(z.mT @ z, z.mT @ y, _RIDGE)
+        else:
+            self._slope = z.mT @ _solve(z @ z.mT, y, _RIDGE)
+
+    def __call__(self, z: Tensor) -> Tensor:
+        """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
+        predicted = self._mean + (z.double() - self._middle) @ self._slope
+        return predicted.unflatten(1, self._shape).to(z.dtype)
+
+    def invert(self, outputs: Tensor) -> Tensor:
+        """Points [N, n] whose expected outputs are closest to outputs [N, *out] in the sense of least squares.
+
+        Where outputs do not determine a point it is close to the mean of the fitted points.
+        """
+        change = outputs.flatten(1).double() - self._mean
+        step = _solve(self._slope @ self._slope.mT, self._slope @ change.mT, _INVERSE_RIDGE).mT
+        return (self._middle + step).to(outputs.dtype)
+
+
+def _solve(square: Tensor, right: Tensor, ridge: float) -> Tensor:
+    """Solve (square + ridge) x = right for a positive matrix, the ridge in units of its mean diagonal."""
+    square.diagonal().add_(ridge * float(square.diagonal().mean()) or 1.0)
+    return torch.cholesky_solve(right, torch.linalg.cholesky(square))

@@ -1,0 +1,96 @@
+"""Outputs of many elements as few coordinates, in the span of some of the outputs, and a surrogate of the coordinates.
+
+Renders of one scene differ in few ways. Their differences to the mean image lie close to a space of far fewer
+dimensions than the image has pixels, and the span of a random part of them is close to that space (Halko, Martinsson
+and Tropp 2011, section 4). A surrogate fitted to the coordinates costs as much as one for outputs of `rank` elements.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.surrogates.surrogate import Surrogate, checked
+
+_FLAT = 1e-7
+"""Variance along a direction, relative to the largest one, below which the direction is left out."""
+
+
+@dataclass(frozen=True)
+class LowRank:
+    """Coordinates in which squared distances are mean squared differences of the outputs' elements."""
+
+    mean: Tensor
+    """Mean output [m]."""
+    basis: Tensor
+    """[m, r], with orthogonal columns of squared length 1/m."""
+    shape: torch.Size
+    """Of one output."""
+
+    @classmethod
+    def of(cls, outputs: Tensor, rank: int) -> "LowRank":
+        """Return the coordinates in the span of at most `rank` of the outputs [P, *out], drawn at random.
+
+        The draw depends on P alone, so that the same outputs give the same coordinates.
+        """
+        flat = outputs.flatten(1)
+        mean = flat.mean(0)
+        chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(0))[:rank]
+        span = flat[chosen.to(flat.device)] - mean
+        values, vectors = torch.linalg.eigh((span @ span.mT).double())
+        kept = values > max(_FLAT * float(values[-1]), math.ulp(0.0))
+        directions = (vectors[:, kept] / values[kept].sqrt()).to(flat.dtype)
+        return cls(mean, span.mT @ directions / math.sqrt(flat.shape[1]), outputs.shape[1:])
+
+    def encode(self, outputs: Tensor) -> Tensor:
+        """Coordinates [K, r] of outputs [K, *out]; what is outside of the span is left out."""
+        return (outputs.flatten(1) - self.mean) @ self.basis
+
+    def decode(self, coordinates: Tensor) -> Tensor:
+        """Outputs [K, *out] of coordinates [K, r]."""
+        flat = self.mean + len(self.mean) * coordinates.to(self.basis.dtype) @ self.basis.mT
+        return flat.unflatten(1, self.shape)
+
+
+class LowRankSurrogate:
+    """A surrogate of outputs through their coordinates, for outputs of many elements; a `Surrogate` itself.
+
+    Args:
+        model: surrogate of the coordinates [r].
+        rank: r at most.
+        capacity: points that are used, the latest ones.
+    """
+
+    def __init__(self, model: Surrogate, *, rank: int = 128, capacity: int = 4000) -> None:
+        if rank < 1:
+            raise ValueError(f"rank must be at least 1, got {rank}")
+        self.model, self.rank, self.capacity = model, rank, capacity
+        self._space: LowRank | None = None
+
+    @property
+    def space(self) -> LowRank:
+        """The coordinates of the latest fit."""
+        if self._space is None:
+            raise RuntimeError("fit the surrogate to evaluations before it is used")
+        return self._space
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
+        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        self._space = LowRank.of(outputs, self.rank)
+        self.model.fit(points, self._space.encode(outputs))
+
+    def coordinates(self, z: Tensor) -> Tensor:
+        """Coordinates [K, r] of the expected outputs at z [K, n]: far cheaper than the outputs themselves."""
+        return self.model(z)
+
+    def __call__(self, z: Tensor) -> Tensor:
+        """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
+        return self.space.decode(self.coordinates(z)).to(z.dtype)
+
+
+def mean_square_differences(a: Tensor, b: Tensor) -> Tensor:
+    """Mean squared differences [A, B] of the outputs with coordinates a [A, r] and b [B, r]."""
+    squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
+    return squares.clamp_min(0.0)

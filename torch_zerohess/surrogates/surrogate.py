@@ -1,0 +1,26 @@
+"""What a surrogate is: a model of a black box, fitted to evaluations, that torch can differentiate."""
+
+from typing import Protocol
+
+from torch import Tensor
+
+
+class Surrogate(Protocol):
+    """Any object with these two methods; see `ProcessSurrogate`, `LinearSurrogate`, `LowRankSurrogate`."""
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        """Fit to outputs [P, *out] at points [P, n]; what was fitted before is forgotten."""
+        ...
+
+    def __call__(self, z: Tensor) -> Tensor:
+        """Expected outputs [K, *out] at z [K, n], differentiable in z."""
+        ...
+
+
+def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points [P, n] and outputs [P, *out] without their graphs; ValueError if a shape is wrong."""
+    if points.ndim != 2 or len(points) < 2:
+        raise ValueError(f"points must be [P, n] with P >= 2, got {list(points.shape)}")
+    if outputs.ndim < 2 or len(outputs) != len(points):
+        raise ValueError(f"outputs must be [{len(points)}, *out], one per point, got {list(outputs.shape)}")
+    return points.detach(), outputs.detach()

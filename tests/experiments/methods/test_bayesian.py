@@ -80,10 +80,10 @@ def test_the_minimum_is_reached_and_every_evaluation_is_counted(name) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_runs_repeat(name) -> None:
-    first, second = (run(name, evaluations=9)[0] for _ in range(2))
+    first, second = (run(name, evaluations=6)[0] for _ in range(2))
     assert torch.equal(first, second)
-    assert len(first) == 9
-    assert not torch.equal(first[1:], run(name, 1, evaluations=9)[0][1:])
+    assert len(first) == 6
+    assert not torch.equal(first[1:], run(name, 1, evaluations=6)[0][1:])
 
 
 @pytest.mark.parametrize("name", NAMES)

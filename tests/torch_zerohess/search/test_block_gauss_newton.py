@@ -128,6 +128,25 @@ def test_a_bent_black_box_takes_few_blocks():
     torch.testing.assert_close(search.x, truth, atol=0.05, rtol=0)
 
 
+def test_a_solution_that_is_far_is_reached_in_steps_of_growing_length():
+    """A distance of 50 first radii: 1 + 2.5 + 2.5^2 + ... is there in five steps."""
+    a = torch.linalg.qr(normal(30, 20))[0].mT
+    search = zh.optim.BlockGaussNewton(torch.zeros(20).double(), sigma=0.1, loss=square(2.5 * a.sum(0)), seed=0)
+    losses = solve(search, lambda x: x @ a, 21 + 6 * (5 + 6))
+    assert search.iterations <= 6
+    assert search.value < 1e-6 * losses[0]
+
+
+def test_where_a_long_step_overshoots_a_short_one_of_the_same_batch_is_taken():
+    """Newton's step for atan(5 x) from 1 ends at -6.1; all steps from 2 upward raise the loss."""
+    search = zh.optim.BlockGaussNewton(
+        torch.ones(4).double(), sigma=8.0, loss=lambda y: y.square().mean(), share=1e-3, seed=0
+    )
+    losses = solve(search, lambda x: torch.atan(5 * x), 5 + 6)
+    assert search.iterations == 1
+    assert search.value < 0.7 * losses[0]
+
+
 def test_a_block_costs_a_quarter_of_the_parameters_and_steps():
     f, truth = bent(60, 120)
     search = zh.optim.BlockGaussNewton(torch.zeros(60).double(), sigma=1.0, loss=square(f(truth[None])[0]), seed=0)

@@ -15,9 +15,9 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
     return {"samples": samples, "start": start, "end": end, "steps": steps, **more}
 
 
-# The two learned surrogates: nine settings on three starts of MUG, SHAD and (relax) BOX2; three settings of relax on BRDF
-# and of zerograds on BOX2, one of zerograds on BRDF. BUNNY and MIRROR were not searched: they have the settings of MUG.
-# On SHAD no setting of zerograds gets there.
+# ZeroGrads and RELAX. Nine settings were tried on three starts of MUG and SHAD, and of RELAX on BOX2. The search on BRDF
+# (RELAX) and on BOX2 (ZeroGrads) had three settings, that of ZeroGrads on BRDF one. BUNNY and MIRROR were not searched:
+# they have the settings of MUG. On SHAD no setting of ZeroGrads gets there.
 # tune mug --method zerograds --runs 3 --trials 8; the same for relax and for shad, box2 and brdf --evaluations 6000
 _ZEROGRADS = {"pairs": 1, "sigma": (1.0, 0.1), "steps": 300, "rate": 0.2, "fit_rate": 0.01, "fits": 30}
 _RELAX = {"samples": 4, "sigma": (1.0, 0.01), "steps": 100, "rate": 0.2, "fit_rate": 0.01, "hidden": (10,)}

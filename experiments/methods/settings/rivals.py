@@ -15,10 +15,13 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
     return {"samples": samples, "start": start, "end": end, "steps": steps, **more}
 
 
-# ZeroGrads and RELAX. Nine settings were tried on three starts of MUG and SHAD, and of RELAX on BOX2. The search on BRDF
-# (RELAX) and on BOX2 (ZeroGrads) had three settings, that of ZeroGrads on BRDF one. BUNNY and MIRROR were not searched:
-# they have the settings of MUG. On SHAD no setting of ZeroGrads gets there.
-# tune mug --method zerograds --runs 3 --trials 8; the same for relax and for shad, box2 and brdf --evaluations 6000
+# ZeroGrads and RELAX, each on three starts. Nine settings were tried on MUG, SHAD, BUNNY and MIRROR, but no ZeroGrads on
+# BUNNY and no RELAX on MIRROR: these two have the settings of MUG. Eight more of ZeroGrads were tried on SHAD, nine of
+# RELAX and three of ZeroGrads on BOX2, three of RELAX and one of ZeroGrads on BRDF. On MIRROR no setting of ZeroGrads
+# gets there.
+# tune mug --method zerograds --runs 3 --trials 8; the same for relax and the others; box2, brdf: --evaluations 6000
+# tune shad --method zerograds --runs 3 --trials 7 --seed 1 --over pairs=1,2 "sigma=(1.0,0.1),(1.0,0.03)" \
+#     steps=100,300 rate=0.05,0.1 fit_rate=0.003,0.01 fits=10,30
 _ZEROGRADS = {"pairs": 1, "sigma": (1.0, 0.1), "steps": 300, "rate": 0.2, "fit_rate": 0.01, "fits": 30}
 _RELAX = {"samples": 4, "sigma": (1.0, 0.01), "steps": 100, "rate": 0.2, "fit_rate": 0.01, "hidden": (10,)}
 

@@ -125,12 +125,9 @@ class BlackBox(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self.smoothing = Smoothing(**state)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_handle"}
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._handle = opaque.register(self)
+        self._handle = opaque.register(self)  # a copy serves its own calls
 
     def extra_repr(self) -> str:
         return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"

@@ -257,3 +257,10 @@ def test_errors():
     with pytest.raises(ValueError, match="not finite"):
         zh.optim.NewtonCG([x]).step(lambda: (x * float("nan")).sum())
     assert torch.equal(x.detach(), torch.ones(2))
+
+
+def test_damping_is_added_to_the_curvature():
+    x = torch.tensor([3.0, -2.0], dtype=torch.float64, requires_grad=True)
+    optimizer = zh.optim.NewtonCG([x], radius=100.0, tolerance=1e-12, damping=6.0, adapt=False)
+    optimizer.step(lambda: (x**2).sum())  # (2 + 6) s = -2 x
+    torch.testing.assert_close(x.detach(), 0.75 * torch.tensor([3.0, -2.0], dtype=torch.float64))

@@ -15,10 +15,12 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
     return {"samples": samples, "start": start, "end": end, "steps": steps, **more}
 
 
-# The two learned surrogates: nine settings on three starts of MUG, SHAD and (relax) BOX2; three settings of relax on BRDF
-# and of zerograds on BOX2, one of zerograds on BRDF. BUNNY and MIRROR were not searched: they have the settings of MUG.
-# On SHAD no setting of zerograds gets there.
-# tune mug --method zerograds --runs 3 --trials 8; the same for relax and for shad, box2 and brdf --evaluations 6000
+# The two learned surrogates, each on three starts: nine settings on MUG, SHAD, BUNNY and MIRROR (no zerograds on BUNNY, no
+# relax on MIRROR: these have the settings of MUG), eight more of zerograds on SHAD, nine of relax and three of zerograds
+# on BOX2, three of relax and one of zerograds on BRDF. On MIRROR no setting of zerograds gets there.
+# tune mug --method zerograds --runs 3 --trials 8; the same for relax and the others; box2, brdf: --evaluations 6000
+# tune shad --method zerograds --runs 3 --trials 7 --seed 1 --over pairs=1,2 "sigma=(1.0,0.1),(1.0,0.03)" \
+#     steps=100,300 rate=0.05,0.1 fit_rate=0.003,0.01 fits=10,30
 _ZEROGRADS = {"pairs": 1, "sigma": (1.0, 0.1), "steps": 300, "rate": 0.2, "fit_rate": 0.01, "fits": 30}
 _RELAX = {"samples": 4, "sigma": (1.0, 0.01), "steps": 100, "rate": 0.2, "fit_rate": 0.01, "hidden": (10,)}
 
@@ -31,11 +33,14 @@ TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "mitsuba_path": {"rate": 0.3},
         "mitsuba_projective": {"rate": 0.2},
         "zerograds": _ZEROGRADS,
-        "relax": _RELAX,
+        "relax": {"samples": 4, "sigma": (0.5, 0.03), "rate": 0.03, "hidden": (10, 10)},
     },
     "mug": {"zerograds": _ZEROGRADS, "relax": _RELAX},
     "mirror": {"zerograds": _ZEROGRADS, "relax": _RELAX},
-    "shad": {"relax": {"samples": 2, "rate": 0.03, "fit_rate": 0.03, "hidden": (64,)}},
+    "shad": {
+        "zerograds": {**_ZEROGRADS, "rate": 0.05, "fit_rate": 0.003},
+        "relax": {"samples": 2, "rate": 0.03, "fit_rate": 0.03, "hidden": (64,)},
+    },
     "quad": {
         "cma_es": {"scale": 0.5},
         "cobyqa": {"scale": 1.0},

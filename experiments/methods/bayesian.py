@@ -131,7 +131,7 @@ def botorch_logei(
     trial: Trial,
     *,
     evaluations: int = EVALUATIONS,
-    noise: float | None = None,
+    noise: float | None = 1e-6,
     restarts: int = 5,
     raw_samples: int = 128,
 ) -> None:
@@ -140,7 +140,8 @@ def botorch_logei(
     Args:
         trial: the run.
         evaluations: after which the method ends.
-        noise: variance of the noise of the standardised loss; inferred if None.
+        noise: variance of the noise of the standardised loss; inferred if None. The tasks repeat their values, and
+            BoTorch takes the noise where it is known. Inferred, it hides the last 99 % of a loss.
         restarts: searches for the next point.
         raw_samples: points from which the starts of these searches are chosen.
     """

@@ -15,10 +15,10 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
     return {"samples": samples, "start": start, "end": end, "steps": steps, **more}
 
 
-# ZeroGrads and RELAX, each on three starts. Nine settings were tried on MUG, SHAD, BUNNY and MIRROR, but no ZeroGrads on
-# BUNNY and no RELAX on MIRROR: these two have the settings of MUG. Eight more of ZeroGrads were tried on SHAD, nine of
-# RELAX and three of ZeroGrads on BOX2, three of RELAX and one of ZeroGrads on BRDF. On MIRROR no setting of ZeroGrads
-# gets there.
+# ZeroGrads and RELAX, each on three starts. Nine settings were tried on MUG, SHAD, BUNNY and MIRROR. ZeroGrads was not
+# searched on BUNNY, nor RELAX on MIRROR: these two have the settings of MUG. Eight more settings of ZeroGrads were tried
+# on SHAD, nine of RELAX and three of ZeroGrads on BOX2, three of RELAX and one of ZeroGrads on BRDF. On MIRROR no
+# setting of ZeroGrads gets there.
 # tune mug --method zerograds --runs 3 --trials 8; the same for relax and the others; box2, brdf: --evaluations 6000
 # tune shad --method zerograds --runs 3 --trials 7 --seed 1 --over pairs=1,2 "sigma=(1.0,0.1),(1.0,0.03)" \
 #     steps=100,300 rate=0.05,0.1 fit_rate=0.003,0.01 fits=10,30
@@ -34,11 +34,14 @@ TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
         "mitsuba_path": {"rate": 0.3},
         "mitsuba_projective": {"rate": 0.2},
         "zerograds": _ZEROGRADS,
-        "relax": _RELAX,
+        "relax": {"samples": 4, "sigma": (0.5, 0.03), "rate": 0.03, "hidden": (10, 10)},
     },
     "mug": {"zerograds": _ZEROGRADS, "relax": _RELAX},
     "mirror": {"zerograds": _ZEROGRADS, "relax": _RELAX},
-    "shad": {"relax": {"samples": 2, "rate": 0.03, "fit_rate": 0.03, "hidden": (64,)}},
+    "shad": {
+        "zerograds": {**_ZEROGRADS, "rate": 0.05, "fit_rate": 0.003},
+        "relax": {"samples": 2, "rate": 0.03, "fit_rate": 0.03, "hidden": (64,)},
+    },
     "quad": {
         "cma_es": {"scale": 0.5},
         "cobyqa": {"scale": 1.0},

@@ -16,8 +16,8 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
 
 
 # ZeroGrads and RELAX, each on three starts. Nine settings were tried on MUG, SHAD, BUNNY and MIRROR. ZeroGrads was
-# not searched on BUNNY, nor RELAX on MIRROR: these have the settings of MUG. Eight more settings of ZeroGrads were tried
-# on SHAD, nine of RELAX and three of ZeroGrads on BOX2, three of RELAX and one of ZeroGrads on BRDF. On MIRROR no
+# not searched on BUNNY, nor RELAX on MIRROR: these have the settings of MUG. Eight more settings of ZeroGrads were
+# tried on SHAD, nine of RELAX and three of ZeroGrads on BOX2, three of RELAX and one of ZeroGrads on BRDF. On MIRROR no
 # setting of ZeroGrads gets there.
 # tune mug --method zerograds --runs 3 --trials 8; the same for relax and the others; box2, brdf: --evaluations 6000
 # tune shad --method zerograds --runs 3 --trials 7 --seed 1 --over pairs=1,2 "sigma=(1.0,0.1),(1.0,0.03)" \

@@ -91,6 +91,8 @@ def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, up
 def _projected_gradient(gradient: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:
     """Return points down the gradient, [24, r], each moved to the nearest point of the box and into the ball."""
     largest = gradient.abs().max().clamp_min(_SMALLEST)
-    lengths = radius * 2.0 ** torch.arange(_LONGEST, _LONGEST - _HALVINGS, -1, dtype=gradient.dtype, device=gradient.device)
+    lengths = radius * 2.0 ** torch.arange(
+        _LONGEST, _LONGEST - _HALVINGS, -1, dtype=gradient.dtype, device=gradient.device
+    )
     path = (-lengths[:, None] * (gradient / largest)).clamp(lower, upper)
     return path * (radius / path.norm(dim=1, keepdim=True).clamp_min(radius))

@@ -149,3 +149,13 @@ def test_named_files_exist(name, file):
     if "/" not in file:
         found += [any((ROOT / top).rglob(file)) for top in ("torch_zerohess", "experiments", "tests", "csrc")]
     assert any(found), f"{name} names {file}"
+
+
+def test_tests_that_are_named_exist():
+    """The list of constants names the test that notices each of them."""
+    named = set(re.findall(r"`(test_\w+)`", TEXTS["tests/README.md"]))
+    defined = {
+        name for path in (ROOT / "tests").rglob("test_*.py") for name in re.findall(r"def (test_\w+)", path.read_text())
+    }
+    assert len(named) > 90
+    assert named <= defined

@@ -90,10 +90,10 @@ def test_products_match_the_dense_matrix(case, mode):
 @pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
 def test_matrix_free_at_the_size_of_the_cnn(mode):
     """267 745 weights: H v against double differentiation of the closed form, on the same float64 network."""
-    from experiments.problems.tasks.cnn import PRESETS
+    from experiments.problems.tasks import cnn
 
     torch.manual_seed(0)
-    encoder = PRESETS["fast"].encoder().double()
+    encoder = cnn.task().encoder().double()
     parameters = list(encoder.parameters())
     assert sum(p.numel() for p in parameters) == 267_745
     images = torch.rand(2, 3, 64, 64, dtype=torch.float64)

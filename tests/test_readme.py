@@ -19,7 +19,7 @@ TEXTS = {name: (ROOT / name).read_text() for name in DOCUMENTS if (ROOT / name).
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(r"^(?:\S*/)?python3? -m experiments (.*)$")
 SETUP = "python3 -m venv .venv && .venv/bin/pip install"
-FILE = re.compile(r"[\w./-]+\.(?:py|h|cpp|csv|png|webp|toml|md)")
+FILE = re.compile(r"[\w./-]+\.(?:py|h|cpp|csv|png|webp|toml|md)(?!\w)")
 
 
 def blocks(text: str, language: str) -> list[str]:

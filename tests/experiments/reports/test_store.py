@@ -28,7 +28,8 @@ def results(tmp_path, monkeypatch):
     """An empty folder for stored tables, and code that is that of a commit."""
     monkeypatch.setattr(stored, "RESULTS", tmp_path / "stored")
     monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": True})
-    monkeypatch.setattr("sys.argv", ["experiments", "run", "bowl", "--limit", "15"])
+    own = ["--out", "/home/somebody/a folder", "--jobs=2"]  # of this machine: not to be stored
+    monkeypatch.setattr("sys.argv", ["experiments", "run", "bowl", *own, "--limit", "15"])
     return tmp_path / "stored"
 
 

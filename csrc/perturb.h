@@ -1,4 +1,4 @@
-// Perturbed points, the perturbations that rounding leaves of them, and their importance weights.
+// Perturbed points, the perturbations that were applied to them after rounding, and importance weights.
 // Literal reference: torch_zerohess/sampling/proposals.py.
 #pragma once
 

@@ -61,6 +61,18 @@ def bump(x):
     return torch.exp(-0.5 * ((torch.linspace(-6, 6, 40, dtype=torch.float64) - x[:, :1]) / 0.7).square())
 
 
+def spiral(x):
+    """Outputs [K, 2] of x [K, 1] whose loss has a local minimum in every turn."""
+    return torch.cat([torch.sin(2 * x) + 0.25 * x, torch.cos(2 * x)], 1)
+
+
+def well(z):
+    """A loss [K] that is 1 but for a paraboloid around (2, -2), 4 % of the box [-4, 4]^2, and one near (-2.5, 1)."""
+    narrow = (z - vector(2.0, -2.0)).square().sum(1) / 0.8
+    shallow = 0.5 + (z - vector(-2.5, 1.0)).square().sum(1)
+    return torch.minimum(torch.minimum(narrow, shallow), torch.ones(len(z), dtype=torch.float64))
+
+
 def misfit(f, solution):
     """The mean square of an output of f against the one at the solution."""
     target = f(solution[None])[0]

@@ -19,7 +19,7 @@ TEXTS = {name: (ROOT / name).read_text() for name in DOCUMENTS if (ROOT / name).
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(r"^(?:\S*/)?python3? -m experiments (.*)$")
 SETUP = "python3 -m venv .venv && .venv/bin/pip install"
-FILE = re.compile(r"[\w./-]+\.(?:py|h|cpp|csv|png|webp|toml|md)")
+FILE = re.compile(r"[\w./-]+\.(?:py|h|cpp|csv|png|webp|toml|md)(?!\w)")
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -149,3 +149,13 @@ def test_named_files_exist(name, file):
     if "/" not in file:
         found += [any((ROOT / top).rglob(file)) for top in ("torch_zerohess", "experiments", "tests", "csrc")]
     assert any(found), f"{name} names {file}"
+
+
+def test_tests_that_are_named_exist():
+    """The list of constants names the test that notices each of them."""
+    named = set(re.findall(r"`(test_\w+)`", TEXTS["tests/README.md"]))
+    defined = {
+        name for path in (ROOT / "tests").rglob("test_*.py") for name in re.findall(r"def (test_\w+)", path.read_text())
+    }
+    assert len(named) > 90
+    assert named <= defined

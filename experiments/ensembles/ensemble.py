@@ -1,5 +1,6 @@
 """Many runs: every method on every task from the same starts, resumed where they were, behind one progress bar."""
 
+import math
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -116,7 +117,7 @@ class _Progress:
         self._bar, self._ended = bar, bar.n
         self._running: dict[tuple[str, str, int], float] = {}
         self._first: dict[tuple[str, str, int], float | None] = {}
-        self._interval, self._drawn = 0.1 if sys.stderr.isatty() else 30.0, 0.0
+        self._interval, self._drawn = 0.1 if sys.stderr.isatty() else 30.0, -math.inf
 
     def __call__(self, job: Job, message: Message) -> None:
         key = job.task_name, job.method_name, job.run
@@ -141,8 +142,8 @@ class _Progress:
 def ordered(jobs: Iterable[Job]) -> list[Job]:
     """Return jobs task by task, since every scene that a process has loaded slows down all of them.
 
-    Those of a task are run by run, so that an ensemble that is stopped has about as many of each method; methods that
-    load another scene come last.
+    The jobs of a task are in the order of their runs, so that an ensemble that is stopped has about as many runs of
+    each method. Methods that load another scene come last.
     """
     position: dict[str, int] = {}
 

@@ -28,7 +28,7 @@ _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _PROGRESS = 0.2
 """Seconds between two messages about a running job."""
 _OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-"""Signals that come from without, so that a process killed by one says nothing about the method."""
+"""Signals from outside: a process killed by one says nothing about the method."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Trouble:
-    """A job that could not be run, for a reason that says nothing about the method."""
+    """A job that could not be run, for a reason outside of the method."""
 
     reason: str
 

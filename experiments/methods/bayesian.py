@@ -31,7 +31,7 @@ from experiments.methods.method import Method
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
-EVALUATIONS = 100
+EVALUATIONS = 60
 """Evaluations after which both methods end, if not set."""
 MOST = 20
 """Most parameters. Frazier (2018), "A tutorial on Bayesian optimization", gives 20 as the usual limit."""
@@ -71,11 +71,12 @@ class Model:
     """
 
     def __init__(self, noise: float | None) -> None:
-        self._noise, self._state = noise, None
+        self._noise = noise
+        self._state: dict[str, Any] | None = None
 
     def __call__(self, z: Tensor, outputs: Tensor) -> Any:
         """Return the model fitted to points z [N, n] and outputs [N, m]."""
-        from botorch.exceptions import ModelFittingError
+        from botorch.exceptions.errors import ModelFittingError
         from botorch.fit import fit_gpytorch_mll
         from botorch.models import SingleTaskGP
         from gpytorch.mlls import ExactMarginalLogLikelihood
@@ -130,7 +131,7 @@ def botorch_logei(
     trial: Trial,
     *,
     evaluations: int = EVALUATIONS,
-    noise: float | None = None,
+    noise: float | None = 1e-6,
     restarts: int = 5,
     raw_samples: int = 128,
 ) -> None:
@@ -139,7 +140,8 @@ def botorch_logei(
     Args:
         trial: the run.
         evaluations: after which the method ends.
-        noise: variance of the noise of the standardised loss; inferred if None.
+        noise: variance of the noise of the standardised loss; inferred if None. The tasks repeat their values, and
+            BoTorch takes the noise where it is known. Inferred, it hides the last 99 % of a loss.
         restarts: searches for the next point.
         raw_samples: points from which the starts of these searches are chosen.
     """
@@ -183,7 +185,7 @@ def botorch_composite(
     """
     from botorch.acquisition.logei import qLogExpectedImprovement
     from botorch.acquisition.objective import GenericMCObjective
-    from botorch.sampling import SobolQMCNormalSampler
+    from botorch.sampling.normal import SobolQMCNormalSampler
 
     output, model = trial.task.output, Model(noise)
     assert output is not None
@@ -194,11 +196,15 @@ def botorch_composite(
         components = Components(outputs, rank, left_out)
         # The acquisition smooths at a fixed scale: in units of the best loss an improvement is between 0 and 1.
         unit = losses.min().clamp_min(torch.finfo(torch.float64).tiny)
+
+        def objective(c: Tensor, X: Tensor | None = None) -> Tensor:
+            return -components.loss(c) / unit
+
         acquisition = qLogExpectedImprovement(
             model(z, components.coordinates),
             best_f=-1.0,
             sampler=SobolQMCNormalSampler(torch.Size([samples]), seed=trial.seed),
-            objective=GenericMCObjective(lambda c, X=None: -components.loss(c) / unit),
+            objective=GenericMCObjective(objective),
         )
         return maximiser(acquisition, z.shape[1], restarts, raw_samples)
 
@@ -225,7 +231,7 @@ def search(trial: Trial, evaluations: int, evaluate: Black, propose: Propose) ->
 
 def maximiser(acquisition: Any, n: int, restarts: int, raw_samples: int) -> Tensor:
     """Return where an acquisition function is largest in the unit cube, [1, n]."""
-    from botorch.optim import optimize_acqf
+    from botorch.optim.optimize import optimize_acqf
 
     cube = torch.stack([torch.zeros(n), torch.ones(n)]).double()
     with warnings.catch_warnings():
@@ -265,5 +271,6 @@ METHODS = (
         with_settings(botorch_composite),
         _has_residuals,
         ("botorch",),
+        uses="image",
     ),
 )

@@ -1,4 +1,4 @@
-"""Derivative-free optimizers, what a user would pick instead of ours: CMA-ES, COBYQA, Py-BOBYQA and DFO-LS.
+"""Derivative-free optimizers that a user would pick instead of ours: CMA-ES, COBYQA, Py-BOBYQA and DFO-LS.
 
 Each is the implementation that its package ships, with the package's own settings but for the size of the first step,
 which is `Task.sigma` times `scale`. They report the best point that they have evaluated. Methods that choose their
@@ -22,9 +22,8 @@ from experiments.runs.trial import Trial
 Array = NDArray[np.float64]
 MOST = 100
 """Parameters beyond which COBYQA, made for small problems, takes minutes between two evaluations."""
-
 MOST_RESIDUALS = 2000
-"""The same for DFO-LS, which keeps the residuals of n points."""
+"""Parameters beyond which DFO-LS, which keeps the residuals of n points, takes gigabytes."""
 
 
 class Best:

@@ -3,11 +3,13 @@
 The loss of a prediction depends on the image that it is for, so one surrogate h(z, r) serves all images r: a network of
 the parameters z and of r at 8x8 pixels. ZeroGrads fits it to the losses of the latest batch, RELAX makes it a control
 variate of their score function (see `experiments.methods.learned`). The gradient at the predictions goes on through the
-encoder to its weights, which Adam moves. The papers instead take the weights themselves for the parameters (ZeroGrads:
-35 000 of them) or have no input image (RELAX); sampling 268 000 weights would leave out that the encoder is a white box.
+encoder to its weights, which Adam moves. Neither paper has an encoder with a black box after it. ZeroGrads trains a
+network by taking its 35 000 weights for the parameters of the black box; here these would be 268 000, and the encoder,
+which is a white box, would be sampled as well.
 
-Both methods know the loss alone: no render, no bounds, no derivative of the black box. Sigma is that of the task. Sigma
-and the learning rate of the encoder go down linearly over nine tenths of the evaluations, as for the source's methods.
+Both methods see the losses and the training images, but no render, no bounds, no derivative of the black box. Sigma is
+that of the task. Sigma and the learning rate of the encoder go down linearly over nine tenths of the evaluations, as
+for the source's methods.
 """
 
 from collections import deque

@@ -8,14 +8,20 @@
 | handles_adam | handles | the losses of the handles | Adam |
 | handles_newton, **recommended** | handles | the losses of the handles | Newton, a Hessian per handle; then Adam |
 
-*Handles* are the vertices of a coarser mesh, whose displacements subdivision makes smooth: first few, then more. *The
-loss of a handle* is that of the pixels that it can change, a box in every view around the vertices it moves: this takes
-the cameras, which are known, and no render. All handles are perturbed in the same images, and each is a black box of
-its own few parameters, with a gradient and a Hessian that a few images determine. What the others do to the same pixels
-is noise; what they do elsewhere is not in it. The gradients together are that of the whole loss, but for the faint ends
-of the bumps, and for the smoothing over what others do, which is with the density of their samples; the Hessians are
-the diagonal blocks of that of the whole loss. A pixel that only one of mesh and target covers counts as more than its
-shading: where an ear is missing, or a dark web fills the gap beside it, the squares of the pixels alone have minima.
+*Handles* are the vertices of a coarser mesh. Subdivision makes their displacements smooth. A run begins with few
+handles and goes on with more.
+
+*The loss of a handle* is the loss of the pixels that the handle can change: a box in every view, around the vertices
+that it moves. The boxes follow from the cameras, which are known; they take no render. All handles are perturbed in the
+same images. Each is a black box of its own few parameters, so that a few images determine its gradient and Hessian.
+Other handles that change the same pixels add noise; changes elsewhere do not.
+
+The gradients of the handles together are the gradient of the whole loss, with two differences: the faint ends of the
+bumps are cut off, and the smoothing over the other handles has the density of their samples. The Hessians are the
+diagonal blocks of the Hessian of the whole loss.
+
+A pixel that only mesh or only target covers counts as more than its difference in shading. With the difference alone, a
+missing ear and a dark web beside an ear are local minima.
 
 Large steps: Nicolet, Jacobson and Jakob 2021, "Large steps in inverse rendering of geometry".
 """
@@ -39,7 +45,7 @@ LEVELS = (1, 2, 3, 3, 4)
 BEYOND = 2.0
 """Margin of the box of a handle in units of sigma, for what its perturbations reach; 1 pixel comes on top."""
 DAMPING = 0.5
-"""Added to the eigenvalues of the blocks, in units of the mean size of all: what is hardly seen hardly moves."""
+"""Added to the eigenvalues of the blocks, in units of their mean size: a handle that is hardly seen hardly moves."""
 
 
 def handles(

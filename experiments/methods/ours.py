@@ -46,7 +46,7 @@ def search(
         sigma=sigma or task.sigma,
         bounds=task.bounds,
         loss=loss,
-        # engine=engine,
+        engine=engine,
         restarts=task.evaluations,  # the harness ends the run
         seed=trial.seed,
     )

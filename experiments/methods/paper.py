@@ -14,8 +14,8 @@ the trust region is in units of the parameters for our_h, and in units of sigma 
 source. Settings: `experiments.methods.settings`. The same derivatives on network tasks:
 `experiments.methods.paper_networks`.
 
-What differs from the source: our_h and our_hvpa subtract f(x) from every value, for the one evaluation more, without
-which a Hessian drowns in the noise of a constant; the optimizer's own differences are in its docstring.
+What differs from the source: our_h and our_hvpa subtract f(x) from every value. That takes one evaluation more; without
+it the Hessian drowns in the noise of a constant. `zh.optim.NonlinearCG` says what else differs.
 """
 
 from collections.abc import Callable

@@ -26,9 +26,9 @@ class SampledGradient:
 
     trial: whose black box is sampled.
     samples: pairs; an estimate costs 2 samples + 1 evaluations.
-    frozen: whether every estimate uses the same perturbations. The noise is then a function of x and sigma, and the
-        difference of two gradients has little of it; value and gradient are still estimates of their own, so that the
-        gradient is not quite that of the value.
+    frozen: whether every estimate uses the same perturbations. The noise is then a function of x and sigma, so the
+        difference of two gradients has little of it. Value and gradient are separate estimates even then: the gradient
+        is not exactly the gradient of the value.
     """
 
     def __init__(self, trial: Trial, samples: int, *, frozen: bool) -> None:

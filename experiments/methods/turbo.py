@@ -29,7 +29,7 @@ SUCCESSES = 3
 """Successes in a row after which the length is doubled."""
 GAIN = 1e-3
 """An evaluation is a success if it is lower than the best by more than this part of the best."""
-EVALUATIONS = 200
+EVALUATIONS = 100
 """Evaluations after which the method ends, if not set."""
 
 
@@ -80,7 +80,7 @@ def turbo(trial: Trial, *, evaluations: int = EVALUATIONS, steps: int = 50) -> N
         region, z, losses = Region(n), design[:0], design.new_empty(0)
         while not region.ended:
             begun = len(z) >= len(design)
-            following = _candidate(z, losses, region.length, steps, generator) if begun else design[len(z), None]
+            following = candidate(z, losses, region.length, steps, generator) if begun else design[len(z), None]
             x = cube.outside(following)
             loss = trial.loss(x)
             if begun:
@@ -104,7 +104,7 @@ def box(centre: Tensor, lengths: Tensor, length: float) -> tuple[Tensor, Tensor]
     return (centre - sides / 2).clamp(0.0, 1.0), (centre + sides / 2).clamp(0.0, 1.0)
 
 
-def _candidate(z: Tensor, losses: Tensor, length: float, steps: int, generator: np.random.Generator) -> Tensor:
+def candidate(z: Tensor, losses: Tensor, length: float, steps: int, generator: np.random.Generator) -> Tensor:
     """Return the candidate [1, n] at which a draw of the model of losses [N] at z [N, n] is lowest."""
     n, count = z.shape[1], min(100 * z.shape[1], 5000)
     spread = float(losses.std(correction=0))
@@ -140,7 +140,7 @@ def _model(z: Tensor, losses: Tensor, steps: int) -> Any:
         outputscale_constraint=Interval(0.05, 20.0),
     )
     likelihood = GaussianLikelihood(noise_constraint=Interval(5e-4, 0.2))
-    model = SingleTaskGP(z, losses[:, None], likelihood=likelihood, covar_module=kernel, outcome_transform=None)
+    model: Any = SingleTaskGP(z, losses[:, None], likelihood=likelihood, covar_module=kernel, outcome_transform=None)
     model.initialize(
         **{
             "covar_module.outputscale": 1.0,

@@ -1,8 +1,8 @@
 """A task in other circumstances: another start, fewer samples per pixel, fresh noise, a compressed reference.
 
-The black box changes, the errors do not: whatever a run saw, its image error is that of the task itself, whose renders
-have the task's samples per pixel and all the seed of the clean reference. So rows of different circumstances can be
-compared, and a run with noise or a compressed reference can end at an error of 0.
+The black box changes, the errors do not: the image error of a run is always the image error of the unchanged task, with
+its samples per pixel, its seed and its clean reference. So rows of different circumstances can be compared, and a run
+with noise or with a compressed reference can end at an error of 0.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ class Change:
 
 @dataclass(frozen=True, kw_only=True)
 class Varied(Task):
-    """A task that other processes make again from how it was made."""
+    """A task that is pickled as the arguments of `load`."""
 
     made: tuple[str, Preset, str, int | None, Change]
 
@@ -75,8 +75,8 @@ class Varied(Task):
 def load(name: str, preset: Preset, variant: str, evaluations: int | None, change: Change) -> Task:
     """Return a task of the catalogue, changed.
 
-    Scenes stay loaded for the next run of the process, unless their noise is fresh: the seeds of a scene go on from
-    call to call, and a run should not depend on those before it.
+    A scene stays loaded for the next run of the process, unless its noise is fresh: its seeds go on from call to call,
+    and a run must not depend on the runs before it.
 
     Args:
         name: of the task.
@@ -154,7 +154,7 @@ def _rendered(task: Task, reason: str) -> RenderedTask:
 
 
 class Seen(Reference):
-    """A reference that is not what the renders will be compared with at the solution.
+    """A reference that differs from a render of the solution: by noise, by samples, or by compression.
 
     Args:
         task: whose scene it is.

@@ -139,10 +139,12 @@ def _fitted(table: pd.DataFrame, query: Query) -> str:
         [f"`{one}`", about["title"][one], about["uses"][one], *(cells.get((task, one), "") for task in tasks)]
         for one in methods
     ]
-    what = {"both": "evaluations, seconds", "evaluations": "evaluations", "seconds": "seconds"}[show]
+    what = {"both": "evaluations and seconds", "evaluations": "evaluations", "seconds": "seconds"}[show]
     note = f"Median {what} until the {metric} error is reduced by {level} %"
     note += ", of the starts that get there; in brackets the share of starts that get there, if not all do"
     note += " (95 % interval)." if interval else "."
+    if any(str(one).startswith("image") for one in about["uses"]):
+        note += " Where a task has no image, a method that uses the image uses the loss."
     return markdown(headers, rows) + _origin(table, note)
 
 

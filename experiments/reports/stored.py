@@ -4,6 +4,7 @@ All rows of a file come from one commit without changes, one machine, one preset
 made of medians of runs (`store`), or is the table of a study (`keep`).
 """
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -81,8 +82,19 @@ def origin(commands: Sequence[Mapping[str, Any]], what: str) -> dict[str, str]:
         "commit": str(*commits),
         "date": min(str(one["started"]) for one in commands)[:10],
         "machine": str(*machines),
-        "command": "; ".join(dict.fromkeys(str(one["command"]) for one in commands)),
+        "command": "; ".join(dict.fromkeys(_elsewhere(str(one["command"])) for one in commands)),
     }
+
+
+def _elsewhere(command: str) -> str:
+    """Return a command without what is of this machine only: its folder, and how many processes it had."""
+    words, kept = iter(shlex.split(command)), []
+    for word in words:
+        if word in ("--out", "--jobs"):
+            next(words)
+        elif not word.startswith(("--out=", "--jobs=")):
+            kept.append(word)
+    return shlex.join(kept)
 
 
 def _described(machine: Mapping[str, Any]) -> str:

@@ -1,8 +1,8 @@
 """The journal of a run: the values of every evaluated batch, so that a run that was killed can be replayed.
 
 A batch is a line of JSON (a hash of the points, times, shape and type of the values) followed by the compressed values.
-From the first batch on that a kill or a power cut has left in parts, the journal is cut off when it is read again. A
-batch reaches the disk when the system writes it, within a minute: that much a power cut costs.
+A kill or a power cut may leave a batch in parts: reading cuts the journal off before the first such batch. The system
+writes a batch to the disk within a minute, so a power cut costs the last minute.
 """
 
 import hashlib

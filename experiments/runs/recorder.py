@@ -16,9 +16,9 @@ from experiments.runs.records import Files, Log, Record
 class Recorder:
     """Evaluations, seconds and rows of one run of a method on a task.
 
-    A run that was killed is replayed: the method starts again, evaluations are answered from the journal and rows that
-    the log already has are taken from there, with their times, so that no black box is called twice and both clocks go
-    on where they were; `skip` hears of the calls and points that it has missed. Without `files` nothing is written.
+    A run that was killed is replayed. The method starts again; evaluations are answered from the journal, and rows are
+    taken from the log, with their times. So no black box is called twice, and both clocks go on where they were. Then
+    `skip` is told how many calls and points were answered from the journal. Without `files` nothing is written.
     """
 
     def __init__(

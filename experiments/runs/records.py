@@ -93,10 +93,10 @@ class Files:
 class Log:
     """Appends records to a file, flushed line by line, so that a killed run leaves all it had.
 
-    Lines reach the disk when the system writes them, within a minute, and all of them when the log is closed: a power
-    cut takes the last rows of a run that goes on, which are made again, and none of a run that has an outcome.
+    The system writes lines to the disk within a minute, and all of them when the log is closed. So a power cut takes
+    the last rows of a run that goes on, which are made again, and no row of a run that has an outcome.
 
-    `records` are those the file already has; from the first line on that is cut or broken they are removed from it.
+    `records` are those that the file has. Opening it cuts the file off before the first line that is broken.
     """
 
     def __init__(self, path: Path) -> None:

@@ -21,9 +21,9 @@ from torch_zerohess.smoothing import Smoothing
 class BlackBox(nn.Module):
     """A black box, convolved with a Gaussian, as a layer: F(x) = E fn(x + sigma u), u ~ N(0, I).
 
-    One forward call is one batch of evaluations; gradients, Hessians and Hessian-vector products of any transform of
-    torch are taken from that batch. Where no derivative can be asked for (under `torch.no_grad`, or where neither x
-    nor anything before it requires grad), only f(x) is evaluated.
+    One forward call is one batch of evaluations. Gradients, Hessians and Hessian-vector products, by any transform of
+    torch, use that batch. If no derivative can be asked for (under `torch.no_grad`, or if x does not require grad),
+    only f(x) is evaluated.
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out], scalar values (a loss) or tensors (an image). It may use NumPy,
@@ -32,7 +32,7 @@ class BlackBox(nn.Module):
         smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
-        value: "center" returns f(x), "smoothed" the estimate of F(x). The derivatives are those of F in both cases.
+        value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
 
     Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x.
@@ -77,16 +77,16 @@ class BlackBox(nn.Module):
         else:
             result = _value(self._evaluate(flat.detach(), others), flat, flat.detach(), zero=True)
         if torch.compiler.is_compiling() and x.requires_grad:
-            # A compiled backward can be differentiated again in silence, wrongly, unless it has saved an input of the
-            # graph: then torch raises. This term is zero and saves x.
+            # torch differentiates a compiled backward a second time without an error, and gets a wrong number, unless
+            # the backward has saved an input of the graph. This term is zero and saves x: now torch raises.
             result = result + 0.0 * x.sin().sum()
         return result.reshape((*batch, *result.shape[1:]))
 
     def freeze(self, x: Tensor, *aux: Tensor) -> Callable[[Tensor], Tensor]:
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
-        The function re-weights the same evaluations to the density around its argument, so that near x it is the
-        smoothed black box, with derivatives of every order and no further evaluation.
+        The function re-weights the same evaluations to the density around its argument. Near x it estimates the
+        smoothed black box and has derivatives of every order; it makes no further evaluation.
         """
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = x.detach().reshape(-1, n).clone()
@@ -119,25 +119,22 @@ class BlackBox(nn.Module):
         return self.call.fn
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The settings travel with the state_dict, so that an annealed sigma is resumed."""
+        """Return the settings, so that a state_dict resumes an annealed sigma."""
         return {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self.smoothing = Smoothing(**state)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_handle"}
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
-        self._handle = opaque.register(self)
+        self._handle = opaque.register(self)  # a copy serves its own calls
 
     def extra_repr(self) -> str:
         return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"
 
 
 class Input(torch.autograd.Function):
-    """The identity, which marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
+    """The identity. It marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
 
     @staticmethod
     def forward(x: Tensor) -> Tensor:
@@ -163,7 +160,7 @@ def smooth(
 ) -> Callable[..., Tensor]:
     """Return fn, convolved with a Gaussian, as a differentiable function of a tensor: `BlackBox` without the module.
 
-    Arguments, shapes and errors are those of `BlackBox`.
+    Arguments, shapes and errors: see `BlackBox`.
 
     Example:
         >>> f = smooth(lambda z: (z > 0).double().sum(1), Smoothing(sigma=0.5, samples=4000, seed=0))

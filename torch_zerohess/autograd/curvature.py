@@ -5,8 +5,8 @@ For a loss L(theta) = l(y(theta)) with white-box y (a network) and sampled l (a 
     exact          H = J^T (d2l/dy2) J + sum_k (dl/dy_k) d2y_k/dtheta2
     gauss_newton   H = J^T (d2l/dy2) J,      J = dy/dtheta
 
-The second is what the supplement of Wang, Fischer and Ritschel (2025) calls the grey-box Hessian, section E: it drops
-the term in the curvature of the network, hence its "approximately".
+The supplement of Wang, Fischer and Ritschel (2025, section E) calls the second one the grey-box Hessian. It drops the
+term in the curvature of the network, hence "approximately" in the source.
 """
 
 from collections.abc import Sequence
@@ -19,16 +19,17 @@ from torch_zerohess.autograd.blackbox import Input
 from torch_zerohess.autograd.transforms import made_by
 
 _DENSE = 10_000
+"""Parameters beyond which `to_dense` refuses: the matrix would take 800 MB in float64."""
 
 
 class CurvatureOperator:
-    """Hessian of a scalar loss with respect to parameters, as a symmetric operator that is never formed.
+    """Hessian of a scalar loss with respect to parameters, as a symmetric matrix-free operator.
 
     Args:
         outputs: the loss, a tensor of one element with a graph. The graph is kept.
         inputs: the parameters, one tensor or several, N numbers in all.
-        mode: "exact" or "gauss_newton", see the module. "gauss_newton" counts the curvature through the inputs of the
-            black boxes alone: a term of the loss that reaches the parameters in another way has none.
+        mode: "exact" or "gauss_newton", see the module. With "gauss_newton" only the curvature through the inputs of
+            the black boxes counts: a term of the loss that reaches the parameters in another way adds none.
         through: for "gauss_newton", the tensors y at which the white box ends; the inputs of all `BlackBox` layers
             between `inputs` and `outputs` if None.
 
@@ -138,7 +139,10 @@ def hvp(
 
 
 def black_box_inputs(outputs: Tensor) -> list[Tensor]:
-    """Return the tensors that enter `BlackBox` layers on the way to `outputs`, each once."""
+    """Return the inputs of the `BlackBox` layers on the way to `outputs`, each tensor once.
+
+    Raises ValueError if there is none, or if one black box depends on another.
+    """
     found = {_edge(one): one for one in _entries(outputs.grad_fn)}
     if not found:
         raise ValueError(
@@ -174,7 +178,7 @@ def _entries(node: Node | None) -> list[Tensor]:
 
 
 def _edges_before(node: Node | None) -> set[tuple[object, int]]:
-    """Gradient edges that lead into a node, without its own."""
+    """Return all gradient edges that can be reached from a node, (node, number of its output) each."""
     seen: set[tuple[object, int]] = set()
     stack = [node]
     while stack:

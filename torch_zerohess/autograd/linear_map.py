@@ -1,8 +1,8 @@
 """The linear map between parameters and samples as an autograd function: all that autograd must know about sampling.
 
-With perturbations U [K, n], an estimate depends on x through U d alone, d = (x - x_0) / sigma, and its derivatives
-through U^T a. Both maps are linear and each is the other's transpose, so that one function, which calls itself in
-`backward` and `jvp`, has derivatives of every order, in every mode, batched or not. U is stored or drawn again.
+With perturbations U [K, n], an estimate depends on x only through U d, d = (x - x_0) / sigma. Its derivatives need
+U^T a. Both maps are linear and each is the transpose of the other. So one function serves both: it calls itself in
+`backward` and `jvp`, and has derivatives of every order, in every mode, batched or not. U is stored or drawn again.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ from torch_zerohess.sampling.kernels import Redrawn, Samples
 
 
 def project(u: Samples, t: Tensor, *, zero: bool = False) -> Tensor:
-    """Return U t, [B, M, K] for u [B, K, n] and t [B, M, n]; `zero` says that t is known to be zero in value."""
+    """Return U t, [B, M, K], for u [B, K, n] and t [B, M, n]; `zero` promises that t is zero in value."""
     if torch.compiler.is_compiling() and isinstance(u, Tensor):
         return t @ u.mT  # Dynamo traces no function with a custom jvp; plain operations need none
     result: Tensor = _LinearMap.apply(t, False, zero, *_flat(u))
@@ -88,7 +88,10 @@ def _fold(part: Any, dim: int | None, V: int) -> Any:
 
 
 def first_order_only(x: Tensor) -> Tensor:
-    """Return x with a second derivative that raises instead of being silently zero; compiled code has none anyway."""
+    """Return x such that second derivatives raise instead of being zero.
+
+    Under `torch.compile` it returns x as it is: a second derivative of compiled code raises in any case.
+    """
     result: Tensor = x if torch.compiler.is_compiling() else _FirstOrderOnly.apply(x)
     return result
 

@@ -26,7 +26,7 @@ from torch.autograd.graph import Node
 
 
 def transform_active() -> bool:
-    """Whether a transform of `torch.func` is active: grad, vjp, jvp, vmap, or what is made of them."""
+    """Whether a transform of `torch.func` is active: grad, vjp, jvp, vmap, or one composed of these."""
     return torch._C._functorch.maybe_current_level() is not None
 
 

@@ -198,6 +198,7 @@ def _finite(
 
 
 def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
+    """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
     if isinstance(rule, str):
         point = points[tuple(where.tolist())]
         text = ", ".join(f"{float(p):.6g}" for p in point[:8]) + (", ..." if len(point) > 8 else "")
@@ -206,12 +207,13 @@ def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) 
         raise ValueError(
             f"fn returned {wrong} at the point [{text}]; choose on_nonfinite='drop' or a number to go on without it"
         )
-    return torch.where(torch.isfinite(values), values, torch.as_tensor(float(rule), dtype=values.dtype))
+    # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
+    return torch.where(torch.isfinite(values), values.double(), float(rule))
 
 
 def _tensor(result: Any) -> Tensor:
     try:
-        # Numbers of Python have the precision of float64, not that of torch's default.
+        # A number of Python is float64, whatever the default dtype of torch.
         return torch.as_tensor(result, dtype=torch.float64 if isinstance(result, float) else None)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

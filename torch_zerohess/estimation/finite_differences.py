@@ -20,11 +20,13 @@ def finite_difference_hvp(
     step: float = 1 / 3,
     vectorized: bool = True,
 ) -> Tensor:
-    """Return (g(x + e) - g(x - e)) |v / sigma| / (2 step), e = step sigma (v / sigma) / |v / sigma|: about H v.
+    """Return an estimate of the Hessian of F times v from two gradient estimates g.
 
-    It takes two gradient estimates, twice the evaluations of `estimate(...).hvp(v)`, and has an error of second order
-    in the step besides. With a scalar sigma this is the source's (g(x + eps v^) - g(x - eps v^)) |v| / (2 eps) with
-    eps = sigma / 3 (Wang, Fischer and Ritschel 2025, OurHVP).
+        Hv = (g(x + e) - g(x - e)) |v / sigma| / (2 step),    e = step sigma (v / sigma) / |v / sigma|
+
+    It takes twice the evaluations of `estimate(...).hvp(v)` and has an additional error of second order in the step.
+    With a scalar sigma this is the source's (g(x + eps v^) - g(x - eps v^)) |v| / (2 eps) with eps = sigma / 3 (Wang,
+    Fischer and Ritschel 2025, OurHVP).
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out], or of one point where not `vectorized`, as for `estimate`.
@@ -32,7 +34,7 @@ def finite_difference_hvp(
         v: [*batch, n] or [n]; a zero vector gives zero.
         smoothing: how to sample each of the two gradients.
         *aux: further inputs of fn, [*batch, ...] each.
-        common: draw the same perturbations on both sides, so that most of the noise cancels in the difference; False
+        common: draw the same perturbations on both sides, so that most of the noise cancels in the difference. False
             draws independent ones, as the source does.
         step: length of the difference in units of sigma.
         vectorized: False if fn takes one point [n] at a time.
@@ -42,6 +44,12 @@ def finite_difference_hvp(
 
     Raises:
         ValueError, TypeError: as `estimate`, or if v or step are not as described.
+
+    Example:
+        >>> x, v = torch.tensor([1.0, 2.0]), torch.tensor([1.0, 0.0])
+        >>> product = finite_difference_hvp(lambda z: (z**4).sum(1), x, v, Smoothing(sigma=0.1, samples=512, seed=0))
+        >>> bool((product - torch.tensor([12.0, 0.0])).abs().max() < 1.0)
+        True
     """
     n = x.shape[-1] if isinstance(x, Tensor) and x.dim() else 0
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):

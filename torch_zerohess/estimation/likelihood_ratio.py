@@ -25,7 +25,7 @@ class LikelihoodRatio(Stein):
 
     @classmethod
     def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
-        """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as those of "uniform" can."""
+        """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as weights of "uniform" can."""
         B, n = x.shape
         density, single, x64 = _density(smoothing), x.dtype == torch.float32, x.double().contiguous()
         if _kept(smoothing, keep):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class Evaluator(Protocol):
-    """Calls a black box on a batch of points, wherever and in whatever order; the result is in order of the points."""
+    """Calls a black box on a batch of points, in any process and order; results are in the order of the points."""
 
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Any:
         """Return fn(points [K, n], *aux [K, ...]), values of K points."""

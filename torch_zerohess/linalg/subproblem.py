@@ -6,9 +6,15 @@ import torch
 from torch import Tensor
 
 _BISECTIONS = 60
+"""Bisections for the shift of the Hessian, at most."""
+_PRECISE = 1e-12
+"""Relative precision of the shift, and the least shift relative to the largest curvature."""
+_SINGULAR = 1e-14
+"""Curvature, relative to the largest one, that may as well be zero."""
 _SMALLEST = 1e-300
-_HALVINGS = 24
-"""Lengths tried along the gradient where bounds are hit."""
+"""Least number that is divided by."""
+_LONGEST, _HALVINGS = 8, 24
+"""Lengths tried along the gradient where bounds are hit: radius times 2^8 and less."""
 
 
 def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
@@ -20,12 +26,12 @@ def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
 def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
     """Return s [r] with |s| <= radius that minimises a.s + s.(curvature s)/2, in any order and of any sign.
 
-    By bisection for the shift mu of s = -a / (curvature + mu) (More and Sorensen 1983). In the hard case, where a has
-    no component along the most negative curvature, the step is completed along it to the boundary.
+    By bisection for the shift mu of s = -a / (curvature + mu) (More and Sorensen 1983). In the hard case a has no
+    component along the most negative curvature; the step then goes on along it, to the boundary.
     """
     least, index = curvature.min(0)
     lowest, largest = float(least), float(curvature.abs().max())
-    if lowest > 1e-14 * largest:
+    if lowest > _SINGULAR * largest:
         s = -a / curvature
         if float(s.norm()) <= radius:
             return s
@@ -34,9 +40,9 @@ def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
         return torch.zeros_like(a)
     # In units of radius and scale, where nothing over- or underflows: s = -a / (gap + rest), mu = rest - lowest.
     a, curvature, largest = a / scale / radius, curvature / scale, largest / scale
-    negative = lowest < -1e-14 * largest * scale
+    negative = lowest < -_SINGULAR * largest * scale
     gap = curvature - curvature[index] if negative else curvature.clamp_min(0.0)
-    low = _SMALLEST if negative else max(1e-12 * largest, _SMALLEST)
+    low = _SMALLEST if negative else max(_PRECISE * largest, _SMALLEST)
     s = -a / (gap + low)
     if float(s.norm()) <= 1.0:
         if negative:  # the hard case
@@ -50,15 +56,16 @@ def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
             low = middle
         else:
             high = middle
-        if high - low <= 1e-12 * high:
+        if high - low <= _PRECISE * high:
             break
     return radius * -a / (gap + high)
 
 
 def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return a step as `ball_step`, with lower <= s <= upper [r]: parameters that hit a bound stay there.
+    """Return a step as `ball_step` that also stays within lower <= s <= upper [r].
 
-    Which ones hit is a guess; the best point along the projected gradient is returned if it is better.
+    Parameters that hit a bound stay there, and the others get a new step. Which ones hit is a guess. The best point
+    along the projected gradient is returned if it is better.
     """
     s, free = torch.zeros_like(gradient), torch.ones_like(gradient, dtype=torch.bool)
     while bool(free.any()):
@@ -84,6 +91,8 @@ def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, up
 def _projected_gradient(gradient: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:
     """Return points down the gradient, [24, r], each moved to the nearest point of the box and into the ball."""
     largest = gradient.abs().max().clamp_min(_SMALLEST)
-    lengths = radius * 2.0 ** torch.arange(8, 8 - _HALVINGS, -1, dtype=gradient.dtype, device=gradient.device)
+    lengths = radius * 2.0 ** torch.arange(
+        _LONGEST, _LONGEST - _HALVINGS, -1, dtype=gradient.dtype, device=gradient.device
+    )
     path = (-lengths[:, None] * (gradient / largest)).clamp(lower, upper)
     return path * (radius / path.norm(dim=1, keepdim=True).clamp_min(radius))

@@ -28,9 +28,10 @@ class Newton(NewtonStep):
     - "abs": m(w) = abs(w), which turns steps towards a saddle around and does not rely on a negative eigenvalue
       beyond its own magnitude (Dauphin et al. 2014): the safer choice for sampled Hessians.
 
-    What rounding leaves of a zero eigenvalue, and of the gradient along it, counts as zero. With `adapt` the closure is
-    called once more, without derivatives: a step that does not lower the loss is taken back, and the radius follows the
-    ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Without it every step is taken.
+    Eigenvalues within rounding of zero count as zero, and so do components of the gradient along their eigenvectors.
+    With `adapt` the closure is called once more, without derivatives: a step that does not lower the loss is taken
+    back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Without
+    `adapt` every step is taken.
 
     Args:
         params: parameters, one group, 10 000 numbers at most.

@@ -20,12 +20,12 @@ class NewtonCG(NewtonStep):
     loss is taken back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright,
     algorithm 4.1). Without it every step is taken, as suits a loss over small batches.
 
-    Noise. Sampled derivatives have an error, which exact steps amplify in flat directions. If the closure returns
-    several losses [R], independent estimates whose mean is meant (`layer(x.expand(R, n))`, or one per image of a
-    batch), conjugate gradients stop when the residual or the curvature does not differ from zero by more than their
-    errors, which are known from the spread of the R. A gradient that is itself that small gives no step: more samples
-    are needed, not more steps. It takes no more evaluations of the black box, but R backward passes for each one.
-    `exit` says why conjugate gradients ended last.
+    Noise. Sampled derivatives have an error, which exact steps amplify in flat directions. The closure may return
+    several losses [R], independent estimates whose mean is the loss (`layer(x.expand(R, n))`, or one per image of a
+    batch). The spread of the R gives the errors of residual and curvature, and conjugate gradients stop when one of
+    them does not differ from zero by more than its error. If the gradient itself does not, no step is made: more
+    samples are needed, not more steps. This costs no evaluations of the black box, but R backward passes instead of
+    one. `exit` says why conjugate gradients ended last.
 
     Args:
         params: parameters, one group.
@@ -36,8 +36,8 @@ class NewtonCG(NewtonStep):
         damping: added to the diagonal of H.
         adapt: whether to test the step and adapt the radius.
         max_radius: the radius never grows beyond it.
-        noise: standard deviations by which residual and curvature must stand out from their errors, if there are
-            several losses (see `steihaug.noise_level`); 0 takes their mean for exact.
+        noise: number of standard errors by which residual and curvature must differ from zero, if there are several
+            losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact.
 
     The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
     pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them.

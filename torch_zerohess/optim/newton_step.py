@@ -1,4 +1,4 @@
-"""A step that minimises a quadratic model in a trust region, and its test: what `Newton` and `NewtonCG` share."""
+"""A step that minimises a quadratic model in a trust region, and its test: shared by `Newton` and `NewtonCG`."""
 
 import math
 from abc import abstractmethod
@@ -11,7 +11,7 @@ from torch_zerohess.linalg.steihaug import Step
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, pair
 
 _ROUNDING = 10.0
-"""Units of rounding of the loss below which a decrease cannot be tested."""
+"""Smallest predicted decrease that can be tested, in units of rounding of the loss."""
 
 
 class NewtonStep(SecondOrder):
@@ -65,7 +65,7 @@ class NewtonStep(SecondOrder):
         )
 
     def _try(self, s: Tensor, closure: Closure, loss: Tensor) -> float:
-        """Move by s [N] and return by how much the loss fell; the move is taken back where it did not."""
+        """Move by s [N] and return by how much the loss fell; if it did not fall, take the move back."""
         before, actual = self._copy(), math.nan
         self._add(s)
         try:

@@ -29,20 +29,20 @@ class NonlinearCG(SecondOrder):
 
         x <- x + t d/|d|,    t = -g.d |d| / d.Hd,    |t| <= radius,
 
-    each with loss, gradient and curvature from a new call of the closure; the first uses those that d was made from,
-    so that a step calls the closure `line_search_iterations` times at most. It is steepest descent (d = -g) at the
-    start, after `recompute` steps, and where d would not descend. This is OurH, OurHVP and OurHVPA of Wang, Fischer
-    and Ritschel (2025), who follow Shewchuk (1994, B4), with these decisions where the source leaves room:
+    Every move uses loss, gradient and curvature of a new call of the closure; only the first move shares the call that
+    d was made from. So a step calls the closure `line_search_iterations` times at most. The direction is steepest
+    descent (d = -g) at the start, after `recompute` steps, and if d would not descend. This is OurH, OurHVP and OurHVPA
+    of Wang, Fischer and Ritschel (2025), who follow Shewchuk (1994, B4), with these decisions:
 
-    - Where d.Hd is not positive, "abs" takes its magnitude, and "radius" goes to the boundary; both have the scale of
-      the problem, which the source's fallback, a step of length |g|^3, has not.
-    - Directions are used by their unit vector; one that is exactly zero, on a plateau, makes no move.
-    - The restart counter of the source is never raised; here it counts.
-    - The radius is in units of the parameters; for one in units of sigma set `param_groups[0]["radius"]` as sigma
-      changes.
+    - If d.Hd is not positive, "abs" takes its magnitude, and "radius" goes to the boundary. Both scale with the
+      problem; the source's fallback, a step of length |g|^3, does not.
+    - Directions are normalised. A direction that is exactly zero, on a plateau, makes no move.
+    - The source never raises its restart counter; here it counts.
+    - The radius is in units of the parameters. For a radius in units of sigma set `param_groups[0]["radius"]` whenever
+      sigma changes.
 
-    A point where the loss or its gradient is not finite is left by taking back three quarters of the move to it, up to
-    nine times, also at the start of the next step.
+    If the loss or its gradient is not finite after a move, three quarters of the move are taken back, up to nine times,
+    also at the start of the next step.
 
     Args:
         params: parameters, one group.

@@ -1,4 +1,4 @@
-"""What the second-order optimizers share: one group of parameters as a vector, and the quadratic model of a loss."""
+"""Shared by the second-order optimizers: one group of parameters as a vector, and the quadratic model of a loss."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -11,11 +11,11 @@ from torch.optim import Optimizer
 from torch_zerohess.autograd.curvature import CurvatureOperator
 
 Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
-"""What a closure returns: the loss, or the loss and where its white box ends."""
+"""Result of a closure: the loss, or a pair of the loss and the tensors at which its white box ends."""
 Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
 TRIALS = 10
-"""Evaluations of a step, shortened after each at which the loss is not finite."""
+"""Evaluations of one step at most; it is shortened after each one at which the loss is not finite."""
 
 
 class Model:
@@ -110,7 +110,7 @@ class SecondOrder(Optimizer):
 
 
 def pair(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:
-    """Return loss and where the white box ends, if the closure says so."""
+    """Return the loss, and the tensors at which the white box ends if the closure returned them."""
     loss, through = result if isinstance(result, tuple) else (result, None)
     if not isinstance(loss, Tensor) or loss.numel() == 0:
         raise TypeError(f"closure must return the loss, a tensor with a graph, got {loss!r}")

@@ -1,8 +1,8 @@
 """The operations that the C++ extension speeds up, each beside its literal reference in torch.
 
-A CPU tensor goes to the extension where it was built; any other device, and an installation without a compiler, to the
-reference. Drawn perturbations have the same bits on both ways; sums differ by rounding only, within n units in the
-last place of the sum of magnitudes.
+CPU tensors go to the extension if it was built. Tensors on other devices, and all tensors of an installation without
+a compiler, go to the reference. Both draw the same bits. Their sums of n terms differ by rounding: n units in the last
+place of the sum of magnitudes at most.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch_zerohess.sampling import extension, proposals
 
 _MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
-_WIDE = 64  # likewise for the outer products of a Hessian
+_WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
 _CHUNK = 1 << 22  # elements of drawn rows held at a time
 
 
@@ -36,7 +36,7 @@ class Redrawn(NamedTuple):
         return len(self.rows) // len(self.x) * (2 if self.antithetic else 1)
 
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Yield what `place` returns, for a part of the rows at a time, and which k of the K rows these are."""
+        """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
         B, n = self.x.shape
         S = len(self.rows) // B
         step = max(1, _CHUNK // (B * n))

@@ -13,7 +13,7 @@ DIMENSIONS = 0
 PICKS = 1
 """Stream of the choices of a mixture: its component and the dimensions of its lobe."""
 EXTRA = 2
-"""Stream of whatever a sampler needs besides: scrambles, radii, jitter."""
+"""Stream of everything else that a sampler draws: scrambles, shifts, jitter."""
 
 _MASK = 0xFFFFFFFF
 _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
@@ -43,7 +43,7 @@ def _philox(counter: tuple[Tensor, ...], key: tuple[Tensor, Tensor]) -> tuple[Te
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(_ROUNDS):
-        # Products of 32-bit words wrap in int64; the wrapped bits are those of the unsigned product.
+        # Products of 32-bit words wrap in int64; the wrapped bits equal the bits of the unsigned product.
         p0, p1 = c0 * _MULTIPLIERS[0], c2 * _MULTIPLIERS[1]
         c0, c1, c2, c3 = ((p1 >> 32) & _MASK) ^ c1 ^ k0, p1 & _MASK, ((p0 >> 32) & _MASK) ^ c3 ^ k1, p0 & _MASK
         k0, k1 = (k0 + _WEYL[0]) & _MASK, (k1 + _WEYL[1]) & _MASK

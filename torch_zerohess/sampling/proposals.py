@@ -11,9 +11,9 @@ density over- or underflows, a ratio does not.
 | first order: mean of the n gradient lobes | sqrt(pi/2) sum |u| / n |
 | second order: mean of the n^2 Hessian lobes | [(pi/2)((sum |u|)^2 - sum u^2) + sqrt(2 pi e)/4 sum |u^2-1|] / n^2 |
 
-The aggregate divides by the density of the whole mixture (balance heuristic): dividing by that of the one lobe that was
-drawn has infinite variance. A Gaussian share and both orders are always in the mixture, because the lobe of one order
-vanishes where the kernel of another does not.
+The aggregate divides by the density of the whole mixture (balance heuristic). Dividing by the density of the one lobe
+that was drawn has infinite variance. The mixture always has a Gaussian share and, at order 2, the lobes of both orders,
+because the lobe of one order vanishes where the kernel of another does not.
 """
 
 import math
@@ -25,7 +25,7 @@ from torch_zerohess.sampling.philox import DIMENSIONS, PICKS, uniforms
 from torch_zerohess.sampling.quantiles import gradient_lobe_quantile, hessian_lobe_quantile, normal_quantile
 
 NORMAL, GRADIENT_LOBE, DIAGONAL_LOBE, OFF_DIAGONAL_LOBE, EVERY_GRADIENT_LOBE, BOX = range(6)
-"""What a row of noise is: column 2 of `rows`."""
+"""Kinds of rows: column 2 of `rows`."""
 GAUSSIAN, FIRST_ORDER, SECOND_ORDER, UNIFORM, SIGNED_LOBES = range(5)
 """Densities of whole rows."""
 
@@ -94,8 +94,8 @@ def place(
     """Return points z = x + sigma u [B, K, n] in the type of x, the applied u = (z - x) / sigma, and weights [B, K].
 
     u: [B * S, n] float64; with `antithetic` K = 2 S and the second half of the rows has the opposite sign.
-    x: [B, n] and sigma: [n], float64; `single` rounds z to float32. The u returned is what rounding left of the one
-    drawn, so that estimates stay right where sigma is near the rounding of x.
+    x: [B, n] and sigma: [n], float64; `single` rounds z to float32. The applied u differs from the u drawn by the
+    rounding of z. It keeps estimates right where sigma is near the rounding of x.
     """
     u = u.view(len(x), -1, u.shape[1])
     if antithetic:

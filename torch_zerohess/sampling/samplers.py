@@ -1,7 +1,7 @@
 """Perturbations u [R, n] of a batch of B estimates with S samples each, R = B * S: random, Sobol, orthogonal.
 
-All three have the same distribution row by row; they differ in how the rows of one estimate depend on each other.
-Rows that depend on each other form one independent draw: `draw_size` tells how many consecutive samples it has.
+Each row has the same distribution with all three samplers. They differ in how the rows of one estimate depend on each
+other. Rows that depend on each other form one independent draw of `draw_size` consecutive samples.
 """
 
 import torch
@@ -33,8 +33,9 @@ def sobol(
 ) -> tuple[Tensor, Tensor]:
     """Scrambled Sobol points: rows [R, 5] and u [R, n].
 
-    Each independent scramble is a linear matrix scramble (Matousek 1998), shared by the batch, and a digital shift of
-    each batch element; the bits below the thirty of the sequence are random. Raises ValueError if n is over 21 198.
+    Each independent scramble is a linear matrix scramble (Matousek 1998), shared by the batch, and a digital shift,
+    one per batch element. The sequence has thirty bits; the bits below them are random. Raises ValueError if n is over
+    21 198.
     """
     if n + 3 > torch.quasirandom.SobolEngine.MAXDIM:
         most = torch.quasirandom.SobolEngine.MAXDIM - 3
@@ -60,8 +61,8 @@ def orthogonal(
 ) -> tuple[Tensor, Tensor]:
     """Blocks of orthogonal directions with independent chi-distributed lengths (Yu et al. 2016): rows and u [R, n].
 
-    The orthonormal and the triangular factor of a Gaussian matrix are independent, so the lengths of its own rows
-    scale the directions and leave every row N(0, I).
+    The orthonormal factor of a Gaussian matrix is independent of the lengths of its rows. So each direction is scaled
+    by the length of its own row, and every row is N(0, I).
     """
     rows = kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device)
     plain = rows.clone()
@@ -77,7 +78,7 @@ def orthogonal(
 
 
 def _orthogonalized(block: Tensor) -> Tensor:
-    """Gram-Schmidt, twice, on the rows of [B, c, n]: sums in a fixed order, where a QR's follow the threads."""
+    """Gram-Schmidt, twice, on the rows of [B, c, n]; unlike QR its bits do not follow the number of threads."""
     basis = torch.empty_like(block)
     for row in range(block.shape[1]):
         v = block[:, row : row + 1]

@@ -19,6 +19,8 @@ _GAIN = 0.02
 """Part of the loss by which such a step lowers it."""
 _MISLED = 2.0
 """Misfit beyond which the next step needs more samples than the last one."""
+_NARROW, _BY_LENGTH, _WIDER = 0.85, 0.3, 1.05
+"""Factor for sigma after a step of no length, its growth with the length, and the largest one."""
 _RETRIES = 2
 """Shorter steps tried in a row before samples are drawn."""
 _SHORTER, _RETRY = 0.4, 0.9
@@ -75,4 +77,4 @@ def _followed(known: DescentProgress, smoothed: float) -> DescentProgress:
 
 def _narrowing(length: float) -> float:
     """Factor for sigma after a step of a length in units of the radius: short steps have found the minimum."""
-    return min(max(0.85 + 0.3 * length, 0.8), 1.05)
+    return min(_NARROW + _BY_LENGTH * length, _WIDER)

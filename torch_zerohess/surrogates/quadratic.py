@@ -1,7 +1,7 @@
 """Quadratic models of a black box around a point, by regression on evaluations in its neighbourhood.
 
-With u = (z - x)/sigma, gradient and Hessian of the smoothed function are the Hermite coefficients of degree 1 and 2 of
-u -> f(x + sigma u) under the normal density; a weighted least-squares fit estimates them, and can use evaluations that
+Let u = (z - x)/sigma. Gradient and Hessian of the smoothed function are the Hermite coefficients of degree 1 and 2 of
+u -> f(x + sigma u) under the normal density. A weighted least-squares fit estimates them, also from evaluations that
 were made around other points (see `Pool`). Both models live in the span of the perturbations: with fewer evaluations
 than parameters they know nothing of the other directions, and a step does not go there.
 """
@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 _NOISE = (1e-7, 1e-4, 1e-2, 1e-1)
-"""Variance of what a quadratic leaves over, in units of the prior's; the evidence chooses."""
+"""Variances of the part of the values that is not quadratic, in units of the prior's; the evidence chooses."""
 _CONSTANT = 10.0
 """Prior variance of the constant term."""
 _RIDGES = (1e-6, 1e-3, 0.2)
-"""Prior precision of a slope, in evaluations; the evidence chooses."""
+"""Prior precisions of a slope, in evaluations; the evidence chooses."""
 _ROUNDING = 1e-15
-"""Variation of values, relative to their size, that is none."""
+"""Variation of values, relative to their size, that is rounding: the values are constant."""
 _DAMPING = 1e-3
 """Added to the curvature of an image model, in units of its mean eigenvalue."""
 
@@ -75,7 +75,7 @@ class LocalModel:
         return s if self.basis is None else self.basis @ s
 
     def decrease(self, s: Tensor) -> float:
-        """How much the model falls from 0 to s [r]."""
+        """Decrease of the model from 0 to s [r]."""
         return -float(self.gradient @ s + 0.5 * (s @ self.hessian @ s))
 
     def misfit(self, s: Tensor, output: Tensor) -> float:
@@ -90,11 +90,11 @@ class LocalModel:
 def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
     """Fit a quadratic to values [P] at u [P, n] with weights [P], for any P >= 1 and n.
 
-    Kernel ridge regression with the kernel 10 + u.u'/n + (u.u')^2/2n^2 + (|u|^2-n)(|u'|^2-n)/4n^2: a Gaussian prior
-    over slopes, over all entries of the Hessian and over its trace, so that few evaluations in many dimensions still
-    tell the mean curvature. P numbers describe the Hessian, whatever n: a full one where P is large, one of low rank
-    plus a multiple of the identity else. The variance of what is left over is chosen by the evidence (marginal
-    likelihood), from exact interpolation to noise.
+    Kernel ridge regression with the kernel 10 + u.u'/n + (u.u')^2/2n^2 + (|u|^2-n)(|u'|^2-n)/4n^2. This is a Gaussian
+    prior over slopes, over all entries of the Hessian and over its trace: a few evaluations in many dimensions still
+    tell the mean curvature. P numbers describe the Hessian, whatever n. Where P is large it is a full one, otherwise
+    one of low rank plus a multiple of the identity. The evidence (marginal likelihood) chooses the variance of the
+    part that is not quadratic, from exact interpolation to noise.
     """
     n = u.shape[1]
     basis, s = _reduced(u)
@@ -131,12 +131,12 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
 def fit_outputs(
     u: Tensor, outputs: Tensor, weights: Tensor, loss: Callable[[Tensor], Tensor], shape: torch.Size
 ) -> LocalModel:
-    """Fit outputs [P, m] linearly at u [P, n] and return the quadratic model of `loss` after it (generalized
-    Gauss-Newton). Derivatives of the loss that are not finite, as those of a norm at zero, count as zero.
+    """Fit outputs [P, m] linearly at u [P, n]; return the quadratic model of `loss` after them (Gauss-Newton).
 
-    The intercept is the smoothed output M = E f(x + sigma u), the slopes its Jacobian J [n, m]; the model of the loss
-    has gradient J grad(loss)(M) and Hessian J loss''(M) J^T. It smooths the output, loss(E f), not the loss, E loss(f).
-    `loss` takes an output of the given `shape`.
+    The intercept is the smoothed output M = E f(x + sigma u), the slopes are its Jacobian J [n, m]. The model of the
+    loss has the gradient J grad(loss)(M) and the Hessian J loss''(M) J^T. It smooths the output, loss(E f), not the
+    loss, E loss(f). `loss` takes an output of the given `shape`. Derivatives of the loss that are not finite, such as
+    the derivative of a norm at zero, count as zero.
     """
     P, _ = u.shape
     basis, s = _reduced(u)
@@ -209,7 +209,7 @@ def _ridge(s: Tensor, outputs: Tensor, weights: Tensor) -> float:
 
 
 def _reduced(u: Tensor) -> tuple[Tensor | None, Tensor]:
-    """Return a basis of the span of u [P, n] and the coordinates in it; the identity where P >= n."""
+    """Return a basis of the span of u [P, n] and the coordinates in it; None, for the identity, and u if P >= n."""
     if len(u) >= u.shape[1]:
         return None, u
     basis, triangle = torch.linalg.qr(u.mT)
@@ -252,5 +252,5 @@ def loss_derivatives(
 
 
 def _finite(derivatives: Tensor) -> Tensor:
-    """Zero in place of what is not finite: a norm at zero, a root, a logarithm outside of its domain."""
+    """Replace derivatives that are not finite by zero: of a norm at zero, of a logarithm outside of its domain."""
     return torch.nan_to_num(derivatives, nan=0.0, posinf=0.0, neginf=0.0)

@@ -2,8 +2,8 @@
 
 1024 black-box parameters, the reflectances of a grey label on the front of the mug. Textures are 32x32 crops of
 pictures of skimage.data, 2 to 8 of their pixels to one of the texture; the held-out ones are from other pictures than
-those of training. A label is 34 pixels wide at 96x96, so that the render determines each of its own pixels, those at
-the sides the least, where they are seen at a slant.
+those of training. The label is 34 pixels wide at 96x96, so that the render determines all 32x32 pixels of the texture.
+It determines the pixels at the sides least, since they are seen at a slant.
 """
 
 from collections.abc import Sequence

@@ -148,17 +148,19 @@ import sys
 from pathlib import Path
 from small import GATED, GATED_BUMP, SEARCH
 from experiments.ensembles.ensemble import Ensemble
-from experiments.methods import METHODS
 
 if __name__ == "__main__":
     ensemble = Ensemble(Path(sys.argv[1]), range(2), jobs=2)
-    plan = {"search": ([GATED], [SEARCH]), "our_g": ([GATED_BUMP], [METHODS["our_g"]])}
+    plan = {"search": ([GATED], [SEARCH]), "our_g": ([GATED_BUMP], ["our_g"])}
     print(len(ensemble.run(ensemble.plan(*plan[sys.argv[2]]))))
 """
 
 
-@pytest.mark.parametrize(("method", "task"), [("search", TASK), ("our_g", BUMP)], ids=["fitting", "network"])
-@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGINT], ids=["SIGKILL", "SIGINT"])
+@pytest.mark.parametrize(
+    ("by", "method", "task"),
+    [(signal.SIGKILL, "search", TASK), (signal.SIGINT, "search", TASK), (signal.SIGKILL, "our_g", BUMP)],
+    ids=["SIGKILL", "SIGINT", "network"],
+)
 def test_a_killed_ensemble_goes_on(tmp_path, by, method, task):
     """All processes end with the one that is killed, and starting it again gives the rows of one that was not."""
     root = Path(__file__).parents[3]
@@ -211,5 +213,9 @@ def test_network_tasks_are_run_in_the_same_plan(tmp_path, capsys):
         ("stopped", "evaluations used up"),
     ]
     assert (tmp_path / "bump" / "shift" / "0.pt").exists()
-    said = capsys.readouterr().err
-    assert "images rendered" in said
+
+
+def test_the_first_progress_of_a_network_is_that_of_its_images(tmp_path, capsys):
+    one = Ensemble(tmp_path, range(1))
+    one.run(one.plan([BUMP], [SHIFT]))
+    assert "bump shift 0: 0 of 16 images rendered" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from experiments.methods.settings import settings
 from experiments.problems.tasks import box2
 from experiments.runs.attempt import attempt
 
-TASK = replace(box2.task(), evaluations=40)
+TASK = replace(box2.task(), evaluations=12)
 RUNNABLE = [name for name, method in METHODS.items() if not method.unusable(TASK)]
 
 

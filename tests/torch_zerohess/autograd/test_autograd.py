@@ -365,6 +365,29 @@ def test_compiled_layer_sees_new_settings() -> None:
         close(x.grad, estimate(SCALAR.f, BATCH, smoothing).gradient)
 
 
+def test_compiled_layer_stores_perturbations_whatever_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dynamo traces no function that draws them again."""
+    monkeypatch.setattr(perturbations, "STORED", 0)
+    x = leaf(BATCH)
+    torch.compile(BlackBox(SCALAR.f, AGGREGATE), fullgraph=True, backend="aot_eager")(x).sum().backward()
+    close(x.grad, estimate(SCALAR.f, BATCH, AGGREGATE).gradient)
+
+
+@BOTH
+def test_a_forward_pass_makes_no_pass_over_the_samples_and_a_gradient_makes_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    passes: list[str] = []
+    for name in ("project", "accumulate"):
+        original = getattr(kernels, name)
+        monkeypatch.setattr(kernels, name, lambda *a, o=original, n=name: passes.append(n) or o(*a))
+    x = leaf()
+    y = BlackBox(SCALAR.f, AGGREGATE)(x)
+    assert passes == []  # the perturbation of x is zero there, and so is its projection
+    y.backward()
+    assert passes == ["accumulate"]
+
+
 @pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
 def test_compiled_inside_a_network(backend: str) -> None:
     model, inputs = network(BlackBox(IMAGE.f, AGGREGATE))

@@ -90,10 +90,10 @@ def test_products_match_the_dense_matrix(case, mode):
 @pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
 def test_matrix_free_at_the_size_of_the_cnn(mode):
     """267 745 weights: H v against double differentiation of the closed form, on the same float64 network."""
-    from experiments.problems.tasks.cnn import PRESETS
+    from experiments.problems.tasks import cnn
 
     torch.manual_seed(0)
-    encoder = PRESETS["fast"].encoder().double()
+    encoder = cnn.task().encoder().double()
     parameters = list(encoder.parameters())
     assert sum(p.numel() for p in parameters) == 267_745
     images = torch.rand(2, 3, 64, 64, dtype=torch.float64)
@@ -160,38 +160,21 @@ def test_errors_name_what_is_wrong():
             make()
 
 
-@pytest.mark.parametrize("common", [True, False])
-@pytest.mark.parametrize("vector", ["one", "batch"])
-def test_finite_difference_hvp(common, vector):
-    """Against H v of the closed form; the step's own error is of second order, here below 3 %."""
-    wave = TRUTHS["plane wave"]
-    sigma = torch.tensor([0.4, 0.6, 0.5], dtype=torch.float64)
-    x = torch.tensor([[0.4, -0.2, 0.1], [0.0, 0.5, -0.3]], dtype=torch.float64)
-    v = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
-    vectors = v if vector == "one" else v.expand(2, 3) * torch.tensor([[1.0], [-2.0]], dtype=torch.float64)
-    smoothing = zh.Smoothing(sigma=sigma, samples=1 << 14, sampler="sobol", seed=1)
-    found = zh.finite_difference_hvp(wave.f, x, vectors, smoothing, common=common)
-    hessians = torch.func.vmap(torch.func.hessian(lambda z: wave.smoothed(z, sigma)))(x)
-    expected = (hessians @ vectors.expand(2, 3)[..., None])[..., 0]
-    assert (found - expected).abs().max() < 0.03 * expected.abs().max()
+def test_a_dense_matrix_beyond_ten_thousand_parameters_is_refused():
+    x = torch.zeros(10_001, requires_grad=True)
+    operator = zh.CurvatureOperator((x**2).sum(), x)
+    with pytest.raises(ValueError, match="matrix of 10001 squared numbers: use H @ v"):
+        operator.to_dense()
+    torch.testing.assert_close(operator @ torch.ones(10_001), torch.full((10_001,), 2.0))
 
 
-def test_finite_difference_hvp_of_a_zero_vector_is_zero():
-    smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
-    assert torch.equal(
-        zh.finite_difference_hvp(lambda z: z.sum(1), torch.ones(3), torch.zeros(3), smoothing), torch.zeros(3)
-    )
-
-
-def test_common_random_numbers_reduce_the_noise():
-    wave, x, v = TRUTHS["plane wave"], torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    spread = {
-        common: torch.stack(
-            [
-                zh.finite_difference_hvp(wave.f, x + 0.3, v, zh.Smoothing(sigma=0.5, samples=8, seed=s), common=common)
-                for s in range(200)
-            ]
-        ).std(0)
-        for common in (True, False)
-    }
-    assert bool((spread[True] < spread[False]).all())
+@pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
+def test_parameters_that_the_loss_does_not_depend_on_have_no_curvature(mode):
+    used, linear, unused = (torch.tensor([1.0, 2.0], requires_grad=True) for _ in range(3))
+    loss = (used**2).sum() + linear.sum()
+    through = [used, linear] if mode == "gauss_newton" else None
+    operator = zh.CurvatureOperator(loss, [used, linear, unused], mode=mode, through=through)
+    assert operator.gradient.tolist() == [2.0, 4.0, 1.0, 1.0, 0.0, 0.0]
+    assert torch.equal(operator.to_dense(), torch.diag(torch.tensor([2.0, 2.0, 0.0, 0.0, 0.0, 0.0])))
+    alone = zh.CurvatureOperator(linear.sum(), linear)  # its gradient has no graph at all
+    assert torch.equal(alone.to_dense(), torch.zeros(2, 2))

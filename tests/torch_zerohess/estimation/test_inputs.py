@@ -203,12 +203,6 @@ OTHERS = [
         ValueError,
         "sampler 'sobol' has .* dimensions at most, but x has 30000 parameters: use 'random'",
     ),
-    # 1 + n + n (n + 1) / 2 sets of 3 pairs.
-    (
-        lambda: estimate(f, torch.zeros(1000), S.replace(proposal="optimal")),
-        ValueError,
-        "proposal 'optimal' would need 3009006 evaluations .* at most 1000000 .* use proposal 'aggregate'",
-    ),
 ]
 
 
@@ -216,6 +210,16 @@ OTHERS = [
 def test_other_arguments(call, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         call()
+
+
+def test_optimal_sampling_stops_at_a_million_evaluations() -> None:
+    """1 + n + n (n + 1) / 2 = 6 sets of pairs for two parameters."""
+    most = S.replace(proposal="optimal", samples=83_333)
+    assert estimate(f, X, most).evaluations == 999_996 + 1
+    message = "would need 1000008 evaluations for 1 x 2 .* at most 1000000 .* use proposal 'aggregate'"
+    with pytest.raises(ValueError, match=message):
+        estimate(f, X, most.replace(samples=83_334))
+    assert most.replace(samples=3).evaluations(1000, center=False) == 3_009_006
 
 
 FIRST_ORDER = "first derivatives only .*use Smoothing\\(proposal='aggregate', order=2\\)"

@@ -167,3 +167,11 @@ def test_errors():
         zh.optim.Newton([x]).step(lambda: x.detach().sum())
     with pytest.raises(ValueError, match="params must have a parameter that requires grad, got none"):
         zh.optim.Newton([x.detach()])
+
+
+def test_a_step_says_whether_the_boundary_stopped_it():
+    for radius, reason in ((0.5, "boundary"), (50.0, "converged")):
+        x = vector(3.0, -2.0).requires_grad_()
+        optimizer = zh.optim.Newton([x], radius=radius)
+        optimizer.step(lambda x=x: (x**2).sum())
+        assert optimizer.exit == reason

@@ -196,6 +196,26 @@ def test_a_move_to_where_the_loss_is_not_finite_is_shortened():
         assert float(x.detach()) == pytest.approx(0.5)
 
 
+def test_a_move_is_shortened_to_a_quarter():
+    x, tried = vector(0.0).requires_grad_(), []
+
+    def closure():
+        tried.append(float(x.detach()))
+        return torch.where(x > 0.1, torch.nan, -x).sum()
+
+    NonlinearCG([x], radius=4.0, line_search_iterations=2).step(closure)
+    assert tried == [0.0, 4.0, 1.0, 0.25, 0.0625]
+
+
+def test_a_direction_that_does_not_descend_is_replaced_by_the_gradient():
+    """The slope grows tenfold and turns round, so that g + beta d' is 100 times the old direction: uphill."""
+    x, slope = vector(0.0).requires_grad_(), 1.0
+    optimizer = NonlinearCG([x], radius=1.0, line_search_iterations=1, recompute=100)
+    for slope, after in ((1.0, -1.0), (-10.0, 0.0)):
+        optimizer.step(lambda slope=slope: slope * x.sum())
+        assert float(x.detach()) == after
+
+
 def test_where_the_loss_is_finite_nowhere_else_the_parameters_stay():
     x = vector(1.0, 1.0).requires_grad_()
     optimizer = NonlinearCG([x], radius=2.0)

@@ -114,6 +114,25 @@ def test_sums_within_the_bound(n: int, M: int) -> None:
         assert torch.equal(got, got.mT)
 
 
+@pytest.mark.parametrize(("n", "M"), [(3, 2), (3, 9), (64, 8), (65, 9)])
+def test_extension_and_matrix_product_agree_within_the_bound(n: int, M: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`_MANY_VECTORS`, `_WIDE` and `_CHUNK` choose the faster of two ways: no result changes beyond rounding."""
+    K = 11
+    u, t, a = samples(n, K, M)
+    size, squares, weighted = u.abs(), u * u, u.mT[:, None] * a[:, :, None]
+    for threshold in (0, 10**9):
+        for chunk in (1, 1 << 22):
+            monkeypatch.setattr(kernels, "_MANY_VECTORS", threshold)
+            monkeypatch.setattr(kernels, "_WIDE", threshold)
+            monkeypatch.setattr(kernels, "_CHUNK", chunk)
+            check(kernels.project(u, t), t @ u.mT, t.abs() @ size.mT, n)
+            check(kernels.accumulate(u, a), a @ u, a.abs() @ size, K)
+            check(kernels.accumulate_squares(u, a), a @ squares, a.abs() @ squares, K)
+            got = kernels.hessian(u, a)
+            check(got, weighted @ u[:, None], weighted.abs() @ size[:, None], K)
+            assert torch.equal(got, got.mT)
+
+
 @pytest.mark.parametrize("antithetic", [True, False])
 @pytest.mark.parametrize("single", [True, False])
 @pytest.mark.parametrize("n", [1, 7, 128, 129, 300])

@@ -227,3 +227,90 @@ def test_a_round_whose_start_is_not_finite_goes_on_to_what_is():
     while search.rounds == 1 and torch.equal(search.center, start):
         search.tell(bowl(search.ask()))
     assert search.rounds == 1  # it has moved before sigma has shrunk to nothing
+
+
+# What is kept, how much is asked for at a time, and where a round begins.
+
+
+def kept(search):
+    """How many evaluations a search keeps."""
+    return len(search.state_dict()["progress"]["pool"]["values"])
+
+
+@pytest.mark.parametrize(
+    ("n", "with_loss", "pool", "expected"),
+    [
+        *[(2, False, None, 60), (8, False, None, 90), (30, False, None, 500), (100, False, None, 600)],
+        *[(3, True, None, 60), (20, True, None, 120), (2, False, 7, 7)],
+    ],
+)
+def test_as_many_evaluations_are_kept_as_two_models_take(n, with_loss, pool, expected):
+    """A quadratic of a loss has (n + 1)(n + 2)/2 coefficients, a linear output n + 1."""
+    search = Descent(zeros(n), sigma=1.0, loss=torch.sum if with_loss else None, pool=pool, seed=0)
+    while search.evaluations < expected + 10:
+        points = search.ask()
+        noise = torch.randn(len(points), generator=torch.Generator().manual_seed(search.evaluations)).double()
+        search.tell(noise[:, None] if with_loss else noise)
+    assert kept(search) == expected
+
+
+def test_at_most_64_samples_at_a_time():
+    search = Descent(zeros(200), sigma=1.0, seed=0)
+    assert len(search.ask()) == 65  # with the start
+    counts = set()
+    while search.evaluations < 1500:
+        counts.add(len(search.ask()))
+        search.tell(bowl(search.ask()))
+    assert max(counts - {65}) == 64
+
+
+def second_round(seed, bounds):
+    search = Descent(zeros(3), sigma=2.0, bounds=bounds, seed=seed)
+    while search.rounds == 0:
+        search.tell(bowl(search.ask()))
+    assert search.sigma == 1.5
+    assert torch.equal(search.ask()[0], search.center)
+    return search
+
+
+def test_a_further_round_begins_at_another_point():
+    """Around the first start with two sigma where there is no box, anywhere in it otherwise. 40 rounds each.
+
+    Within five standard errors of mean and standard deviation, 120 numbers each: false alarms 1e-6.
+    """
+    free = torch.stack([second_round(seed, None).center for seed in range(40)]) / 2.0  # in units of sigma
+    assert abs(float(free.mean())) < 5 * 2.0 / math.sqrt(120)
+    assert abs(float(free.std()) - 2.0) < 5 * 2.0 / math.sqrt(240)
+    boxed = torch.stack([second_round(seed, (-3.0, 6.0)).center for seed in range(40)])
+    assert float(boxed.min()) < -2.5
+    assert float(boxed.max()) > 5.5
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0, 100.0])
+def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
+    """Wider by a power of 3/2, up to the seventh; there is none if all evaluations are farther away."""
+    search = Descent(zeros(3), sigma=1.0, seed=0)
+    points = search.ask()
+    search.tell(bowl(points))
+    state = search.state_dict()
+    pool = state["progress"]["pool"]
+    pool["points"], pool["sigmas"] = search.x + factor * (points - search.x), factor * pool["sigmas"]
+    search.load_state_dict(state)
+    found = search.model_at_best()
+    if factor == 100.0:
+        assert found is None
+    else:
+        power = math.log(found[1]) / math.log(1.5)
+        assert power == pytest.approx(round(power))
+        assert (round(power) == 0) == (factor == 1.0)
+        assert round(power) <= 7
+
+
+def test_after_ten_batches_without_a_finite_value_it_ends():
+    search, batches = Descent(zeros(2), sigma=1.0, seed=0), 0
+    search.tell(bowl(search.ask()))
+    while not search.done and batches < 30:
+        search.tell(torch.full((len(search.ask()),), math.nan))
+        batches += 1
+    assert batches == 10
+    assert "10 batches in a row had values that are not finite" in search.message

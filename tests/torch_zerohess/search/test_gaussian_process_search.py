@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from searches import bar, bump, misfit, waves
+from searches import bar, bump, misfit, spiral, waves
 
 from torch_zerohess.optim import GaussianProcessSearch
 from truths import vector
@@ -28,9 +28,6 @@ def test_it_crosses_a_plateau_that_is_wider_than_sigma(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_it_leaves_a_local_minimum(seed):
     """(sin 2x + x/4, cos 2x) has a local minimum in every turn; the solution is two turns away."""
-
-    def spiral(x):
-        return torch.cat([torch.sin(2 * x) + 0.25 * x, torch.cos(2 * x)], 1)
 
     search = GaussianProcessSearch(
         vector(-3.0), sigma=1.0, bounds=(-5.0, 6.0), loss=misfit(spiral, vector(4.0)), restarts=100, seed=seed
@@ -112,23 +109,58 @@ def test_outputs_that_are_not_finite_are_avoided():
     assert search.value <= 1e-3
 
 
-def test_it_ends_where_nothing_is_finite():
+def test_after_ten_batches_without_a_finite_value_it_ends():
     search = GaussianProcessSearch(vector(0.0), sigma=1.0, bounds=(-2.0, 2.0), loss=misfit(waves, vector(1.0)), seed=0)
     search.tell(waves(search.ask()))
-    while not search.done:
+    batches = 0
+    while not search.done and batches < 30:
         search.tell(torch.full((len(search.ask()), 5), math.nan))
-    assert "not finite" in search.message
-    assert search.evaluations < 20
+        batches += 1
+    assert batches == 10
+    assert "10 batches in a row had values that are not finite" in search.message
 
 
-def test_it_arrives_and_says_so():
-    search = GaussianProcessSearch(
-        vector(0.5), sigma=1.0, bounds=(-2.0, 2.0), loss=misfit(waves, vector(1.0)), restarts=0, seed=0
-    )
+def test_it_arrives_after_three_short_steps_and_explores():
+    loss, moved = misfit(waves, vector(1.0)), []
+    search = GaussianProcessSearch(vector(0.5), sigma=1.0, bounds=(-2.0, 2.0), loss=loss, restarts=1, seed=0)
     while not search.done and search.evaluations < 100:
         search.tell(waves(search.ask()))
-    assert "below 0.01 of sigma" in search.message
+        assert search.sigma > 0.0
+        moved.append(search.sigma)
+        if search.rounds == 1 and len(moved) > 3:
+            assert max(moved[-3:]) < 0.01 <= moved[-4]
+            assert search.state_dict()["progress"]["exploring"] == 2
+            moved = []
+    assert search.rounds == 2
+    assert search.message == "3 steps in a row were below 0.01 of sigma, 2 times"
     assert abs(float(search.x[0]) - 1.0) < 0.02
+
+
+@pytest.mark.parametrize(("n", "pool", "expected"), [(1, None, 60), (40, None, 82), (1, 9, 9), (3, 4, 8)])
+def test_so_many_evaluations_are_kept(n, pool, expected):
+    """Sixty, or as many as are given; at least the start, its samples, and as many steps."""
+    search = GaussianProcessSearch(
+        torch.zeros(n, dtype=torch.float64), sigma=1.0, bounds=(-2.0, 2.0), pool=pool, restarts=10**6, seed=0
+    )
+    while search.evaluations < expected + 20:
+        search.tell(search.ask().square().sum(1) + torch.sin(9 * search.ask()).sum(1))
+    assert len(search.state_dict()["progress"]["pool"]["values"]) == expected
+
+
+@pytest.mark.parametrize(("pool", "first"), [(None, 20), (12, 12)])
+def test_noise_is_told_from_ten_outputs_per_coefficient_on(pool, first):
+    """Ten per coefficient of a line; a pool that is smaller tells when it is full."""
+    generator = torch.Generator().manual_seed(0)
+    search = GaussianProcessSearch(
+        vector(-3.0), sigma=1.5, bounds=(-5.0, 5.0), loss=misfit(bump, vector(1.3)), restarts=99, pool=pool, seed=0
+    )
+    noisy = {}
+    while search.evaluations < 30:
+        points = search.ask()
+        search.tell(bump(points) + torch.randn(len(points), 40, generator=generator, dtype=torch.float64))
+        noisy[search.evaluations] = search.state_dict()["progress"]["noisy"]
+    assert not any(noisy[k] for k in noisy if k < first)
+    assert noisy[first]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])

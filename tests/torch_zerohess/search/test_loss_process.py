@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from searches import well
 
 from torch_zerohess import minimize
 from torch_zerohess.optim import GaussianProcessSearch
@@ -13,13 +14,6 @@ def search_for(f, x0, evaluations, **settings):
     while search.evaluations < evaluations and not search.done:
         search.tell(f(search.ask()))
     return search
-
-
-def well(z):
-    """A loss [K] that is 1 but for a paraboloid around (2, -2), 4 % of the box, and one near the start."""
-    narrow = (z - vector(2.0, -2.0)).square().sum(1) / 0.8
-    shallow = 0.5 + (z - vector(-2.5, 1.0)).square().sum(1)
-    return torch.minimum(torch.minimum(narrow, shallow), torch.ones(len(z), dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -122,3 +116,38 @@ def test_it_ends_after_its_rounds_and_says_why():
     assert search.done
     assert search.rounds == 3
     assert "3 times" in search.message
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_process_and_quadratics_take_turns(seed):
+    """Two steps of the process below 0.1 in a row, or 3 (n + 1) evaluations without something better, hand over to
+    quadratics with a sigma of 0.3, unless these have ended within 0.05 of the best point; they end after as many
+    evaluations without something better, or when they have converged.
+    """
+    search = GaussianProcessSearch(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0), restarts=10**6, seed=seed)
+    short = waited = handed = 0
+    lowest, finished = torch.inf, torch.full((2,), torch.inf, dtype=torch.float64)
+    while search.evaluations < 150:
+        before = search.state_dict()["progress"]
+        points = search.ask()
+        search.tell(well(points))
+        now = search.state_dict()["progress"]
+        waited = 0 if search.value < lowest else waited + len(points)
+        lowest = search.value
+        if before["finishing"]:
+            converged = now["quadratics"]["done"]
+            assert now["finishing"] == (not converged and waited < 9)
+            if not now["finishing"]:
+                finished, waited = search.x, 0
+                length = float(now["quadratics"]["step"].norm()) * now["quadratics"]["sigma"]
+                assert torch.equal(now["solved"], search.x) == (length < 1e-3)
+                assert now["quadratics"]["sigma"] < 1e-5 or not converged
+        else:
+            short = short + 1 if before["moved"] < 0.1 else 0
+            new = float((search.x - finished).norm()) > 0.05
+            assert now["finishing"] == ((short >= 2 or waited >= 9) and new)
+            if now["finishing"]:
+                assert now["quadratics"]["sigma"] == 0.3
+                short = waited = 0
+                handed += 1
+    assert handed >= 1

@@ -1,0 +1,105 @@
+"""One call of the black box: what it is given, what becomes of values that are not finite, and the baseline."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess.estimation.evaluation import _mean_of_others
+from truths import spread, vector
+
+S = Smoothing(sigma=0.5, samples=8, proposal="gaussian", seed=1)
+X = vector(0.1, 0.2)
+
+
+def f(z: Tensor) -> Tensor:
+    return z.square().sum(1)
+
+
+def holes(*rows: int):
+    """f, but nan at some of the points of a call."""
+
+    def fn(z: Tensor) -> Tensor:
+        values = f(z)
+        values[list(rows)] = math.nan
+        return values
+
+    return fn
+
+
+def test_a_center_that_is_not_finite_cannot_be_dropped() -> None:
+    """The last point is x itself. Other points are not finite either: x is the one that is named."""
+    with pytest.raises(ValueError, match=r"fn returned nan at the point \[0\.1, 0\.2\]"):
+        estimate(holes(0, 16), X, S, on_nonfinite="drop")
+    plain = S.replace(baseline="none")
+    assert estimate(holes(0), X, plain, value="smoothed", on_nonfinite="drop").dropped == 2
+
+
+def test_the_other_one_of_a_dropped_pair_goes_with_it() -> None:
+    got = estimate(holes(2, 11), X, S, on_nonfinite="drop")
+    assert got.dropped == 4  # rows 2, 10 and 3, 11
+    kept = [k for k in range(16) if k % 8 not in (2, 3)]
+    u = (got.points[:-1] - X) / 0.5
+    by_hand = ((f(got.points[:-1]) - f(X[None]))[:, None] * u)[kept].mean(0) / 0.5
+    torch.testing.assert_close(got.gradient, by_hand)
+    single = estimate(holes(2), X, S.replace(antithetic=False), on_nonfinite="drop")
+    assert single.dropped == 1
+
+
+def test_too_few_draws_left_is_an_error() -> None:
+    everything_but_one = holes(*range(1, 8))
+    assert estimate(everything_but_one, X, S, on_nonfinite="drop").dropped == 14
+    with pytest.raises(ValueError, match="left 1 of 8 draws, 2 are needed"):
+        estimate(everything_but_one, X, S.replace(baseline="mean"), on_nonfinite="drop")
+    with pytest.raises(ValueError, match="left 0 of 8 draws, 1 are needed"):
+        estimate(holes(*range(8)), X, S, on_nonfinite="drop")
+    # 16 points in two scrambles: a whole one is gone, and what is left is one draw.
+    sobol = S.replace(samples=16, sampler="sobol", baseline="mean")
+    with pytest.raises(ValueError, match="left one independent draw, baseline 'mean' needs two"):
+        estimate(holes(*range(8)), X, sobol, on_nonfinite="drop", value="smoothed")
+
+
+def test_the_sets_of_optimal_sampling_cannot_be_dropped_from() -> None:
+    with pytest.raises(ValueError, match="cannot re-weight the element-wise sets of proposal 'optimal'"):
+        estimate(holes(3), X, S.replace(proposal="optimal"), on_nonfinite="drop")
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
+def test_a_number_in_place_of_nan_keeps_its_precision(dtype: torch.dtype) -> None:
+    """1e6 is infinite in float16, and 0.1 is another number in float32."""
+    for number in (1e6, 0.1):
+        fn = holes(0)
+        got = estimate(lambda z, fn=fn: fn(z).to(dtype), X, S, on_nonfinite=number)
+        assert float(got.values[0]) == number
+        layer = BlackBox(lambda z: torch.full_like(z[:, 0], math.nan).to(dtype), S, on_nonfinite=number)
+        with torch.no_grad():
+            assert float(layer(X)) == number
+
+
+def test_the_function_cannot_change_auxiliary_inputs() -> None:
+    a = torch.ones(2)
+
+    def greedy(z: Tensor, one: Tensor) -> Tensor:
+        result = f(z) * one.sum(1)
+        one.zero_()
+        return result
+
+    x = X.expand(2, 2)
+    with torch.no_grad():
+        BlackBox(greedy, S)(x, a[:, None])
+    estimate(greedy, x, S, a[:, None])
+    assert torch.equal(a, torch.ones(2))
+
+
+def test_the_baseline_is_the_mean_of_the_other_draws() -> None:
+    """Draws of one, two and three rows, one row dropped: every row gets the mean over the rows of the other draws."""
+    values, draws = spread(6, -1.0, 3.0).view(1, 6, 1), [[[0]], [[1, 2]], [[3, 4, 5]]]
+    kept = torch.tensor([1.0, 1.0, 1.0, 1.0, 0.0, 1.0], dtype=torch.float64)
+    share = (kept / kept.sum()).view(1, 6, 1)
+    got = _mean_of_others(values, share, [torch.tensor(one) for one in draws])[0, :, 0]
+    f = values[0, :, 0]
+    first, second, third = f[0], f[1:3].sum(), f[3] + f[5]
+    expected = [(second + third) / 4, *[(first + third) / 3] * 2, *[(first + second) / 3] * 3]
+    torch.testing.assert_close(got, torch.stack(expected))

@@ -1,0 +1,79 @@
+"""Products by finite differences against closed forms, and the settings of the source."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_zerohess as zh
+from truths import PlaneWave, vector
+
+WAVE = PlaneWave(vector(0.9, -0.7, 1.1))
+
+
+@pytest.mark.parametrize("common", [True, False])
+@pytest.mark.parametrize("shape", ["one", "batch"])
+def test_against_the_closed_form(common: bool, shape: str) -> None:
+    """The step's own error is of second order, here below 3 %."""
+    sigma, v = vector(0.4, 0.6, 0.5), vector(1.0, -2.0, 0.5)
+    x = torch.tensor([[0.4, -0.2, 0.1], [0.0, 0.5, -0.3]], dtype=torch.float64)
+    vectors = v if shape == "one" else v.expand(2, 3) * torch.tensor([[1.0], [-2.0]], dtype=torch.float64)
+    smoothing = zh.Smoothing(sigma=sigma, samples=1 << 14, sampler="sobol", seed=1)
+    found = zh.finite_difference_hvp(WAVE.f, x, vectors, smoothing, common=common)
+    hessians = torch.func.vmap(torch.func.hessian(lambda z: WAVE.smoothed(z, sigma)))(x)
+    expected = (hessians @ vectors.expand(2, 3)[..., None])[..., 0]
+    assert (found - expected).abs().max() < 0.03 * expected.abs().max()
+
+
+def points_of_two_gradients(v: Tensor, **settings) -> list[Tensor]:
+    """Points [K, 2] at which the black box is called on either side, for sigma = (0.1, 0.4)."""
+    called: list[Tensor] = []
+
+    def fn(z: Tensor) -> Tensor:
+        called.append(z.clone())
+        return z.sum(1)
+
+    smoothing = zh.Smoothing(sigma=vector(0.1, 0.4), samples=3, baseline="none", seed=5)
+    zh.finite_difference_hvp(fn, vector(0.0, 0.0), v, smoothing, **settings)
+    return called
+
+
+@pytest.mark.parametrize(("settings", "length"), [({}, 1 / 3), ({"step": 0.2}, 0.2)])
+def test_the_step_is_a_third_of_sigma_in_the_metric_of_sigma(settings: dict, length: float) -> None:
+    v = vector(0.3, -0.8)
+    forward, backward = points_of_two_gradients(v, **settings)
+    offset = (forward.mean(0) - backward.mean(0)) / 2 / vector(0.1, 0.4)  # pairs have their mean at their x
+    assert float(offset.norm()) == pytest.approx(length)
+    torch.testing.assert_close(offset / offset.norm(), v / vector(0.1, 0.4) / (v / vector(0.1, 0.4)).norm())
+
+
+def test_both_sides_use_the_same_perturbations_unless_they_are_not_to() -> None:
+    for settings, same in (({}, True), ({"common": True}, True), ({"common": False}, False)):
+        forward, backward = points_of_two_gradients(vector(1.0, 0.0), **settings)
+        assert torch.allclose(forward - forward.mean(0), backward - backward.mean(0)) == same
+
+
+def test_a_zero_vector_gives_zero() -> None:
+    smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
+    found = zh.finite_difference_hvp(lambda z: z.sum(1), torch.ones(3), torch.zeros(3), smoothing)
+    assert torch.equal(found, torch.zeros(3))
+
+
+def test_common_random_numbers_reduce_the_noise() -> None:
+    x, v = torch.full((3,), 0.3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+
+    def scatter(common: bool) -> Tensor:
+        products = [
+            zh.finite_difference_hvp(WAVE.f, x, v, zh.Smoothing(sigma=0.5, samples=8, seed=s), common=common)
+            for s in range(200)
+        ]
+        return torch.stack(products).std(0)
+
+    assert bool((scatter(True) < scatter(False)).all())
+
+
+def test_errors() -> None:
+    smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
+    with pytest.raises(ValueError, match=r"v must be a tensor of shape \[3\] or that of x, got torch.Size\(\[2\]\)"):
+        zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(2), smoothing)
+    with pytest.raises(ValueError, match=r"step must be positive, in units of sigma, got 0\.0"):
+        zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(3), smoothing, step=0.0)

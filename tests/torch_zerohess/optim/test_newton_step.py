@@ -1,0 +1,78 @@
+"""The test of a step: Nocedal and Wright, algorithm 4.1, for both Newton optimizers."""
+
+import math
+
+import pytest
+import torch
+
+from torch_zerohess.optim import Newton, NewtonCG
+from torch_zerohess.optim.newton_step import _next_radius
+from truths import vector
+
+BOTH = pytest.mark.parametrize("optimizer", [Newton, NewtonCG])
+
+
+@pytest.mark.parametrize(
+    ("ratio", "length", "after"),
+    [
+        (-3.0, 2.0, 0.5),  # a quarter of the step
+        (0.2, 1.0, 0.25),
+        (0.26, 2.0, 2.0),  # neither good nor bad
+        (0.74, 2.0, 2.0),
+        (0.76, 2.0, 4.0),  # good, and the boundary was in the way
+        (1.0, 1.99, 4.0),
+        (1.0, 1.5, 2.0),  # good, inside
+    ],
+)
+def test_radius_follows_the_ratio_of_actual_to_predicted_decrease(ratio: float, length: float, after: float) -> None:
+    assert _next_radius(ratio, length, 2.0) == after
+
+
+@BOTH
+def test_radius_after_steps_of_known_ratio(optimizer) -> None:
+    """Loss -x + c x^2 with the c x^2 hidden from the graph: the model promises 1, the step of length 1 gives 1 - c."""
+    for c, after in ((0.0, 2.0), (0.5, 1.0), (0.9, 0.25), (1.5, 0.25)):
+        x = vector(0.0).requires_grad_()
+        steps = optimizer([x], radius=1.0)
+        steps.step(lambda x=x, c=c: (c * x.detach() ** 2 - x).sum())
+        assert steps.param_groups[0]["radius"] == after
+        assert float(x.detach()) == (1.0 if c < 1.0 else 0.0)
+
+
+@BOTH
+def test_radius_never_grows_beyond_its_maximum(optimizer) -> None:
+    x = vector(0.0).requires_grad_()
+    steps = optimizer([x], radius=1.0, max_radius=1.5)
+    for radius in (1.5, 1.5):
+        steps.step(lambda: (-x).sum())
+        assert steps.param_groups[0]["radius"] == radius
+
+
+@BOTH
+def test_a_step_is_shortened_to_a_quarter_nine_times(optimizer) -> None:
+    x, tried = vector(0.0).requires_grad_(), []
+
+    def closure() -> torch.Tensor:
+        tried.append(float(x.detach()))
+        return torch.where(x > 0.0, math.nan, -x).sum() if tried[1:] else (-x).sum()
+
+    with pytest.raises(ValueError, match="even after it was shortened"):
+        optimizer([x], radius=1.0).step(closure)
+    assert tried == [0.0] + [0.25**k for k in range(10)]
+    assert float(x.detach()) == 0.0
+
+
+@BOTH
+def test_a_decrease_within_rounding_is_not_tested(optimizer) -> None:
+    """float32 around 1e6 has steps of 1/16: a promise of 0.5 cannot be tested, one of 50 can."""
+    for slope, calls, radius in ((0.5, 1, 1.0), (50.0, 2, 2.0)):
+        x, called = torch.zeros(1, requires_grad=True), []
+
+        def closure(x=x, called=called, slope=slope) -> torch.Tensor:
+            called.append(1)
+            return 1e6 - slope * x.sum()
+
+        steps = optimizer([x], radius=1.0)
+        steps.step(closure)
+        assert len(called) == calls
+        assert steps.param_groups[0]["radius"] == radius

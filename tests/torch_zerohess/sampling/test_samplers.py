@@ -1,0 +1,119 @@
+"""Which samples form one independent draw, and what makes the draws of one estimate, and of a batch, independent."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from torch_zerohess import Smoothing
+from torch_zerohess.sampling import proposals, samplers
+from truths import spread
+
+CPU = torch.device("cpu")
+
+
+def drawn(sampler: str, batch: int, n: int, samples: int, seed: int = 5) -> Tensor:
+    """Perturbations [batch, samples, n] of a Gaussian."""
+    smoothing = Smoothing(sigma=1.0, samples=samples, proposal="gaussian", sampler=sampler)
+    u = samplers.SAMPLERS[sampler](seed, batch, n, smoothing, proposals.GAUSSIAN, CPU)[1]
+    return u.view(batch, samples, n)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "samples", "n", "size"),
+    [
+        ("random", 12, 3, 1),
+        # Scrambles: 8 of at least 8 points, else 4, else 2 of any length, else 1.
+        ("sobol", 256, 3, 32),
+        ("sobol", 64, 3, 8),
+        ("sobol", 56, 3, 14),
+        ("sobol", 32, 3, 8),
+        ("sobol", 20, 3, 10),
+        ("sobol", 16, 3, 8),
+        ("sobol", 2, 3, 1),
+        ("sobol", 9, 3, 9),
+        # Blocks: n rows where there are two blocks of them, else half of the samples.
+        ("orthogonal", 12, 3, 3),
+        ("orthogonal", 12, 10, 6),
+        ("orthogonal", 7, 10, 4),
+        ("orthogonal", 1, 10, 1),
+    ],
+)
+def test_draw_size(sampler: str, samples: int, n: int, size: int) -> None:
+    assert samplers.draw_size(Smoothing(sigma=1.0, samples=samples, sampler=sampler), n) == size
+
+
+def test_orthogonal_blocks_are_independent_of_each_other() -> None:
+    u = drawn("orthogonal", 20_000, 2, 3)  # a block of two and one of one
+    cosines = torch.nn.functional.cosine_similarity(u[:, :1], u[:, 1:], dim=2)
+    assert float(cosines[:, 0].abs().max()) < 1e-12
+    # Two directions in the plane that are independent: cos^2 has mean 1/2 and variance 1/8. 5 standard errors.
+    assert abs(float(cosines[:, 1].square().mean()) - 0.5) < 5 * (1 / 8 / 20_000) ** 0.5
+
+
+def test_the_rows_left_over_are_orthogonal_too() -> None:
+    u = drawn("orthogonal", 4, 9, 7)  # blocks of four and three rows
+    gram = u[:, 4:] @ u[:, 4:].mT
+    assert float((gram - torch.diag_embed(gram.diagonal(dim1=1, dim2=2))).abs().max()) < 1e-13
+
+
+def test_orthogonal_rows_stay_orthogonal_where_the_gaussian_ones_are_nearly_parallel() -> None:
+    """The second pass of Gram-Schmidt: after one, rounding is multiplied by the condition of the block."""
+    block = torch.ones(1, 3, 5, dtype=torch.float64) + 1e-9 * spread(15, -1.0, 1.0).view(1, 3, 5)
+    q = samplers._orthogonalized(block)
+    unit = q / q.norm(dim=2, keepdim=True)
+    assert float((unit @ unit.mT - torch.eye(3)).abs().max()) < 1e-14
+    torch.testing.assert_close(q.norm(dim=2), block.norm(dim=2))
+
+
+def test_sobol_points_of_a_batch_and_of_its_scrambles_differ() -> None:
+    u = drawn("sobol", 3, 2, 32).view(3 * 4, 8, 2)  # four scrambles of eight points each
+    first = u[:, 0]
+    assert len(first.unique(dim=0)) == 12
+    # Between two scrambles of one batch element more than a digital shift differs: their matrices do.
+    p = torch.special.ndtr(u[:4]) * 2**20
+    ranks = p.long()
+    shifted = [ranks[k] ^ ranks[k, :1] for k in range(4)]
+    assert not torch.equal(shifted[0] >> 12, shifted[1] >> 12)
+
+
+def test_sobol_numbers_use_all_bits_and_never_reach_zero_or_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty bits of the sequence and random ones below. At the extremes the half ulp keeps the quantile finite."""
+    p = torch.special.ndtr(drawn("sobol", 400, 2, 64).flatten())
+    below = torch.remainder(p * 2**30, 1.0)  # of p in the middle, where ndtr inverts the quantile to 1e-16
+    middle = below[(p > 0.1) & (p < 0.9)]
+    assert abs(float(middle.mean()) - 0.5) < 5 * (1 / 12 / len(middle)) ** 0.5
+    assert abs(float(middle.var()) - 1 / 12) < 0.005
+
+    def extreme(seeds: Tensor, rows: Tensor, first: int, count: int, stream: int) -> Tensor:
+        return torch.full((len(rows), count), float(extreme.value), dtype=torch.float64)
+
+    monkeypatch.setattr(samplers, "uniforms", extreme)
+    monkeypatch.setattr(torch.quasirandom, "SobolEngine", Edge)
+    for extreme.value in (0.0, 1.0 - 2.0**-53):  # all bits of shift and jitter zero, or one
+        assert bool(torch.isfinite(drawn("sobol", 1, 2, 4)).all())
+
+
+class Edge:
+    """A sequence that stays at zero."""
+
+    MAXDIM = 21_201
+
+    def __init__(self, dimension: int, scramble: bool, seed: int) -> None:
+        self.dimension = dimension
+
+    def draw(self, size: int, dtype: torch.dtype) -> Tensor:
+        return torch.zeros(size, self.dimension, dtype=dtype)
+
+
+def test_shifts_jitter_and_scrambles_are_different_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No number of the counter-based noise is used twice."""
+    used: list[tuple[int, int, int]] = []
+    original = samplers.uniforms
+
+    def recorded(seeds: Tensor, rows: Tensor, first: int, count: int, stream: int) -> Tensor:
+        used.extend((int(seed), int(row), stream) for seed, row in zip(seeds, rows, strict=True))
+        return original(seeds, rows, first, count, stream)
+
+    monkeypatch.setattr(samplers, "uniforms", recorded)
+    drawn("sobol", 3, 2, 32)
+    assert len(set(used)) == len(used) == 4 + 12 + 96

@@ -1,0 +1,78 @@
+"""ZeroGrads and RELAX on network tasks: costs, repetition, and that they learn because of their surrogate."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from small import BUMP, SIZE, Bump
+from torch import nn
+
+from experiments.methods import METHODS, learned_networks
+from experiments.methods.learned_networks import Surrogate
+from experiments.problems.network_task import Size
+from experiments.runs.attempt import attempt
+from experiments.runs.network_trial import NetworkTrial
+
+RENDERS = {"zerograds": 4 * 2, "relax": 4 * 2}
+"""Of a step: images of a batch, times samples."""
+LEARNING = Bump(Size(16, 1, 2, evaluations=1500, images=256, held_out=32))
+
+
+def run(name, task=BUMP, number=0, **settings):
+    trials = []
+    outcome = attempt(task, name, number, lambda trial: (trials.append(trial), METHODS[name](trial, settings))[1])
+    assert outcome.status == "stopped", outcome.traceback
+    return outcome, trials[0]
+
+
+def improvement(name, **settings) -> float:
+    """Parameter error before over that after the training."""
+    _, trial = run(name, LEARNING, **settings)
+    return trial.rows[0].parameter_error / LEARNING.parameter_error(trial.encoder)
+
+
+@pytest.mark.parametrize("name", RENDERS)
+def test_every_method_trains_within_its_budget(name):
+    outcome, trial = run(name)
+    assert [row.evaluations for row in trial.rows] == list(range(0, SIZE.evaluations + 1, RENDERS[name]))
+    assert outcome.evaluations == trial.rows[-1].evaluations
+    assert all(math.isfinite(row.parameter_error) and math.isfinite(row.image_error) for row in trial.rows)
+    start = BUMP.encoders(0)[1]
+    for a, b in zip(trial.encoder.parameters(), start.parameters(), strict=True):
+        assert not torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", RENDERS)
+def test_a_run_repeats_itself(name):
+    first, second = ([replace(row, seconds=0.0) for row in run(name, number=3)[1].rows] for _ in range(2))
+    assert first == second
+
+
+def test_zerograds_learns_by_its_fit():
+    assert improvement("zerograds", fits=30) > 10
+    assert improvement("zerograds", fits=0) < 2
+
+
+def test_relax_learns(monkeypatch):
+    assert improvement("relax") > 10
+    monkeypatch.setattr(learned_networks, "lax", lambda f, h, x, u, sigma: 0.0 * h(x)[:, None] * u)
+    assert improvement("relax") == 1.0
+
+
+def test_the_surrogate_sees_parameters_and_image():
+    """In units of the first sigma, relative to the mean prediction; losses over the mean of the first call."""
+    trial = NetworkTrial(BUMP, "zerograds", 0)
+    surrogate, images = Surrogate(trial, (4,), nn.Tanh), trial.images[:3]
+    with torch.no_grad():
+        centre = trial.encoder(trial.images).mean(0)
+    z = centre + torch.tensor([[0.0], [1.0], [2.0]])
+    seen = nn.functional.avg_pool2d(images, 2).flatten(1)  # 16 pixels to 8
+    inputs = torch.cat([torch.tensor([[0.0], [1.0], [2.0]]), seen], 1)
+    torch.testing.assert_close(surrogate.of(images)(z), surrogate.network(inputs))
+    first, mean = surrogate.loss(z, images)
+    again, _ = surrogate.loss(z[:1], images[:1])
+    truth = BUMP.loss(z, images)
+    torch.testing.assert_close(first, truth / truth.mean())
+    assert mean == pytest.approx(float(truth.mean()))
+    torch.testing.assert_close(again, first[:1])

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -30,7 +29,9 @@ class Elementwise(Stein):
     droppable = False
 
     @classmethod
-    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+    def draw(
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool
+    ) -> tuple[Tensor, "Elementwise"]:
         """See `Stein.draw`; ValueError if more than a million evaluations would be needed."""
         B, n = x.shape
         evaluations = B * smoothing.evaluations(n, center=False)
@@ -63,7 +64,9 @@ class Elementwise(Stein):
         return [self.weight, self.rows]
 
     @classmethod
-    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> Self:
+    def rebuild(
+        cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool
+    ) -> "Elementwise":
         weight, rows = tensors
         return cls(weight, rows, x.shape[1], smoothing.order)
 

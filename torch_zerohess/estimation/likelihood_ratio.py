@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -24,7 +23,9 @@ class LikelihoodRatio(Stein):
     """N(u) / p(u), [B, K]."""
 
     @classmethod
-    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+    def draw(
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool
+    ) -> tuple[Tensor, "LikelihoodRatio"]:
         """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as weights of "uniform" can."""
         B, n = x.shape
         density, single, x64 = _density(smoothing), x.dtype == torch.float32, x.double().contiguous()
@@ -57,7 +58,9 @@ class LikelihoodRatio(Stein):
         return [first, self.weight]
 
     @classmethod
-    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> Self:
+    def rebuild(
+        cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool
+    ) -> "LikelihoodRatio":
         first, weight = tensors
         if _kept(smoothing, keep):
             return cls(first, weight)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -26,7 +25,9 @@ class SignedLobes(Stein):
     """sign(u) sqrt(2/pi), [B, K, n]."""
 
     @classmethod
-    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+    def draw(
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool
+    ) -> tuple[Tensor, "SignedLobes"]:
         B, n = x.shape
         density, single = proposals.SIGNED_LOBES, x.dtype == torch.float32
         _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
@@ -42,7 +43,9 @@ class SignedLobes(Stein):
         return [self.kernel]
 
     @classmethod
-    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> Self:
+    def rebuild(
+        cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool
+    ) -> "SignedLobes":
         return cls(*tensors)
 
     @property

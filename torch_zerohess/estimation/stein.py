@@ -20,7 +20,7 @@ in units of sigma: the caller divides by sigma.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -60,7 +60,7 @@ class Stein(ABC):
 
     @classmethod
     @abstractmethod
-    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, "Stein"]:
         """Draw samples around x [B, n] and return their points [B, K, n], in the dtype of x, and the family.
 
         sigma: float64 [n]; keep: store the perturbations instead of drawing them again whenever they are needed.
@@ -77,7 +77,7 @@ class Stein(ABC):
 
     @classmethod
     @abstractmethod
-    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> Self:
+    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: Smoothing, keep: bool) -> "Stein":
         """Return the family that `tensors` were taken from, drawn around x [B, n] with the same sigma and settings."""
 
     @property

@@ -6,7 +6,6 @@ The sums of a family are the derivatives of sum_k a_k ratio_k(d) at d = 0, which
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import pytest
 import torch
@@ -176,7 +175,9 @@ class PlainGaussian(Stein):
     u: Tensor
 
     @classmethod
-    def draw(cls, x: Tensor, sigma: Tensor, smoothing: zh.Smoothing, seed: int, keep: bool) -> tuple[Tensor, Self]:
+    def draw(
+        cls, x: Tensor, sigma: Tensor, smoothing: zh.Smoothing, seed: int, keep: bool
+    ) -> tuple[Tensor, "PlainGaussian"]:
         generator = torch.Generator().manual_seed(seed)
         u = torch.randn(len(x), smoothing.samples, x.shape[1], dtype=torch.float64, generator=generator)
         u = torch.cat([u, -u], 1) if smoothing.antithetic else u
@@ -190,7 +191,9 @@ class PlainGaussian(Stein):
         return [self.u]
 
     @classmethod
-    def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: zh.Smoothing, keep: bool) -> Self:
+    def rebuild(
+        cls, tensors: Sequence[Tensor], x: Tensor, sigma: Tensor, smoothing: zh.Smoothing, keep: bool
+    ) -> "PlainGaussian":
         return cls(*tensors)
 
     def value(self, a: Tensor) -> Tensor:

@@ -103,3 +103,11 @@ def test_the_baseline_is_the_mean_of_the_other_draws() -> None:
     first, second, third = f[0], f[1:3].sum(), f[3] + f[5]
     expected = [(second + third) / 4, *[(first + third) / 3] * 2, *[(first + second) / 3] * 3]
     torch.testing.assert_close(got, torch.stack(expected))
+
+
+def test_the_baseline_of_a_constant_is_the_constant_to_the_bit() -> None:
+    """Otherwise the rounding of a large offset would look like a variation of f."""
+    for K in (3, 7, 11, 13):
+        values = torch.full((1, K, 1), 1e12 / 3, dtype=torch.float64)
+        share = torch.full((1, K, 1), 1 / K, dtype=torch.float64)
+        assert torch.equal(_mean_of_others(values, share, [torch.arange(K)[:, None]]), values)

@@ -61,7 +61,7 @@ def zerograds(
     rate: tuple[float, float] = (5e-4, 1e-4),
     inner: float = 0.1,
     fit_rate: float = 1e-3,
-    fits: int = 3,
+    fits: int = 10,
     hidden: Sequence[int] = (64, 64, 64),
 ) -> None:
     """ZeroGrads: Adam along the gradient of the fitted surrogate at the predictions.

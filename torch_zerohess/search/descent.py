@@ -26,12 +26,17 @@ _SHARPNESS = 0.1
 """Mean squared distance, in units of sigma^2, within which evaluations weigh the same in a faithful model."""
 _REFUSED = 10
 """Batches in a row with values that are not finite, after which a round ends."""
+_HALVING = 0.5
+"""Factor for sigma after a step to a point whose value is not finite."""
 _RESTART = 1.5
 """First sigma of a further round."""
 _AWAY = 2.0
 """Standard deviation of its start from the first one, where there is no box to draw it from."""
 _WIDENINGS, _WIDENING = 8, 1.5
 """How often, and by which factor, sigma is widened to find evaluations around the best point."""
+
+_POOL, _POOL_PER_PARAMETER, _POOL_OF_QUADRATIC = 60, 6, 500
+"""Evaluations kept at least, per parameter at least, and at most for a full quadratic of the loss."""
 
 
 class LocalQuadratics(Method[DescentProgress]):
@@ -131,7 +136,7 @@ class LocalQuadratics(Method[DescentProgress]):
     def _judged(self, known: DescentProgress, evaluated: Evaluated, loss: float) -> DescentProgress:
         """Decide by the end of a step what to do next."""
         if loss == math.inf:
-            return replace(known, sigma=0.5 * known.sigma).sampling(2)
+            return replace(known, sigma=_HALVING * known.sigma).sampling(2)
         if evaluated.outputs is not None and self._follows:
             return after_output(known, evaluated.points[0], loss, evaluated.outputs[0])
         return after_loss(known, evaluated.points[0], loss, self.settings.noise)
@@ -256,6 +261,6 @@ class Descent(AskTell[DescentProgress]):
 
 
 def _capacity(n: int, *, loss_alone: bool) -> int:
-    """Evaluations to keep: twice what determines the model, within reason."""
-    quadratic = min((n + 1) * (n + 2), 500) if loss_alone else 0
-    return max(60, 6 * n, quadratic)
+    """Evaluations to keep: twice the coefficients of a quadratic of the loss, within reason."""
+    quadratic = min((n + 1) * (n + 2), _POOL_OF_QUADRATIC) if loss_alone else 0
+    return max(_POOL, _POOL_PER_PARAMETER * n, quadratic)

@@ -11,6 +11,8 @@ _DECREASE = 1e-3
 """Part of the loss by which it must fall for a move; or less,"""
 _PROMISED = 0.1
 """this part of the decrease that the model promises, as the loss may have a large offset."""
+_SLACK = 2.0
+"""Standard deviations of the noise within which a decrease does not count."""
 _LONG, _GOOD, _GROWTH = 0.9, 0.5, 1.2
 """A step of this length, in units of the radius, that achieves this part of its promise widens sigma by this factor."""
 _SHORT, _SHRINKING = 0.4, 0.75
@@ -25,7 +27,7 @@ def after_loss(known: DescentProgress, point: Tensor, loss: float, noise: float)
     """Return what is known after the loss at the end [n] of a step, and what to do next."""
     model = known.model
     assert model is not None
-    slack = 2.0 * noise
+    slack = _SLACK * noise
     promised = model.decrease(known.step)
     ratio = (known.value - loss + slack) / (promised + slack) if promised + slack > 0.0 else -math.inf
     least = min(_DECREASE * abs(known.value), _PROMISED * max(promised, 0.0))

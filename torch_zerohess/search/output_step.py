@@ -21,6 +21,8 @@ _MISLED = 2.0
 """Misfit beyond which the next step needs more samples than the last one."""
 _NARROW, _BY_LENGTH, _WIDER = 0.85, 0.3, 1.05
 """Factor for sigma after a step of no length, its growth with the length, and the largest one."""
+_FEWER = 8
+"""Parameters per pair of samples where the model was not far off."""
 _RETRIES = 2
 """Shorter steps tried in a row before samples are drawn."""
 _SHORTER, _RETRY = 0.4, 0.9
@@ -65,7 +67,7 @@ def after_output(known: DescentProgress, point: Tensor, loss: float, output: Ten
         else:
             narrow = max(narrow, min(_PLATEAU, WIDEST / known.sigma))
     known = replace(known, sigma=narrow * known.sigma)
-    some, most = 2 * math.ceil(known.n / 8), 2 * math.ceil(known.n / 2)
+    some, most = 2 * math.ceil(known.n / _FEWER), 2 * math.ceil(known.n / 2)
     return known.sampling(min(2**known.misled, most) if misfit > _MISLED else some)
 
 

@@ -37,6 +37,10 @@ _SAME = 1e-4
 """Distance below which a point is known already."""
 _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
+_FLOOR = 1e-2
+"""Least sigma, over the tolerance."""
+_ROUND = 2
+"""Steps after an arrival, over n, that are more optimistic."""
 _REFUSED = 10
 """Batches in a row with values that are not finite, after which the search ends."""
 _TELLING = 10
@@ -146,7 +150,7 @@ class ProcessMethod(Method[Q]):
 
     def arrived(self, known: Q, reason: str) -> Q:
         """End, or explore."""
-        known = replace(known, settled=0, exploring=2 * self.settings.n, rounds=known.rounds + 1)
+        known = replace(known, settled=0, exploring=_ROUND * self.settings.n, rounds=known.rounds + 1)
         if known.rounds > self.settings.restarts:
             return replace(known, done=True, message=f"{reason}, {known.rounds} times")
         return known
@@ -156,7 +160,7 @@ class ProcessMethod(Method[Q]):
         tolerance = self.settings.tolerance
         known = replace(
             known,
-            sigma=min(max(known.moved, 1e-2 * tolerance), 1.0),
+            sigma=min(max(known.moved, _FLOOR * tolerance), 1.0),
             exploring=max(known.exploring - 1, 0),
             settled=known.settled + 1 if known.moved < tolerance else 0,
         )

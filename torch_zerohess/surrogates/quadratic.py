@@ -24,6 +24,13 @@ _ROUNDING = 1e-15
 _DAMPING = 1e-3
 """Added to the curvature of an image model, in units of its mean eigenvalue."""
 
+_INTERCEPT = 1e-9
+"""Prior precision of the constant term of an output, in evaluations."""
+_JITTER = 1e-13
+"""Added to a kernel matrix, in units of its mean diagonal element, so that rounding leaves it definite."""
+_EIGEN = 1e-12
+"""Relative error to which a Hessian times a vector may be a multiple of that vector."""
+
 
 @dataclass(frozen=True)
 class LocalModel:
@@ -143,7 +150,7 @@ def fit_outputs(
     r = s.shape[1]
     design = torch.cat([s.new_ones(P, 1), s], 1)
     gram = design.mT @ (weights[:, None] * design)
-    gram.diagonal()[0] += 1e-9
+    gram.diagonal()[0] += _INTERCEPT
     gram.diagonal()[1:] += _ridge(s, outputs, weights)
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
     slopes = inverse @ (design.mT @ (weights[:, None] * outputs))
@@ -180,7 +187,7 @@ class _Evidence:
     @classmethod
     def of(cls, kernel: Tensor, noise: float, root: Tensor, target: Tensor) -> "_Evidence":
         matrix = root[:, None] * kernel * root
-        matrix.diagonal().add_(noise + 1e-13 * float(matrix.diagonal().mean()))
+        matrix.diagonal().add_(noise + _JITTER * float(matrix.diagonal().mean()))
         factor = torch.linalg.cholesky(matrix)
         white = torch.linalg.solve_triangular(factor, target[:, None], upper=False)
         variance = float(white.square().mean()) + math.ulp(0.0)
@@ -244,7 +251,7 @@ def loss_derivatives(
         probe = torch.tensordot(generic, directions, dims=1).to(y)
         image, square = product(probe), float(probe.square().sum())
         scale = float((image * probe).sum()) / square if square > 0.0 else 0.0
-        if float((image - scale * probe).norm()) <= 1e-12 * abs(scale) * math.sqrt(square):
+        if float((image - scale * probe).norm()) <= _EIGEN * abs(scale) * math.sqrt(square):
             products = scale * directions.reshape(len(directions), -1)
         else:
             products = torch.stack([product(one.to(y)).flatten() for one in directions]).to(directions)

@@ -56,6 +56,12 @@ def entropy(y):
     return (q * (q / p).log() + (1 - q) * ((1 - q) / (1 - p)).log()).mean()
 
 
+def ripples(z):
+    """A paraboloid with a local minimum in every turn of a cosine."""
+    d = z - vector(2.0, -1.5)
+    return 0.05 * d.square().sum(1) + 0.3 * (1 - torch.cos(2 * d)).sum(1)
+
+
 CASES = {
     # A descent with the loss alone.
     "a bowl": Case(descent(zeros(3), sigma=2.0), bowl, 1e-8, 150),
@@ -78,6 +84,12 @@ CASES = {
     # A process of the loss, and quadratics.
     "a well": Case(process(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0)), well, 1e-6, 205),
     "a curved valley in a box": Case(process(zeros(2) - 1.2, sigma=0.5, bounds=(-2.0, 2.0)), rosenbrock, 1e-6, 270),
+    "ripples": Case(process(vector(-4.0, 4.0), sigma=1.0, bounds=(-5.0, 5.0)), ripples, 1e-3, 340, 8),
+    "ripples beside a penalty": Case(
+        process(vector(-4.0, 4.0), sigma=1.0, bounds=(-5.0, 5.0)),
+        lambda z: torch.where(z[:, 1] > 4.1, 1e12, ripples(z)),
+        *(1e-3, 560, 8),
+    ),
     "a bowl in a box": Case(process(zeros(3), sigma=1.0, bounds=(-4.0, 5.0)), bowl, 1e-6, 140),
 }
 

@@ -43,6 +43,12 @@ def test_a_step_that_lowers_the_loss_is_taken(length, factor):
     assert after.sigma == pytest.approx(0.5 * factor)
 
 
+def test_sigma_grows_only_where_the_model_was_good():
+    """The step achieves 0.6, or 0.4, of what its model promised."""
+    assert after_loss(step(length=0.95), END, 9.4, 0.0).sigma == pytest.approx(1.2)
+    assert after_loss(step(length=0.95), END, 9.6, 0.0).sigma == 1.0
+
+
 def test_a_better_sample_is_preferred():
     after = after_loss(step(length=0.95, lowest=Best(BEST, 8.0)), END, 9.0, 0.0)
     assert torch.equal(after.center, BEST)

@@ -131,7 +131,7 @@ def botorch_logei(
     trial: Trial,
     *,
     evaluations: int = EVALUATIONS,
-    noise: float | None = 1e-6,
+    noise: float | None = 2e-6,
     restarts: int = 5,
     raw_samples: int = 128,
 ) -> None:

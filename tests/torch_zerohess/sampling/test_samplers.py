@@ -58,7 +58,7 @@ def test_the_rows_left_over_are_orthogonal_too() -> None:
 
 def test_orthogonal_rows_stay_orthogonal_where_the_gaussian_ones_are_nearly_parallel() -> None:
     """The second pass of Gram-Schmidt: after one, rounding is multiplied by the condition of the block."""
-    block = torch.ones(1, 3, 5, dtype=torch.float64) + 1e-9 * spread(15, -1.0, 1.0).view(1, 3, 5)
+    block = 3.0 + 1e-9 * spread(15, -1.0, 1.0).view(1, 3, 5)
     q = samplers._orthogonalized(block)
     unit = q / q.norm(dim=2, keepdim=True)
     assert float((unit @ unit.mT - torch.eye(3)).abs().max()) < 1e-14
@@ -67,17 +67,15 @@ def test_orthogonal_rows_stay_orthogonal_where_the_gaussian_ones_are_nearly_para
 
 def test_sobol_points_of_a_batch_and_of_its_scrambles_differ() -> None:
     u = drawn("sobol", 3, 2, 32).view(3 * 4, 8, 2)  # four scrambles of eight points each
-    first = u[:, 0]
-    assert len(first.unique(dim=0)) == 12
+    bits = (torch.special.ndtr(u) * 2**20).long()  # above the jitter, which differs in any case
+    assert len(bits[:, 0].unique(dim=0)) == 12
     # Between two scrambles of one batch element more than a digital shift differs: their matrices do.
-    p = torch.special.ndtr(u[:4]) * 2**20
-    ranks = p.long()
-    shifted = [ranks[k] ^ ranks[k, :1] for k in range(4)]
+    shifted = [bits[k] ^ bits[k, :1] for k in range(4)]
     assert not torch.equal(shifted[0] >> 12, shifted[1] >> 12)
 
 
 def test_sobol_numbers_use_all_bits_and_never_reach_zero_or_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Thirty bits of the sequence and random ones below. At the extremes the half ulp keeps the quantile finite."""
+    """Thirty bits of the sequence and random ones below. At the extremes the half ulp limits u: 2^-53 is at -8.21."""
     p = torch.special.ndtr(drawn("sobol", 400, 2, 64).flatten())
     below = torch.remainder(p * 2**30, 1.0)  # of p in the middle, where ndtr inverts the quantile to 1e-16
     middle = below[(p > 0.1) & (p < 0.9)]
@@ -90,7 +88,13 @@ def test_sobol_numbers_use_all_bits_and_never_reach_zero_or_one(monkeypatch: pyt
     monkeypatch.setattr(samplers, "uniforms", extreme)
     monkeypatch.setattr(torch.quasirandom, "SobolEngine", Edge)
     for extreme.value in (0.0, 1.0 - 2.0**-53):  # all bits of shift and jitter zero, or one
-        assert bool(torch.isfinite(drawn("sobol", 1, 2, 4)).all())
+        assert 8.2 < float(drawn("sobol", 1, 2, 4).abs().max()) < 8.3
+
+
+def test_every_scramble_has_one_point_in_each_of_its_cells() -> None:
+    """8 scrambles of 4096 points: their first 12 bits are all different in every dimension."""
+    cells = (torch.special.ndtr(drawn("sobol", 1, 1, 8 * 4096)) * 4096).long().view(8, 4096)
+    assert torch.equal(cells.sort(1).values, torch.arange(4096).expand(8, 4096))
 
 
 class Edge:

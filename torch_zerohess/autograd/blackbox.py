@@ -8,14 +8,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.autograd import opaque, transforms
+from torch_zerohess.autograd import control_variate, opaque, transforms
 from torch_zerohess.autograd.linear_map import first_order_only, project
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
+from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import checked_input, folded_aux
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.surrogates.memory import Memory
 
 
 class BlackBox(nn.Module):
@@ -29,6 +33,11 @@ class BlackBox(nn.Module):
         fn: [K, n], *aux [K, ...] -> [K, *out], scalar values (a loss) or tensors (an image). It may use NumPy,
             Mitsuba, another program; it gets detached tensors and is not differentiated. A module given as fn is not
             registered: its parameters are not trained through this layer.
+        head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
+            operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
+        memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
+            training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
+            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept.
         smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
@@ -52,6 +61,8 @@ class BlackBox(nn.Module):
         fn: Callable[..., Any],
         smoothing: Smoothing,
         *,
+        head: Head | None = None,
+        memory: Memory | None = None,
         vectorized: bool = True,
         evaluator: Evaluator | None = None,
         value: ValueMode = "center",
@@ -61,7 +72,12 @@ class BlackBox(nn.Module):
         if not isinstance(smoothing, Smoothing):
             raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
         self.smoothing = smoothing
-        self.call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite)
+        if memory is not None and not isinstance(memory, Memory):
+            raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
+        self.call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite, head)
+        self.memory = memory
+        self.control: Control | None = None
+        """The memory during the present call."""
         self.output_shapes: dict[tuple[int | torch.Size, ...], torch.Size] = {}
         self._handle = opaque.register(self)
 
@@ -75,7 +91,7 @@ class BlackBox(nn.Module):
         if self.call.value == "center" and not transforms.derivative_possible(x):
             result = self._center(flat.detach(), others)
         else:
-            result = _value(self._evaluate(flat.detach(), others), flat, flat.detach(), zero=True)
+            result = self._around(flat.detach(), others)(flat)
         if torch.compiler.is_compiling() and x.requires_grad:
             # torch differentiates a compiled backward a second time without an error, and gets a wrong number, unless
             # the backward has saved an input of the graph. This term is zero and saves x: now torch raises.
@@ -90,13 +106,53 @@ class BlackBox(nn.Module):
         """
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = x.detach().reshape(-1, n).clone()
-        expansion = self._evaluate(center, folded_aux(_without_grad(aux), batch))
+        around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
         def frozen(z: Tensor) -> Tensor:
-            result = _value(expansion, z.reshape(-1, n), center, zero=False)
+            result = around(z.reshape(-1, n))
             return result.reshape((*batch, *result.shape[1:]))
 
         return frozen
+
+    def _around(self, center: Tensor, aux: list[Tensor], *, zero: bool = True) -> Callable[[Tensor], Tensor]:
+        """Evaluate around a center [B, n], and return the estimate as a function of x [B, n].
+
+        zero: promises that x equals the center in value.
+        """
+        if self.memory is None:
+            return self._estimated(center, aux, zero)
+        if torch.compiler.is_compiling():
+            raise RuntimeError(
+                "a layer with a memory cannot be compiled, because its surrogate changes from call to call: "
+                "exclude the layer with torch.compiler.disable"
+            )
+        self.control = Control.of(self.memory, self.call.head, learning=self.training)
+        with transforms.outside(), transforms.random_numbers_allowed():
+            seed = int(torch.randint(2**62, ())) if self.smoothing.seed is None else self.smoothing.seed
+        try:
+            return control_variate.around(
+                self.control,
+                center,
+                aux,
+                self.smoothing.sigma_vector(center.shape[1], center.device),
+                seed,
+                self.smoothing.order,
+                lambda part, its_aux: self._estimated(part, its_aux, zero),
+                value=self.call.value,
+            )
+        finally:
+            self.control = None
+
+    def _estimated(self, center: Tensor, aux: list[Tensor], zero: bool) -> Callable[[Tensor], Tensor]:
+        """Return the part of the estimate that comes from new evaluations, as `_around` does."""
+        expansion = self._evaluate(center, aux)
+        entropy = isinstance(self.call.head, LocalEntropy) and not (self.control and self.control.active)
+
+        def estimated(x: Tensor) -> Tensor:
+            result = _value(expansion, x, center, zero=zero)
+            return control_variate.local_entropy_value(result, self.call.value) if entropy else result
+
+        return estimated
 
     def _evaluate(self, x: Tensor, aux: list[Tensor]) -> Expansion:
         B, n = x.shape
@@ -119,11 +175,18 @@ class BlackBox(nn.Module):
         return self.call.fn
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the settings, so that a state_dict resumes an annealed sigma."""
-        return {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
+        """Return the settings, so that a state_dict resumes an annealed sigma, and what the memory keeps."""
+        settings = {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
+        return settings if self.memory is None else {**settings, "memory": self.memory.state_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.smoothing = Smoothing(**state)
+        settings = dict(state)
+        memory = settings.pop("memory", None)
+        if memory is not None and self.memory is None:
+            raise ValueError("the state has a memory, but the layer has none: make it with memory=Memory()")
+        self.smoothing = Smoothing(**settings)
+        if memory is not None and self.memory is not None:
+            self.memory.load_state_dict(memory)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
@@ -153,6 +216,8 @@ def smooth(
     fn: Callable[..., Any],
     smoothing: Smoothing,
     *,
+    head: Head | None = None,
+    memory: Memory | None = None,
     vectorized: bool = True,
     evaluator: Evaluator | None = None,
     value: ValueMode = "center",
@@ -168,7 +233,16 @@ def smooth(
         >>> bool((slope - 0.7979).abs() < 0.05)
         True
     """
-    return BlackBox(fn, smoothing, vectorized=vectorized, evaluator=evaluator, value=value, on_nonfinite=on_nonfinite)
+    return BlackBox(
+        fn,
+        smoothing,
+        head=head,
+        memory=memory,
+        vectorized=vectorized,
+        evaluator=evaluator,
+        value=value,
+        on_nonfinite=on_nonfinite,
+    )
 
 
 def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Tensor:

@@ -89,7 +89,22 @@ class CurvatureOperator:
         t = self._split(v)
         if self.mode == "exact":
             return self._flat(_grad(self._slopes, self._inputs, t))
-        return self._flat(_grad(self._through, self._inputs, self.output_curvature(self.output_step(v))))
+        return self.pull(self.output_curvature(self.output_step(v)))
+
+    @property
+    def inputs(self) -> list[Tensor]:
+        """The parameters."""
+        return self._inputs
+
+    @property
+    def through(self) -> list[Tensor]:
+        """The tensors y at which the white box ends ("gauss_newton" only)."""
+        return self._through
+
+    @property
+    def output_gradient(self) -> list[Tensor]:
+        """dl/dy in the shapes of `through`, without a graph ("gauss_newton" only)."""
+        return [one.detach() for one in self._slopes]
 
     def output_step(self, v: Tensor) -> list[Tensor]:
         """Return J v, how far the inputs of the black boxes move along v [N] ("gauss_newton" only)."""
@@ -99,6 +114,10 @@ class CurvatureOperator:
     def output_curvature(self, t: Sequence[Tensor]) -> list[Tensor]:
         """Return (d2l/dy2) t for vectors in the shapes of the inputs of the black boxes."""
         return _grad(self._slopes, self._through, t)
+
+    def pull(self, d: Sequence[Tensor]) -> Tensor:
+        """Return J^T d, [N], for vectors d in the shapes of the inputs of the black boxes ("gauss_newton" only)."""
+        return self._flat(_grad(self._through, self._inputs, d))
 
     def to_dense(self) -> Tensor:
         """Return the matrix [N, N], one product per column; ValueError beyond 10 000 parameters."""

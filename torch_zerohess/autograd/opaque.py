@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.stein import Layout
@@ -26,13 +27,14 @@ class Owner(Protocol):
 
     call: BlackBoxCall
     smoothing: Smoothing
+    control: Control | None
     output_shapes: dict[tuple[int | torch.Size, ...], torch.Size]
 
 
 def expand(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Expansion:
     """Evaluate once around x [B, n], without autograd; `keep` stores the perturbations."""
     with torch.no_grad(), transforms.random_numbers_allowed():
-        expansion = evaluate(owner.call, x, aux, owner.smoothing, keep).expansion
+        expansion = evaluate(owner.call, x, aux, owner.smoothing, keep, owner.control).expansion
     owner.output_shapes[_signature(x, aux)] = expansion.base.shape[1:]
     return expansion
 
@@ -89,7 +91,7 @@ def _output_shape(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> torch.Size:
             probe = torch.zeros(1, int(x.shape[1]), dtype=x.dtype, device=x.device)
             others = [torch.zeros(1, *map(int, one.shape[1:]), dtype=one.dtype, device=one.device) for one in aux]
             try:
-                owner.output_shapes[signature] = owner.call(probe, others).shape[1:]
+                owner.output_shapes[signature] = owner.call.values(probe[:, None], others)[0].shape[2:]
             except Exception as error:
                 raise RuntimeError(
                     "torch.compile needs the output shape of the black box, and calling it at zero failed: call the "

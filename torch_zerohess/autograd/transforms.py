@@ -11,6 +11,8 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
+| leave all transforms for a while | `torch._functorch.pyfunctorch.temporarily_clear_interpreter_stack` | \
+a random seed is drawn once, whatever maps over the layer |
 | real tensors in a fake kernel | `torch._subclasses.fake_tensor.unset_fake_temporarily` | none exists |
 | is a tensor a symbolic zero | `Tensor._is_zerotensor` | none exists |
 | which function made this node | `Function._backward_cls` | `Node.name()` is a string that other functions may share |
@@ -76,6 +78,13 @@ def random_numbers_allowed() -> AbstractContextManager[None]:
     That vmap maps over tangents only, but it forbids random numbers in everything below.
     """
     return cast("AbstractContextManager[None]", torch._C._ExcludeDispatchKeyGuard(_VMAP_MODE))
+
+
+def outside() -> AbstractContextManager[None]:
+    """Compute with plain tensors, random ones included, as if no transform of `torch.func` were active."""
+    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack  # loaded late: slow to import
+
+    return cast("AbstractContextManager[None]", temporarily_clear_interpreter_stack())
 
 
 _VMAP_MODE = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("VmapMode"))  # type: ignore[arg-type]

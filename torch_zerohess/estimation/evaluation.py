@@ -8,10 +8,14 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation import local_entropy
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.expansion import Expansion
+from torch_zerohess.estimation.head import Head, apply_head, checked_head
 from torch_zerohess.estimation.perturbations import draws, perturb
 from torch_zerohess.estimation.stein import Stein, total
 from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
 
 ValueMode = Literal["center", "smoothed"]
@@ -21,7 +25,9 @@ ValueMode = Literal["center", "smoothed"]
 class BlackBoxCall:
     """How to call a black box: the function, and what to do with what it returns.
 
-    fn: [K, n], *aux [K, ...] -> [K, *out], or of one point [n] -> [*out] where not `vectorized`.
+    fn: [K, n], *aux [K, ...] -> [K, *out], or of one point [n] -> [*out] where not `vectorized`. Without aux if there
+        is a head.
+    head: white box after fn, see `estimation.head`; None: the outputs of fn are the values.
     on_nonfinite: "raise", "drop" (leave out the whole antithetic pair), or a number to put in its place.
     """
 
@@ -30,10 +36,12 @@ class BlackBoxCall:
     evaluator: Evaluator = field(default_factory=Inline)
     value: ValueMode = "center"
     on_nonfinite: str | float = "raise"
+    head: Head | None = None
 
     def __post_init__(self) -> None:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
+        checked_head(self.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
         rule = self.on_nonfinite
@@ -57,6 +65,19 @@ class BlackBoxCall:
                 + ("; for a function of one point pass vectorized=False" if self.vectorized else "")
             )
         return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
+
+    def values(self, points: Tensor, aux: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
+
+        Without a head they are the same.
+        """
+        B, E = points.shape[:2]
+        flat = points.flatten(0, 1).clone()  # the black box may write to its input
+        if self.head is None:
+            values = self(flat, [one.repeat_interleave(E, 0) for one in aux]).unflatten(0, (B, E))
+            return values, values
+        outputs = self(flat, []).unflatten(0, (B, E))
+        return apply_head(self.head, outputs, aux), outputs
 
     def _each(self, points: Tensor, *aux: Tensor) -> Tensor:
         return torch.stack([_tensor(self.fn(*one)) for one in zip(points, *aux, strict=True)])
@@ -85,10 +106,23 @@ class Evaluations:
         return int((self.share == 0).sum())
 
 
-def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Smoothing, keep: bool) -> Evaluations:
+def evaluate(
+    call: BlackBoxCall,
+    x: Tensor,
+    aux: Sequence[Tensor],
+    smoothing: Smoothing,
+    keep: bool,
+    control: Control | None = None,
+) -> Evaluations:
     """Draw perturbations of x [B, n] and call the black box once, on all of them and on x itself where it is needed.
 
-    aux: [B, ...] each, repeated for every point of its batch element; keep: see `perturb`.
+    Args:
+        call: the black box.
+        x: [B, n].
+        aux: [B, ...] each, for every point of its batch element.
+        smoothing: how to sample.
+        keep: see `perturb`.
+        control: what is subtracted from the values before they become coefficients.
     """
     seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
     perturbations = perturb(x, smoothing, seed, keep)
@@ -96,28 +130,66 @@ def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Sm
     B, K, n = points.shape
     with_center = call.value == "center" or smoothing.baseline == "center"
     everywhere = torch.cat([points, x[:, None]], 1) if with_center else points
-    repeated = [one.repeat_interleave(everywhere.shape[1], 0) for one in aux]
-    # A copy where there is none yet: the black box may write to its input.
-    flat = everywhere.flatten(0, 1) if with_center else everywhere.flatten(0, 1).clone()
-    values = call(flat, repeated).unflatten(0, (B, -1))
+    values, outputs = call.values(everywhere, control.references(aux) if control else aux)
     values, kept = _finite(values, everywhere, call.on_nonfinite, K, smoothing, stein)
     center = values[:, K] if with_center else None
-    values = values[:, :K]
     share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
         share = kept / kept.sum(1, keepdim=True).double()
-    baseline, coefficients = _coefficients(values.reshape(B, K, -1), center, share[..., None], smoothing, n)
-    if call.value == "center" and center is not None:
+    rest, rest_center = _remaining(call, values, center, K, everywhere, outputs, aux, control)
+    values = values[:, :K]
+    baseline, coefficients = _coefficients(rest.reshape(B, K, -1), rest_center, share[..., None], smoothing, n)
+    coefficients = coefficients.reshape(rest.shape)
+    if isinstance(call.head, LocalEntropy):
+        coefficients[..., 1:] = 0.0  # of constants
+    if call.value == "center" and center is not None and not isinstance(call.head, LocalEntropy):
         base = center.double()
     else:
-        base = stein.smoothed(values.reshape(B, K, -1), baseline, coefficients.mT).reshape((B, *values.shape[2:]))
-    expansion = Expansion(base, coefficients.reshape(values.shape), perturbations.sigma, stein)
+        flat = coefficients.reshape(B, K, -1)
+        base = stein.smoothed(rest.reshape(B, K, -1), baseline, flat.mT).reshape((B, *rest.shape[2:]))
+        if isinstance(call.head, LocalEntropy):
+            base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
+    expansion = Expansion(base, coefficients, perturbations.sigma, stein)
     return Evaluations(points, values, center, share, expansion)
+
+
+def _remaining(
+    call: BlackBoxCall,
+    values: Tensor,
+    center: Tensor | None,
+    K: int,
+    points: Tensor,
+    outputs: Tensor,
+    aux: Sequence[Tensor],
+    control: Control | None,
+) -> tuple[Tensor, Tensor | None]:
+    """Return what is to be smoothed, [B, K, *out], and the same at the center [B, *out].
+
+    These are the values, less what the control variate explains; for a local entropy the packed values.
+    """
+    if isinstance(call.head, LocalEntropy):
+        T, m = local_entropy.scales(values[:, :K], call.head.temperature)
+        if control is not None:
+            T, m = control.scales(aux) or (T, m)
+        rows, packed_center = local_entropy.packed(values[:, :K], center, T, m)
+        if control is None:
+            return rows, packed_center
+        predicted = control.explain(values, points, outputs, aux)
+        if predicted is not None:
+            rows[..., 0] -= local_entropy.tempered(predicted[:, :K], T, m)
+            if packed_center is not None:
+                packed_center[:, 0] -= local_entropy.tempered(predicted[:, K:], T, m)[:, 0]
+        return rows, packed_center
+    predicted = control.explain(values, points, outputs, aux) if control else None
+    if control is None or predicted is None:
+        return values[:, :K], center
+    rest = values.double() - control.coefficient * predicted
+    return rest[:, :K], None if center is None else rest[:, K]
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
     """Return f(x), [B, *out], for x [B, n]: one evaluation per batch element and nothing else."""
-    values = call(x.clone(), [one.clone() for one in aux])
+    values = call.values(x[:, None], [one.clone() for one in aux])[0][:, 0]
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):
         values = _replaced(values, bad.nonzero()[0], x, call.on_nonfinite)

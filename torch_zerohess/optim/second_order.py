@@ -58,9 +58,11 @@ class Model:
         length = v.norm()  # of a unit vector, so that float32 parameters neither over- nor underflow
         if not float(length) > 0.0:
             return torch.zeros_like(self.gradients)
+        unit = v / length
         if self._blocks is None:
-            return torch.stack([one @ (v / length) for one in self._operators]).double() * length
-        return torch.stack([self._through(*pair, v / length) for pair in zip(self._operators, self._blocks, strict=True)])
+            return torch.stack([one @ unit for one in self._operators]).double() * length
+        pairs = zip(self._operators, self._blocks, strict=True)
+        return torch.stack([self._through(operator, blocks, unit) for operator, blocks in pairs]) * length
 
     @staticmethod
     def _through(operator: CurvatureOperator, blocks: Sequence[Tensor], v: Tensor) -> Tensor:

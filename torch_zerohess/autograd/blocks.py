@@ -6,8 +6,11 @@ Sampled matrices are often indefinite. "abs" replaces the eigenvalues of each by
 positive (saddle-free Newton: Dauphin et al. 2014).
 """
 
+from collections.abc import Sequence
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 
 from torch_zerohess.autograd.curvature import CurvatureOperator
 
@@ -61,17 +64,54 @@ def magnitudes(blocks: Tensor) -> Tensor:
 
 
 def jacobian(operator: CurvatureOperator) -> Tensor:
-    """Return J [M, N] of all M elements of the outputs of the white box with respect to the N parameters."""
-    rows = []
-    for index, y in enumerate(operator.through):
-        units = torch.eye(y.numel(), dtype=y.dtype, device=y.device).view(y.numel(), *y.shape)
-        parts = torch.autograd.grad(
-            operator.through[index],
-            operator.inputs,
-            units,
-            retain_graph=True,
-            is_grads_batched=True,
-            materialize_grads=True,
-        )
-        rows.append(torch.cat([part.flatten(1) for part in parts], 1))
-    return torch.cat(rows)
+    """Return J [M, N] of all M elements of the outputs of the white box by the N parameters: M backward passes."""
+    return torch.cat([_rows(operator, index) for index in range(len(operator.through))])
+
+
+def _rows(operator: CurvatureOperator, index: int) -> Tensor:
+    y, rows = operator.through[index], []
+    for element in range(y.numel()):
+        d = [torch.zeros_like(one) for one in operator.through]
+        d[index].view(-1)[element] = 1.0
+        rows.append(operator.pull(d))
+    return torch.stack(rows)
+
+
+class SampleJacobian:
+    """The Jacobian of a network whose outputs each depend on one sample of the batch, in about one backward pass.
+
+    Made in a closure of `NewtonCG` with solver "dual", which otherwise takes one backward pass for every output of the
+    batch. Layers that mix samples, such as batch normalisation in training mode, have no such Jacobian.
+
+    Args:
+        network: a module, samples [B, ...] -> [B, n].
+        samples: the batch that the closure evaluates, [B, ...].
+
+    Example:
+        >>> network, x = torch.nn.Linear(3, 2), torch.ones(4, 3)
+        >>> SampleJacobian(network, x)(list(network.parameters())).shape
+        torch.Size([8, 8])
+    """
+
+    def __init__(self, network: nn.Module, samples: Tensor) -> None:
+        if not isinstance(network, nn.Module):
+            raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
+        self._network, self._samples = network, samples
+
+    def __call__(self, parameters: Sequence[Tensor]) -> Tensor:
+        """Return J [B n, N] by parameters of the network, N numbers in all.
+
+        Raises ValueError for a parameter that the network does not have.
+        """
+        names = {id(one): name for name, one in self._network.named_parameters()}
+        if not all(id(one) in names for one in parameters):
+            raise ValueError("parameters of the optimizer must be parameters of the network of the SampleJacobian")
+        chosen = {names[id(one)]: one.detach() for one in parameters}
+
+        def output(values: dict[str, Tensor], sample: Tensor) -> Tensor:
+            result: Tensor = functional_call(self._network, values, (sample[None],))
+            return result[0]
+
+        jacobians = torch.func.vmap(torch.func.jacrev(output), in_dims=(None, 0))(chosen, self._samples)
+        count = next(iter(jacobians.values())).shape[:2].numel()
+        return torch.cat([jacobians[name].reshape(count, -1) for name in chosen], 1)

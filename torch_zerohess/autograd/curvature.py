@@ -10,6 +10,7 @@ term in the curvature of the network, hence "approximately" in the source.
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -74,8 +75,6 @@ class CurvatureOperator:
             self._through = black_box_inputs(outputs) if through is None else _listed(through)
             self._slopes = _grad([outputs], self._through, None, create_graph=True)
             self.gradient = self._flat(_grad([outputs], self._inputs, None))
-            self._dummies = [torch.zeros_like(y, requires_grad=True) for y in self._through]
-            self._pulled = _grad(self._through, self._inputs, self._dummies, create_graph=True)
 
     gradient: Tensor
     """Gradient of the loss, [N]."""
@@ -108,8 +107,14 @@ class CurvatureOperator:
 
     def output_step(self, v: Tensor) -> list[Tensor]:
         """Return J v, how far the inputs of the black boxes move along v [N] ("gauss_newton" only)."""
-        # J^T d is linear in the dummy d; its transpose by a second backward pass is J.
-        return _grad(self._pulled, self._dummies, self._split(v))
+        dummies, pulled = self._pulled
+        return _grad(pulled, dummies, self._split(v))
+
+    @cached_property
+    def _pulled(self) -> tuple[list[Tensor], list[Tensor]]:
+        """A dummy d and J^T d, which is linear in d: its transpose by a second backward pass is J."""
+        dummies = [torch.zeros_like(y, requires_grad=True) for y in self._through]
+        return dummies, _grad(self._through, self._inputs, dummies, create_graph=True)
 
     def output_curvature(self, t: Sequence[Tensor]) -> list[Tensor]:
         """Return (d2l/dy2) t for vectors in the shapes of the inputs of the black boxes."""

@@ -58,7 +58,8 @@ class NewtonCG(NewtonStep):
             losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact.
 
     The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
-    pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them.
+    pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them. For solver
+    "dual" it may return (loss, y, SampleJacobian(network, samples)), which saves most of the backward passes.
 
     Example:
         >>> import torch

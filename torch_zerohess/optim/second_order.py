@@ -8,13 +8,16 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from torch_zerohess.autograd.blocks import jacobian, magnitudes, output_blocks
+from torch_zerohess.autograd.blocks import jacobian as white_box_jacobian
+from torch_zerohess.autograd.blocks import magnitudes, output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.linalg.dual import dual_step
 from torch_zerohess.linalg.steihaug import Step
 
-Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
-"""Result of a closure: the loss, or a pair of the loss and the tensors at which its white box ends."""
+Jacobian = Callable[[Sequence[Tensor]], Tensor]
+"""Parameters -> J [M, N] of the outputs of the white box, see `SampleJacobian`."""
+Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], Jacobian]
+"""Result of a closure: the loss, or with it the tensors at which its white box ends, or with both their Jacobian."""
 Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
 _OUTSIDE = 1e-4
@@ -30,13 +33,17 @@ class Model:
     """
 
     def __init__(
-        self, losses: Tensor, operators: Sequence[CurvatureOperator], modification: str | None = None
+        self,
+        losses: Tensor,
+        operators: Sequence[CurvatureOperator],
+        modification: str | None = None,
+        jacobian: Jacobian | None = None,
     ) -> None:
         self.loss = losses.detach().mean()
         """[], the mean of the losses."""
         self.gradients = torch.stack([one.gradient for one in operators]).double()
         """[R, N], float64"""
-        self._operators = operators
+        self._operators, self._jacobian = operators, jacobian
         self._blocks = None if modification is None else [self._modified(one) for one in operators]
 
     @staticmethod
@@ -79,7 +86,7 @@ class Model:
         A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
         slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
         g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
-        J = jacobian(self._operators[0])
+        J = white_box_jacobian(self._operators[0]) if self._jacobian is None else self._jacobian(self._operators[0].inputs)
         if float((self.gradient - (J.mT @ g.to(J)).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
             raise ValueError(
                 "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone: "
@@ -128,7 +135,7 @@ class SecondOrder(Optimizer):
         """Evaluate the closure where the parameters are; `separate` keeps the estimates of several losses apart."""
         curvature = self.param_groups[0]["curvature"]
         with torch.enable_grad():
-            losses, through = pair(closure())
+            losses, through, jacobian = parts_of(closure())
             if not losses.requires_grad:
                 raise ValueError("closure must return a loss with a graph, got one without: no parameter is in it")
             parts = list(losses.reshape(-1).unbind()) if separate else [losses.mean()]
@@ -136,6 +143,7 @@ class SecondOrder(Optimizer):
                 losses,
                 [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts],
                 self._output_modification,
+                jacobian,
             )
 
     def _add(self, step: Tensor) -> None:
@@ -160,12 +168,12 @@ class SecondOrder(Optimizer):
                 one.copy_(before)
 
 
-def pair(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:
-    """Return the loss, and the tensors at which the white box ends if the closure returned them."""
-    loss, through = result if isinstance(result, tuple) else (result, None)
+def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, Jacobian | None]:
+    """Return the loss, the tensors at which the white box ends, and their Jacobian, as far as the closure gave them."""
+    loss, through, jacobian = (*result, None, None)[:3] if isinstance(result, tuple) else (result, None, None)
     if not isinstance(loss, Tensor) or loss.numel() == 0:
         raise TypeError(f"closure must return the loss, a tensor with a graph, got {loss!r}")
-    return loss, through
+    return loss, through, jacobian
 
 
 def check_positive(**settings: float) -> None:

@@ -146,7 +146,10 @@ class BlackBox(nn.Module):
     def _estimated(self, center: Tensor, aux: list[Tensor], zero: bool) -> Callable[[Tensor], Tensor]:
         """Return the part of the estimate that comes from new evaluations, as `_around` does."""
         expansion = self._evaluate(center, aux)
-        entropy = isinstance(self.call.head, LocalEntropy) and not (self.control and self.control.active)
+        active = self.control is not None and self.control.active
+        entropy = isinstance(self.call.head, LocalEntropy) and not active
+        if active and self.memory is not None and self.memory.order == 1:
+            return lambda x: _tangent(expansion, x, center)
 
         def estimated(x: Tensor) -> Tensor:
             result = _value(expansion, x, center, zero=zero)
@@ -256,6 +259,13 @@ def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Te
     d = (x.double() - center.double()) / expansion.sigma
     total = ratios(d, zero)
     change = total - (total if zero else ratios(torch.zeros_like(d), True)).detach()
+    return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
+
+
+def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
+    """Return the expansion around `center` at x [B, n], to first order."""
+    slope = expansion.stein.gradient(expansion.flat.mT.contiguous()) / expansion.sigma
+    change = (slope @ (x.double() - center.double())[..., None])[..., 0]
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
 
 

@@ -38,6 +38,8 @@ class Memory:
             Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
             None: all of them. 0: none; the estimate is then that of g, and biased towards it.
+        order: highest derivative that new evaluations enter. 1: second derivatives are those of the surrogate alone,
+            without noise, and biased towards it; values and gradients stay unbiased.
         draws: points per element at which the surrogate's term is evaluated.
 
     Raises:
@@ -58,6 +60,7 @@ class Memory:
         *,
         capacity: int = 4000,
         fresh: int | None = None,
+        order: int = 2,
         draws: int = 64,
     ) -> None:
         for name, number, least in (("capacity", capacity, 2), ("fresh", fresh, 0), ("draws", draws, 2)):
@@ -72,7 +75,9 @@ class Memory:
         if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):
             raise TypeError(f"surrogate must have fit(points, outputs), got {type(surrogate).__name__} without it")
         self.surrogate: Any = AutomaticSurrogate(capacity=capacity) if surrogate is None else surrogate
-        self.capacity, self.fresh, self.draws = capacity, fresh, draws
+        if order not in (1, 2):
+            raise ValueError(f"order must be 1 or 2, got {order}")
+        self.capacity, self.fresh, self.order, self.draws = capacity, fresh, order, draws
         self.evaluations = 0
         """Evaluations taken so far, those that are no longer kept included."""
         self.pathwise: bool | None = None
@@ -150,7 +155,7 @@ class Memory:
 
     @property
     def coefficient(self) -> float:
-        """c in [0, 1]: the regression of h(f) on h(g) over earlier evaluations, that g had not seen; 0 before any."""
+        """Coefficient c in [0, 1]: the regression of h(f) on h(g) over evaluations that g had not seen; 0 before."""
         if self.fresh == 0:
             return 1.0
         covariance, variance = self._moments

@@ -77,7 +77,16 @@ class Evaluations:
     """f(x), [B, *out], where it was evaluated."""
     share: Tensor
     """Weight of each row in a mean, [B, K]: 1/K; where rows were dropped, zero for them and more for the others."""
+    baseline: Tensor
+    """What was subtracted from f, its mean over the rows, [B, P]."""
     expansion: Expansion
+
+    @property
+    def smoothed(self) -> Tensor:
+        """The estimate of F(x), float64 [B, *out], whether or not it is the base of the expansion."""
+        B, K = self.share.shape
+        values, a = self.values.reshape(B, K, -1), self.expansion.flat.mT
+        return self.expansion.stein.smoothed(values, self.baseline, a).reshape(self.expansion.base.shape)
 
     @property
     def dropped(self) -> int:
@@ -107,12 +116,18 @@ def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Sm
     if kept is not None:
         share = kept / kept.sum(1, keepdim=True).double()
     baseline, coefficients = _coefficients(values.reshape(B, K, -1), center, share[..., None], smoothing, n)
+    # The sum of finite numbers may be infinite, but that of others is never finite.
+    if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
+        raise ValueError(
+            f"fn returned values up to {float(values.abs().max()):.3g}, whose differences are not finite in float64: "
+            "scale what fn returns"
+        )
     if call.value == "center" and center is not None:
         base = center.double()
     else:
         base = stein.smoothed(values.reshape(B, K, -1), baseline, coefficients.mT).reshape((B, *values.shape[2:]))
     expansion = Expansion(base, coefficients.reshape(values.shape), perturbations.sigma, stein)
-    return Evaluations(points, values, center, share, expansion)
+    return Evaluations(points, values, center, share, baseline, expansion)
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -213,7 +228,14 @@ def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) 
 
 def _tensor(result: Any) -> Tensor:
     try:
-        # A number of Python is float64, whatever the default dtype of torch.
-        return torch.as_tensor(result, dtype=torch.float64 if isinstance(result, float) else None)
+        # Numbers of Python are float64, alone and in lists, whatever the default dtype of torch.
+        leaf = result
+        while isinstance(leaf, (list, tuple)) and len(leaf):
+            leaf = leaf[0]
+        if isinstance(leaf, float):
+            return torch.as_tensor(result, dtype=torch.float64)
+        tensor = torch.as_tensor(result)
+        mixed = isinstance(leaf, int) and tensor.is_floating_point()  # [1, 2.5]
+        return torch.as_tensor(result, dtype=torch.float64) if mixed else tensor
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

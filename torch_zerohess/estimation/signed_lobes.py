@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Stein
+from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.smoothing import Smoothing
 
@@ -67,6 +67,12 @@ class SignedLobes(Stein):
         return SignedLobes(self.kernel[:, index].flatten(0, 1))
 
     def variance(
-        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
-    ) -> Tensor:
-        return variance_of_draws(self, quantity, a, share, draws, v)
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
+        return variance_of_draws(self, quantity, a, share, draws, v, pooled)

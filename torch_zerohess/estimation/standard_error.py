@@ -38,8 +38,9 @@ def variance_of_draws(
 
     A baseline that is the mean of the other draws makes the draws depend on each other. The variance is then that of
     the jackknife (Efron and Stein 1981), from the estimates Y_d without draw d, whose baselines leave it out as well:
-    sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 / (D - 1). It is right in the mean, and too careful by the part of the variance
-    that products of two draws have: a few percent from ten draws on.
+    sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 / (D - 1). It counts the variance that products of two draws have, a baseline
+    times a kernel, 2 (D - 1) / (D - 2) times: the standard error of four draws is 20 to 40 % too large where such
+    products matter (the Hessian, and the gradient without antithetic pairs), that of sixteen 3 to 8 %.
 
     Args:
         stein: the family.
@@ -106,7 +107,8 @@ def _jackknife(divided: "_Divided", whole: Tensor, shares: Tensor, pooled: Tenso
         if divided.quantity == "value":  # the baseline itself is part of it
             coupled = coupled - g
         without = alphas - alpha + coupled
-        result += ((without - (1 - s) * whole[:, None]) ** 2 / _positive(s)).sum(1)
+        squares = (without - (1 - s) * whole[:, None]) ** 2 / _positive(s)
+        result += torch.where(s > 0, squares, 0.0).sum(1)
     return result
 
 

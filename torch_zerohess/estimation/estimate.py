@@ -11,14 +11,13 @@ from torch import Tensor
 from torch_zerohess.estimation.adaptive import MOST, check_limits, draw_until
 from torch_zerohess.estimation.batch import Batch, combined, combined_spread
 from torch_zerohess.estimation.evaluation import BlackBoxCall, Evaluations, ValueMode, evaluate
-from torch_zerohess.estimation.inputs import checked_input, folded_aux
+from torch_zerohess.estimation.inputs import checked_input, folded_aux, short
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.smoothing import Smoothing
 
-_SHOWN = 8  # numbers of a tensor that a repr shows
 _ONE_SIGMA = 0.6826894921370859  # probability within one standard deviation of a normal distribution
 _MOST_LEVEL = 0.9999  # up to which the factor of Student's t is right to four digits
 
@@ -169,7 +168,7 @@ class Estimate:
 
     def __repr__(self) -> str:
         shape = f"x {list(self._x.shape)}, output {[*self._batch, *self._out]}"
-        parts = [shape, f"value={_short(self.value)}", f"gradient={_short(self.gradient)}"]
+        parts = [shape, f"value={short(self.value)}", f"gradient={short(self.gradient)}"]
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
 
@@ -210,17 +209,6 @@ class Estimate:
             raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")
         t = (v.detach().to(self._sigma) / self._sigma).expand(*self._batch, n).reshape(-1, 1, n)
         return t.expand(-1, self._out.numel(), -1).contiguous()
-
-
-def _short(tensor: Tensor) -> str:
-    """Return the numbers of a small tensor, the shape of a large one."""
-    if tensor.numel() > _SHOWN:
-        return str(list(tensor.shape))
-    return str(_rounded(tensor.tolist())).replace("'", "")
-
-
-def _rounded(numbers: Any) -> Any:
-    return [_rounded(one) for one in numbers] if isinstance(numbers, list) else f"{numbers:.4g}"
 
 
 def estimate(

@@ -17,8 +17,8 @@ from torch_zerohess.smoothing import Smoothing
 class SignedLobes(Stein):
     """Proposal "fr22": every dimension is drawn from the gradient lobe. First order only.
 
-    It is biased for n > 1, in the smoothed value too: it smooths the other dimensions with the gradient's lobe instead
-    of the Gaussian.
+    The gradient is biased for n > 1: it smooths the other dimensions with the gradient's lobe instead of the Gaussian.
+    The smoothed value is biased for every n, because it smooths every dimension with that lobe.
     """
 
     kernel: Tensor

@@ -179,6 +179,13 @@ def test_errors_of_optimal_sampling_do_not_cancel(samples: int) -> None:
         torch.testing.assert_close(errors, plain.standard_error(quantity, v), rtol=0.0, atol=3e-3)
 
 
+def test_the_error_of_a_value_does_not_depend_on_what_is_subtracted() -> None:
+    """The value of optimal sampling is the mean of f over its own rows, with any baseline."""
+    smoothing = PLAIN.replace(sigma=SIGMA, samples=4, proposal="optimal", seed=2)
+    center, mean = (estimate(WAVE, X, smoothing.replace(baseline=one)) for one in ("center", "mean"))
+    torch.testing.assert_close(mean.standard_error("value"), center.standard_error("value"), rtol=1e-12, atol=0.0)
+
+
 def test_levels_and_quantities_out_of_range() -> None:
     got = estimate(WAVE, X, PLAIN)
     for level in (0.0, 1.0, -0.5, math.nan):

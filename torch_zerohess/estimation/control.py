@@ -73,9 +73,7 @@ class Control:
         return predicted if self.active else None
 
 
-def predict(
-    surrogate: Callable[[Tensor], Tensor] | Any, head: Head | None, z: Tensor, aux: Sequence[Tensor]
-) -> Tensor:
+def predict(surrogate: Callable[[Tensor], Tensor] | Any, head: Head | None, z: Tensor, aux: Sequence[Tensor]) -> Tensor:
     """Return h(g(z), r) [B, E, *out] for points z [B, E, n] and aux r [B, ...], differentiable in z."""
     B, E = z.shape[:2]
     if isinstance(head, LocalEntropy):

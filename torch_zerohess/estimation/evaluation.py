@@ -12,8 +12,9 @@ from torch_zerohess.estimation import local_entropy
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
+from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.perturbations import draws, perturb
-from torch_zerohess.estimation.stein import Stein, total
+from torch_zerohess.estimation.stein import total
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
@@ -98,7 +99,16 @@ class Evaluations:
     """f(x), [B, *out], where it was evaluated."""
     share: Tensor
     """Weight of each row in a mean, [B, K]: 1/K; where rows were dropped, zero for them and more for the others."""
+    baseline: Tensor
+    """What was subtracted from f, its mean over the rows, [B, P]."""
     expansion: Expansion
+
+    @property
+    def smoothed(self) -> Tensor:
+        """The estimate of F(x), float64 [B, *out], whether or not it is the base of the expansion."""
+        B, K = self.share.shape
+        values, a = self.values.reshape(B, K, -1), self.expansion.flat.mT
+        return self.expansion.stein.smoothed(values, self.baseline, a).reshape(self.expansion.base.shape)
 
     @property
     def dropped(self) -> int:
@@ -131,7 +141,7 @@ def evaluate(
     with_center = call.value == "center" or smoothing.baseline == "center"
     everywhere = torch.cat([points, x[:, None]], 1) if with_center else points
     values, outputs = call.values(everywhere, control.references(aux) if control else aux)
-    values, kept = _finite(values, everywhere, call.on_nonfinite, K, smoothing, stein)
+    values, kept = finite_values(values, everywhere, call.on_nonfinite, K, smoothing, stein)
     center = values[:, K] if with_center else None
     share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
@@ -139,6 +149,12 @@ def evaluate(
     rest, rest_center = _remaining(call, values, center, K, everywhere, outputs, aux, control)
     values = values[:, :K]
     baseline, coefficients = _coefficients(rest.reshape(B, K, -1), rest_center, share[..., None], smoothing, n)
+    # The sum of finite numbers may be infinite, but that of others is never finite.
+    if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
+        raise ValueError(
+            f"fn returned values up to {float(values.abs().max()):.3g}, whose differences are not finite in float64: "
+            "scale what fn returns"
+        )
     coefficients = coefficients.reshape(rest.shape)
     if isinstance(call.head, LocalEntropy):
         coefficients[..., 1:] = 0.0  # of constants
@@ -150,7 +166,7 @@ def evaluate(
         if isinstance(call.head, LocalEntropy):
             base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
     expansion = Expansion(base, coefficients, perturbations.sigma, stein)
-    return Evaluations(points, values, center, share, expansion)
+    return Evaluations(points, values, center, share, baseline, expansion)
 
 
 def _remaining(
@@ -192,7 +208,7 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     values = call.values(x[:, None], [one.clone() for one in aux])[0][:, 0]
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):
-        values = _replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
+        values = replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
     return values
 
 
@@ -234,58 +250,16 @@ def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
     return origin + result
 
 
-def _finite(
-    values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing, stein: Stein
-) -> tuple[Tensor, Tensor | None]:
-    """Treat values [B, E, *out] that are not finite at points [B, E, n].
-
-    Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
-    """
-    bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
-    if not bool(bad.any()):
-        return values, None
-    if on_nonfinite != "drop" or bool(bad[:, K:].any()):
-        where = bad.nonzero()[0]
-        if on_nonfinite == "drop":  # the center cannot be dropped
-            where = torch.tensor([int(bad[:, K].nonzero()[0]), K])
-        rule = "raise" if on_nonfinite == "drop" else on_nonfinite
-        return _replaced(values, where, points, rule), None
-    kept = ~bad[:, :K]
-    if smoothing.antithetic:
-        pair = kept[:, : K // 2] & kept[:, K // 2 :]
-        kept = torch.cat([pair, pair], 1)
-    fewest = 2 if smoothing.baseline == "mean" else 1
-    left = int(kept.sum(1).min()) // (2 if smoothing.antithetic else 1)
-    if left < fewest:
-        raise ValueError(
-            f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: fn is not finite "
-            "almost everywhere around x"
-        )
-    if not stein.droppable:
-        raise ValueError(
-            f"on_nonfinite='drop' cannot re-weight the element-wise sets of proposal {smoothing.proposal!r}: give a "
-            "number to put in place of values that are not finite"
-        )
-    return torch.where(bad.reshape(*bad.shape, *[1] * (values.dim() - 2)), 0.0, values), kept
-
-
-def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
-    """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
-    if isinstance(rule, str):
-        point = points[tuple(where.tolist())]
-        text = ", ".join(f"{float(p):.6g}" for p in point[:8]) + (", ..." if len(point) > 8 else "")
-        value = values[tuple(where.tolist())]
-        wrong = float(value.flatten()[~torch.isfinite(value.flatten())][0])
-        raise ValueError(
-            f"fn returned {wrong} at the point [{text}]; choose on_nonfinite='drop' or a number to go on without it"
-        )
-    # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
-    return torch.where(torch.isfinite(values), values.double(), float(rule))
-
-
 def _tensor(result: Any) -> Tensor:
     try:
-        # A number of Python is float64, whatever the default dtype of torch.
-        return torch.as_tensor(result, dtype=torch.float64 if isinstance(result, float) else None)
+        # Numbers of Python are float64, alone and in lists, whatever the default dtype of torch.
+        leaf = result
+        while isinstance(leaf, (list, tuple)) and len(leaf):
+            leaf = leaf[0]
+        if isinstance(leaf, float):
+            return torch.as_tensor(result, dtype=torch.float64)
+        tensor = torch.as_tensor(result)
+        mixed = isinstance(leaf, int) and tensor.is_floating_point()  # [1, 2.5]
+        return torch.as_tensor(result, dtype=torch.float64) if mixed else tensor
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

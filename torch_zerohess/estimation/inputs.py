@@ -1,9 +1,11 @@
-"""Checks of what the caller passes: the point x, and auxiliary inputs of the black box."""
+"""Checks of what the caller passes, the point x and auxiliary inputs of the black box; and tensors as short text."""
 
 from typing import Any
 
 import torch
 from torch import Tensor
+
+_SHOWN = 8  # numbers of a tensor that a text shows
 
 
 def checked_input(x: Any) -> Tensor:
@@ -27,3 +29,12 @@ def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
                 f"aux[{number}] must have the batch dimensions {list(batch)} of x first, got {list(one.shape)}"
             )
     return [one.detach().reshape(batch.numel(), *one.shape[len(batch) :]) for one in aux]
+
+
+def short(tensor: Tensor) -> str:
+    """Return the numbers of a small tensor in four digits, the shape of a large one."""
+    return str(_rounded(tensor.tolist())).replace("'", "") if tensor.numel() <= _SHOWN else f"{list(tensor.shape)}"
+
+
+def _rounded(numbers: Any) -> Any:
+    return [_rounded(one) for one in numbers] if isinstance(numbers, list) else f"{numbers:.4g}"

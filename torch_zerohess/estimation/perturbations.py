@@ -40,16 +40,29 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
 
     keep: store them, instead of drawing them again whenever they are needed (see `stored`).
 
-    Raises ValueError if x is not finite, if sigma has the wrong length or is below the rounding of x, and where the
-    family of the proposal cannot serve this many parameters.
+    Raises ValueError if x is not finite, if sigma has the wrong length, is below the rounding of x or leads out of the
+    range of its dtype, and where the family of the proposal cannot serve this many parameters.
     """
-    if not bool(torch.isfinite(x).all()):
-        b, d = (int(index) for index in (~torch.isfinite(x)).nonzero()[0])
-        raise ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
     sigma = smoothing.sigma_vector(x.shape[1], x.device)
+    # No perturbation is longer than this: quantiles end at 10, and lengths of directions are sqrt(n) or little more.
+    farthest = x.abs() + (10.0 + x.shape[1] ** 0.5) * sigma
+    if not bool((farthest < torch.finfo(x.dtype).max).all()):
+        raise _out_of_range(x, sigma, farthest)
     points, stein = FAMILIES[smoothing.proposal].draw(x, sigma, smoothing, seed, keep)
     _check_moved(points, x, sigma)
     return Perturbations(points, stein, sigma)
+
+
+def _out_of_range(x: Tensor, sigma: Tensor, farthest: Tensor) -> ValueError:
+    """Return the error for an x that is not finite, or points around it that are not."""
+    if not bool(torch.isfinite(x).all()):
+        b, d = (int(index) for index in (~torch.isfinite(x)).nonzero()[0])
+        return ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
+    b, d = (int(index) for index in (farthest >= torch.finfo(x.dtype).max).nonzero()[0])
+    return ValueError(
+        f"sigma is too large: x + sigma*u is not finite in {x.dtype} for parameter {d}, x = {float(x[b, d])}, sigma = "
+        f"{float(sigma[d])}; use other units of x"
+    )
 
 
 def _check_moved(points: Tensor, x: Tensor, sigma: Tensor) -> None:

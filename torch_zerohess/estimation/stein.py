@@ -28,7 +28,7 @@ from torch import Tensor
 from torch_zerohess.sampling.kernels import Samples
 from torch_zerohess.smoothing import Smoothing
 
-Quantity = Literal["value", "gradient", "hessian_diagonal", "hvp"]
+Quantity = Literal["value", "gradient", "hessian_diagonal", "hessian", "hvp"]
 Projection = Callable[[Samples, Tensor], Tensor]
 """(u [B, K, n] or its recipe, t [B, M, n]) -> [B, M, K], differentiable in t: see `autograd.linear_map.project`."""
 
@@ -37,6 +37,14 @@ FIRST_ORDER_ERROR = (
     "use Smoothing(proposal='aggregate', order=2) for Hessians and Hessian-vector products"
 )
 _BLOCK = 4096
+
+
+class Spread(NamedTuple):
+    """How far an estimate may be from its expectation."""
+
+    variance: Tensor
+    degrees: Tensor
+    """Degrees of freedom of the variance, for Student's t; of its shape."""
 
 
 class Layout(NamedTuple):
@@ -118,15 +126,26 @@ class Stein(ABC):
 
     @abstractmethod
     def variance(
-        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
-    ) -> Tensor:
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
         """Return the variance of a sum in its shape: see `standard_error.variance_of_draws` for the arguments."""
 
     def sums(self, quantity: Quantity, a: Tensor, v: Tensor | None) -> Tensor:
         """Return the sums of one quantity; v is the vector of "hvp"."""
         if quantity == "hvp" and v is not None:
             return self.hvp(a, v)
-        sums = {"value": self.value, "gradient": self.gradient, "hessian_diagonal": self.hessian_diagonal}
+        sums = {
+            "value": self.value,
+            "gradient": self.gradient,
+            "hessian_diagonal": self.hessian_diagonal,
+            "hessian": self.hessian,
+        }
         return sums[quantity](a)
 
 

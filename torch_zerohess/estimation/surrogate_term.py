@@ -156,9 +156,7 @@ class SurrogateTerm:
         return list(torch.eye(len(self.sigma), dtype=torch.float64, device=self.x.device))
 
 
-def prefers_pathwise(
-    control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int
-) -> bool:
+def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int) -> bool:
     """Whether pathwise derivatives of the surrogate at x [B, n] vary less than Stein's sums.
 
     Both are computed for a few elements of the batch, and the variances of the derivative of this order compared. The

@@ -11,7 +11,6 @@ from torch_zerohess.linalg.steihaug import Step, steihaug
 from torch_zerohess.optim.newton_step import NewtonStep
 from torch_zerohess.optim.second_order import Model, check_count, check_not_negative, check_positive, check_radius
 
-
 SOLVERS = ("steihaug", "clip", "dual")
 _FAR = 1e6
 """Boundary of conjugate gradients for solver "clip", in units of the radius: where negative curvature ends them."""

@@ -86,7 +86,11 @@ class Model:
         A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
         slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
         g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
-        J = white_box_jacobian(self._operators[0]) if self._jacobian is None else self._jacobian(self._operators[0].inputs)
+        J = (
+            white_box_jacobian(self._operators[0])
+            if self._jacobian is None
+            else self._jacobian(self._operators[0].inputs)
+        )
         if float((self.gradient - (J.mT @ g.to(J)).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
             raise ValueError(
                 "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone: "

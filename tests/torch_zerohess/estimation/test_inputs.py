@@ -179,7 +179,7 @@ OTHERS = [
     ),
     (lambda: estimate(f, X, S).hvp(torch.ones(3)), ValueError, r"v must be a tensor of shape \[2\] .*got \[3\]"),
     (lambda: estimate(f, X, S).hvp([1.0, 2.0]), ValueError, r"v must be a tensor of shape \[2\] .*got list"),
-    (lambda: estimate(f, X, S).standard_error("hessian"), ValueError, "quantity must be 'value', .*got 'hessian'"),
+    (lambda: estimate(f, X, S).standard_error("slope"), ValueError, "quantity must be 'value', .*got 'slope'"),
     (lambda: estimate(f, X, S).standard_error("hvp"), ValueError, "v is the vector of quantity 'hvp'"),
     (lambda: estimate(f, X, S).standard_error("value", X), ValueError, "v is the vector of quantity 'hvp'"),
     (lambda: estimate(f, X, ONE).standard_error("value"), ValueError, "at least two independent draws"),

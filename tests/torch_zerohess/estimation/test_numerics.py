@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess.estimation.finite_differences import finite_difference_hvp
 from torch_zerohess.estimation.perturbations import stored
 from truths import PlaneWave, Quadratic, Step, spread, vector
 
@@ -44,20 +45,42 @@ def test_sigma_of_any_size_around_zero(sigma: float, baseline: str, proposal: st
     check(got.hvp(vector(1.0, 2.0)), truth.hessian(x, s) @ vector(1.0, 2.0))
 
 
-@pytest.mark.parametrize("antithetic", [True, False])
-@pytest.mark.parametrize("sigma", [1e-12, 1e-14, 3e-16])
-def test_sigma_near_the_rounding_of_x(sigma: float, antithetic: bool) -> None:
-    # x = 1 has neighbours 2.2e-16 above and 1.1e-16 below. A linear function in exact steps from 1: all that is left of
-    # the error is the perturbation, which must be the one that rounding left, not the one that was drawn.
-    def f(z: Tensor) -> Tensor:
-        return 3.0 * (z[:, 0] - 1.0)
+def dithered(ulps: float) -> tuple[float, float]:
+    """Gradient of z and Hessian of z^2 / 2 smoothed with sigma = `ulps` steps, where z is rounded to whole steps.
 
-    smoothing = Smoothing(sigma=sigma, samples=64, proposal="gaussian", antithetic=antithetic, seed=5)
-    got = replicates(f, vector(1.0), smoothing)
-    applied = (got.points[:, :-1, 0] - 1.0) / sigma
-    torch.testing.assert_close(got.gradient[:, 0], 3.0 * applied.square().mean(1), rtol=1e-12, atol=0.0)
-    # Rounding to steps of h adds h^2 / 12 to the variance of a perturbation.
-    check(got.gradient, vector(3.0), 3.0 * (2.0**-52 / sigma) ** 2 / 12)
+    A sum over the cells of rounding, of E[u; cell] and E[u^2 - 1; cell] in closed form. Both are 1 without rounding.
+    """
+    gradient, hessian = 0.0, 0.0
+    for step in range(-400, 401):
+        low, high = (step - 0.5) / ulps, (step + 0.5) / ulps
+        at_low, at_high = (math.exp(-0.5 * u * u) / math.sqrt(2 * math.pi) for u in (low, high))
+        gradient += step * (at_low - at_high) / ulps
+        hessian += 0.5 * step * step * (low * at_low - high * at_high) / ulps**2
+    return gradient, hessian
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("antithetic", [True, False])
+@pytest.mark.parametrize("proposal", ["gaussian", "aggregate", "optimal"])
+@pytest.mark.parametrize("ulps", [0.5, 1.0, 2.0, 30.0])
+def test_sigma_near_the_rounding_of_x(ulps: float, proposal: str, antithetic: bool, dtype: torch.dtype) -> None:
+    # The neighbours of 1.5 are as far above as below. Rounding acts as dither: the bias that it leaves in estimates
+    # from the drawn perturbation is that of the closed form, 1 % and 13 % at half a step and 5e-9 and 2e-7 at one.
+    step = torch.finfo(dtype).eps
+    sigma, x = ulps * step, torch.tensor([1.5], dtype=dtype)
+    smoothing = Smoothing(sigma=sigma, samples=32, proposal=proposal, antithetic=antithetic, seed=5)
+
+    def f(z: Tensor) -> Tensor:
+        t = (z.double() - 1.5) / sigma
+        return torch.cat([t, 0.5 * t * t], 1)
+
+    got = replicates(f, x, smoothing)
+    gradient, hessian = dithered(ulps)
+    check(got.gradient[:, 0, 0] * sigma, vector(gradient)[0])
+    check(got.hessian()[:, 1, 0, 0] * sigma**2, vector(hessian)[0])
+    if ulps >= 1:
+        assert abs(gradient - 1) < 1e-6
+        assert abs(hessian - 1) < 1e-6
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -106,14 +129,84 @@ def test_sigmas_of_very_different_sizes(scales: tuple[float, float]) -> None:
     assert float((got.hessian() - got.hessian().mT).abs().max()) == 0.0
 
 
-@pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30, 1e150])
-def test_values_of_any_size(scale: float) -> None:
+@pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30, 1e150, 1e300])
+@pytest.mark.parametrize("baseline", ["center", "mean", "none"])
+@pytest.mark.parametrize("proposal", ["aggregate", "optimal"])
+def test_values_of_any_size(proposal: str, baseline: str, scale: float) -> None:
     wave, x, s = PlaneWave(vector(0.9, -0.7)), vector(0.4, -0.3), vector(0.5, 0.5)
-    got = replicates(lambda z: scale * wave.f(z), x, Smoothing(sigma=0.5, samples=8, seed=6))
+    smoothing = Smoothing(sigma=0.5, samples=8, seed=6, proposal=proposal, baseline=baseline)
+    got = replicates(lambda z: scale * wave.f(z), x, smoothing)
     check(got.gradient / scale, wave.gradient(x, s))
     check(got.hessian() / scale, wave.hessian(x, s))
-    if scale < 1e100:
-        assert bool((got.standard_error("gradient") / scale).isfinite().all())
+    # Squares of such values do not exist in float64, their standard errors do.
+    plain = replicates(wave.f, x, smoothing)
+    for quantity in ("value", "gradient", "hessian", "hvp"):
+        v = vector(1.0, 2.0) if quantity == "hvp" else None
+        error = got.standard_error(quantity, v) / scale
+        torch.testing.assert_close(error, plain.standard_error(quantity, v), rtol=1e-7, atol=1e-14)
+
+
+@pytest.mark.parametrize("sigma", [1e-300, 1e-160, 1e150, 1e300])
+def test_sigma_whose_square_does_not_exist(sigma: float) -> None:
+    x, s = vector(0.4, -0.3) * sigma, vector(1.0, 1.0)
+    wave = PlaneWave(vector(0.7, -0.5))
+    size = 1e-100 if sigma < 1 else 1.0  # so that its derivatives exist
+    smoothing = Smoothing(sigma=sigma, samples=8, seed=3)
+    got = replicates(lambda z: size * wave.f(z / sigma), x, smoothing)
+    check(got.gradient / size * sigma, wave.gradient(x / sigma, s))
+    plain = replicates(wave.f, x / sigma, smoothing.replace(sigma=1.0))
+    errors = got.standard_error("gradient") / size * sigma
+    torch.testing.assert_close(errors, plain.standard_error("gradient"), rtol=1e-9, atol=1e-12)
+    if sigma == 1e-160:
+        v = vector(1.0, 2.0)
+        check(got.hessian() * sigma / size * sigma, wave.hessian(x / sigma, s))
+        check(got.hvp(v) * sigma / size * sigma, wave.hessian(x / sigma, s) @ v)
+        for quantity, vector_of in (("hessian", None), ("hessian_diagonal", None), ("hvp", v)):
+            errors = got.standard_error(quantity, vector_of) * sigma / size * sigma
+            torch.testing.assert_close(errors, plain.standard_error(quantity, vector_of), rtol=1e-9, atol=1e-12)
+
+
+SIGMA_ERROR = r"the {} is not finite in torch\.float{}: sigma is .* and fn returned up to .*; scale x and sigma"
+
+
+def test_what_does_not_exist_is_an_error_that_names_its_cause() -> None:
+    small = estimate(lambda z: (z / 1e-160).exp().sum(1), vector(0.0, 0.0), Smoothing(sigma=1e-160, seed=1))
+    assert bool((small.gradient > 1e155).all())
+    for name, call in (
+        ("hessian", small.hessian),
+        ("hessian_diagonal", small.hessian_diagonal),
+        ("hvp", lambda: small.hvp(vector(1.0, 1.0))),
+        ("standard error of the hessian", lambda: small.standard_error("hessian")),
+        ("interval of the hessian", lambda: small.confidence_interval("hessian")),
+    ):
+        with pytest.raises(ValueError, match=SIGMA_ERROR.format(name, 64)):
+            call()
+    single = estimate(lambda z: (z.double() / 1e-30).exp().sum(1), torch.zeros(2), Smoothing(sigma=1e-30, seed=1))
+    assert bool(torch.isfinite(single.gradient).all())
+    with pytest.raises(ValueError, match=SIGMA_ERROR.format("hessian", 32)):
+        single.hessian()
+    for sigma, dtype in ((1e308, torch.float64), (1e38, torch.float32)):
+        for call in (estimate, lambda f, x, s: BlackBox(f, s).freeze(x)):
+            with pytest.raises(ValueError, match=r"sigma is too large: x \+ sigma\*u is not finite in torch.float"):
+                call(lambda z: z.sum(1), torch.zeros(2, dtype=dtype), Smoothing(sigma=sigma, seed=1))
+    for baseline in ("center", "mean"):
+        with pytest.raises(ValueError, match=r"fn returned values up to 1\.7e\+308, whose differences are not finite"):
+            estimate(
+                lambda z: 1.7e308 * z[:, 0].sign(),
+                vector(0.1),
+                Smoothing(sigma=1.0, samples=32, baseline=baseline, seed=1),
+            )
+
+
+@pytest.mark.parametrize("sigma", [1e-200, 1e200])
+def test_differences_of_gradients_where_squares_do_not_exist(sigma: float) -> None:
+    wave, smoothing = PlaneWave(vector(0.7, -0.5)), Smoothing(sigma=1.0, samples=64, seed=3)
+    x, v = vector(0.4, -0.3), vector(1.0, 2.0)
+    plain = finite_difference_hvp(wave.f, x, v, smoothing)
+    # Of a v of length sigma the product is of the order of f / sigma.
+    scaled = smoothing.replace(sigma=sigma)
+    found = finite_difference_hvp(lambda z: wave.f(z / sigma), x * sigma, v * sigma, scaled)
+    torch.testing.assert_close(found * sigma, plain, rtol=1e-10, atol=1e-10)
 
 
 def test_a_narrow_step_on_a_plateau() -> None:

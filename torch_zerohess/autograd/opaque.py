@@ -48,7 +48,7 @@ def register(owner: Owner) -> int:
     return handle
 
 
-@torch.library.custom_op("torch_zerohess::evaluate", mutates_args=())
+@torch.library.custom_op("torch_zerohess::evaluate", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))
 def _evaluate(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
     """Return `Expansion.tensors`. K, the number of perturbations, is what the fake kernel needs of the settings."""
     return expand(_owners[handle], keep, x, aux).tensors()

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.autograd import opaque, transforms
-from torch_zerohess.autograd.linear_map import first_order_only, project
+from torch_zerohess.autograd.limit import limited
+from torch_zerohess.autograd.linear_map import project
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.inputs import checked_input, folded_aux
@@ -86,7 +87,8 @@ class BlackBox(nn.Module):
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order; it makes no further evaluation.
+        smoothed black box and has derivatives of every order (of proposal "optimal": of the first and second, of "fr22":
+        of the first; others raise ValueError). It makes no further evaluation.
         """
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = x.detach().reshape(-1, n).clone()
@@ -176,7 +178,7 @@ def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Te
     stein, c = expansion.stein, expansion.flat
 
     def ratios(d: Tensor, zero: bool) -> Tensor:
-        d = first_order_only(d) if stein.first_order else d
+        d = d if stein.highest is None else limited(d, stein.highest)
         return (stein.ratio(d, functools.partial(project, zero=zero))[:, None] @ c)[:, 0]
 
     d = (x.double() - center.double()) / expansion.sigma

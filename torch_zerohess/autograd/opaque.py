@@ -48,21 +48,40 @@ def register(owner: Owner) -> int:
     return handle
 
 
-@torch.library.custom_op("torch_zerohess::evaluate", mutates_args=(), tags=(torch.Tag.nondeterministic_seeded,))
+def _owner(handle: int) -> Owner:
+    try:
+        return _owners[handle]
+    except KeyError:
+        raise RuntimeError(
+            f"a traced graph calls black box number {handle}, which does not live in this process, or no longer: keep "
+            "the layer for as long as the graph, and trace again after loading it elsewhere"
+        ) from None
+
+
+# A compiler may merge two calls with the same inputs, or repeat one of them. Two calls of a black box are two draws,
+# and its values may carry noise of their own.
+_RANDOM = (torch.Tag.nondeterministic_seeded,)
+
+
+@torch.library.custom_op("torch_zerohess::evaluate", mutates_args=(), tags=_RANDOM)
 def _evaluate(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
     """Return `Expansion.tensors`. K, the number of perturbations, is what the fake kernel needs of the settings."""
-    return expand(_owners[handle], keep, x, aux).tensors()
+    owner = _owner(handle)
+    if K != (drawn := owner.smoothing.evaluations(x.shape[1], center=False)):
+        raise RuntimeError(f"a graph was traced for {K} perturbations, but now the layer draws {drawn}: trace again")
+    return expand(owner, keep, x, aux).tensors()
 
 
-@torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=())
+@torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=(), tags=_RANDOM)
 def _evaluate_center(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
-    values = evaluate_center(_owners[handle].call, x, aux)
-    _owners[handle].output_shapes[_signature(x, aux)] = values.shape[1:]
+    owner = _owner(handle)
+    values = evaluate_center(owner.call, x, aux)
+    owner.output_shapes[_signature(x, aux)] = values.shape[1:]
     return values.to(x.dtype)
 
 
 def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Layout]:
-    owner = _owners[handle]
+    owner = _owner(handle)
     return Expansion.layout(owner.smoothing, x.shape[0], K, x.shape[1], _output_shape(owner, x, aux), keep)
 
 
@@ -73,7 +92,7 @@ def _(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Ten
 
 @_evaluate_center.register_fake
 def _(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
-    return x.new_empty(len(x), *_output_shape(_owners[handle], x, aux))
+    return x.new_empty(len(x), *_output_shape(_owner(handle), x, aux))
 
 
 def _signature(x: Tensor, aux: Sequence[Tensor]) -> tuple[int | torch.Size, ...]:

@@ -1,8 +1,9 @@
 """Derivatives of a higher order than the samples serve raise, instead of being zero.
 
-The weights of some families are polynomials in x. Their higher derivatives are zero, and that is not an estimate. The
-identity `limited(x, order)` counts how often it was differentiated: its derivative is another identity that remembers
-x and the order that is left, and with none left that identity has no derivative.
+The weights of some families are polynomials in x. Their higher derivatives are zero, and that is not an estimate. So
+`limited(x, order)` is an identity that counts. Its derivative adds a zero that depends on x and has order - 1
+derivatives, the derivative of that zero another zero with one derivative less, and the last zero has none: it raises.
+Derivatives with respect to anything else, such as a vector that multiplies the gradient, pass.
 """
 
 from typing import Any
@@ -25,7 +26,7 @@ def limited(x: Tensor, order: int) -> Tensor:
 
 
 class Limit(torch.autograd.Function):
-    """The identity, with `order` derivatives."""
+    """`apply(x, order)`: x, with `order` derivatives."""
 
     generate_vmap_rule = True
 
@@ -41,41 +42,40 @@ class Limit(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return _Derivative.apply(gradient, *ctx.saved_tensors, ctx.order - 1, ctx.order), None
+        return gradient + _Zero.apply(*ctx.saved_tensors, ctx.order - 1, ctx.order), None
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
-        result: Tensor = _Derivative.apply(tangent, *ctx.saved_tensors, ctx.order - 1, ctx.order)
+        result: Tensor = tangent + _Zero.apply(*ctx.saved_tensors, ctx.order - 1, ctx.order)
         return result
 
 
-class _Derivative(torch.autograd.Function):
-    """`apply(gradient, x, left, order)`: the gradient, as something that depends on x and has `left` derivatives."""
+class _Zero(torch.autograd.Function):
+    """`apply(x, left, order)`: zeros in the shape of x, with `left` derivatives of the `order` there were."""
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(gradient: Tensor, x: Tensor, left: int, order: int) -> Tensor:
-        return gradient.clone()
+    def forward(x: Tensor, left: int, order: int) -> Tensor:
+        return torch.zeros_like(x)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        _, x, ctx.left, ctx.order = inputs
+        x, ctx.left, ctx.order = inputs
         ctx.save_for_backward(x)
         ctx.save_for_forward(x)
 
     @staticmethod
-    def next(ctx: Any, vector: Tensor | None) -> Tensor:
+    def derivative(ctx: Any) -> Tensor:
         if ctx.left == 0:
             raise ValueError(ORDER_ERRORS[ctx.order])
-        (x,) = ctx.saved_tensors
-        result: Tensor = _Derivative.apply(torch.zeros_like(x) if vector is None else vector, x, ctx.left - 1, ctx.order)
+        result: Tensor = _Zero.apply(*ctx.saved_tensors, ctx.left - 1, ctx.order)
         return result
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
-        return _Derivative.next(ctx, gradient), None, None, None
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return _Zero.derivative(ctx), None, None
 
     @staticmethod
-    def jvp(ctx: Any, tangent: Tensor | None, *_: Any) -> Tensor:
-        return _Derivative.next(ctx, tangent)
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        return _Zero.derivative(ctx)

@@ -63,6 +63,25 @@ def _owner(handle: int) -> Owner:
 _RANDOM = (torch.Tag.nondeterministic_seeded,)
 
 
+def noise_checked(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
+    """Return x; ValueError where a vmap wants different noise for each of its calls, but all of them are one call."""
+    if torch.compiler.is_compiling():
+        from torch_zerohess.autograd import in_graph  # loaded late: it loads the compiler
+
+        compiled: Tensor = in_graph.noise_checked(handle, x, aux)
+        return compiled
+    return noise_checked_now(handle, x, aux)
+
+
+def noise_checked_now(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
+    if transforms.different_noise_wanted([x, *aux]) and _owner(handle).smoothing.seed is None:
+        raise ValueError(
+            "vmap(randomness='different') over a black box whose inputs are not mapped over: all share one estimate; "
+            "expand x over the mapped dimension, or use randomness='same'"
+        )
+    return x
+
+
 @torch.library.custom_op("torch_zerohess::evaluate", mutates_args=(), tags=_RANDOM)
 def _evaluate(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
     """Return `Expansion.tensors`. K, the number of perturbations, is what the fake kernel needs of the settings."""
@@ -129,6 +148,11 @@ def _mapped(info: Any, in_dims: Any, x: Tensor, aux: list[Tensor]) -> tuple[Tens
 
 @_evaluate.register_vmap
 def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> Any:
+    if info.randomness == "same" and _owner(handle).smoothing.seed is None:
+        raise ValueError(
+            "vmap(randomness='same') over a black box: its noise is independent for each point of a batch; use "
+            "randomness='different', or give Smoothing a seed"
+        )
     folded, others = _mapped(info, in_dims, x, aux)
     results = _evaluate(handle, K, keep, folded, others)
     batched = [one.batched for one in _layout(handle, K, keep, folded, others)]  # after it: the shape is known by now

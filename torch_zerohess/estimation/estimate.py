@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.evaluation import BlackBoxCall, Evaluations, ValueMode, evaluate
-from torch_zerohess.estimation.inputs import checked_input, folded_aux
+from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import draws, stored
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.evaluators.inline import Evaluator, Inline
@@ -131,7 +131,7 @@ def estimate(
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out]; it may use NumPy or anything else.
-        x: [*batch, n], float32 or float64.
+        x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came.
         smoothing: how to sample.
         *aux: further inputs of fn, [*batch, ...] each, repeated for every evaluation of their batch element.
         vectorized: False if fn takes one point [n] at a time.
@@ -151,6 +151,6 @@ def estimate(
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
     call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite)
     x = checked_input(x).detach().clone()
-    batch, flat = x.shape[:-1], x.reshape(-1, x.shape[-1])
+    batch, flat = x.shape[:-1], working(x).reshape(-1, x.shape[-1])
     keep = stored(smoothing, *flat.shape)
     return Estimate(evaluate(call, flat, folded_aux(aux, batch), smoothing, keep), batch, x, smoothing)

@@ -76,7 +76,9 @@ class BlackBox(nn.Module):
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
         if torch.compiler.is_exporting():
-            raise RuntimeError("BlackBox cannot be exported: a black box is code of this process, and no graph holds it")
+            raise RuntimeError(
+                "BlackBox cannot be exported: a black box is code of this process, and no graph holds it"
+            )
         dtype, x = checked_input(x).dtype, working(x)
         if x.requires_grad and not transforms.watched(x) and not transforms.has_tangent(x):
             x = Input.apply(x)

@@ -4,6 +4,9 @@ The weights of some families are polynomials in x. Their higher derivatives are 
 `limited(x, order)` is an identity that counts. Its derivative adds a zero that depends on x and has order - 1
 derivatives, the derivative of that zero another zero with one derivative less, and the last zero has none: it raises.
 Derivatives with respect to anything else, such as a vector that multiplies the gradient, pass.
+
+Every `jvp` here applies autograd functions and nothing else. In nested forward mode torch (tried: 2.15) switches the
+outer tangents off inside a custom jvp: plain operations lose them without an error, and applied functions do not.
 """
 
 from typing import Any
@@ -46,7 +49,28 @@ class Limit(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, _: None) -> Tensor:
-        result: Tensor = tangent + _Zero.apply(*ctx.saved_tensors, ctx.order - 1, ctx.order)
+        result: Tensor = _Sum.apply(tangent, _Zero.apply(*ctx.saved_tensors, ctx.order - 1, ctx.order))
+        return result
+
+
+class _Sum(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(a: Tensor, b: Tensor) -> Tensor:
+        return a + b
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        return gradient, gradient
+
+    @staticmethod
+    def jvp(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
+        result: Tensor = _Sum.apply(a, b)
         return result
 
 

@@ -75,10 +75,7 @@ class BlackBox(nn.Module):
 
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
-        if torch.compiler.is_exporting():
-            raise RuntimeError(
-                "BlackBox cannot be exported: a black box is code of this process, and no graph holds it"
-            )
+        _before_compiling()
         dtype, x = checked_input(x).dtype, working(x)
         if x.requires_grad and not transforms.watched(x) and not transforms.has_tangent(x):
             x = Input.apply(x)
@@ -98,9 +95,10 @@ class BlackBox(nn.Module):
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order (of proposal "optimal": of the first and second, of "fr22":
-        of the first; others raise ValueError). It makes no further evaluation.
+        smoothed black box and has derivatives of every order. Those of proposals "optimal" (with order=2) and "fr22"
+        end at the second and first, and higher ones raise ValueError. It makes no further evaluation.
         """
+        _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = working(x).detach().reshape(-1, n).clone()
         expansion = self._evaluate(center, folded_aux(_without_grad(aux), batch))
@@ -197,6 +195,13 @@ def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Te
     total = ratios(d, zero)
     change = total - (total if zero else ratios(torch.zeros_like(d), True)).detach()
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
+
+
+def _before_compiling() -> None:
+    if torch.compiler.is_compiling():
+        if torch.compiler.is_exporting():
+            raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
+        from torch_zerohess.autograd import in_graph  # noqa: F401 loaded late: it loads the compiler
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -19,11 +19,6 @@ from torch_zerohess.estimation.stein import ORDER_ERRORS
 
 def limited(x: Tensor, order: int) -> Tensor:
     """Return x such that derivatives of it of a higher order than `order` (1 or 2) raise ValueError."""
-    if torch.compiler.is_compiling():
-        from torch_zerohess.autograd import in_graph  # loaded late: it loads the compiler
-
-        compiled: Tensor = in_graph.limited(x, order)
-        return compiled
     result: Tensor = Limit.apply(x, order)
     return result
 

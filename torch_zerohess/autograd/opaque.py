@@ -65,15 +65,6 @@ _RANDOM = (torch.Tag.nondeterministic_seeded,)
 
 def noise_checked(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
     """Return x; ValueError where a vmap wants different noise for each of its calls, but all of them are one call."""
-    if torch.compiler.is_compiling():
-        from torch_zerohess.autograd import in_graph  # loaded late: it loads the compiler
-
-        compiled: Tensor = in_graph.noise_checked(handle, x, aux)
-        return compiled
-    return noise_checked_now(handle, x, aux)
-
-
-def noise_checked_now(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
     if transforms.different_noise_wanted([x, *aux]) and _owner(handle).smoothing.seed is None:
         raise ValueError(
             "vmap(randomness='different') over a black box whose inputs are not mapped over: all share one estimate; "
@@ -86,7 +77,7 @@ def noise_checked_now(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
 def _evaluate(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
     """Return `Expansion.tensors`. K, the number of perturbations, is what the fake kernel needs of the settings."""
     owner = _owner(handle)
-    if K != (drawn := owner.smoothing.evaluations(x.shape[1], center=False)):
+    if (drawn := owner.smoothing.evaluations(x.shape[1], center=False)) != K:
         raise RuntimeError(f"a graph was traced for {K} perturbations, but now the layer draws {drawn}: trace again")
     return expand(owner, keep, x, aux).tensors()
 

@@ -8,8 +8,10 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | what is inside a functorch wrapper | `torch._C._functorch.get_unwrapped`, `is_functorch_wrapped_tensor` |
 `torch.func.debug_unwrap` skips all levels at once |
 | is a forward-mode level open | `forward_ad._current_level` | `forward_ad.unpack_dual` answers for one tensor only |
-| how large is a batch under vmap | `torch._C._functorch.is_batchedtensor`, `maybe_get_level`, `maybe_get_bdim` | `torch.func` does not tell |
-| may random numbers differ | `torch._C._functorch.get_interpreter_stack`, `CVmapInterpreterPtr`, `TransformType`, `RandomnessType` | a vmap rule is told, but is not called where nothing is mapped |
+| how large is a batch under vmap | `torch._C._functorch.is_batchedtensor`, `maybe_get_level`, `maybe_get_bdim` |
+`torch.func` does not tell |
+| which `randomness` has a vmap | `torch._C._functorch.get_interpreter_stack`, `CVmapInterpreterPtr`, `TransformType`,
+`RandomnessType` | a vmap rule is told, but is not called where it maps over nothing |
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |

@@ -5,7 +5,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-
 _HALF = (torch.float16, torch.bfloat16)
 
 

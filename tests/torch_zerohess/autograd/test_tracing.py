@@ -76,7 +76,7 @@ def test_a_graph_that_outlives_its_layer_or_its_settings_says_so() -> None:
         value = make_fx(layer)(X)
     del layer
     for graph in (traced, value):
-        with pytest.raises(RuntimeError, match="calls black box number.*keep the layer for as long as the graph"):
+        with pytest.raises(RuntimeError, match=r"calls black box number.*keep the layer for as long as the graph"):
             graph(X)
 
 

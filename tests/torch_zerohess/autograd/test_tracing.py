@@ -29,6 +29,8 @@ def fresh_compiler() -> None:
 @pytest.fixture(params=["stored", "redrawn"])
 def memory(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.param == "redrawn":
+        if not extension.available:
+            pytest.skip("the quantile functions in torch look at the numbers, so only the extension draws fake rows")
         monkeypatch.setattr(perturbations, "STORED", 0)
 
 

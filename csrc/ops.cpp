@@ -27,6 +27,11 @@ using torch::stable::Tensor;
 
 constexpr int64_t kGrain = 1 << 14;  // elements of work that one more thread is worth
 
+// Every argument is checked before LibTorch is asked about it: LibTorch prints a trace to stderr where it refuses.
+void check_size(int64_t size, const char* name, int64_t least) {
+  STD_TORCH_CHECK(size >= least, name, " is ", size, ", but must be at least ", least);
+}
+
 void check(const Tensor& tensor, const char* name, int64_t dim, ScalarType type = ScalarType::Double) {
   STD_TORCH_CHECK(tensor.scalar_type() == type, name, " has the wrong dtype");
   STD_TORCH_CHECK(tensor.dim() == dim, name, " has ", tensor.dim(), " dimensions instead of ", dim);
@@ -42,6 +47,8 @@ const Row* row_data(const Tensor& rows) {
 }
 
 Tensor pick_rows(int64_t seed, int64_t first, int64_t count, int64_t n, int64_t proposal) {
+  check_size(count, "count", 0);
+  check_size(n, "n", 1);
   Tensor rows = torch::stable::empty({count, 5}, ScalarType::Long);
   Row* out = reinterpret_cast<Row*>(rows.mutable_data_ptr<int64_t>());
   for (int64_t r = 0; r < count; ++r) out[r] = pick(seed, first + r, n, proposal);
@@ -49,6 +56,7 @@ Tensor pick_rows(int64_t seed, int64_t first, int64_t count, int64_t n, int64_t 
 }
 
 Tensor draw(const Tensor& rows, int64_t n) {
+  check_size(n, "n", 0);
   const Row* row = row_data(rows);
   const int64_t R = rows.size(0);
   Tensor u = torch::stable::empty({R, n}, ScalarType::Double);
@@ -107,7 +115,6 @@ std::tuple<Tensor, Tensor, Tensor> place_all(
 // `rows_of(b)` gives the rows of U that belong to batch element b.
 template <class RowsOf>
 Tensor project_with(const RowsOf& rows_of, int64_t K, const Tensor& t) {
-  check(t, "t", 3);
   const int64_t B = t.size(0), M = t.size(1), n = t.size(2);
   Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
   const double* vectors = t.const_data_ptr<double>();
@@ -123,7 +130,6 @@ Tensor project_with(const RowsOf& rows_of, int64_t K, const Tensor& t) {
 
 template <class RowsOf>
 Tensor accumulate_with(const RowsOf& rows_of, int64_t n, bool squares, const Tensor& a) {
-  check(a, "a", 3);
   const int64_t B = a.size(0), M = a.size(1), K = a.size(2), blocks = (n + kBlock - 1) / kBlock;
   Tensor result = torch::stable::empty({B, M, n}, ScalarType::Double);
   const double* coefficients = a.const_data_ptr<double>();
@@ -145,29 +151,35 @@ auto stored(const Tensor& u) {
 }
 
 auto drawn(const Tensor& rows, const Tensor& x, const Tensor& sigma, bool single) {
+  const Row* row = row_data(rows);
   check(x, "x", 2);
   check(sigma, "sigma", 1);
   STD_TORCH_CHECK(
       x.size(0) > 0 && rows.size(0) % x.size(0) == 0 && sigma.size(0) == x.size(1), "rows, x and sigma do not fit");
   const int64_t S = rows.size(0) / x.size(0);
-  return [row = row_data(rows), px = x.const_data_ptr<double>(), ps = sigma.const_data_ptr<double>(), n = x.size(1), S,
+  return [row, px = x.const_data_ptr<double>(), ps = sigma.const_data_ptr<double>(), n = x.size(1), S,
           single](int64_t b) { return DrawnRows{row + b * S, px + b * n, ps, S, single}; };
 }
 
 Tensor project(const Tensor& u, const Tensor& t) {
+  const auto rows_of = stored(u);
+  check(t, "t", 3);
   STD_TORCH_CHECK(u.size(0) == t.size(0) && u.size(2) == t.size(2), "u and t do not fit");
-  return project_with(stored(u), u.size(1), t);
+  return project_with(rows_of, u.size(1), t);
 }
 
 Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
+  const auto rows_of = stored(u);
+  check(a, "a", 3);
   STD_TORCH_CHECK(u.size(0) == a.size(0) && u.size(1) == a.size(2), "u and a do not fit");
-  return accumulate_with(stored(u), u.size(2), squares, a);
+  return accumulate_with(rows_of, u.size(2), squares, a);
 }
 
 Tensor project_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& t) {
+  const auto rows_of = drawn(rows, x, sigma, single);  // checks what is divided by below
+  check(t, "t", 3);
   STD_TORCH_CHECK(x.size(0) == t.size(0) && x.size(1) == t.size(2), "x and t do not fit");
-  const auto rows_of = drawn(rows, x, sigma, single);  // checks what the next line divides by
   const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
   return project_with(rows_of, K, t);
 }
@@ -175,7 +187,8 @@ Tensor project_drawn(
 Tensor accumulate_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& a,
     bool squares) {
-  const auto rows_of = drawn(rows, x, sigma, single);  // checks what the next line divides by
+  const auto rows_of = drawn(rows, x, sigma, single);  // checks what is divided by below
+  check(a, "a", 3);
   const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
   STD_TORCH_CHECK(x.size(0) == a.size(0) && K == a.size(2), "rows and a do not fit");
   return accumulate_with(rows_of, x.size(1), squares, a);

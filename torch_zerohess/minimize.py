@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from torch_zerohess.estimation.evaluation import BlackBoxCall
-from torch_zerohess.estimation.inputs import checked_input, short
+from torch_zerohess.estimation.inputs import checked_input, short, working
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.optim.second_order import check_count
 from torch_zerohess.search.space import Bounds
@@ -95,7 +95,7 @@ def minimize(
         >>> bool((fit.x - 3).abs().max() < 1e-3), fit.evaluations < 50
         (True, True)
     """
-    x0 = checked_input(x0)
+    x0 = working(checked_input(x0))
     search = TrustRegion(x0, sigma=sigma, bounds=bounds, loss=loss, engine=engine, seed=seed, **settings)
     smallest = len(search.ask()) + 1
     if max_evaluations < smallest:

@@ -1,8 +1,8 @@
 """Our methods on network tasks: a layer that remembers its renders, and Newton or Adam steps on the weights.
 
-The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory`). New renders are made for a few images
-of a batch only. This is what a user would write: everything comes from the public names of the library. All tasks have
-the same settings, the defaults below; they were chosen on runs 100 to 104 of CNN, which no table reports.
+The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory`). New renders are made for few images
+of a batch. This is what a user would write: everything comes from the public names of the library. All tasks have the
+same settings, the defaults below; they were chosen on runs 100 to 104 of CNN, which no table reports.
 """
 
 from typing import Literal

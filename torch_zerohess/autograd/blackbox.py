@@ -9,12 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.autograd import control_variate, opaque, transforms
-from torch_zerohess.autograd.linear_map import first_order_only, project
+from torch_zerohess.autograd.limit import limited
+from torch_zerohess.autograd.linear_map import project
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head
-from torch_zerohess.estimation.inputs import checked_input, folded_aux
+from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.heads import LocalEntropy
@@ -44,7 +45,14 @@ class BlackBox(nn.Module):
         value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
 
-    Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x.
+    Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For float16 and
+    bfloat16, as autocast makes them, fn gets float32.
+
+    Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch: that is
+    randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
+    "different" where neither x nor aux is mapped over.
+
+    `torch.export` raises RuntimeError: no file can hold the black box.
 
     Example:
         >>> layer = BlackBox(lambda z: z.round().sum(1), Smoothing(sigma=1.0, samples=2000, seed=0))
@@ -83,8 +91,9 @@ class BlackBox(nn.Module):
 
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
-        x = checked_input(x)
-        if x.requires_grad and not transforms.watched(x) and not transforms.forward_mode_active():
+        _before_compiling()
+        dtype, x = checked_input(x).dtype, working(x)
+        if x.requires_grad and not transforms.watched(x) and not transforms.has_tangent(x):
             x = Input.apply(x)
         batch = x.shape[:-1]
         flat, others = x.reshape(-1, x.shape[-1]), folded_aux(_without_grad(aux), batch)
@@ -96,16 +105,18 @@ class BlackBox(nn.Module):
             # torch differentiates a compiled backward a second time without an error, and gets a wrong number, unless
             # the backward has saved an input of the graph. This term is zero and saves x: now torch raises.
             result = result + 0.0 * x.sin().sum()
-        return result.reshape((*batch, *result.shape[1:]))
+        return result.reshape((*batch, *result.shape[1:])).to(dtype)
 
     def freeze(self, x: Tensor, *aux: Tensor) -> Callable[[Tensor], Tensor]:
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order; it makes no further evaluation.
+        smoothed black box and has derivatives of every order. Those of proposals "optimal" (with order=2) and "fr22"
+        end at the second and first, and higher ones raise ValueError. It makes no further evaluation.
         """
+        _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
-        center = x.detach().reshape(-1, n).clone()
+        center = working(x).detach().reshape(-1, n).clone()
         around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
         def frozen(z: Tensor) -> Tensor:
@@ -159,9 +170,10 @@ class BlackBox(nn.Module):
 
     def _evaluate(self, x: Tensor, aux: list[Tensor]) -> Expansion:
         B, n = x.shape
-        keep = torch.compiler.is_compiling() or stored(self.smoothing, B, n)
         if not transforms.watched(x):
-            return opaque.expand(self, keep, x, aux)
+            return opaque.expand(self, stored(self.smoothing, B, n), x, aux)
+        x = opaque.noise_checked(self._handle, x, aux)
+        keep = torch.compiler.is_compiling() or stored(self.smoothing, B * transforms.mapped_size([x, *aux]), n)
         K = self.smoothing.evaluations(n, center=False)
         tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, x, aux)
         return Expansion.rebuild(tensors, x, self.smoothing, keep)
@@ -253,7 +265,7 @@ def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Te
     stein, c = expansion.stein, expansion.flat
 
     def ratios(d: Tensor, zero: bool) -> Tensor:
-        d = first_order_only(d) if stein.first_order else d
+        d = d if stein.highest is None else limited(d, stein.highest)
         return (stein.ratio(d, functools.partial(project, zero=zero))[:, None] @ c)[:, 0]
 
     d = (x.double() - center.double()) / expansion.sigma
@@ -267,6 +279,13 @@ def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
     slope = expansion.stein.gradient(expansion.flat.mT.contiguous()) / expansion.sigma
     change = (slope @ (x.double() - center.double())[..., None])[..., 0]
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
+
+
+def _before_compiling() -> None:
+    if torch.compiler.is_compiling():
+        if torch.compiler.is_exporting():
+            raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
+        from torch_zerohess.autograd import in_graph  # noqa: F401 loaded late: it loads the compiler
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -71,8 +71,8 @@ class Elementwise(Stein):
         return cls(weight, rows, x.shape[1], smoothing.order)
 
     @property
-    def first_order(self) -> bool:
-        return self.order == 1
+    def highest(self) -> int:
+        return self.order
 
     def value(self, a: Tensor) -> Tensor:
         return (a * self.weight[:, None])[..., self.rows[:, 2] == NORMAL].sum(2)

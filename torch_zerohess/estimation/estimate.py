@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_zerohess.estimation.adaptive import MOST, check_limits, draw_until
 from torch_zerohess.estimation.batch import Batch, combined, combined_spread
 from torch_zerohess.estimation.evaluation import BlackBoxCall, Evaluations, ValueMode, evaluate
-from torch_zerohess.estimation.inputs import checked_input, folded_aux, short
+from torch_zerohess.estimation.inputs import checked_input, folded_aux, short, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
@@ -233,7 +233,7 @@ def estimate(
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out]; it may use NumPy or anything else.
-        x: [*batch, n], float32 or float64.
+        x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came.
         smoothing: how to sample.
         *aux: further inputs of fn, [*batch, ...] each, repeated for every evaluation of their batch element.
         vectorized: False if fn takes one point [n] at a time.
@@ -256,7 +256,7 @@ def estimate(
     call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite)
     check_limits(tolerance, max_evaluations)
     x = checked_input(x).detach().clone()
-    batch, flat, aux_rows = x.shape[:-1], x.reshape(-1, x.shape[-1]), folded_aux(aux, x.shape[:-1])
+    batch, flat, aux_rows = x.shape[:-1], working(x).reshape(-1, x.shape[-1]), folded_aux(aux, x.shape[:-1])
     B, n = flat.shape
 
     def draw(own: Smoothing) -> Batch:

@@ -6,17 +6,23 @@ import torch
 from torch import Tensor
 
 _SHOWN = 8  # numbers of a tensor that a text shows
+_HALF = (torch.float16, torch.bfloat16)
 
 
 def checked_input(x: Any) -> Tensor:
     """Return x, or raise TypeError or ValueError if it is not a real floating tensor [*batch, n] with n > 0."""
     if not isinstance(x, Tensor):
         raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
-    if x.dtype not in (torch.float32, torch.float64):
+    if x.dtype not in (torch.float32, torch.float64, *_HALF):
         raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
     if x.dim() == 0 or x.numel() == 0:
         raise ValueError(f"x must have shape [*batch, n] with n and every batch dimension > 0, got {list(x.shape)}")
     return x
+
+
+def working(x: Tensor) -> Tensor:
+    """Return x in the type to compute in: float32 for float16 and bfloat16, as autocast makes them, else its own."""
+    return x.float() if x.dtype in _HALF else x
 
 
 def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:

@@ -49,8 +49,8 @@ class SignedLobes(Stein):
         return cls(*tensors)
 
     @property
-    def first_order(self) -> bool:
-        return True
+    def highest(self) -> int:
+        return 1
 
     def value(self, a: Tensor) -> Tensor:
         return a.sum(2)

@@ -36,6 +36,12 @@ FIRST_ORDER_ERROR = (
     "these samples serve first derivatives only (proposal 'fr22', or 'optimal' with order=1): "
     "use Smoothing(proposal='aggregate', order=2) for Hessians and Hessian-vector products"
 )
+ORDER_ERRORS = {
+    1: FIRST_ORDER_ERROR,
+    2: "proposal 'optimal' has samples for the value, gradient and Hessian, and none for third derivatives: "
+    "use Smoothing(proposal='aggregate')",
+}
+"""What to say of a derivative beyond the order that samples serve."""
 _BLOCK = 4096
 
 
@@ -60,7 +66,7 @@ class Stein(ABC):
     """A family of weights for one batch of samples: the sums, and the rules that go with them.
 
     A family without second derivatives leaves `hvp`, `hessian_diagonal` and `hessian` as they are here, where they
-    raise, and returns True from `first_order`.
+    raise, and returns 1 from `highest`.
     """
 
     droppable: bool = True
@@ -89,9 +95,14 @@ class Stein(ABC):
         """Return the family that `tensors` were taken from, drawn around x [B, n] with the same sigma and settings."""
 
     @property
+    def highest(self) -> int | None:
+        """Highest order of the derivatives that these samples serve, 1 or 2; None if they serve every order."""
+        return None
+
+    @property
     def first_order(self) -> bool:
         """Whether these samples serve first derivatives only."""
-        return False
+        return self.highest == 1
 
     @abstractmethod
     def value(self, a: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A surrogate chosen by the evaluations: a Gaussian process or an affine map, whichever predicts held-out outputs better.
+"""A surrogate chosen by the evaluations: a Gaussian process or an affine map, whichever predicts held-out ones better.
 
 Outputs of many elements are represented by coordinates in the span of some of them (`LowRank`).
 """

@@ -1,0 +1,55 @@
+"""Shapes and types of what the C++ operators return, for tensors without numbers: fake tensors, tracers, compilers.
+
+Shapes: B batch, S samples, K = S or 2 S evaluations per x, n parameters, M vectors; see `csrc/ops.cpp`.
+"""
+
+import torch
+from torch import Tensor
+
+
+def pick_rows(seed: int, first: int, count: int, n: int, proposal: int) -> Tensor:
+    return torch.empty(count, 5, dtype=torch.int64)
+
+
+def draw(rows: Tensor, n: int) -> Tensor:
+    return rows.new_empty(rows.shape[0], n, dtype=torch.float64)
+
+
+def place(
+    u: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, proposal: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    B, n = x.shape
+    K = u.shape[0] // B * (2 if antithetic else 1)
+    points = u.new_empty(B, K, n, dtype=torch.float32 if single else torch.float64)
+    return points, u.new_empty(B, K, n), u.new_empty(B, K)
+
+
+def project(u: Tensor, t: Tensor) -> Tensor:
+    return t.new_empty(t.shape[0], t.shape[1], u.shape[1])
+
+
+def accumulate(u: Tensor, a: Tensor, squares: bool) -> Tensor:
+    return a.new_empty(a.shape[0], a.shape[1], u.shape[2])
+
+
+def hessian(u: Tensor, a: Tensor) -> Tensor:
+    return a.new_empty(a.shape[0], a.shape[1], u.shape[2], u.shape[2])
+
+
+def project_drawn(rows: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, t: Tensor) -> Tensor:
+    return t.new_empty(t.shape[0], t.shape[1], rows.shape[0] // x.shape[0] * (2 if antithetic else 1))
+
+
+def accumulate_drawn(
+    rows: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, a: Tensor, squares: bool
+) -> Tensor:
+    return a.new_empty(a.shape[0], a.shape[1], x.shape[1])
+
+
+OPERATORS = (pick_rows, draw, place, project, accumulate, hessian, project_drawn, accumulate_drawn)
+
+
+def register() -> None:
+    """Tell torch the shapes; to be called once, after the operators were loaded."""
+    for one in OPERATORS:
+        torch.library.register_fake(f"torch_zerohess::{one.__name__}", one)

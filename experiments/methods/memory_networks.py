@@ -26,24 +26,26 @@ def through_memory(
     *,
     steps: Literal["newton", "adam"],
     batch: int = 16,
-    first: int = 40,
-    radius: tuple[float, float] = (0.07, 0.003),
-    rate: tuple[float, float] = (1e-3, 1e-4),
+    radius: tuple[float, float] = (0.14, 0.003),
+    rate: tuple[float, float] = (3e-3, 3e-4),
     damping: float = 3e-4,
 ) -> None:
-    """Train until the evaluations are used; then go on with the surrogate alone until there were 1 000 steps.
+    """Train until the evaluations are used.
+
+    The first renders are around the predictions of the first images, at distances of sigma. A tenth of the evaluations
+    is used for them, 20 to 64; of many parameters n + 76, so that an affine map is known. If none are left, training
+    goes on with the surrogate alone.
 
     Args:
         trial: the run.
         steps: on the weights.
         batch: images of a step.
-        first: renders before the first step, around the predictions of the first images; at least n + 76.
         radius: first and last trust radius of "newton".
         rate: first and last learning rate of "adam".
         damping: of "newton".
     """
     task, network, images = trial.task, trial.encoder, trial.images
-    first = min(task.evaluations, max(first, task.n + 76 if task.n > MOST else 0))
+    first = min(max(task.evaluations // 10, 20), 64) if task.n <= MOST else min(task.evaluations, task.n + 76)
     fresh = max(1, round((task.evaluations - first) / (2 * _STEPS)))
     total = (task.evaluations - first) // (2 * fresh)
     curvature = 2 if steps == "newton" and task.n <= MOST else 1

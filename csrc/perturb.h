@@ -1,4 +1,4 @@
-// Perturbed points, the perturbations that were applied to them after rounding, and importance weights.
+// Perturbations, the points that they lead to, and importance weights.
 // Literal reference: torch_zerohess/sampling/proposals.py.
 #pragma once
 
@@ -58,15 +58,15 @@ ZH_CLONES static inline void draw_columns(const Row& row, int64_t first, int64_t
   if (row.kind == kOffDiagonalLobe && has_j) out[j] = gradient_lobe_quantile(p_j);
 }
 
-// z = x + sigma u in the type of x, and u again as (z - x) / sigma: the perturbation that was really applied.
+// z = x + sigma u in the type of x, and u again. The rounding of z acts as dither: estimates from the u that was drawn
+// have less bias than estimates from (z - x) / sigma, see the reference.
 template <typename T>
 ZH_INLINE double place(double x, double sigma, double u, T* point) {
-  const T z = T(x + sigma * u);
-  if (point) *point = z;
-  return (double(z) - x) / sigma;
+  if (point) *point = T(x + sigma * u);
+  return u;
 }
 
-// Density ratio N(u) / p(u) of one row of n applied perturbations.
+// Density ratio N(u) / p(u) of one row of n perturbations.
 ZH_CLONES static inline double weight(const double* u, int64_t n, int64_t proposal) {
   if (proposal == kGaussian || proposal == kSignedLobes) return 1.0;
   double first[8] = {}, second[8] = {}, hole[8] = {};

@@ -91,20 +91,21 @@ def with_lobes(rows: Tensor, u: Tensor, p_i: Tensor, p_j: Tensor) -> Tensor:
 def place(
     u: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, proposal: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points z = x + sigma u [B, K, n] in the type of x, the applied u = (z - x) / sigma, and weights [B, K].
+    """Return points z = x + sigma u [B, K, n] in the type of x, u [B, K, n] with its signs, and weights [B, K].
 
     u: [B * S, n] float64; with `antithetic` K = 2 S and the second half of the rows has the opposite sign.
-    x: [B, n] and sigma: [n], float64; `single` rounds z to float32. The applied u differs from the u drawn by the
-    rounding of z. It keeps estimates right where sigma is near the rounding of x.
+    x: [B, n] and sigma: [n], float64; `single` rounds z to float32.
+
+    u is returned as it was drawn, not as (z - x) / sigma: the rounding of z acts as dither. With h the distance of x to
+    its neighbours, the gradient of a linear function and the Hessian of a quadratic one have a relative bias below 1e-6
+    at sigma = h, of -0.014 and 0.13 at h / 2, of -0.57 and 0.73 at h / 4. With (z - x) / sigma and Gaussian
+    perturbations it would be 0.08 and 0.22 at h, 0.31 and 1.22 at h / 2.
     """
     u = u.view(len(x), -1, u.shape[1])
     if antithetic:
         u = torch.cat([u, -u], 1)
     points = x[:, None] + sigma * u
-    if single:
-        points = points.float()
-    applied = (points.double() - x[:, None]) / sigma
-    return points, applied, weights(applied, proposal)
+    return points.float() if single else points, u, weights(u, proposal)
 
 
 def weights(u: Tensor, proposal: int) -> Tensor:

@@ -21,7 +21,7 @@ _CHUNK = 1 << 22  # elements of drawn rows held at a time
 class Redrawn(NamedTuple):
     """Rows of perturbations kept as their recipe, O(K + n), instead of their numbers, O(K n).
 
-    rows: int64 [B * S, 5]; x: [B, n], sigma: [n], float64; K = 2 S with `antithetic`, else S.
+    rows: int64 [B * S, 5]; x: [B, n]; sigma: float64 [n]; K = 2 S with `antithetic`, else S; `single`: in float32.
     """
 
     rows: Tensor
@@ -38,14 +38,14 @@ class Redrawn(NamedTuple):
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
         B, n = self.x.shape
-        S = len(self.rows) // B
+        S, x = len(self.rows) // B, self.x.double()
         step = max(1, _CHUNK // (B * n))
         for first in range(0, S, step):
             part = self.rows.view(B, S, 5)[:, first : first + step]
-            u = draw(part.reshape(-1, 5), n)
+            u = draw(part.reshape(-1, 5), n, self.single)
             index = torch.arange(first, first + part.shape[1], device=u.device)
             columns = torch.cat([index, index + S]) if self.antithetic else index
-            yield *place(u, self.x, self.sigma, self.antithetic, self.single, proposal), columns
+            yield *place(u, x, self.sigma, self.antithetic, self.single, proposal), columns
 
 
 Samples = Tensor | Redrawn
@@ -63,9 +63,11 @@ def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: 
     return rows.to(device)
 
 
-def draw(rows: Tensor, n: int) -> Tensor:
+def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
     """See `proposals.draw`."""
-    return torch.ops.torch_zerohess.draw(rows.contiguous(), n) if _compiled(rows) else proposals.draw(rows, n)
+    if _compiled(rows):
+        return torch.ops.torch_zerohess.draw(rows.contiguous(), n, single)
+    return proposals.draw(rows, n, single)
 
 
 def place(
@@ -73,8 +75,33 @@ def place(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `proposals.place`."""
     if _compiled(u):
-        return torch.ops.torch_zerohess.place(u.contiguous(), x, sigma, antithetic, single, proposal)
+        return torch.ops.torch_zerohess.place(u.double().contiguous(), x, sigma, antithetic, single, proposal)
     return proposals.place(u, x, sigma, antithetic, single, proposal)
+
+
+def sample(
+    seed: int, S: int, x: Tensor, sigma: Tensor, antithetic: bool, proposal: int, center: bool, keep: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pick rows, draw them in the precision of x and place them around x [B, n], in one pass.
+
+    Returns rows [B * S, 5], points [B, E, n], perturbations [B, K, n], or [0, K, n] unless `keep`, and weights [B, K]:
+    see `proposals.pick_rows`, `proposals.draw` and `proposals.place`. E = K + 1 with x as the last point where
+    `center`, else K.
+    """
+    if _compiled(x):
+        return torch.ops.torch_zerohess.sample(seed, S, x.contiguous(), sigma, antithetic, proposal, center, keep)
+    (B, n), single = x.shape, x.dtype == torch.float32
+    rows = pick_rows(seed, 0, B * S, n, proposal, x.device)
+    recipe = Redrawn(rows, x, sigma, antithetic, single)
+    points, weights = x.new_empty(B, recipe.K + center, n), sigma.new_empty(B, recipe.K)
+    u = sigma.new_empty(B if keep else 0, recipe.K, n)
+    for part, part_u, part_weights, columns in recipe.chunks(proposal):
+        points[:, columns], weights[:, columns] = part, part_weights
+        if keep:
+            u[:, columns] = part_u
+    if center:
+        points[:, -1] = x
+    return rows, points, u, weights
 
 
 def project(u: Samples, t: Tensor) -> Tensor:

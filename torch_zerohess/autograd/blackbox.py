@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.autograd import opaque, transforms
+from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.linear_map import first_order_only, project
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
@@ -137,12 +138,9 @@ class Input(torch.autograd.Function):
     """The identity. It marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
 
     @staticmethod
-    def forward(x: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
         return x.view_as(x)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
@@ -173,6 +171,15 @@ def smooth(
 
 def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Tensor:
     """Return the expansion around `center` at x [B, n], with a graph; `zero` says that x equals `center` in value."""
+    if zero and not transforms.watched(x) and not transforms.forward_mode_active():
+        result: Tensor = ClosedForm.apply(
+            x, expansion, functools.partial(_general, expansion, center=center, zero=True)
+        )
+        return result
+    return _general(expansion, x, center=center, zero=zero)
+
+
+def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> Tensor:
     stein, c = expansion.stein, expansion.flat
 
     def ratios(d: Tensor, zero: bool) -> Tensor:

@@ -218,10 +218,21 @@ Tensor hessian(const Tensor& u, const Tensor& a) {
       hessian_row(rows + m / M * K * n, i, K, n, coefficients + m * K, out + m * n * n);
     }
   });
-  for (int64_t m = 0; m < B * M; ++m)
-    for (int64_t i = 1; i < n; ++i)
-      for (int64_t j = 0; j < i; ++j) out[(m * n + i) * n + j] = out[(m * n + j) * n + i];
+  for (int64_t m = 0; m < B * M; ++m) mirror_rows(out + m * n * n, n, 0, n);
   return result;
+}
+
+// Makes matrices [B, n, n] symmetric, in place: their lower triangles become copies of the upper ones.
+void mirror(const Tensor& matrices) {
+  check(matrices, "matrices", 3);
+  const int64_t B = matrices.size(0), n = matrices.size(1);
+  STD_TORCH_CHECK(matrices.size(2) == n, "matrices are not square");
+  double* out = matrices.mutable_data_ptr<double>();
+  for (int64_t b = 0; b < B; ++b) {
+    torch::stable::parallel_for(0, n, grain(2 * n), [&](int64_t begin, int64_t end) {
+      mirror_rows(out + b * n * n, n, begin, end);
+    });
+  }
 }
 
 }  // namespace
@@ -238,6 +249,7 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("project(Tensor u, Tensor t) -> Tensor");
   m.def("accumulate(Tensor u, Tensor a, bool squares) -> Tensor");
   m.def("hessian(Tensor u, Tensor a) -> Tensor");
+  m.def("mirror(Tensor(a!) matrices) -> ()");
   m.def(
       "project_drawn(Tensor rows, Tensor x, Tensor sigma, bool antithetic, bool single, Tensor t) "
       "-> Tensor");
@@ -257,6 +269,7 @@ STABLE_TORCH_LIBRARY_IMPL(torch_zerohess, CPU, m) {
   m.impl("project", TORCH_BOX(&project));
   m.impl("accumulate", TORCH_BOX(&accumulate));
   m.impl("hessian", TORCH_BOX(&hessian));
+  m.impl("mirror", TORCH_BOX(&mirror));
   m.impl("project_drawn", TORCH_BOX(&project_drawn));
   m.impl("accumulate_drawn", TORCH_BOX(&accumulate_drawn));
 }

@@ -134,4 +134,15 @@ inline void hessian_row(const double* u, int64_t i, int64_t K, int64_t n, const 
   for (int64_t k = 0; k < K; ++k) add_scaled(a[k] * u[k * n + i], u + k * n + i, n - i, out + i * n + i);
 }
 
+// Copies rows begin .. end of the lower triangle of a matrix [n, n] from its upper triangle, in tiles that fit the cache.
+inline void mirror_rows(double* matrix, int64_t n, int64_t begin, int64_t end) {
+  constexpr int64_t kTile = 32;
+  for (int64_t top = begin; top < end; top += kTile) {
+    const int64_t bottom = std::min(top + kTile, end);
+    for (int64_t left = 0; left < bottom; left += kTile)
+      for (int64_t i = top; i < bottom; ++i)
+        for (int64_t j = left; j < std::min(left + kTile, i); ++j) matrix[i * n + j] = matrix[j * n + i];
+  }
+}
+
 }  // namespace zerohess

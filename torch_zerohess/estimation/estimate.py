@@ -55,8 +55,9 @@ class Estimate:
 
     def hessian(self) -> Tensor:
         """d2F/dx_i dx_j: [*batch, *out, n, n], symmetric; formed at every call."""
-        n = len(self._sigma)
-        return self._shaped(self._stein.hessian(self._a) / (self._sigma[:, None] * self._sigma), n, n)
+        n, sigma = len(self._sigma), self._smoothing.sigma
+        product = sigma * sigma if isinstance(sigma, float) else self._sigma[:, None] * self._sigma
+        return self._shaped(self._stein.hessian(self._a).div_(product), n, n)
 
     def standard_error(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
         """Standard error of an estimate, in the shape of the estimate, from the spread of its independent draws.

@@ -169,6 +169,8 @@ def _finite(
 
     Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
     """
+    if math.isfinite(float(values.sum())):  # it is not, if one of them is not
+        return values, None
     bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
     if not bool(bad.any()):
         return values, None

@@ -40,7 +40,7 @@ class LikelihoodRatio(Stein):
                 drawn, x.double().contiguous(), sigma, smoothing.antithetic, single, density
             )
             made = cls(u, weight)
-        if bool((weight == 0).all(1).any()):
+        if density == proposals.UNIFORM and bool((weight == 0).all(1).any()):
             raise ValueError(
                 f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"
             )

@@ -5,6 +5,7 @@ a compiler, go to the reference. Both draw the same bits. Their sums of n terms 
 place of the sum of magnitudes at most.
 """
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from torch_zerohess.sampling import extension, proposals
 
 _MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
 _WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
+_STRIP = 128  # rows of a wide Hessian that one matrix product gives
 _CHUNK = 1 << 22  # elements of drawn rows held at a time
 
 
@@ -53,7 +55,7 @@ Samples = Tensor | Redrawn
 
 
 def _compiled(tensor: Tensor) -> bool:
-    return extension.available and tensor.device.type == "cpu"
+    return extension.available and tensor.is_cpu
 
 
 def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: torch.device) -> Tensor:
@@ -139,9 +141,28 @@ def hessian(u: Samples, a: Tensor) -> Tensor:
             flat = _total(part @ (one[..., :, None] * one[..., None, :]).flatten(2) for one, part in pieces)
             result = flat.unflatten(2, (u.shape[2], u.shape[2]))
         else:
-            result = (u.mT[:, None] * a[:, :, None]) @ u[:, None]
-        return result.triu() + result.triu(1).mT
+            result = _upper(u, a)
+        return _symmetric(result)
     return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
+
+
+def _upper(u: Tensor, a: Tensor) -> Tensor:
+    """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] for i <= j, and numbers below; about half of the whole product."""
+    n = u.shape[2]
+    result = u.new_empty(*a.shape[:2], n, n)
+    for b, m in itertools.product(range(len(u)), range(a.shape[1])):
+        weighted = (a[b, m, :, None] * u[b]).mT
+        for i in range(0, n, _STRIP):
+            torch.mm(weighted[i : i + _STRIP], u[b, :, i:], out=result[b, m, i : i + _STRIP, i:])
+    return result
+
+
+def _symmetric(upper: Tensor) -> Tensor:
+    """Return matrices [..., n, n] of which only the upper triangle is right, made symmetric."""
+    if _compiled(upper):
+        torch.ops.torch_zerohess.mirror(upper.flatten(0, -3))
+        return upper
+    return upper.triu() + upper.triu(1).mT
 
 
 def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:

@@ -206,6 +206,7 @@ def test_extension_and_matrix_product_agree_within_the_bound(n: int, M: int, mon
             monkeypatch.setattr(kernels, "_MANY_VECTORS", threshold)
             monkeypatch.setattr(kernels, "_WIDE", threshold)
             monkeypatch.setattr(kernels, "_CHUNK", chunk)
+            monkeypatch.setattr(kernels, "_STRIP", 7)
             check(kernels.project(u, t), t @ u.mT, t.abs() @ size.mT, n)
             check(kernels.accumulate(u, a), a @ u, a.abs() @ size, K)
             check(kernels.accumulate_squares(u, a), a @ squares, a.abs() @ squares, K)
@@ -266,6 +267,14 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     assert all(torch.equal(p, q) for p, q in zip(one, two, strict=True))
 
 
+@pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 100])
+def test_mirror_copies_the_upper_triangle(n: int) -> None:
+    matrices = spread(2 * n * n, -1.0, 1.0).view(2, n, n)
+    expected = matrices.triu() + matrices.triu(1).mT
+    ops.mirror(matrices)
+    assert torch.equal(matrices, expected)
+
+
 def test_noncontiguous_inputs() -> None:
     u, t, a = samples(9, 6, 2)
     turned = [one.mT.contiguous().mT for one in (u, t, a)]
@@ -304,6 +313,12 @@ WRONG = {
     "accumulate: K": lambda: ops.accumulate(doubles(1, 4, 3), doubles(1, 2, 5), False),
     "accumulate: dimensions": lambda: ops.accumulate(doubles(1, 4, 3), doubles(1, 4), False),
     "hessian: K": lambda: ops.hessian(doubles(1, 4, 3), doubles(1, 2, 5)),
+    "mirror: square": lambda: ops.mirror(doubles(1, 3, 4)),
+    "mirror: dimensions": lambda: ops.mirror(doubles(3, 3)),
+    "sample: no samples": lambda: ops.sample(0, 0, doubles(2, 3), doubles(3), True, 0, True, True),
+    "sample: sigma": lambda: ops.sample(0, 4, doubles(2, 3), doubles(2), True, 0, True, True),
+    "sample: no batch": lambda: ops.sample(0, 4, doubles(0, 3), doubles(3), True, 0, True, True),
+    "sample: type of x": lambda: ops.sample(0, 4, doubles(2, 3).half(), doubles(3), True, 0, True, True),
     "hessian: float32": lambda: ops.hessian(doubles(1, 4, 3).float(), doubles(1, 2, 4)),
     "project_drawn: n": lambda: ops.project_drawn(*recipe(), doubles(2, 1, 4)),
     "project_drawn: sigma": lambda: ops.project_drawn(*recipe(sigma=1), doubles(2, 1, 3)),

@@ -75,11 +75,11 @@ class LikelihoodRatio(Stein):
 
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
         a = a * self.weight[:, None]
-        return kernels.accumulate(self.u, a * kernels.project(self.u, v)) - total(a.mT).mT * v
+        return kernels.accumulate(self.u, a * kernels.project(self.u, v)).addcmul_(total(a.mT).mT, v, value=-1.0)
 
     def hessian_diagonal(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]
-        return kernels.accumulate_squares(self.u, a) - total(a.mT).mT
+        return kernels.accumulate_squares(self.u, a).sub_(total(a.mT).mT)
 
     def hessian(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]

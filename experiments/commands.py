@@ -50,7 +50,7 @@ COMMANDS = {
     "gallery": Command("experiments.studies.gallery:gallery", "pictures and animations of all tasks", long=True),
     "caustic": Command("experiments.studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),
     "bench": Command(
-        "experiments.studies.bench:bench", "time of the extension against pure torch and against the machine", long=True
+        "experiments.studies.bench:bench", "time of the extension against pure torch and torch", long=True
     ),
     "stability": Command("experiments.studies.stability:stability", "extreme cases against closed forms", long=True),
     "doctor": Command("experiments.commands:doctor", "what this installation can do"),

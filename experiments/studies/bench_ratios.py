@@ -4,7 +4,7 @@
 |---|---|---|
 | noise | picks, perturbations, points and density ratios of proposal "aggregate" | `torch.randn` of the same count |
 | Hessian | `Estimate.hessian` | the bare matrix product of its samples |
-| gradient + HVP | one gradient and one product of perturbations that are drawn again, three passes | three passes of noise |
+| gradient + HVP | one gradient and one product from perturbations that are drawn again | three passes of noise |
 | threads | the noise with one thread | with two |
 
 A ratio above 1 says that the package is faster, or that two threads are.

@@ -146,18 +146,19 @@ auto stored(const Tensor& u) {
 
 // Checks what follows divides by.
 auto drawn(const Tensor& rows, const Tensor& x, const Tensor& sigma, bool single) {
+  const Row* row = row_data(rows);
   STD_TORCH_CHECK(x.dim() == 2 && sigma.dim() == 1, "x and sigma must have 2 and 1 dimensions");
   STD_TORCH_CHECK(
       x.size(0) > 0 && rows.size(0) > 0 && rows.size(0) % x.size(0) == 0 && sigma.size(0) == x.size(1),
       "rows, x and sigma do not fit");
   const int64_t S = rows.size(0) / x.size(0);
-  return [row = row_data(rows), S, single](int64_t b) { return DrawnRows{row + b * S, S, single}; };
+  return [row, S, single](int64_t b) { return DrawnRows{row + b * S, S, single}; };
 }
 
 Tensor project(const Tensor& u, const Tensor& t) {
-  STD_TORCH_CHECK(u.size(0) == t.size(0) && u.size(2) == t.size(2), "u and t do not fit");
-  check(t, "t", 3);
   const auto rows_of = stored(u);
+  check(t, "t", 3);
+  STD_TORCH_CHECK(u.size(0) == t.size(0) && u.size(2) == t.size(2), "u and t do not fit");
   const int64_t B = t.size(0), M = t.size(1), n = t.size(2), K = u.size(1);
   Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
   const double* vectors = t.const_data_ptr<double>();
@@ -178,9 +179,9 @@ Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
 
 Tensor project_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& t) {
-  STD_TORCH_CHECK(x.size(0) == t.size(0) && x.size(1) == t.size(2), "x and t do not fit");
-  check(t, "t", 3);
   const auto rows_of = drawn(rows, x, sigma, single);
+  check(t, "t", 3);
+  STD_TORCH_CHECK(x.size(0) == t.size(0) && x.size(1) == t.size(2), "x and t do not fit");
   const int64_t B = t.size(0), M = t.size(1), n = t.size(2), S = rows.size(0) / B, K = antithetic ? 2 * S : S;
   Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
   const double* vectors = t.const_data_ptr<double>();

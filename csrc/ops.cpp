@@ -27,6 +27,11 @@ using torch::stable::Tensor;
 
 constexpr int64_t kGrain = 1 << 14;  // elements of work that one more thread is worth
 
+// Every argument is checked before LibTorch is asked about it: LibTorch prints a trace to stderr where it refuses.
+void check_size(int64_t size, const char* name, int64_t least) {
+  STD_TORCH_CHECK(size >= least, name, " is ", size, ", but must be at least ", least);
+}
+
 void check(const Tensor& tensor, const char* name, int64_t dim, ScalarType type = ScalarType::Double) {
   STD_TORCH_CHECK(tensor.scalar_type() == type, name, " has the wrong dtype");
   STD_TORCH_CHECK(tensor.dim() == dim, name, " has ", tensor.dim(), " dimensions instead of ", dim);
@@ -42,6 +47,8 @@ const Row* row_data(const Tensor& rows) {
 }
 
 Tensor pick_rows(int64_t seed, int64_t first, int64_t count, int64_t n, int64_t proposal) {
+  check_size(count, "count", 0);
+  check_size(n, "n", 1);
   Tensor rows = torch::stable::empty({count, 5}, ScalarType::Long);
   Row* out = reinterpret_cast<Row*>(rows.mutable_data_ptr<int64_t>());
   for (int64_t r = 0; r < count; ++r) out[r] = pick(seed, first + r, n, proposal);
@@ -50,6 +57,7 @@ Tensor pick_rows(int64_t seed, int64_t first, int64_t count, int64_t n, int64_t 
 
 template <typename T>
 Tensor draw_as(const Tensor& rows, int64_t n, ScalarType type) {
+  check_size(n, "n", 0);
   const Row* row = row_data(rows);
   Tensor u = torch::stable::empty({rows.size(0), n}, type);
   T* out = u.mutable_data_ptr<T>();
@@ -123,7 +131,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sample(
 // `rows_of(b)` gives the rows of U that belong to batch element b.
 template <class RowsOf>
 Tensor accumulate_with(const RowsOf& rows_of, int64_t n, bool squares, const Tensor& a) {
-  check(a, "a", 3);
   const int64_t B = a.size(0), M = a.size(1), K = a.size(2), blocks = (n + kBlock - 1) / kBlock;
   Tensor result = torch::stable::empty({B, M, n}, ScalarType::Double);
   const double* coefficients = a.const_data_ptr<double>();
@@ -173,8 +180,10 @@ Tensor project(const Tensor& u, const Tensor& t) {
 }
 
 Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
+  const auto rows_of = stored(u);
+  check(a, "a", 3);
   STD_TORCH_CHECK(u.size(0) == a.size(0) && u.size(1) == a.size(2), "u and a do not fit");
-  return accumulate_with(stored(u), u.size(2), squares, a);
+  return accumulate_with(rows_of, u.size(2), squares, a);
 }
 
 Tensor project_drawn(
@@ -200,6 +209,7 @@ Tensor accumulate_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& a,
     bool squares) {
   const auto rows_of = drawn(rows, x, sigma, single);
+  check(a, "a", 3);
   const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
   STD_TORCH_CHECK(x.size(0) == a.size(0) && K == a.size(2), "rows and a do not fit");
   return accumulate_with(rows_of, x.size(1), squares, a);

@@ -30,6 +30,7 @@ def run(
     jobs: int = 1,
     seed: int = 0,
     limit: float | None = None,
+    evaluations: int | None = None,
     variant: str = "auto",
     threads: int | None = None,
 ) -> None:
@@ -44,13 +45,14 @@ def run(
         jobs: processes, one thread each but for `threads`; the results do not depend on it.
         seed: number of the first run.
         limit: seconds that a run may take; 600, for networks any, if not given.
+        evaluations: that a run may use; those of the task if not given.
         variant: of Mitsuba; auto takes a just-in-time one only where it is known to work.
         threads: render threads of networks; all cores if not given. Other tasks have one per process.
     """
     names = chosen("TASK", tasks, list(TASKS))
     wanted = None if methods.strip() == "all" else chosen("methods", methods.split(","), list(METHODS))
     fitting, networks = (range(seed, seed + (number if runs is None else runs)) for number in (RUNS, NETWORK_RUNS))
-    ensemble = Ensemble(out, fitting, preset, jobs, limit, variant, networks, threads)
+    ensemble = Ensemble(out, fitting, preset, jobs, limit, variant, networks, threads, evaluations)
     try:
         outcomes = _run(ensemble, names, wanted)
         _report(ensemble, names, outcomes)

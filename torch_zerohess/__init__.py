@@ -10,7 +10,7 @@ Hessian-vector products of F are estimated from one batch of evaluations of f (S
     loss.backward()                                             # or torch.func, or zh.optim.NewtonCG
 """
 
-from torch_zerohess import adapters, evaluators, losses, optim
+from torch_zerohess import adapters, evaluators, heads, losses, optim
 from torch_zerohess.autograd.blackbox import BlackBox, smooth
 from torch_zerohess.autograd.curvature import CurvatureOperator, hvp
 from torch_zerohess.doctor import doctor
@@ -19,12 +19,14 @@ from torch_zerohess.estimation.finite_differences import finite_difference_hvp
 from torch_zerohess.minimize import Minimum, minimize
 from torch_zerohess.optim.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.surrogates.memory import Memory
 
 __all__ = [
     "BlackBox",
     "CurvatureOperator",
     "Estimate",
     "LinearSigma",
+    "Memory",
     "Minimum",
     "Smoothing",
     "adapters",
@@ -32,6 +34,7 @@ __all__ = [
     "estimate",
     "evaluators",
     "finite_difference_hvp",
+    "heads",
     "hvp",
     "losses",
     "minimize",

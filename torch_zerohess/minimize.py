@@ -1,13 +1,13 @@
 """Minimise a plain function from a start, without a torch model: `TrustRegion` with its evaluations done for you."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
 from torch_zerohess.estimation.evaluation import BlackBoxCall
-from torch_zerohess.estimation.inputs import checked_input
+from torch_zerohess.estimation.inputs import checked_input, short, working
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.optim.second_order import check_count
 from torch_zerohess.search.space import Bounds
@@ -23,7 +23,7 @@ class Iterate:
     x: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Minimum:
     """The best point found, and the smoothed function around it.
 
@@ -40,11 +40,15 @@ class Minimum:
     sigma: Tensor
     """Width of the model per parameter [n]."""
     evaluations: int
-    history: list[Iterate] = field(repr=False)
+    history: list[Iterate]
     message: str
     """Why the search ended."""
     engine: str
     """Which search it was: "gaussian_process" or "descent"."""
+
+    def __repr__(self) -> str:
+        found = f"x={short(self.x)}, value={self.value:.6g}, evaluations={self.evaluations}"
+        return f"Minimum({found}, engine={self.engine!r}, message={self.message!r})"
 
 
 def minimize(
@@ -91,7 +95,7 @@ def minimize(
         >>> bool((fit.x - 3).abs().max() < 1e-3), fit.evaluations < 50
         (True, True)
     """
-    x0 = checked_input(x0)
+    x0 = working(checked_input(x0))
     search = TrustRegion(x0, sigma=sigma, bounds=bounds, loss=loss, engine=engine, seed=seed, **settings)
     smallest = len(search.ask()) + 1
     if max_evaluations < smallest:

@@ -25,8 +25,9 @@ class Smoothing:
             share and divides by the density of that mixture; "gaussian" is the plain normal; "uniform" a box of +-5
             sigma, for comparison; "optimal" one sample set per element of gradient and Hessian, with constant weights
             (samples is then per element); "fr22" all dimensions from the signed first-derivative lobe, first order
-            only and biased for n > 1, also in its smoothed value (Fischer and Ritschel 2023), a baseline of the
-            literature.
+            only, a baseline of the literature (Fischer and Ritschel 2023). Its gradient is biased for n > 1, and its
+            smoothed value for every n: in one dimension the smoothed value of x^2 is x^2 + 2 sigma^2 instead of
+            x^2 + sigma^2.
         antithetic: use every perturbation with both signs.
         baseline: what is subtracted from f. "center" is f(x); "mean" the mean of all other draws, which costs no
             evaluation; "none" nothing. It changes the variance, by orders of magnitude, and not the expectation.

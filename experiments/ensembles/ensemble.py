@@ -40,6 +40,8 @@ class Ensemble:
     """Runs on network tasks, if they are not `runs`."""
     threads: int | None = None
     """That render the images of a network task; all cores if None. A fitting task has one per process."""
+    evaluations: int | None = None
+    """That a run may use; those of the task if None."""
 
     def __post_init__(self) -> None:
         for runs in (self.runs, self.network_runs or self.runs):
@@ -47,7 +49,7 @@ class Ensemble:
                 raise SystemExit(f"runs must be at least 1, got {len(runs)}")
             if runs.start < 0:
                 raise SystemExit(f"seed must be at least 0, got {runs.start}")
-        for name, value in (("jobs", self.jobs), ("threads", self.threads)):
+        for name, value in (("jobs", self.jobs), ("threads", self.threads), ("evaluations", self.evaluations)):
             if value is not None and value < 1:
                 raise SystemExit(f"{name} must be at least 1, got {value}")
         if self.limit is not None and not self.limit > 0:
@@ -73,6 +75,7 @@ class Ensemble:
     def _jobs(self, task: str | Task | NetworkTask, methods: Sequence[str | Method] | None) -> list[Job]:
         preset, variant, threads = self.preset, self.variant, self.threads
         loaded = catalogue.load(task, preset, variant, threads) if isinstance(task, str) else task
+        loaded = catalogue.budgeted(loaded, self.evaluations)
         network = isinstance(loaded, NetworkTask)
         shared = {"preset": preset, "variant": variant} | ({"threads": threads} if network else {"level": LEVELS[-1]})
         limit = LIMIT if self.limit is None and not network else self.limit

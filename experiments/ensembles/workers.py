@@ -180,6 +180,7 @@ def _execute(job: Job, connection: Connection) -> Message:
 
     try:
         task = _load(job.task, job.preset, job.variant, job.threads) if isinstance(job.task, str) else job.task
+        task = catalogue.budgeted(task, job.budget)
         method = METHODS[job.method] if isinstance(job.method, str) else job.method
         method.load()
         return attempt(

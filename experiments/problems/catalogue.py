@@ -5,6 +5,7 @@ import importlib
 import importlib.util
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Literal
 
 from experiments.problems.network_task import NetworkTask
@@ -45,6 +46,16 @@ def fitting(name: str, preset: Preset = "fast", variant: str = "auto") -> Task:
     task = load(name, preset, variant)
     assert isinstance(task, Task), f"name must be one of {', '.join(FITTING)}, got {name}"
     return task
+
+
+def budgeted(task: Task | NetworkTask, evaluations: int | None) -> Task | NetworkTask:
+    """Return a task whose runs may use so many evaluations, if not None."""
+    if evaluations is None or evaluations == task.evaluations:
+        return task
+    if isinstance(task, NetworkTask):
+        task.size = replace(task.size, evaluations=evaluations)
+        return task
+    return replace(task, evaluations=evaluations)
 
 
 @contextmanager

@@ -324,3 +324,10 @@ def test_what_is_refused(wrong, error, message):
     settings = {"fn": bowl, "x0": zeros(), "sigma": 1.0, "seed": 0, **wrong}
     with pytest.raises(error, match=message):
         zh.minimize(settings.pop("fn"), settings.pop("x0"), **settings)
+
+
+def test_a_minimum_says_what_was_found() -> None:
+    fit = zh.minimize(bowl, torch.zeros(2, dtype=torch.float64), sigma=2.0, seed=0, restarts=0)
+    assert repr(fit).startswith("Minimum(x=[")
+    told = f"value={fit.value:.6g}, evaluations={fit.evaluations}, engine='descent', message={fit.message!r})"
+    assert repr(fit).endswith(told)

@@ -121,6 +121,12 @@ class MitsubaScene:
         self.values.keep([name for one in self.parameters for name in one.names])
         self._calls = seed
 
+    def __repr__(self) -> str:
+        width, height = (int(one) for one in self.scene.sensors()[0].film().size())
+        settings = f"film=({width}, {height}), spp={self.spp}, noise={self.noise!r}, variant={self.variant!r}"
+        some = ", ".join(self.labels[:4]) + ", ..." * (self.n > 4)
+        return f"MitsubaScene(n={self.n}, parameters=[{some}], {settings})"
+
     def __call__(self, x: Tensor) -> Tensor:
         """Render points [K, n].
 

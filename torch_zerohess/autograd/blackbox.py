@@ -8,15 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.autograd import opaque, transforms
+from torch_zerohess.autograd import control_variate, opaque, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
-from torch_zerohess.autograd.linear_map import first_order_only, project
+from torch_zerohess.autograd.limit import limited
+from torch_zerohess.autograd.linear_map import project
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
-from torch_zerohess.estimation.inputs import checked_input, folded_aux
+from torch_zerohess.estimation.head import Head
+from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.surrogates.memory import Memory
 
 
 class BlackBox(nn.Module):
@@ -30,13 +35,25 @@ class BlackBox(nn.Module):
         fn: [K, n], *aux [K, ...] -> [K, *out], scalar values (a loss) or tensors (an image). It may use NumPy,
             Mitsuba, another program; it gets detached tensors and is not differentiated. A module given as fn is not
             registered: its parameters are not trained through this layer.
+        head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
+            operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
+        memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
+            training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
+            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept.
         smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
         value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
 
-    Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x.
+    Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For float16 and
+    bfloat16, as autocast makes them, fn gets float32.
+
+    Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch: that is
+    randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
+    "different" where neither x nor aux is mapped over.
+
+    `torch.export` raises RuntimeError: no file can hold the black box.
 
     Example:
         >>> layer = BlackBox(lambda z: z.round().sum(1), Smoothing(sigma=1.0, samples=2000, seed=0))
@@ -53,6 +70,8 @@ class BlackBox(nn.Module):
         fn: Callable[..., Any],
         smoothing: Smoothing,
         *,
+        head: Head | None = None,
+        memory: Memory | None = None,
         vectorized: bool = True,
         evaluator: Evaluator | None = None,
         value: ValueMode = "center",
@@ -62,48 +81,102 @@ class BlackBox(nn.Module):
         if not isinstance(smoothing, Smoothing):
             raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
         self.smoothing = smoothing
-        self.call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite)
+        if memory is not None and not isinstance(memory, Memory):
+            raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
+        self.call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite, head)
+        self.memory = memory
+        self.control: Control | None = None
+        """The memory during the present call."""
         self.output_shapes: dict[tuple[int | torch.Size, ...], torch.Size] = {}
         self._handle = opaque.register(self)
 
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
-        x = checked_input(x)
-        if x.requires_grad and not transforms.watched(x) and not transforms.forward_mode_active():
+        _before_compiling()
+        dtype, x = checked_input(x).dtype, working(x)
+        if x.requires_grad and not transforms.watched(x) and not transforms.has_tangent(x):
             x = Input.apply(x)
         batch = x.shape[:-1]
         flat, others = x.reshape(-1, x.shape[-1]), folded_aux(_without_grad(aux), batch)
         if self.call.value == "center" and not transforms.derivative_possible(x):
             result = self._center(flat.detach(), others)
         else:
-            result = _value(self._evaluate(flat.detach(), others), flat, flat.detach(), zero=True)
+            result = self._around(flat.detach(), others)(flat)
         if torch.compiler.is_compiling() and x.requires_grad:
             # torch differentiates a compiled backward a second time without an error, and gets a wrong number, unless
             # the backward has saved an input of the graph. This term is zero and saves x: now torch raises.
             result = result + 0.0 * x.sin().sum()
-        return result.reshape((*batch, *result.shape[1:]))
+        return result.reshape((*batch, *result.shape[1:])).to(dtype)
 
     def freeze(self, x: Tensor, *aux: Tensor) -> Callable[[Tensor], Tensor]:
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order; it makes no further evaluation.
+        smoothed black box and has derivatives of every order. Those of proposals "optimal" (with order=2) and "fr22"
+        end at the second and first, and higher ones raise ValueError. It makes no further evaluation.
         """
+        _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
-        center = x.detach().reshape(-1, n).clone()
-        expansion = self._evaluate(center, folded_aux(_without_grad(aux), batch))
+        center = working(x).detach().reshape(-1, n).clone()
+        around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
         def frozen(z: Tensor) -> Tensor:
-            result = _value(expansion, z.reshape(-1, n), center, zero=False)
+            result = around(z.reshape(-1, n))
             return result.reshape((*batch, *result.shape[1:]))
 
         return frozen
 
+    def _around(self, center: Tensor, aux: list[Tensor], *, zero: bool = True) -> Callable[[Tensor], Tensor]:
+        """Evaluate around a center [B, n], and return the estimate as a function of x [B, n].
+
+        zero: promises that x equals the center in value.
+        """
+        if self.memory is None:
+            return self._estimated(center, aux, zero)
+        if torch.compiler.is_compiling():
+            raise RuntimeError(
+                "a layer with a memory cannot be compiled, because its surrogate changes from call to call: "
+                "exclude the layer with torch.compiler.disable"
+            )
+        self.control = Control.of(self.memory, self.call.head, learning=self.training)
+        with transforms.outside(), transforms.random_numbers_allowed():
+            seed = int(torch.randint(2**62, ())) if self.smoothing.seed is None else self.smoothing.seed
+        try:
+            return control_variate.around(
+                self.control,
+                center,
+                aux,
+                self.smoothing.sigma_vector(center.shape[1], center.device),
+                seed,
+                self.smoothing.order,
+                lambda part, its_aux: self._estimated(part, its_aux, zero),
+                value=self.call.value,
+            )
+        finally:
+            self.control = None
+
+    def _estimated(self, center: Tensor, aux: list[Tensor], zero: bool) -> Callable[[Tensor], Tensor]:
+        """Return the part of the estimate that comes from new evaluations, as `_around` does."""
+        expansion = self._evaluate(center, aux)
+        active = self.control is not None and self.control.active
+        entropy = isinstance(self.call.head, LocalEntropy) and not active
+        if active and self.memory is not None and self.memory.order == 1:
+            return lambda x: _tangent(expansion, x, center)
+
+        plain = zero and self.control is None and not entropy  # nothing but the expansion stands between x and values
+
+        def estimated(x: Tensor) -> Tensor:
+            result = _value(expansion, x, center, zero=zero, plain=plain)
+            return control_variate.local_entropy_value(result, self.call.value) if entropy else result
+
+        return estimated
+
     def _evaluate(self, x: Tensor, aux: list[Tensor]) -> Expansion:
         B, n = x.shape
-        keep = torch.compiler.is_compiling() or stored(self.smoothing, B, n)
         if not transforms.watched(x):
-            return opaque.expand(self, keep, x, aux)
+            return opaque.expand(self, stored(self.smoothing, B, n), x, aux)
+        x = opaque.noise_checked(self._handle, x, aux)
+        keep = torch.compiler.is_compiling() or stored(self.smoothing, B * transforms.mapped_size([x, *aux]), n)
         K = self.smoothing.evaluations(n, center=False)
         tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, x, aux)
         return Expansion.rebuild(tensors, x, self.smoothing, keep)
@@ -120,11 +193,18 @@ class BlackBox(nn.Module):
         return self.call.fn
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the settings, so that a state_dict resumes an annealed sigma."""
-        return {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
+        """Return the settings, so that a state_dict resumes an annealed sigma, and what the memory keeps."""
+        settings = {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
+        return settings if self.memory is None else {**settings, "memory": self.memory.state_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.smoothing = Smoothing(**state)
+        settings = dict(state)
+        memory = settings.pop("memory", None)
+        if memory is not None and self.memory is None:
+            raise ValueError("the state has a memory, but the layer has none: make it with memory=Memory()")
+        self.smoothing = Smoothing(**settings)
+        if memory is not None and self.memory is not None:
+            self.memory.load_state_dict(memory)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
@@ -151,6 +231,8 @@ def smooth(
     fn: Callable[..., Any],
     smoothing: Smoothing,
     *,
+    head: Head | None = None,
+    memory: Memory | None = None,
     vectorized: bool = True,
     evaluator: Evaluator | None = None,
     value: ValueMode = "center",
@@ -166,30 +248,56 @@ def smooth(
         >>> bool((slope - 0.7979).abs() < 0.05)
         True
     """
-    return BlackBox(fn, smoothing, vectorized=vectorized, evaluator=evaluator, value=value, on_nonfinite=on_nonfinite)
+    return BlackBox(
+        fn,
+        smoothing,
+        head=head,
+        memory=memory,
+        vectorized=vectorized,
+        evaluator=evaluator,
+        value=value,
+        on_nonfinite=on_nonfinite,
+    )
 
 
-def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Tensor:
-    """Return the expansion around `center` at x [B, n], with a graph; `zero` says that x equals `center` in value."""
-    if zero and not transforms.watched(x) and not transforms.forward_mode_active():
-        result: Tensor = ClosedForm.apply(
-            x, expansion, functools.partial(_general, expansion, center=center, zero=True)
-        )
+def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool, plain: bool) -> Tensor:
+    """Return the expansion around `center` at x [B, n], with a graph.
+
+    zero: says that x equals `center` in value.
+    plain: allows the closed form where no transform is active; it needs `zero`.
+    """
+    general = functools.partial(_general, expansion, center=center, zero=zero)
+    if plain and not transforms.watched(x) and not transforms.forward_mode_active():
+        result: Tensor = ClosedForm.apply(x, expansion, general)
         return result
-    return _general(expansion, x, center=center, zero=zero)
+    return general(x)
 
 
 def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> Tensor:
     stein, c = expansion.stein, expansion.flat
 
     def ratios(d: Tensor, zero: bool) -> Tensor:
-        d = first_order_only(d) if stein.first_order else d
+        d = d if stein.highest is None else limited(d, stein.highest)
         return (stein.ratio(d, functools.partial(project, zero=zero))[:, None] @ c)[:, 0]
 
     d = (x.double() - center.double()) / expansion.sigma
     total = ratios(d, zero)
     change = total - (total if zero else ratios(torch.zeros_like(d), True)).detach()
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
+
+
+def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
+    """Return the expansion around `center` at x [B, n], to first order."""
+    slope = expansion.stein.gradient(expansion.flat.mT.contiguous()) / expansion.sigma
+    change = (slope @ (x.double() - center.double())[..., None])[..., 0]
+    return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
+
+
+def _before_compiling() -> None:
+    if torch.compiler.is_compiling():
+        if torch.compiler.is_exporting():
+            raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
+        from torch_zerohess.autograd import in_graph  # noqa: F401 loaded late: it loads the compiler
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

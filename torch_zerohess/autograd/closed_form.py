@@ -30,7 +30,7 @@ class ClosedForm(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
         again = torch.is_grad_enabled()
-        if again or transforms.watched(gradient):
+        if again or transforms.watched(gradient) or transforms.forward_mode_active():
             with torch.enable_grad():
                 value = ctx.general(x)
             (result,) = torch.autograd.grad(value, x, gradient, create_graph=again)

@@ -10,6 +10,7 @@ term in the curvature of the network, hence "approximately" in the source.
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -74,8 +75,6 @@ class CurvatureOperator:
             self._through = black_box_inputs(outputs) if through is None else _listed(through)
             self._slopes = _grad([outputs], self._through, None, create_graph=True)
             self.gradient = self._flat(_grad([outputs], self._inputs, None))
-            self._dummies = [torch.zeros_like(y, requires_grad=True) for y in self._through]
-            self._pulled = _grad(self._through, self._inputs, self._dummies, create_graph=True)
 
     gradient: Tensor
     """Gradient of the loss, [N]."""
@@ -89,16 +88,41 @@ class CurvatureOperator:
         t = self._split(v)
         if self.mode == "exact":
             return self._flat(_grad(self._slopes, self._inputs, t))
-        return self._flat(_grad(self._through, self._inputs, self.output_curvature(self.output_step(v))))
+        return self.pull(self.output_curvature(self.output_step(v)))
+
+    @property
+    def inputs(self) -> list[Tensor]:
+        """The parameters."""
+        return self._inputs
+
+    @property
+    def through(self) -> list[Tensor]:
+        """The tensors y at which the white box ends ("gauss_newton" only)."""
+        return self._through
+
+    @property
+    def output_gradient(self) -> list[Tensor]:
+        """dl/dy in the shapes of `through`, without a graph ("gauss_newton" only)."""
+        return [one.detach() for one in self._slopes]
 
     def output_step(self, v: Tensor) -> list[Tensor]:
         """Return J v, how far the inputs of the black boxes move along v [N] ("gauss_newton" only)."""
-        # J^T d is linear in the dummy d; its transpose by a second backward pass is J.
-        return _grad(self._pulled, self._dummies, self._split(v))
+        dummies, pulled = self._pulled
+        return _grad(pulled, dummies, self._split(v))
+
+    @cached_property
+    def _pulled(self) -> tuple[list[Tensor], list[Tensor]]:
+        """A dummy d and J^T d, which is linear in d: its transpose by a second backward pass is J."""
+        dummies = [torch.zeros_like(y, requires_grad=True) for y in self._through]
+        return dummies, _grad(self._through, self._inputs, dummies, create_graph=True)
 
     def output_curvature(self, t: Sequence[Tensor]) -> list[Tensor]:
         """Return (d2l/dy2) t for vectors in the shapes of the inputs of the black boxes."""
         return _grad(self._slopes, self._through, t)
+
+    def pull(self, d: Sequence[Tensor]) -> Tensor:
+        """Return J^T d, [N], for vectors d in the shapes of the inputs of the black boxes ("gauss_newton" only)."""
+        return self._flat(_grad(self._through, self._inputs, d))
 
     def to_dense(self) -> Tensor:
         """Return the matrix [N, N], one product per column; ValueError beyond 10 000 parameters."""

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
-from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR
 from torch_zerohess.sampling import kernels
 from torch_zerohess.sampling.kernels import Redrawn, Samples
 
@@ -85,55 +84,3 @@ def _fold(part: Any, dim: int | None, V: int) -> Any:
         return part
     part = part.expand(V, *part.shape) if dim is None else part.movedim(dim, 0)
     return part.flatten(0, 1)
-
-
-def first_order_only(x: Tensor) -> Tensor:
-    """Return x such that second derivatives raise instead of being zero.
-
-    Under `torch.compile` it returns x as it is: a second derivative of compiled code raises in any case.
-    """
-    result: Tensor = x if torch.compiler.is_compiling() else _FirstOrderOnly.apply(x)
-    return result
-
-
-class _FirstOrderOnly(torch.autograd.Function):
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(x: Tensor) -> Tensor:
-        return x.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        result: Tensor = _NoDerivative.apply(gradient, *ctx.saved_tensors)
-        return result
-
-    @staticmethod
-    def jvp(ctx: Any, tangent: Tensor) -> Tensor:
-        result: Tensor = _NoDerivative.apply(tangent, *ctx.saved_tensors)
-        return result
-
-
-class _NoDerivative(torch.autograd.Function):
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(gradient: Tensor, x: Tensor) -> Tensor:
-        return gradient.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[None, None]:
-        raise ValueError(FIRST_ORDER_ERROR)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        raise ValueError(FIRST_ORDER_ERROR)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.stein import Layout
@@ -26,13 +27,14 @@ class Owner(Protocol):
 
     call: BlackBoxCall
     smoothing: Smoothing
+    control: Control | None
     output_shapes: dict[tuple[int | torch.Size, ...], torch.Size]
 
 
 def expand(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Expansion:
     """Evaluate once around x [B, n], without autograd; `keep` stores the perturbations."""
     with torch.no_grad(), transforms.random_numbers_allowed():
-        expansion = evaluate(owner.call, x, aux, owner.smoothing, keep).expansion
+        expansion = evaluate(owner.call, x, aux, owner.smoothing, keep, owner.control).expansion
     owner.output_shapes[_signature(x, aux)] = expansion.base.shape[1:]
     return expansion
 
@@ -48,21 +50,50 @@ def register(owner: Owner) -> int:
     return handle
 
 
-@torch.library.custom_op("torch_zerohess::evaluate", mutates_args=())
+def _owner(handle: int) -> Owner:
+    try:
+        return _owners[handle]
+    except KeyError:
+        raise RuntimeError(
+            f"a traced graph calls black box number {handle}, which does not live in this process, or no longer: keep "
+            "the layer for as long as the graph, and trace again after loading it elsewhere"
+        ) from None
+
+
+# A compiler may merge two calls with the same inputs, or repeat one of them. Two calls of a black box are two draws,
+# and its values may carry noise of their own.
+_RANDOM = (torch.Tag.nondeterministic_seeded,)
+
+
+def noise_checked(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
+    """Return x; ValueError where a vmap wants different noise for each of its calls, but all of them are one call."""
+    if transforms.different_noise_wanted([x, *aux]) and _owner(handle).smoothing.seed is None:
+        raise ValueError(
+            "vmap(randomness='different') over a black box whose inputs are not mapped over: all share one estimate; "
+            "expand x over the mapped dimension, or use randomness='same'"
+        )
+    return x
+
+
+@torch.library.custom_op("torch_zerohess::evaluate", mutates_args=(), tags=_RANDOM)
 def _evaluate(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
     """Return `Expansion.tensors`. K, the number of perturbations, is what the fake kernel needs of the settings."""
-    return expand(_owners[handle], keep, x, aux).tensors()
+    owner = _owner(handle)
+    if (drawn := owner.smoothing.evaluations(x.shape[1], center=False)) != K:
+        raise RuntimeError(f"a graph was traced for {K} perturbations, but now the layer draws {drawn}: trace again")
+    return expand(owner, keep, x, aux).tensors()
 
 
-@torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=())
+@torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=(), tags=_RANDOM)
 def _evaluate_center(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
-    values = evaluate_center(_owners[handle].call, x, aux)
-    _owners[handle].output_shapes[_signature(x, aux)] = values.shape[1:]
+    owner = _owner(handle)
+    values = evaluate_center(owner.call, x, aux)
+    owner.output_shapes[_signature(x, aux)] = values.shape[1:]
     return values.to(x.dtype)
 
 
 def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Layout]:
-    owner = _owners[handle]
+    owner = _owner(handle)
     return Expansion.layout(owner.smoothing, x.shape[0], K, x.shape[1], _output_shape(owner, x, aux), keep)
 
 
@@ -73,7 +104,7 @@ def _(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Ten
 
 @_evaluate_center.register_fake
 def _(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
-    return x.new_empty(len(x), *_output_shape(_owners[handle], x, aux))
+    return x.new_empty(len(x), *_output_shape(_owner(handle), x, aux))
 
 
 def _signature(x: Tensor, aux: Sequence[Tensor]) -> tuple[int | torch.Size, ...]:
@@ -89,7 +120,7 @@ def _output_shape(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> torch.Size:
             probe = torch.zeros(1, int(x.shape[1]), dtype=x.dtype, device=x.device)
             others = [torch.zeros(1, *map(int, one.shape[1:]), dtype=one.dtype, device=one.device) for one in aux]
             try:
-                owner.output_shapes[signature] = owner.call(probe, others).shape[1:]
+                owner.output_shapes[signature] = owner.call.values(probe[:, None], others)[0].shape[2:]
             except Exception as error:
                 raise RuntimeError(
                     "torch.compile needs the output shape of the black box, and calling it at zero failed: call the "
@@ -110,6 +141,11 @@ def _mapped(info: Any, in_dims: Any, x: Tensor, aux: list[Tensor]) -> tuple[Tens
 
 @_evaluate.register_vmap
 def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> Any:
+    if info.randomness == "same" and _owner(handle).smoothing.seed is None:
+        raise ValueError(
+            "vmap(randomness='same') over a black box: its noise is independent for each point of a batch; use "
+            "randomness='different', or give Smoothing a seed"
+        )
     folded, others = _mapped(info, in_dims, x, aux)
     results = _evaluate(handle, K, keep, folded, others)
     batched = [one.batched for one in _layout(handle, K, keep, folded, others)]  # after it: the shape is known by now

@@ -8,14 +8,22 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | what is inside a functorch wrapper | `torch._C._functorch.get_unwrapped`, `is_functorch_wrapped_tensor` |
 `torch.func.debug_unwrap` skips all levels at once |
 | is a forward-mode level open | `forward_ad._current_level` | `forward_ad.unpack_dual` answers for one tensor only |
+| how large is a batch under vmap | `torch._C._functorch.is_batchedtensor`, `maybe_get_level`, `maybe_get_bdim` |
+`torch.func` does not tell |
+| which `randomness` has a vmap | `torch._C._functorch.get_interpreter_stack`, `CVmapInterpreterPtr`, `TransformType`,
+`RandomnessType` | a vmap rule is told, but is not called where it maps over nothing |
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
+| leave all transforms for a while | `torch._functorch.pyfunctorch.temporarily_clear_interpreter_stack` | \
+a random seed is drawn once, whatever maps over the layer |
 | real tensors in a fake kernel | `torch._subclasses.fake_tensor.unset_fake_temporarily` | none exists |
 | is a tensor a symbolic zero | `Tensor._is_zerotensor` | none exists |
 | which function made this node | `Function._backward_cls` | `Node.name()` is a string that other functions may share |
 """
 
+import math
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import cast
 
@@ -31,8 +39,13 @@ def transform_active() -> bool:
 
 
 def forward_mode_active() -> bool:
-    """Whether a level of forward-mode differentiation is open, so that a tensor may carry a tangent."""
+    """Whether a level of forward-mode differentiation is open in any thread, so that a tensor may carry a tangent."""
     return forward_ad._current_level >= 0
+
+
+def has_tangent(x: Tensor) -> bool:
+    """Whether x carries a tangent of forward-mode differentiation. A level that another thread opened gives it none."""
+    return forward_mode_active() and forward_ad.unpack_dual(x).tangent is not None
 
 
 def watched(x: Tensor) -> bool:
@@ -56,7 +69,7 @@ def derivative_wanted(x: Tensor) -> bool:
     while True:
         if x.requires_grad and torch.is_grad_enabled():
             return True
-        if forward_mode_active() and forward_ad.unpack_dual(x).tangent is not None:
+        if has_tangent(x):
             return True
         if not torch._C._functorch.is_functorch_wrapped_tensor(x):
             return False
@@ -70,12 +83,46 @@ def derivative_possible(x: Tensor) -> bool:
     return transform_active() or derivative_wanted(x)
 
 
+def _mapped(x: Tensor) -> Iterator[tuple[int, int]]:
+    """Yield each level of vmap over x, and its size."""
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(x):
+        inner = functorch.get_unwrapped(x)
+        if functorch.is_batchedtensor(x):
+            yield functorch.maybe_get_level(x), int(inner.shape[functorch.maybe_get_bdim(x)])
+        x = inner
+
+
+def mapped_size(tensors: Sequence[Tensor]) -> int:
+    """Return how many times larger a batch is than it seems: the product of the sizes of all vmaps over it."""
+    return math.prod(dict(pair for one in tensors for pair in _mapped(one)).values())
+
+
+def different_noise_wanted(tensors: Sequence[Tensor]) -> bool:
+    """Whether a vmap with randomness="different" is active that maps over none of the tensors."""
+    functorch = torch._C._functorch
+    levels = {level for one in tensors for level, _ in _mapped(one)}
+    return any(
+        one.key() == functorch.TransformType.Vmap
+        and functorch.CVmapInterpreterPtr(one).randomness() == functorch.RandomnessType.Different
+        and one.level() not in levels
+        for one in functorch.get_interpreter_stack() or ()
+    )
+
+
 def random_numbers_allowed() -> AbstractContextManager[None]:
     """Allow random numbers under the vmap that `torch.autograd.functional` uses for a forward-mode Jacobian.
 
     That vmap maps over tangents only, but it forbids random numbers in everything below.
     """
     return cast("AbstractContextManager[None]", torch._C._ExcludeDispatchKeyGuard(_VMAP_MODE))
+
+
+def outside() -> AbstractContextManager[None]:
+    """Compute with plain tensors, random ones included, as if no transform of `torch.func` were active."""
+    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack  # loaded late: slow to import
+
+    return cast("AbstractContextManager[None]", temporarily_clear_interpreter_stack())
 
 
 _VMAP_MODE = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("VmapMode"))  # type: ignore[arg-type]

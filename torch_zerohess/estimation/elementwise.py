@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Stein
+from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Spread, Stein
 from torch_zerohess.sampling import kernels, proposals
 from torch_zerohess.sampling.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
 from torch_zerohess.smoothing import Smoothing
@@ -71,8 +71,8 @@ class Elementwise(Stein):
         return cls(weight, rows, x.shape[1], smoothing.order)
 
     @property
-    def first_order(self) -> bool:
-        return self.order == 1
+    def highest(self) -> int:
+        return self.order
 
     def value(self, a: Tensor) -> Tensor:
         return (a * self.weight[:, None])[..., self.rows[:, 2] == NORMAL].sum(2)
@@ -111,23 +111,41 @@ class Elementwise(Stein):
         return self.value(values.double().mT / values.shape[1])
 
     def variance(
-        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
-    ) -> Tensor:
-        """Spread of the draws of each element, which are the only ones that estimate it.
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
+        """Spread of the S draws of each element, which are the only ones that estimate it: S - 1 degrees of freedom.
 
-        Raises ValueError if an element has one sample.
+        The hvp is a sum of elements with their own variances; its degrees are those of Welch and Satterthwaite. Raises
+        ValueError if an element has one sample.
         """
+        if quantity not in ("value", "gradient") and self.first_order:
+            raise ValueError(FIRST_ORDER_ERROR)
         index = draws[0].to(a.device)
-        S = int((self.rows[index[:, 0], 2] == NORMAL).sum())
+        groups = 1 + self.n + (0 if self.first_order else self.n * (self.n + 1) // 2)
+        S = len(index) // groups
         if S < 2:
             raise ValueError("a standard error of proposal 'optimal' needs at least 2 samples per element, got 1")
-        y = (a * self.weight[:, None])[:, :, index].sum(3)  # one number per draw
-        plain = Elementwise(torch.ones_like(y[:, 0]), self.rows[index[:, 0]], self.n, self.order)
-
-        def spread(sum_: Tensor, squares: Tensor) -> Tensor:
-            return (squares - sum_**2 / S) * (S / (S - 1))
-
-        if quantity == "hvp" and v is not None:
-            elements = spread(plain.hessian(y), plain.hessian(y * y))
-            return (elements @ (v * v)[..., None])[..., 0]
-        return spread(plain.sums(quantity, y, None), plain.sums(quantity, y * y, None))
+        # The value of a draw is f itself: relative to the mean of the others, draws would seem to be further apart.
+        used = pooled if quantity == "value" and pooled is not None else a
+        y = (used * self.weight[:, None])[:, :, index].sum(3).unflatten(2, (groups, S))
+        elements = ((y - y.mean(3, keepdim=True)) ** 2).sum(3) * (S / (S - 1))
+        if quantity == "value":
+            result = elements[:, :, 0]
+        elif quantity == "gradient":
+            result = elements[:, :, 1 : 1 + self.n]
+        else:
+            i, j = torch.triu_indices(self.n, self.n, device=a.device)
+            hessian = elements.new_zeros(*elements.shape[:2], self.n, self.n)
+            hessian[:, :, i, j] = hessian[:, :, j, i] = elements[:, :, 1 + self.n :]
+            if quantity == "hvp" and v is not None:
+                terms = hessian * (v * v)[:, :, None]
+                result, squares = terms.sum(3), (terms**2).sum(3)
+                return Spread(result, torch.where(squares > 0, result**2 / squares, 1.0) * (S - 1))
+            result = hessian if quantity == "hessian" else hessian.diagonal(dim1=2, dim2=3)
+        return Spread(result, torch.full_like(result, S - 1))

@@ -8,10 +8,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation import local_entropy
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.expansion import Expansion
+from torch_zerohess.estimation.head import Head, apply_head, checked_head
+from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.perturbations import draws, perturb
-from torch_zerohess.estimation.stein import Stein, total
+from torch_zerohess.estimation.stein import total
 from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
 
 ValueMode = Literal["center", "smoothed"]
@@ -21,7 +26,9 @@ ValueMode = Literal["center", "smoothed"]
 class BlackBoxCall:
     """How to call a black box: the function, and what to do with what it returns.
 
-    fn: [K, n], *aux [K, ...] -> [K, *out], or of one point [n] -> [*out] where not `vectorized`.
+    fn: [K, n], *aux [K, ...] -> [K, *out], or of one point [n] -> [*out] where not `vectorized`. Without aux if there
+        is a head.
+    head: white box after fn, see `estimation.head`; None: the outputs of fn are the values.
     on_nonfinite: "raise", "drop" (leave out the whole antithetic pair), or a number to put in its place.
     """
 
@@ -30,10 +37,12 @@ class BlackBoxCall:
     evaluator: Evaluator = field(default_factory=Inline)
     value: ValueMode = "center"
     on_nonfinite: str | float = "raise"
+    head: Head | None = None
 
     def __post_init__(self) -> None:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
+        checked_head(self.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
         rule = self.on_nonfinite
@@ -58,6 +67,19 @@ class BlackBoxCall:
             )
         return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
 
+    def values(self, points: Tensor, aux: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
+
+        Without a head they are the same.
+        """
+        B, E = points.shape[:2]
+        flat = points.flatten(0, 1).clone()  # the black box may write to its input
+        if self.head is None:
+            values = self(flat, [one.repeat_interleave(E, 0) for one in aux]).unflatten(0, (B, E))
+            return values, values
+        outputs = self(flat, []).unflatten(0, (B, E))
+        return apply_head(self.head, outputs, aux), outputs
+
     def _each(self, points: Tensor, *aux: Tensor) -> Tensor:
         return torch.stack([_tensor(self.fn(*one)) for one in zip(points, *aux, strict=True)])
 
@@ -77,7 +99,16 @@ class Evaluations:
     """f(x), [B, *out], where it was evaluated."""
     share: Tensor
     """Weight of each row in a mean, [B, K]: 1/K; where rows were dropped, zero for them and more for the others."""
+    baseline: Tensor
+    """What was subtracted from f, its mean over the rows, [B, P]."""
     expansion: Expansion
+
+    @property
+    def smoothed(self) -> Tensor:
+        """The estimate of F(x), float64 [B, *out], whether or not it is the base of the expansion."""
+        B, K = self.share.shape
+        values, a = self.values.reshape(B, K, -1), self.expansion.flat.mT
+        return self.expansion.stein.smoothed(values, self.baseline, a).reshape(self.expansion.base.shape)
 
     @property
     def dropped(self) -> int:
@@ -85,10 +116,23 @@ class Evaluations:
         return int((self.share == 0).sum())
 
 
-def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Smoothing, keep: bool) -> Evaluations:
+def evaluate(
+    call: BlackBoxCall,
+    x: Tensor,
+    aux: Sequence[Tensor],
+    smoothing: Smoothing,
+    keep: bool,
+    control: Control | None = None,
+) -> Evaluations:
     """Draw perturbations of x [B, n] and call the black box once, on all of them and on x itself where it is needed.
 
-    aux: [B, ...] each, repeated for every point of its batch element; keep: see `perturb`.
+    Args:
+        call: the black box.
+        x: [B, n].
+        aux: [B, ...] each, for every point of its batch element.
+        smoothing: how to sample.
+        keep: see `perturb`.
+        control: what is subtracted from the values before they become coefficients.
     """
     seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
     perturbations = perturb(x, smoothing, seed, keep)
@@ -96,31 +140,75 @@ def evaluate(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor], smoothing: Sm
     B, K, n = points.shape
     with_center = call.value == "center" or smoothing.baseline == "center"
     everywhere = torch.cat([points, x[:, None]], 1) if with_center else points
-    repeated = [one.repeat_interleave(everywhere.shape[1], 0) for one in aux]
-    # A copy where there is none yet: the black box may write to its input.
-    flat = everywhere.flatten(0, 1) if with_center else everywhere.flatten(0, 1).clone()
-    values = call(flat, repeated).unflatten(0, (B, -1))
-    values, kept = _finite(values, everywhere, call.on_nonfinite, K, smoothing, stein)
+    values, outputs = call.values(everywhere, control.references(aux) if control else aux)
+    values, kept = finite_values(values, everywhere, call.on_nonfinite, K, smoothing, stein)
     center = values[:, K] if with_center else None
-    values = values[:, :K]
     share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
         share = kept / kept.sum(1, keepdim=True).double()
-    baseline, coefficients = _coefficients(values.reshape(B, K, -1), center, share[..., None], smoothing, n)
-    if call.value == "center" and center is not None:
+    rest, rest_center = _remaining(call, values, center, K, everywhere, outputs, aux, control)
+    values = values[:, :K]
+    baseline, coefficients = _coefficients(rest.reshape(B, K, -1), rest_center, share[..., None], smoothing, n)
+    # The sum of finite numbers may be infinite, but that of others is never finite.
+    if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
+        raise ValueError(
+            f"fn returned values up to {float(values.abs().max()):.3g}, whose differences are not finite in float64: "
+            "scale what fn returns"
+        )
+    coefficients = coefficients.reshape(rest.shape)
+    if isinstance(call.head, LocalEntropy):
+        coefficients[..., 1:] = 0.0  # of constants
+    if call.value == "center" and center is not None and not isinstance(call.head, LocalEntropy):
         base = center.double()
     else:
-        base = stein.smoothed(values.reshape(B, K, -1), baseline, coefficients.mT).reshape((B, *values.shape[2:]))
-    expansion = Expansion(base, coefficients.reshape(values.shape), perturbations.sigma, stein)
-    return Evaluations(points, values, center, share, expansion)
+        flat = coefficients.reshape(B, K, -1)
+        base = stein.smoothed(rest.reshape(B, K, -1), baseline, flat.mT).reshape((B, *rest.shape[2:]))
+        if isinstance(call.head, LocalEntropy):
+            base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
+    expansion = Expansion(base, coefficients, perturbations.sigma, stein)
+    return Evaluations(points, values, center, share, baseline, expansion)
+
+
+def _remaining(
+    call: BlackBoxCall,
+    values: Tensor,
+    center: Tensor | None,
+    K: int,
+    points: Tensor,
+    outputs: Tensor,
+    aux: Sequence[Tensor],
+    control: Control | None,
+) -> tuple[Tensor, Tensor | None]:
+    """Return what is to be smoothed, [B, K, *out], and the same at the center [B, *out].
+
+    These are the values, less what the control variate explains; for a local entropy the packed values.
+    """
+    if isinstance(call.head, LocalEntropy):
+        T, m = local_entropy.scales(values[:, :K], call.head.temperature)
+        if control is not None:
+            T, m = control.scales(aux) or (T, m)
+        rows, packed_center = local_entropy.packed(values[:, :K], center, T, m)
+        if control is None:
+            return rows, packed_center
+        predicted = control.explain(values, points, outputs, aux)
+        if predicted is not None:
+            rows[..., 0] -= local_entropy.tempered(predicted[:, :K], T, m)
+            if packed_center is not None:
+                packed_center[:, 0] -= local_entropy.tempered(predicted[:, K:], T, m)[:, 0]
+        return rows, packed_center
+    predicted = control.explain(values, points, outputs, aux) if control else None
+    if control is None or predicted is None:
+        return values[:, :K], center
+    rest = values.double() - control.coefficient * predicted
+    return rest[:, :K], None if center is None else rest[:, K]
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
     """Return f(x), [B, *out], for x [B, n]: one evaluation per batch element and nothing else."""
-    values = call(x.clone(), [one.clone() for one in aux])
+    values = call.values(x[:, None], [one.clone() for one in aux])[0][:, 0]
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):
-        values = _replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
+        values = replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
     return values
 
 
@@ -162,60 +250,16 @@ def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
     return origin + result
 
 
-def _finite(
-    values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing, stein: Stein
-) -> tuple[Tensor, Tensor | None]:
-    """Treat values [B, E, *out] that are not finite at points [B, E, n].
-
-    Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
-    """
-    if math.isfinite(float(values.sum())):  # it is not, if one of them is not
-        return values, None
-    bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
-    if not bool(bad.any()):
-        return values, None
-    if on_nonfinite != "drop" or bool(bad[:, K:].any()):
-        where = bad.nonzero()[0]
-        if on_nonfinite == "drop":  # the center cannot be dropped
-            where = torch.tensor([int(bad[:, K].nonzero()[0]), K])
-        rule = "raise" if on_nonfinite == "drop" else on_nonfinite
-        return _replaced(values, where, points, rule), None
-    kept = ~bad[:, :K]
-    if smoothing.antithetic:
-        pair = kept[:, : K // 2] & kept[:, K // 2 :]
-        kept = torch.cat([pair, pair], 1)
-    fewest = 2 if smoothing.baseline == "mean" else 1
-    left = int(kept.sum(1).min()) // (2 if smoothing.antithetic else 1)
-    if left < fewest:
-        raise ValueError(
-            f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: fn is not finite "
-            "almost everywhere around x"
-        )
-    if not stein.droppable:
-        raise ValueError(
-            f"on_nonfinite='drop' cannot re-weight the element-wise sets of proposal {smoothing.proposal!r}: give a "
-            "number to put in place of values that are not finite"
-        )
-    return torch.where(bad.reshape(*bad.shape, *[1] * (values.dim() - 2)), 0.0, values), kept
-
-
-def _replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
-    """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
-    if isinstance(rule, str):
-        point = points[tuple(where.tolist())]
-        text = ", ".join(f"{float(p):.6g}" for p in point[:8]) + (", ..." if len(point) > 8 else "")
-        value = values[tuple(where.tolist())]
-        wrong = float(value.flatten()[~torch.isfinite(value.flatten())][0])
-        raise ValueError(
-            f"fn returned {wrong} at the point [{text}]; choose on_nonfinite='drop' or a number to go on without it"
-        )
-    # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
-    return torch.where(torch.isfinite(values), values.double(), float(rule))
-
-
 def _tensor(result: Any) -> Tensor:
     try:
-        # A number of Python is float64, whatever the default dtype of torch.
-        return torch.as_tensor(result, dtype=torch.float64 if isinstance(result, float) else None)
+        # Numbers of Python are float64, alone and in lists, whatever the default dtype of torch.
+        leaf = result
+        while isinstance(leaf, (list, tuple)) and len(leaf):
+            leaf = leaf[0]
+        if isinstance(leaf, float):
+            return torch.as_tensor(result, dtype=torch.float64)
+        tensor = torch.as_tensor(result)
+        mixed = isinstance(leaf, int) and tensor.is_floating_point()  # [1, 2.5]
+        return torch.as_tensor(result, dtype=torch.float64) if mixed else tensor
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

@@ -58,8 +58,11 @@ def finite_difference_hvp(
         raise ValueError(f"step must be positive, in units of sigma, got {step}")
     sigma = smoothing.sigma_vector(n, x.device)
     t = v.detach().double() / sigma
-    length = t.norm(dim=-1, keepdim=True)
-    offset = (step * sigma * t / length.clamp_min(1e-300)).to(x.dtype)
+    size = t.abs().amax(-1, keepdim=True)  # the square of a large number is infinite
+    direction = torch.where(size > 0, t / size, 0.0)
+    norm = direction.norm(dim=-1, keepdim=True)
+    length = size * norm
+    offset = (step * sigma * direction / norm.clamp_min(1.0)).to(x.dtype)  # the norm is 0 or at least 1
     seed = int(torch.randint(2**62, ())) if smoothing.seed is None else smoothing.seed
     other = seed if common else seed ^ (1 << 61)
     forward, backward = (

@@ -1,20 +1,28 @@
-"""Checks of what the caller passes: the point x, and auxiliary inputs of the black box."""
+"""Checks of what the caller passes, the point x and auxiliary inputs of the black box; and tensors as short text."""
 
 from typing import Any
 
 import torch
 from torch import Tensor
 
+_SHOWN = 8  # numbers of a tensor that a text shows
+_HALF = (torch.float16, torch.bfloat16)
+
 
 def checked_input(x: Any) -> Tensor:
     """Return x, or raise TypeError or ValueError if it is not a real floating tensor [*batch, n] with n > 0."""
     if not isinstance(x, Tensor):
         raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
-    if x.dtype not in (torch.float32, torch.float64):
+    if x.dtype not in (torch.float32, torch.float64, *_HALF):
         raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
     if x.dim() == 0 or x.numel() == 0:
         raise ValueError(f"x must have shape [*batch, n] with n and every batch dimension > 0, got {list(x.shape)}")
     return x
+
+
+def working(x: Tensor) -> Tensor:
+    """Return x in the type to compute in: float32 for float16 and bfloat16, as autocast makes them, else its own."""
+    return x.float() if x.dtype in _HALF else x
 
 
 def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
@@ -27,3 +35,12 @@ def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
                 f"aux[{number}] must have the batch dimensions {list(batch)} of x first, got {list(one.shape)}"
             )
     return [one.detach().reshape(batch.numel(), *one.shape[len(batch) :]) for one in aux]
+
+
+def short(tensor: Tensor) -> str:
+    """Return the numbers of a small tensor in four digits, the shape of a large one."""
+    return str(_rounded(tensor.tolist())).replace("'", "") if tensor.numel() <= _SHOWN else f"{list(tensor.shape)}"
+
+
+def _rounded(numbers: Any) -> Any:
+    return [_rounded(one) for one in numbers] if isinstance(numbers, list) else f"{numbers:.4g}"

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Stein, total
+from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, total
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.sampling.kernels import Redrawn, Samples
 from torch_zerohess.smoothing import Smoothing
@@ -103,9 +103,15 @@ class LikelihoodRatio(Stein):
         return LikelihoodRatio(self.u[:, index].flatten(0, 1), self.weight[:, index].flatten(0, 1))
 
     def variance(
-        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
-    ) -> Tensor:
-        return variance_of_draws(self, quantity, a, share, draws, v)
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
+        return variance_of_draws(self, quantity, a, share, draws, v, pooled)
 
 
 def _kept(smoothing: Smoothing, keep: bool) -> bool:

@@ -1,6 +1,5 @@
 """From settings to the points where the black box is called, and the family of weights that goes with them."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -42,19 +41,35 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
 
     keep: store them, instead of drawing them again whenever they are needed (see `stored`).
 
-    Raises ValueError if x is not finite, if sigma has the wrong length or is below the rounding of x, and where the
-    family of the proposal cannot serve this many parameters.
+    Raises ValueError if x is not finite, if sigma has the wrong length, is below the rounding of x or leads out of the
+    range of its dtype, and where the family of the proposal cannot serve this many parameters.
     """
-    largest = float(x.abs().max())
-    if not math.isfinite(largest):
-        b, d = (int(index) for index in (~torch.isfinite(x)).nonzero()[0])
-        raise ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
     sigma = smoothing.sigma_vector(x.shape[1], x.device)
+    scalar = smoothing.sigma if isinstance(smoothing.sigma, float) else None
+    largest, limits = float(x.abs().max()), torch.finfo(x.dtype)
+    least, most = (float(sigma.min()), float(sigma.max())) if scalar is None else (scalar, scalar)
+    # No perturbation is longer than this: quantiles end at 10, and lengths of directions are sqrt(n) or little more.
+    length = 10.0 + x.shape[1] ** 0.5
+    if not largest + length * most < limits.max:  # an x that is not a number included
+        farthest = x.abs() + length * sigma
+        if not bool((farthest < limits.max).all()):
+            raise _out_of_range(x, sigma, farthest)
     points, stein = FAMILIES[smoothing.proposal].draw(x, sigma, smoothing, seed, keep)
-    least = smoothing.sigma if isinstance(smoothing.sigma, float) else float(sigma.min())
-    if least < _FAR_ABOVE * torch.finfo(x.dtype).eps * largest:
+    if least < _FAR_ABOVE * limits.eps * largest:
         _check_moved(points, x, sigma)
     return Perturbations(points, stein, sigma)
+
+
+def _out_of_range(x: Tensor, sigma: Tensor, farthest: Tensor) -> ValueError:
+    """Return the error for an x that is not finite, or points around it that are not."""
+    if not bool(torch.isfinite(x).all()):
+        b, d = (int(index) for index in (~torch.isfinite(x)).nonzero()[0])
+        return ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
+    b, d = (int(index) for index in (farthest >= torch.finfo(x.dtype).max).nonzero()[0])
+    return ValueError(
+        f"sigma is too large: x + sigma*u is not finite in {x.dtype} for parameter {d}, x = {float(x[b, d])}, sigma = "
+        f"{float(sigma[d])}; use other units of x"
+    )
 
 
 def _check_moved(points: Tensor, x: Tensor, sigma: Tensor) -> None:

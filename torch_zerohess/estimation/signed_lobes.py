@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Stein
+from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.smoothing import Smoothing
 
@@ -17,8 +17,8 @@ from torch_zerohess.smoothing import Smoothing
 class SignedLobes(Stein):
     """Proposal "fr22": every dimension is drawn from the gradient lobe. First order only.
 
-    It is biased for n > 1, in the smoothed value too: it smooths the other dimensions with the gradient's lobe instead
-    of the Gaussian.
+    The gradient is biased for n > 1: it smooths the other dimensions with the gradient's lobe instead of the Gaussian.
+    The smoothed value is biased for every n, because it smooths every dimension with that lobe.
     """
 
     kernel: Tensor
@@ -49,8 +49,8 @@ class SignedLobes(Stein):
         return cls(*tensors)
 
     @property
-    def first_order(self) -> bool:
-        return True
+    def highest(self) -> int:
+        return 1
 
     def value(self, a: Tensor) -> Tensor:
         return a.sum(2)
@@ -67,6 +67,12 @@ class SignedLobes(Stein):
         return SignedLobes(self.kernel[:, index].flatten(0, 1))
 
     def variance(
-        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
-    ) -> Tensor:
-        return variance_of_draws(self, quantity, a, share, draws, v)
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
+        return variance_of_draws(self, quantity, a, share, draws, v, pooled)

@@ -28,7 +28,7 @@ from torch import Tensor
 from torch_zerohess.sampling.kernels import Samples
 from torch_zerohess.smoothing import Smoothing
 
-Quantity = Literal["value", "gradient", "hessian_diagonal", "hvp"]
+Quantity = Literal["value", "gradient", "hessian_diagonal", "hessian", "hvp"]
 Projection = Callable[[Samples, Tensor], Tensor]
 """(u [B, K, n] or its recipe, t [B, M, n]) -> [B, M, K], differentiable in t: see `autograd.linear_map.project`."""
 
@@ -36,7 +36,21 @@ FIRST_ORDER_ERROR = (
     "these samples serve first derivatives only (proposal 'fr22', or 'optimal' with order=1): "
     "use Smoothing(proposal='aggregate', order=2) for Hessians and Hessian-vector products"
 )
+ORDER_ERRORS = {
+    1: FIRST_ORDER_ERROR,
+    2: "proposal 'optimal' has samples for the value, gradient and Hessian, and none for third derivatives: "
+    "use Smoothing(proposal='aggregate')",
+}
+"""What to say of a derivative beyond the order that samples serve."""
 _BLOCK = 4096
+
+
+class Spread(NamedTuple):
+    """How far an estimate may be from its expectation."""
+
+    variance: Tensor
+    degrees: Tensor
+    """Degrees of freedom of the variance, for Student's t; of its shape."""
 
 
 class Layout(NamedTuple):
@@ -52,7 +66,7 @@ class Stein(ABC):
     """A family of weights for one batch of samples: the sums, and the rules that go with them.
 
     A family without second derivatives leaves `hvp`, `hessian_diagonal` and `hessian` as they are here, where they
-    raise, and returns True from `first_order`.
+    raise, and returns 1 from `highest`.
     """
 
     droppable: bool = True
@@ -81,9 +95,14 @@ class Stein(ABC):
         """Return the family that `tensors` were taken from, drawn around x [B, n] with the same sigma and settings."""
 
     @property
+    def highest(self) -> int | None:
+        """Highest order of the derivatives that these samples serve, 1 or 2; None if they serve every order."""
+        return None
+
+    @property
     def first_order(self) -> bool:
         """Whether these samples serve first derivatives only."""
-        return False
+        return self.highest == 1
 
     @abstractmethod
     def value(self, a: Tensor) -> Tensor:
@@ -118,15 +137,26 @@ class Stein(ABC):
 
     @abstractmethod
     def variance(
-        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
-    ) -> Tensor:
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
         """Return the variance of a sum in its shape: see `standard_error.variance_of_draws` for the arguments."""
 
     def sums(self, quantity: Quantity, a: Tensor, v: Tensor | None) -> Tensor:
         """Return the sums of one quantity; v is the vector of "hvp"."""
         if quantity == "hvp" and v is not None:
             return self.hvp(a, v)
-        sums = {"value": self.value, "gradient": self.gradient, "hessian_diagonal": self.hessian_diagonal}
+        sums = {
+            "value": self.value,
+            "gradient": self.gradient,
+            "hessian_diagonal": self.hessian_diagonal,
+            "hessian": self.hessian,
+        }
         return sums[quantity](a)
 
 

@@ -1,5 +1,6 @@
 """Second-order optimizers: for losses that carry a graph, and for black boxes whose evaluations the caller owns."""
 
+from torch_zerohess.autograd.blocks import SampleJacobian
 from torch_zerohess.optim.newton import Newton
 from torch_zerohess.optim.newton_cg import NewtonCG
 from torch_zerohess.optim.nonlinear_cg import NonlinearCG
@@ -8,4 +9,13 @@ from torch_zerohess.search.descent import Descent
 from torch_zerohess.search.gaussian_process_search import GaussianProcessSearch
 from torch_zerohess.search.trust_region import TrustRegion
 
-__all__ = ["BlockGaussNewton", "Descent", "GaussianProcessSearch", "Newton", "NewtonCG", "NonlinearCG", "TrustRegion"]
+__all__ = [
+    "BlockGaussNewton",
+    "Descent",
+    "GaussianProcessSearch",
+    "Newton",
+    "NewtonCG",
+    "NonlinearCG",
+    "SampleJacobian",
+    "TrustRegion",
+]

@@ -6,17 +6,30 @@ from typing import Any
 
 from torch import Tensor
 
+from torch_zerohess.linalg.dual import clipped
 from torch_zerohess.linalg.steihaug import Step, steihaug
 from torch_zerohess.optim.newton_step import NewtonStep
 from torch_zerohess.optim.second_order import Model, check_count, check_not_negative, check_positive, check_radius
+
+SOLVERS = ("steihaug", "clip", "dual")
+_FAR = 1e6
+"""Boundary of conjugate gradients for solver "clip", in units of the radius: where negative curvature ends them."""
 
 
 class NewtonCG(NewtonStep):
     """Truncated Newton steps on network weights or plain parameters, matrix-free.
 
-    A step minimises the quadratic model g.s + s.(H + damping I)s/2 by Steihaug's conjugate gradients inside |s| <=
-    radius. H comes from the graph of the loss (`CurvatureOperator`), so that all its products use the samples of the
-    one forward pass. With `adapt` the closure is called once more, without derivatives: a step that does not lower the
+    A step minimises the quadratic model g.s + s.(H + damping I)s/2 inside |s| <= radius. H comes from the graph of the
+    loss (`CurvatureOperator`), so that all its products use the samples of the one forward pass. Three solvers:
+
+    - "steihaug": conjugate gradients that end on the boundary. Where the radius is short, most steps end there after
+      one or two products, and are close to steepest descent.
+    - "clip": conjugate gradients without a boundary; the step is shortened to the radius afterwards. The direction is
+      Newton's, however short the step.
+    - "dual": the same with an exact solution, by a system of as many equations as the network has outputs in the batch
+      (`linalg.dual.dual_step`). It costs one product J J^T: for batches of few outputs and many weights.
+
+    With `adapt` the closure is called once more, without derivatives: a step that does not lower the
     loss is taken back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright,
     algorithm 4.1). Without it every step is taken, as suits a loss over small batches.
 
@@ -31,6 +44,10 @@ class NewtonCG(NewtonStep):
         params: parameters, one group.
         radius: of the trust region, in units of the parameters; the initial one with `adapt`.
         curvature: "exact", or "gauss_newton" for J^T H J of the black boxes behind a network.
+        solver: "steihaug", "clip" or "dual", see above. "dual" needs curvature "gauss_newton" and a positive damping.
+        modification: None, or "abs" with curvature "gauss_newton": eigenvalues of the Hessian of every element of the
+            batch are replaced by their magnitudes, so that J^T H J is positive (saddle-free Newton: Dauphin et al.
+            2014). The loss must be a sum or mean over the batch.
         iterations: conjugate-gradient products per step, at most.
         tolerance: relative residual at which conjugate gradients stop.
         damping: added to the diagonal of H.
@@ -40,7 +57,8 @@ class NewtonCG(NewtonStep):
             losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact.
 
     The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
-    pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them.
+    pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them. For solver
+    "dual" it may return (loss, y, SampleJacobian(network, samples)), which saves most of the backward passes.
 
     Example:
         >>> import torch
@@ -57,6 +75,8 @@ class NewtonCG(NewtonStep):
         *,
         radius: float = 1.0,
         curvature: str = "exact",
+        solver: str = "steihaug",
+        modification: str | None = None,
         iterations: int = 20,
         tolerance: float = 1e-3,
         damping: float = 0.0,
@@ -68,9 +88,20 @@ class NewtonCG(NewtonStep):
         check_positive(tolerance=tolerance, max_radius=max_radius)
         check_not_negative(damping=damping, noise=noise)
         check_count(iterations=iterations)
+        if solver not in SOLVERS:
+            raise ValueError(f"solver must be one of {', '.join(map(repr, SOLVERS))}, got {solver!r}")
+        if modification not in (None, "abs"):
+            raise ValueError(f"modification must be None or 'abs', got {modification!r}")
+        if (modification or solver == "dual") and curvature != "gauss_newton":
+            what = "modification 'abs'" if modification else "solver 'dual'"
+            raise ValueError(f"{what} needs curvature 'gauss_newton', got {curvature!r}")
+        if solver == "dual" and not damping > 0.0:
+            raise ValueError(f"solver 'dual' needs a positive damping, got {damping}")
         defaults = {
             "radius": radius,
             "curvature": curvature,
+            "solver": solver,
+            "modification": modification,
             "iterations": iterations,
             "tolerance": tolerance,
             "damping": damping,
@@ -80,12 +111,25 @@ class NewtonCG(NewtonStep):
         }
         super().__init__(params, defaults)
 
+    @property
+    def _output_modification(self) -> str | None:
+        modification: str | None = self.param_groups[0]["modification"]
+        return modification
+
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
-        return steihaug(
-            lambda v: model.products(v) + group["damping"] * v,
+        solver, damping = group["solver"], group["damping"]
+        if solver == "dual":
+            return model.dual_step(radius, damping)
+
+        def product(v: Tensor) -> Tensor:
+            return model.products(v) + damping * v
+
+        step = steihaug(
+            product,
             model.gradients,
-            radius,
+            radius if solver == "steihaug" else _FAR * radius,
             iterations=group["iterations"],
             tolerance=group["tolerance"],
             noise=group["noise"],
         )
+        return step if solver == "steihaug" else clipped(step, model.gradient, radius)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.steihaug import Step
-from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, pair
+from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, parts_of
 
 _ROUNDING = 10.0
 """Smallest predicted decrease that can be tested, in units of rounding of the loss."""
@@ -70,7 +70,7 @@ class NewtonStep(SecondOrder):
         self._add(s)
         try:
             with torch.no_grad():
-                actual = float(loss) - float(pair(closure())[0].mean())
+                actual = float(loss) - float(parts_of(closure())[0].mean())
         finally:
             if not 0.0 < actual < math.inf:
                 self._restore(before)

@@ -8,12 +8,20 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from torch_zerohess.autograd.blocks import jacobian as white_box_jacobian
+from torch_zerohess.autograd.blocks import magnitudes, output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
+from torch_zerohess.linalg.dual import dual_step
+from torch_zerohess.linalg.steihaug import Step
 
-Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]]
-"""Result of a closure: the loss, or a pair of the loss and the tensors at which its white box ends."""
+Jacobian = Callable[[Sequence[Tensor]], Tensor]
+"""Parameters -> J [M, N] of the outputs of the white box, see `SampleJacobian`."""
+Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], Jacobian]
+"""Result of a closure: the loss, or with it the tensors at which its white box ends, or with both their Jacobian."""
 Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
+_OUTSIDE = 1e-4
+"""Part of a gradient that may come from elsewhere than the inputs of black boxes, for the dual solve: rounding."""
 TRIALS = 10
 """Evaluations of one step at most; it is shortened after each one at which the loss is not finite."""
 
@@ -24,12 +32,23 @@ class Model:
     The curvature is taken from the graph of the loss, so that all products use the samples of one forward pass.
     """
 
-    def __init__(self, losses: Tensor, operators: Sequence[CurvatureOperator]) -> None:
+    def __init__(
+        self,
+        losses: Tensor,
+        operators: Sequence[CurvatureOperator],
+        modification: str | None = None,
+        jacobian: Jacobian | None = None,
+    ) -> None:
         self.loss = losses.detach().mean()
         """[], the mean of the losses."""
         self.gradients = torch.stack([one.gradient for one in operators]).double()
         """[R, N], float64"""
-        self._operators = operators
+        self._operators, self._jacobian = operators, jacobian
+        self._blocks = None if modification is None else [self._modified(one) for one in operators]
+
+    @staticmethod
+    def _modified(operator: CurvatureOperator) -> list[Tensor]:
+        return [magnitudes(block) for block in output_blocks(operator)]
 
     @property
     def gradient(self) -> Tensor:
@@ -46,7 +65,43 @@ class Model:
         length = v.norm()  # of a unit vector, so that float32 parameters neither over- nor underflow
         if not float(length) > 0.0:
             return torch.zeros_like(self.gradients)
-        return torch.stack([one @ (v / length) for one in self._operators]).double() * length
+        unit = v / length
+        if self._blocks is None:
+            return torch.stack([one @ unit for one in self._operators]).double() * length
+        pairs = zip(self._operators, self._blocks, strict=True)
+        return torch.stack([self._through(operator, blocks, unit) for operator, blocks in pairs]) * length
+
+    @staticmethod
+    def _through(operator: CurvatureOperator, blocks: Sequence[Tensor], v: Tensor) -> Tensor:
+        """J^T A J v with modified blocks of A."""
+        moved = operator.output_step(v)
+        pushed = [
+            (block @ one.reshape(len(block), -1, 1).double()).reshape_as(one).to(one)
+            for block, one in zip(blocks, moved, strict=True)
+        ]
+        return operator.pull(pushed).double()
+
+    def dual_step(self, radius: float, damping: float) -> Step:
+        """Return the step of `linalg.dual.dual_step` for the mean of the losses."""
+        A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
+        slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
+        g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
+        J = (
+            white_box_jacobian(self._operators[0])
+            if self._jacobian is None
+            else self._jacobian(self._operators[0].inputs)
+        )
+        if float((self.gradient - (J.mT @ g.to(J)).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
+            raise ValueError(
+                "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone: "
+                "use solver 'steihaug' or 'clip'"
+            )
+        return dual_step(J, A, g, radius, damping)
+
+    def _dense(self, index: int) -> list[Tensor]:
+        """Blocks [n, n] of one operator, modified if they are to be."""
+        blocks = output_blocks(self._operators[index]) if self._blocks is None else self._blocks[index]
+        return [one for block in blocks for one in block]
 
     def hessian(self) -> Tensor:
         """Return the mean Hessian [N, N], float64 and symmetric."""
@@ -71,6 +126,11 @@ class SecondOrder(Optimizer):
         super().add_param_group(param_group)
 
     @property
+    def _output_modification(self) -> str | None:
+        """How the curvature over the outputs of the white box is modified, see `Model`."""
+        return None
+
+    @property
     def _parameters(self) -> list[Tensor]:
         """Parameters that require grad."""
         return [one for one in self.param_groups[0]["params"] if one.requires_grad]
@@ -79,12 +139,15 @@ class SecondOrder(Optimizer):
         """Evaluate the closure where the parameters are; `separate` keeps the estimates of several losses apart."""
         curvature = self.param_groups[0]["curvature"]
         with torch.enable_grad():
-            losses, through = pair(closure())
+            losses, through, jacobian = parts_of(closure())
             if not losses.requires_grad:
                 raise ValueError("closure must return a loss with a graph, got one without: no parameter is in it")
             parts = list(losses.reshape(-1).unbind()) if separate else [losses.mean()]
             return Model(
-                losses, [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts]
+                losses,
+                [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts],
+                self._output_modification,
+                jacobian,
             )
 
     def _add(self, step: Tensor) -> None:
@@ -109,12 +172,12 @@ class SecondOrder(Optimizer):
                 one.copy_(before)
 
 
-def pair(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None]:
-    """Return the loss, and the tensors at which the white box ends if the closure returned them."""
-    loss, through = result if isinstance(result, tuple) else (result, None)
+def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, Jacobian | None]:
+    """Return the loss, the tensors at which the white box ends, and their Jacobian, as far as the closure gave them."""
+    loss, through, jacobian = (*result, None, None)[:3] if isinstance(result, tuple) else (result, None, None)
     if not isinstance(loss, Tensor) or loss.numel() == 0:
         raise TypeError(f"closure must return the loss, a tensor with a graph, got {loss!r}")
-    return loss, through
+    return loss, through, jacobian
 
 
 def check_positive(**settings: float) -> None:

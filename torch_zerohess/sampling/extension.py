@@ -4,6 +4,8 @@ import importlib
 import os
 import warnings
 
+from torch_zerohess.sampling import shapes
+
 HINT = "install a C++20 compiler (Debian: apt-get install g++) and reinstall: pip install --force-reinstall --no-deps ."
 
 
@@ -20,6 +22,7 @@ def _load() -> tuple[bool, str]:
             stacklevel=2,
         )
         return False, reason
+    shapes.register()
     return True, "built"
 
 

@@ -37,17 +37,22 @@ class Redrawn(NamedTuple):
         """Number of rows for each x."""
         return len(self.rows) // len(self.x) * (2 if self.antithetic else 1)
 
+    def arguments(self) -> tuple[Tensor, Tensor, Tensor, bool, bool]:
+        """Return the recipe as the operators want it: contiguous, which a fold of a batch by vmap need not be."""
+        return self.rows.contiguous(), self.x.contiguous(), self.sigma.contiguous(), self.antithetic, self.single
+
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
-        B, n = self.x.shape
-        S, x = len(self.rows) // B, self.x.double()
+        rows, x, sigma, antithetic, single = self.arguments()
+        B, n = x.shape
+        S, x = len(rows) // B, x.double()
         step = max(1, _CHUNK // (B * n))
         for first in range(0, S, step):
-            part = self.rows.view(B, S, 5)[:, first : first + step]
-            u = draw(part.reshape(-1, 5), n, self.single)
+            part = rows.view(B, S, 5)[:, first : first + step]
+            u = draw(part.reshape(-1, 5), n, single)
             index = torch.arange(first, first + part.shape[1], device=u.device)
-            columns = torch.cat([index, index + S]) if self.antithetic else index
-            yield *place(u, x, self.sigma, self.antithetic, self.single, proposal), columns
+            columns = torch.cat([index, index + S]) if antithetic else index
+            yield *place(u, x, sigma, antithetic, single, proposal), columns
 
 
 Samples = Tensor | Redrawn
@@ -113,7 +118,7 @@ def project(u: Samples, t: Tensor) -> Tensor:
             return torch.ops.torch_zerohess.project(u.contiguous(), t.contiguous())
         return t @ u.mT
     if _compiled(u.x):
-        return torch.ops.torch_zerohess.project_drawn(*u, t.contiguous())
+        return torch.ops.torch_zerohess.project_drawn(*u.arguments(), t.contiguous())
     result = t.new_empty(*t.shape[:2], u.K)
     for _, chunk, _, columns in u.chunks():
         result[..., columns] = t @ chunk.mT
@@ -171,7 +176,7 @@ def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:
             return torch.ops.torch_zerohess.accumulate(u.contiguous(), a.contiguous(), squares)
         return a @ (u * u if squares else u)
     if _compiled(u.x):
-        return torch.ops.torch_zerohess.accumulate_drawn(*u, a.contiguous(), squares)
+        return torch.ops.torch_zerohess.accumulate_drawn(*u.arguments(), a.contiguous(), squares)
     return _total(_sums(chunk, a[..., columns], squares) for _, chunk, _, columns in u.chunks())
 
 

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Generic
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation.inputs import short
 from torch_zerohess.search.space import Bounds, Space, check_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -185,6 +186,12 @@ class AskTell(ABC, Generic[P]):
         """Why the search is done."""
         return self._state.progress.message
 
+    def __repr__(self) -> str:
+        end = f"done: {self.message}" if self.done else f"sigma={self.sigma:.4g}"
+        told = f"value={self.value:.6g}, x={short(self.x)}" if self.evaluations else f"start={short(self.x)}"
+        name = type(self).__name__
+        return f"{name}(engine={self.engine!r}, n={len(self.unit)}, evaluations={self.evaluations}, {told}, {end})"
+
     def model_at_best(self) -> tuple[LocalModel, float] | None:
         """A quadratic model around `x` and its sigma: that at which x was found, or wider if few evaluations are near.
 
@@ -255,11 +262,10 @@ class AskTell(ABC, Generic[P]):
     def _evaluated(self, values: Any, points: Tensor) -> Evaluated:
         """Return what was told as losses and outputs."""
         loss, shape = self._method.settings.loss, self._state.progress.shape
-        values = torch.as_tensor(values).detach().to(self.unit.device)
+        values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
         if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
             wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
             raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
-        values = values.double()
         if loss is None:
             return Evaluated(points, values)
         if shape and values.shape[1:] != shape:

@@ -47,6 +47,12 @@ class LowRank:
         """Coordinates [K, r] of outputs [K, *out]; what is outside of the span is left out."""
         return (outputs.flatten(1) - self.mean) @ self.basis
 
+    def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Coordinates [K, r] of outputs [K, *out], and the mean square [K] of what is outside of the span."""
+        change = outputs.flatten(1) - self.mean
+        known = change @ self.basis
+        return known, (change.square().mean(1) - known.square().sum(1)).clamp_min(0.0)
+
     def decode(self, coordinates: Tensor) -> Tensor:
         """Outputs [K, *out] of coordinates [K, r]."""
         flat = self.mean + len(self.mean) * coordinates.to(self.basis.dtype) @ self.basis.mT

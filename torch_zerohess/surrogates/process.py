@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.gaussian_process import GaussianProcess
+from torch_zerohess.surrogates.inducing import InducedProcess
 from torch_zerohess.surrogates.lengths import most_likely
 from torch_zerohess.surrogates.surrogate import checked
 
@@ -17,10 +17,11 @@ class ProcessSurrogate:
     """Gaussian process of outputs [*out] over parameters [n], a `Surrogate`.
 
     Kernel, lengths and noise are those with the highest evidence on a random part of the points. The posterior is the
-    one given all points. Up to 10 parameters have one length each.
+    one given all points, as a sum over those of them that explain the others (`InducedProcess`). Up to 10 parameters
+    have one length each.
 
     Args:
-        capacity: points that are used, the latest ones. A fit costs capacity^3 / 3 multiplications.
+        capacity: points that are used, the latest ones.
 
     Example:
         >>> points = torch.linspace(0, 6, 20)[:, None]
@@ -34,12 +35,12 @@ class ProcessSurrogate:
         if capacity < 2:
             raise ValueError(f"capacity must be at least 2, got {capacity}")
         self.capacity = capacity
-        self._process: GaussianProcess | None = None
+        self._process: InducedProcess | None = None
         self._lengths = torch.empty(0)
         self._shape = torch.Size()
 
     @property
-    def process(self) -> GaussianProcess:
+    def process(self) -> InducedProcess:
         """The posterior, over z / lengths."""
         if self._process is None:
             raise RuntimeError("fit the surrogate to evaluations before it is used")
@@ -61,7 +62,7 @@ class ProcessSurrogate:
         some = torch.randperm(len(u), generator=torch.Generator().manual_seed(0))[:_EVIDENCE].to(u.device)
         choice = most_likely(u[some], y[some] - y[some].mean(0), anisotropic=u.shape[1] <= _MOST)
         self._lengths = spread * choice.lengths
-        self._process = GaussianProcess.condition(u / choice.lengths, y, choice.kernel, 1.0, choice.noise)
+        self._process = InducedProcess.condition(u / choice.lengths, y, choice.kernel, choice.noise)
 
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
@@ -70,5 +71,4 @@ class ProcessSurrogate:
 
     def uncertainty(self, z: Tensor) -> Tensor:
         """Variance [K] of an element of the output at z [K, n]."""
-        process = self.process
-        return process.uncertainty(process.covariance(z.double() / self._lengths)).to(z.dtype)
+        return self.process.uncertainty(z.double() / self._lengths).to(z.dtype)

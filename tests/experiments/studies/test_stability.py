@@ -6,13 +6,18 @@ from dataclasses import replace
 import pytest
 
 from experiments.problems.closed_forms import ClosedForm, PlaneWave
-from experiments.studies.stability import Case, _cases, _rows, stability
+from experiments.studies.coverage import Coverage
+from experiments.studies.coverage import _rows as _coverage_rows
+from experiments.studies.stability import _rows, stability
+from experiments.studies.stability_cases import Case, cases
 
 
-def test_every_case_of_stability_is_right(tmp_path, capsys) -> None:
+def test_every_case_of_stability_is_right(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [])
     rows = stability(largest=1000, out=tmp_path / "stability.json")  # a wrong row would raise SystemExit
     assert {row.verdict for row in rows} == {"right", "right: refused"}
-    assert sum(row.verdict == "right: refused" for row in rows) == 2
+    # Far from zero twice, sigma 1e308, and a Hessian of order 1e320 and its diagonal.
+    assert sum(row.verdict == "right: refused" for row in rows) == 5
     assert len(json.loads((tmp_path / "stability.json").read_text())) == len(rows)
     assert "WRONG" not in capsys.readouterr().out
 
@@ -31,10 +36,11 @@ class Twice(ClosedForm):
 
 
 def test_stability_notices_wrong_derivatives(monkeypatch, capsys) -> None:
-    case = next(case for case in _cases(1) if case.name == "sigma 1e+00, float64")
+    case = next(case for case in cases(1) if case.name == "sigma 1e+00, float64")
     wrong = Case("wrong", Twice(case.form), case.x, case.sigma)
     assert {row.quantity for row in _rows(wrong, 0) if row.verdict.startswith("WRONG")} >= {"value", "gradient", "HVP"}
-    monkeypatch.setattr("experiments.studies.stability._cases", lambda largest: [case, wrong])
+    monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [case, wrong])
+    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [])
     with pytest.raises(SystemExit) as stopped:
         stability()
     assert stopped.value.code == 1
@@ -42,5 +48,22 @@ def test_stability_notices_wrong_derivatives(monkeypatch, capsys) -> None:
 
 
 def test_stability_notices_what_should_have_been_refused() -> None:
-    case = next(case for case in _cases(1) if case.name == "sigma 1e+00, float64")
-    assert [row.verdict for row in _rows(replace(case, refused=True), 0)] == ["WRONG: not refused"]
+    case = next(case for case in cases(1) if case.name == "sigma 1e+00, float64")
+    assert [row.verdict for row in _rows(replace(case, refused="everything"), 0)] == ["WRONG: not refused"]
+
+
+def test_shares_of_intervals_are_told_and_judged(monkeypatch, capsys) -> None:
+    shares = {"value": (0.9, 0.91), "gradient": (0.95, 0.96)}
+    rows = [Coverage("aggregate, random", 16, 0.95, shares, verdict) for verdict in ("right", "WRONG")]
+    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: rows)
+    monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [])
+    with pytest.raises(SystemExit):
+        stability()
+    assert "0.900 to 0.910" in capsys.readouterr().out
+
+
+def test_standard_errors_of_half_the_size_are_noticed(monkeypatch) -> None:
+    settings = {"proposal": "aggregate", "sampler": "random", "baseline": "center"}
+    assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["right", "right"]
+    monkeypatch.setattr("torch_zerohess.estimation.estimate.student_factor", lambda level, degrees: 0.5 * degrees**0)
+    assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["WRONG", "WRONG"]

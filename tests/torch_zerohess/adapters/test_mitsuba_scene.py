@@ -386,3 +386,10 @@ def test_pixels_that_are_not_finite() -> None:
 def test_unknown_variant_says_what_to_use() -> None:
     with pytest.raises(RuntimeError, match="scalar_rgb"):
         scalar(lamp, [Value(RADIANCE)], variant="no_such_variant")
+
+
+def test_a_scene_says_what_it_is(variant) -> None:
+    scene = MitsubaScene(plane, [Value(REFLECTANCE)], film=(5, 3), spp=2, variant=variant, threads=1)
+    settings = f"film=(5, 3), spp=2, noise='fixed', variant='{variant}'"
+    assert repr(scene) == f"MitsubaScene(n={scene.n}, parameters=[{', '.join(scene.labels)}], {settings})"
+    assert scene.n <= 4

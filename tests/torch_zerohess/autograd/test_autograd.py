@@ -154,6 +154,74 @@ def test_vmap(smoothing: Smoothing) -> None:
     close(nested, e.gradient.view(2, 2, N))
 
 
+NOT_CONTIGUOUS = {
+    "transposed": BATCH.mT.contiguous().mT,
+    "expanded": X.expand(4, N),
+    "sliced": BATCH.repeat_interleave(2, 1)[:, ::2],
+}
+
+
+@BOTH
+@pytest.mark.parametrize("x", NOT_CONTIGUOUS.values(), ids=NOT_CONTIGUOUS.keys())
+def test_points_that_are_not_contiguous(x: Tensor) -> None:
+    assert not x.is_contiguous()
+    func, layer, e = torch.func, BlackBox(SCALAR.f, AGGREGATE), estimate(SCALAR.f, x, AGGREGATE)
+    at = x.detach().requires_grad_()
+    for f in (layer, layer.freeze(x)):
+        close(torch.autograd.grad(f(at).sum(), at)[0], e.gradient)
+    close(func.grad(lambda z: layer(z).sum())(x), e.gradient)
+    close(func.vmap(func.grad(layer))(x), e.gradient)
+    close(func.vmap(func.hessian(layer), in_dims=1)(x.mT), e.hessian())
+
+
+def test_perturbations_of_a_large_batch_under_vmap_are_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    stored: list[bool] = []
+    original = kernels.accumulate
+    monkeypatch.setattr(kernels, "accumulate", lambda u, a: stored.append(isinstance(u, Tensor)) or original(u, a))
+    monkeypatch.setattr(perturbations, "STORED", 2 * N * 12)  # enough for two points
+    func, expected = torch.func, estimate(SCALAR.f, BATCH, AGGREGATE).gradient
+    pair = smooth(lambda z, a: SCALAR.f(z) * a, AGGREGATE)
+    layer, ones = smooth(SCALAR.f, AGGREGATE), torch.ones(2, 2, dtype=torch.float64)
+    for large, gradient in {
+        False: lambda: func.vmap(func.grad(layer))(BATCH[:2]),
+        True: lambda: func.vmap(func.grad(layer))(BATCH),
+    }.items():
+        stored.clear()
+        close(gradient(), expected if large else expected[:2])
+        assert stored == [not large]
+    for gradient in (
+        lambda: func.vmap(func.vmap(func.grad(layer)))(BATCH.view(2, 2, N)),
+        lambda: func.vmap(func.vmap(func.grad(pair), in_dims=(None, 0)))(BATCH[:2], ones),
+    ):
+        stored.clear()
+        gradient()
+        assert stored == [False]
+
+
+def test_randomness_of_vmap_is_honoured_or_refused() -> None:
+    layer, func = BlackBox(SCALAR.f, AGGREGATE.replace(seed=None)), torch.func
+    same_points, factors = X.expand(3, N), torch.ones(3, dtype=torch.float64)
+
+    def mapped(randomness: str) -> Tensor:
+        return func.vmap(func.grad(layer), randomness=randomness)(same_points)
+
+    def shared(randomness: str) -> Tensor:
+        return func.vmap(lambda factor: factor * func.grad(layer)(X), randomness=randomness)(factors)
+
+    assert len(mapped("different").unique(dim=0)) == len(mapped("error").unique(dim=0)) == 3
+    assert len(shared("same").unique(dim=0)) == len(shared("error").unique(dim=0)) == 1
+    refused = {mapped: ("same", "its noise is independent for each"), shared: ("different", "inputs are not mapped")}
+    for call, (randomness, message) in refused.items():
+        with pytest.raises(ValueError, match=message):
+            call(randomness)
+        torch.compiler.reset()
+        with pytest.raises(Exception, match=message):
+            torch.compile(call, fullgraph=True, backend="aot_eager")(randomness)
+    layer.smoothing = AGGREGATE
+    torch.testing.assert_close(mapped("same"), estimate(SCALAR.f, same_points, AGGREGATE).gradient)
+    torch.testing.assert_close(shared("different"), estimate(SCALAR.f, X, AGGREGATE).gradient.expand(3, N))
+
+
 def test_vmap_with_auxiliary_inputs() -> None:
     def scaled(z: Tensor, a: Tensor) -> Tensor:
         return SCALAR.f(z) * a
@@ -324,6 +392,39 @@ def test_dtype_of_the_input_is_that_of_the_output(dtype: torch.dtype, returned: 
     with torch.no_grad():
         assert layer(x).dtype == dtype
     close(x.grad, estimate(layer.call.fn, X.to(dtype), AGGREGATE).gradient)
+
+
+@BOTH
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    seen: list[torch.dtype] = []
+
+    def fn(z: Tensor) -> Tensor:
+        seen.append(z.dtype)
+        return SCALAR.f(z.double()).float()
+
+    layer, x = BlackBox(fn, AGGREGATE), leaf(BATCH.to(dtype))
+    e = estimate(fn, x.detach().float(), AGGREGATE)
+    y = layer(x)
+    y.sum().backward()
+    close(y.detach(), e.value.to(dtype))
+    close(x.grad, e.gradient.to(dtype))
+    close(estimate(fn, x, AGGREGATE).hessian(), e.hessian().to(dtype))
+    close(torch.func.vmap(torch.func.grad(layer))(x.detach()), e.gradient.to(dtype))
+    close(layer.freeze(x)(x.detach()), e.value.to(dtype))
+    with torch.no_grad():
+        close(layer(x), e.value.to(dtype))
+    assert set(seen) == {torch.float32}
+
+
+def test_a_layer_behind_autocast() -> None:
+    model, inputs = nn.Linear(2, N), spread(8, -1.0, 1.0).view(4, 2).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        z = model(inputs)
+        y = BlackBox(SCALAR.f, AGGREGATE)(z)
+    assert y.dtype == z.dtype == torch.bfloat16
+    (gradient,) = torch.autograd.grad(y.sum(), z)
+    close(gradient, estimate(SCALAR.f, z.detach().float(), AGGREGATE).gradient.bfloat16())
 
 
 COMPILED = {

@@ -2,10 +2,12 @@
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
-from torch_zerohess import BlackBox, Smoothing
+from torch_zerohess import BlackBox, Memory, Smoothing
 from torch_zerohess.autograd import blackbox
 from torch_zerohess.autograd.closed_form import ClosedForm
+from torch_zerohess.heads import LocalEntropy
 
 
 def image(z: torch.Tensor) -> torch.Tensor:
@@ -47,6 +49,28 @@ def test_plain_calls_take_the_closed_form_and_transforms_do_not(monkeypatch) -> 
     torch.func.vmap(torch.func.grad(layer))(x.detach()[None])
     torch.func.jvp(layer, (x.detach(),), (torch.ones(2),))
     assert len(taken) == 1
+
+
+def test_a_memory_and_a_local_entropy_take_the_general_graph(monkeypatch) -> None:
+    taken, apply = [], ClosedForm.apply
+    monkeypatch.setattr(ClosedForm, "apply", lambda *given: taken.append(1) or apply(*given))
+    smoothing, x = Smoothing(sigma=0.1, samples=4, seed=0), torch.ones(2, requires_grad=True)
+    for settings in ({"memory": Memory()}, {"head": LocalEntropy(lambda y: y, temperature=1.0)}):
+        BlackBox(lambda z: z.square().sum(1), smoothing, **settings)(x).backward()
+    assert not taken
+
+
+@pytest.mark.parametrize("sampler", ["random", "sobol"])
+def test_a_tangent_of_the_incoming_gradient_is_carried_on(sampler) -> None:
+    layer = BlackBox(image, Smoothing(sigma=0.3, samples=16, seed=3, sampler=sampler))
+    x = torch.tensor([[0.3, -0.2], [1.0, 0.5]], dtype=torch.float64, requires_grad=True)
+    weights = torch.linspace(-1, 2, 6, dtype=torch.float64).view(2, 3, 1)
+    y = layer(x)
+    with forward_ad.dual_level():
+        (gradient,) = torch.autograd.grad(y, x, forward_ad.make_dual(weights, -2.0 * weights), retain_graph=True)
+        tangent = forward_ad.unpack_dual(gradient).tangent
+    (expected,) = torch.autograd.grad(y, x, weights)
+    torch.testing.assert_close(tangent, -2.0 * expected)
 
 
 def test_a_graph_that_was_freed_says_so() -> None:

@@ -1,5 +1,7 @@
 """Each question about torch's transforms, asked where the answer is known."""
 
+import threading
+
 import pytest
 import torch
 from torch import Tensor
@@ -70,6 +72,29 @@ def test_forward_mode_is_seen_where_there_is_a_tangent() -> None:
         assert transforms.derivative_wanted(forward_ad.make_dual(X, V))
         assert not transforms.derivative_wanted(X)
     assert not transforms.forward_mode_active()
+
+
+def test_forward_mode_in_another_thread_changes_nothing_here() -> None:
+    layer, x = zh.BlackBox(lambda z: z.square().sum(1), zh.Smoothing(sigma=0.5, samples=2, seed=0)), X.clone()
+    entered, leave = threading.Event(), threading.Event()
+
+    def differentiate() -> None:
+        with forward_ad.dual_level():
+            entered.set()
+            leave.wait(10)
+
+    other = threading.Thread(target=differentiate)
+    other.start()
+    try:
+        assert entered.wait(10)
+        assert transforms.forward_mode_active()
+        assert not transforms.has_tangent(x)
+        w = x.requires_grad_()
+        gauss_newton = zh.CurvatureOperator(layer(2 * w), w, mode="gauss_newton")
+    finally:
+        leave.set()
+        other.join()
+    torch.testing.assert_close(gauss_newton @ V, zh.CurvatureOperator(layer(2 * w), w, mode="exact") @ V)
 
 
 class Tagged(Tensor):

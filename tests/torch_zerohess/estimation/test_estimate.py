@@ -112,6 +112,19 @@ def test_fr22_is_unbiased_in_one_dimension_and_as_biased_as_theory_says_in_two(
     assert deviation(gradient, two.gradient(x, s)) > 5
 
 
+@pytest.mark.parametrize("antithetic", [True, False])
+def test_the_smoothed_value_of_fr22_is_biased_in_one_dimension_too(antithetic: bool) -> None:
+    """Under the lobe |u| exp(-u^2/2) / 2 the mean of u^2 is 2, under the Gaussian it is 1."""
+    smoothing = Smoothing(sigma=0.8, samples=4, proposal="fr22", antithetic=antithetic, seed=3)
+    parabola, wave = Quadratic(torch.eye(1, dtype=torch.float64) * 2.0, vector(0.0)), Exponential(vector(0.9))
+    x, sigma = vector(0.3), vector(0.8)
+    value = replicates(parabola, x, smoothing, 4000).value
+    assert deviation(value, vector(0.3**2 + 2 * 0.8**2)[0]) < 5
+    assert deviation(value, parabola.value(x, sigma)) > 5
+    value = replicates(wave, x, smoothing, 4000).value
+    assert deviation(value, vector(math.exp(0.27) * lobe_average(0.72))[0]) < 5
+
+
 @pytest.mark.parametrize("stored", [True, False], ids=["stored", "redrawn"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize("proposal", ["aggregate", "gaussian", "optimal", "uniform"])
@@ -280,9 +293,8 @@ def test_functions_of_one_point_and_of_numpy_arrays() -> None:
     for fn, vectorized in ((one_point, False), (with_numpy, True)):
         got = estimate(fn, x, smoothing, vectorized=vectorized)
         torch.testing.assert_close(got.hessian(), batched.hessian(), rtol=1e-12, atol=1e-12)
-    # A Python float has the default type float32.
     got = estimate(one_number, x, smoothing, vectorized=False)
-    torch.testing.assert_close(got.gradient, batched.gradient, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(got.gradient, batched.gradient, rtol=1e-12, atol=1e-12)
 
 
 def test_dtype_of_the_input_is_that_of_the_output() -> None:

@@ -111,3 +111,70 @@ def test_the_baseline_of_a_constant_is_the_constant_to_the_bit() -> None:
         values = torch.full((1, K, 1), 1e12 / 3, dtype=torch.float64)
         share = torch.full((1, K, 1), 1 / K, dtype=torch.float64)
         assert torch.equal(_mean_of_others(values, share, [torch.arange(K)[:, None]]), values)
+
+
+OFFSET = {
+    "list": (lambda z: [1e9 + float(one) for one in z[:, 0]], True),
+    "tuple": (lambda z: tuple(1e9 + float(one) for one in z[:, 0]), True),
+    "list of lists": (lambda z: [[1, 1e9 + float(one)] for one in z[:, 0]], True),
+    "list of one point": (lambda z: [1e9 + float(z[0])], False),
+    "number of one point": (lambda z: 1e9 + float(z[0]), False),
+    "list of NumPy numbers": (lambda z: list(1e9 + z[:, 0].numpy()), True),
+}
+
+
+@pytest.mark.parametrize("name", OFFSET)
+def test_numbers_of_python_are_float64(name: str) -> None:
+    """1e9 + z is 1e9 in float32: the gradient would be zero."""
+    fn, vectorized = OFFSET[name]
+    got = estimate(fn, X, S, vectorized=vectorized)
+    expected = estimate(lambda z: z[:, 0], X, S).gradient
+    slope = got.gradient.reshape(-1, 2)[-1]
+    torch.testing.assert_close(slope, expected, rtol=0.0, atol=1e-5)  # 1e9 is rounded to steps of 1.2e-7
+    y = BlackBox(fn, S, vectorized=vectorized)(X.clone().requires_grad_()).detach().flatten()
+    assert abs(float(y[-1]) - 1e9 - 0.1) < 1e-6
+
+
+def test_lists_keep_the_precision_of_what_is_in_them() -> None:
+    for dtype in (torch.float32, torch.float64):
+        assert estimate(lambda z, t=dtype: list(z[:, 0].to(t)), X, S).values.dtype == dtype
+    with pytest.raises(TypeError, match=r"real floating-point values, got torch\.int64"):
+        estimate(lambda z: [1] * len(z), X, S)
+
+
+@pytest.mark.parametrize("x_dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("returned", "number"), [(torch.float16, 1e6), (torch.float32, 1e40), (torch.bfloat16, 7.001)])
+def test_the_number_in_place_of_nan_is_kept_in_float64(
+    returned: torch.dtype, number: float, x_dtype: torch.dtype
+) -> None:
+    """The number has no finite, or no equal, counterpart in the type that fn returns."""
+    x = X.to(x_dtype)
+    bad = estimate(f, x, S).points[[2, 11]]
+
+    def fn(z: Tensor) -> Tensor:
+        hole = (z[:, None] == bad).all(2).any(1)
+        return torch.where(hole, math.nan, f(z)).to(returned)
+
+    def filled(z: Tensor) -> Tensor:
+        return torch.nan_to_num(fn(z).double(), nan=number)
+
+    for baseline in ("center", "mean", "none"):
+        smoothing = S.replace(baseline=baseline, sigma=0.5)
+        got = estimate(fn, x, smoothing, on_nonfinite=number, value="smoothed")
+        expected = estimate(filled, x, smoothing, value="smoothed")
+        assert got.values.dtype == torch.float64
+        assert float(got.values.max()) == number
+        if number < 1e38 or x_dtype == torch.float64:
+            assert torch.equal(got.gradient, expected.gradient)
+            assert torch.equal(got.hessian(), expected.hessian())
+            assert torch.equal(got.value, expected.value)
+    if number < 1e38 or x_dtype == torch.float64:
+        layer = BlackBox(fn, S, on_nonfinite=number)
+        leaf = x.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(layer(leaf), leaf)
+        torch.testing.assert_close(gradient, estimate(filled, x, S).gradient)
+        with torch.no_grad():
+            assert float(layer(bad[0])) == pytest.approx(number, rel=1e-7)
+    else:  # the gradient does not exist in float32
+        with pytest.raises(ValueError, match=r"the gradient is not finite in torch\.float32"):
+            _ = estimate(fn, x, S, on_nonfinite=number).gradient

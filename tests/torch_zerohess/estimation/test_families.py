@@ -15,7 +15,7 @@ import torch_zerohess as zh
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.estimation.perturbations import FAMILIES, draws, perturb, stored
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Stein, total
+from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Spread, Stein, total
 from torch_zerohess.sampling import kernels, proposals
 from truths import Exponential, deviation, spread, vector
 
@@ -125,7 +125,8 @@ def test_the_variance_of_draws_is_the_textbook_formula(monkeypatch: pytest.Monke
     for chunk in (1 << 22, 1):  # all draws at a time, or one
         monkeypatch.setattr("torch_zerohess.estimation.standard_error._CHUNK", chunk)
         got = variance_of_draws(stein, "value", f / 18, share, draws(smoothing, N), None)
-        close(got, expected.view(1, 1))
+        close(got.variance, expected.view(1, 1))
+        close(got.degrees, torch.full((1, 1), 8.0, dtype=torch.float64))
 
 
 def test_the_variance_of_optimal_sampling_is_the_textbook_formula_per_element() -> None:
@@ -137,14 +138,18 @@ def test_the_variance_of_optimal_sampling_is_the_textbook_formula_per_element() 
     pairs = (f * stein.weight / 10).view(2, 10, S6).mean(0)  # ten sets: value, three slopes, six second derivatives
     expected = pairs.var(1) / S6
     for quantity, elements in (("value", expected[0]), ("gradient", expected[1:4]), ("hessian_diagonal", expected[4:])):
-        got = stein.variance(quantity, f / K, share, draws(smoothing, N), None)[0, 0]
-        close(got, elements[[0, 3, 5]] if quantity == "hessian_diagonal" else elements)  # of 00, 01, 02, 11, 12, 22
+        got = stein.variance(quantity, f / K, share, draws(smoothing, N), None)
+        close(got.variance[0, 0], elements[[0, 3, 5]] if quantity == "hessian_diagonal" else elements)  # of 00, 01, ...
+        assert bool((got.degrees == 5).all())
     v = vector(1.0, -2.0, 0.5).view(1, 1, N)
     upper = torch.zeros(N, N, dtype=torch.float64)
     upper[tuple(torch.triu_indices(N, N))] = expected[4:]
     whole = upper + upper.triu(1).mT
-    got = stein.variance("hvp", f / K, share, draws(smoothing, N), v)[0, 0]
-    close(got, whole @ v[0, 0] ** 2)
+    close(stein.variance("hessian", f / K, share, draws(smoothing, N), None).variance[0, 0], whole)
+    got = stein.variance("hvp", f / K, share, draws(smoothing, N), v)
+    terms = whole * v[0, 0] ** 2
+    close(got.variance[0, 0], terms.sum(1))
+    close(got.degrees[0, 0], 5 * terms.sum(1) ** 2 / (terms**2).sum(1))  # Welch and Satterthwaite
 
 
 def test_a_point_is_compared_with_all_of_its_perturbations() -> None:
@@ -209,8 +214,14 @@ class PlainGaussian(Stein):
         return torch.exp(project(self.u, d[:, None])[:, 0] - 0.5 * (d * d).sum(1, keepdim=True))
 
     def variance(
-        self, quantity: Quantity, a: Tensor, share: Tensor, draws: Sequence[Tensor], v: Tensor | None
-    ) -> Tensor:
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
         raise NotImplementedError
 
 

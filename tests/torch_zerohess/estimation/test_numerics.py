@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess.estimation.finite_differences import finite_difference_hvp
 from torch_zerohess.estimation.perturbations import stored
 from truths import PlaneWave, Quadratic, Step, spread, vector
 
@@ -128,14 +129,84 @@ def test_sigmas_of_very_different_sizes(scales: tuple[float, float]) -> None:
     assert float((got.hessian() - got.hessian().mT).abs().max()) == 0.0
 
 
-@pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30, 1e150])
-def test_values_of_any_size(scale: float) -> None:
+@pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30, 1e150, 1e300])
+@pytest.mark.parametrize("baseline", ["center", "mean", "none"])
+@pytest.mark.parametrize("proposal", ["aggregate", "optimal"])
+def test_values_of_any_size(proposal: str, baseline: str, scale: float) -> None:
     wave, x, s = PlaneWave(vector(0.9, -0.7)), vector(0.4, -0.3), vector(0.5, 0.5)
-    got = replicates(lambda z: scale * wave.f(z), x, Smoothing(sigma=0.5, samples=8, seed=6))
+    smoothing = Smoothing(sigma=0.5, samples=8, seed=6, proposal=proposal, baseline=baseline)
+    got = replicates(lambda z: scale * wave.f(z), x, smoothing)
     check(got.gradient / scale, wave.gradient(x, s))
     check(got.hessian() / scale, wave.hessian(x, s))
-    if scale < 1e100:
-        assert bool((got.standard_error("gradient") / scale).isfinite().all())
+    # Squares of such values do not exist in float64, their standard errors do.
+    plain = replicates(wave.f, x, smoothing)
+    for quantity in ("value", "gradient", "hessian", "hvp"):
+        v = vector(1.0, 2.0) if quantity == "hvp" else None
+        error = got.standard_error(quantity, v) / scale
+        torch.testing.assert_close(error, plain.standard_error(quantity, v), rtol=1e-7, atol=1e-14)
+
+
+@pytest.mark.parametrize("sigma", [1e-300, 1e-160, 1e150, 1e300])
+def test_sigma_whose_square_does_not_exist(sigma: float) -> None:
+    x, s = vector(0.4, -0.3) * sigma, vector(1.0, 1.0)
+    wave = PlaneWave(vector(0.7, -0.5))
+    size = 1e-100 if sigma < 1 else 1.0  # so that its derivatives exist
+    smoothing = Smoothing(sigma=sigma, samples=8, seed=3)
+    got = replicates(lambda z: size * wave.f(z / sigma), x, smoothing)
+    check(got.gradient / size * sigma, wave.gradient(x / sigma, s))
+    plain = replicates(wave.f, x / sigma, smoothing.replace(sigma=1.0))
+    errors = got.standard_error("gradient") / size * sigma
+    torch.testing.assert_close(errors, plain.standard_error("gradient"), rtol=1e-9, atol=1e-12)
+    if sigma == 1e-160:
+        v = vector(1.0, 2.0)
+        check(got.hessian() * sigma / size * sigma, wave.hessian(x / sigma, s))
+        check(got.hvp(v) * sigma / size * sigma, wave.hessian(x / sigma, s) @ v)
+        for quantity, vector_of in (("hessian", None), ("hessian_diagonal", None), ("hvp", v)):
+            errors = got.standard_error(quantity, vector_of) * sigma / size * sigma
+            torch.testing.assert_close(errors, plain.standard_error(quantity, vector_of), rtol=1e-9, atol=1e-12)
+
+
+SIGMA_ERROR = r"the {} is not finite in torch\.float{}: sigma is .* and fn returned up to .*; scale x and sigma"
+
+
+def test_what_does_not_exist_is_an_error_that_names_its_cause() -> None:
+    small = estimate(lambda z: (z / 1e-160).exp().sum(1), vector(0.0, 0.0), Smoothing(sigma=1e-160, seed=1))
+    assert bool((small.gradient > 1e155).all())
+    for name, call in (
+        ("hessian", small.hessian),
+        ("hessian_diagonal", small.hessian_diagonal),
+        ("hvp", lambda: small.hvp(vector(1.0, 1.0))),
+        ("standard error of the hessian", lambda: small.standard_error("hessian")),
+        ("interval of the hessian", lambda: small.confidence_interval("hessian")),
+    ):
+        with pytest.raises(ValueError, match=SIGMA_ERROR.format(name, 64)):
+            call()
+    single = estimate(lambda z: (z.double() / 1e-30).exp().sum(1), torch.zeros(2), Smoothing(sigma=1e-30, seed=1))
+    assert bool(torch.isfinite(single.gradient).all())
+    with pytest.raises(ValueError, match=SIGMA_ERROR.format("hessian", 32)):
+        single.hessian()
+    for sigma, dtype in ((1e308, torch.float64), (1e38, torch.float32)):
+        for call in (estimate, lambda f, x, s: BlackBox(f, s).freeze(x)):
+            with pytest.raises(ValueError, match=r"sigma is too large: x \+ sigma\*u is not finite in torch.float"):
+                call(lambda z: z.sum(1), torch.zeros(2, dtype=dtype), Smoothing(sigma=sigma, seed=1))
+    for baseline in ("center", "mean"):
+        with pytest.raises(ValueError, match=r"fn returned values up to 1\.7e\+308, whose differences are not finite"):
+            estimate(
+                lambda z: 1.7e308 * z[:, 0].sign(),
+                vector(0.1),
+                Smoothing(sigma=1.0, samples=32, baseline=baseline, seed=1),
+            )
+
+
+@pytest.mark.parametrize("sigma", [1e-200, 1e200])
+def test_differences_of_gradients_where_squares_do_not_exist(sigma: float) -> None:
+    wave, smoothing = PlaneWave(vector(0.7, -0.5)), Smoothing(sigma=1.0, samples=64, seed=3)
+    x, v = vector(0.4, -0.3), vector(1.0, 2.0)
+    plain = finite_difference_hvp(wave.f, x, v, smoothing)
+    # Of a v of length sigma the product is of the order of f / sigma.
+    scaled = smoothing.replace(sigma=sigma)
+    found = finite_difference_hvp(lambda z: wave.f(z / sigma), x * sigma, v * sigma, scaled)
+    torch.testing.assert_close(found * sigma, plain, rtol=1e-10, atol=1e-10)
 
 
 def test_a_narrow_step_on_a_plateau() -> None:

@@ -298,6 +298,11 @@ def recipe(rows: int = 4, B: int = 2, n: int = 3, sigma: int = 3, columns: int =
 
 
 WRONG = {
+    "pick_rows: negative count": lambda: ops.pick_rows(0, 0, -1, 3, 0),
+    "pick_rows: no parameters": lambda: ops.pick_rows(0, 0, 4, 0, 0),
+    "draw: dimensions": lambda: ops.draw(torch.zeros(5, dtype=torch.int64), 3),
+    "place: dimensions of u": lambda: ops.place(doubles(3), doubles(2, 3), doubles(3), True, False, 0),
+    "place: dimensions of x": lambda: ops.place(doubles(4, 3), doubles(3), doubles(3), True, False, 0),
     "draw: columns of rows": lambda: ops.draw(torch.zeros(2, 4, dtype=torch.int64), 3),
     "draw: type of rows": lambda: ops.draw(doubles(2, 5), 3),
     "draw: negative n": lambda: ops.draw(torch.zeros(2, 5, dtype=torch.int64), -1),
@@ -324,6 +329,9 @@ WRONG = {
     "project_drawn: sigma": lambda: ops.project_drawn(*recipe(sigma=1), doubles(2, 1, 3)),
     "project_drawn: columns of rows": lambda: ops.project_drawn(*recipe(columns=4), doubles(2, 1, 3)),
     "project_drawn: rows not a multiple": lambda: ops.project_drawn(*recipe(rows=5), doubles(2, 1, 3)),
+    "project_drawn: dimensions of t": lambda: ops.project_drawn(*recipe(), doubles(2, 3)),
+    "project_drawn: dimensions of rows": lambda: ops.project_drawn(doubles(2).long(), *recipe()[1:], doubles(2, 1, 3)),
+    "accumulate_drawn: dimensions of a": lambda: ops.accumulate_drawn(*recipe(), doubles(2, 4), False),
     "accumulate_drawn: K": lambda: ops.accumulate_drawn(*recipe(), doubles(2, 1, 5), False),
     "accumulate_drawn: sigma": lambda: ops.accumulate_drawn(*recipe(sigma=1), doubles(2, 1, 4), False),
     "accumulate_drawn: rows not a multiple": lambda: ops.accumulate_drawn(*recipe(rows=5), doubles(2, 1, 4), False),
@@ -331,9 +339,10 @@ WRONG = {
 
 
 @pytest.mark.parametrize("call", WRONG.values(), ids=WRONG.keys())
-def test_wrong_shapes_raise(call) -> None:
+def test_wrong_shapes_raise(call, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises((RuntimeError, IndexError)):
         call()
+    assert capfd.readouterr().err == "", "LibTorch was asked about an argument that was not checked"
 
 
 def test_no_batch_at_all_raises_and_does_not_end_the_process() -> None:

@@ -465,3 +465,22 @@ def test_a_search_that_is_done_asks_for_nothing(name):
     assert torch.equal(copy.x, search.x)
     with pytest.raises(RuntimeError, match="ask for points"):
         copy.tell(vector(1.0))
+
+
+def test_values_of_python_are_float64() -> None:
+    """1e9 + z is 1e9 in float32: every point would have the same value."""
+    search = Descent(zeros(2), sigma=1.0, seed=0, restarts=0)
+    search.tell([1e9 + float(z[0]) for z in search.ask()])
+    assert search.value < 1e9
+
+
+def test_a_search_says_where_it_is() -> None:
+    for kind, engine in ((TrustRegion, "descent"), (Descent, "descent"), (GaussianProcessSearch, "gaussian_process")):
+        box = (-5.0, 5.0) if kind is GaussianProcessSearch else None
+        search = kind(vector(1.0, 2.0), sigma=1.0, bounds=box, seed=0, restarts=0)
+        start = f"{kind.__name__}(engine='{engine}', n=2, evaluations=0, start=[1, 2], sigma=1)"
+        assert repr(search) == start
+        search.tell((search.ask() ** 2).sum(1))
+        assert f"evaluations={search.evaluations}, value={search.value:.6g}, x=[" in repr(search)
+    run(search, lambda z: (z**2).sum(1), 500)
+    assert search.message in repr(search)

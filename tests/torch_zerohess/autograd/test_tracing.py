@@ -1,0 +1,154 @@
+"""Layers and operators in graphs: fake tensors, tracers, compilers, export."""
+
+import pytest
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils.checkpoint import checkpoint
+
+from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess.estimation import perturbations
+from torch_zerohess.sampling import extension, proposals
+from truths import spread, truths
+
+# torch's own forward mode compiles decompositions with its deprecated torch.jit.
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
+
+N = 3
+F, X, BATCH = truths(N)["wave"].f, spread(N, -0.6, 0.7), spread(4 * N, -1.0, 1.0).view(4, N)
+S = Smoothing(sigma=0.5, samples=6, seed=12)
+ops = torch.ops.torch_zerohess
+
+
+@pytest.fixture(autouse=True)
+def fresh_compiler() -> None:
+    torch.compiler.reset()
+
+
+@pytest.fixture(params=["stored", "redrawn"])
+def memory(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.param == "redrawn":
+        if not extension.available:
+            pytest.skip("the quantile functions in torch look at the numbers, so only the extension draws fake rows")
+        monkeypatch.setattr(perturbations, "STORED", 0)
+
+
+def test_two_calls_in_compiled_code_are_two_draws() -> None:
+    layer = BlackBox(F, S.replace(seed=None), value="smoothed")
+    difference = torch.compile(lambda x: (layer(x) - layer(x)).sum(), fullgraph=True, backend="aot_eager")
+    assert float(difference(X.clone().requires_grad_()).detach()) != 0.0
+
+
+def test_two_calls_of_a_noisy_function_in_compiled_code_are_two_calls() -> None:
+    calls: list[int] = []
+    layer, w = BlackBox(lambda z: calls.append(len(z)) or F(z) + len(calls), S), torch.ones((), requires_grad=True)
+    # Only a graph with a derivative is searched for common parts. The layer has none here: it returns f(x) alone.
+    difference = torch.compile(lambda w: (layer(X) - layer(X)) * w, fullgraph=True, backend="aot_eager")(w)
+    assert float(difference.detach()) == -1.0
+
+
+def test_compiled_checkpoints_draw_the_same_again() -> None:
+    layer = BlackBox(F, S.replace(seed=None))
+
+    def gradient(wrapped) -> Tensor:
+        torch.manual_seed(3)
+        x = X.clone().requires_grad_()
+        wrapped(lambda x: checkpoint(lambda y: layer(y) * layer(y), x.sin(), use_reentrant=False))(x).backward()
+        return x.grad
+
+    compiled = gradient(lambda f: torch.compile(f, fullgraph=True, backend="aot_eager"))
+    torch.testing.assert_close(compiled, gradient(lambda f: f))
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_layer_cannot_be_exported(strict: bool) -> None:
+    with pytest.raises(Exception, match="cannot be exported"):
+        torch.export.export(torch.nn.Sequential(BlackBox(F, S)), (X,), strict=strict)
+
+
+def test_a_graph_that_outlives_its_layer_or_its_settings_says_so() -> None:
+    layer = BlackBox(F, S)
+    traced = make_fx(torch.func.grad(layer))(X)
+    torch.testing.assert_close(traced(X), estimate(F, X, S).gradient)
+    layer.smoothing = S.replace(samples=7)
+    with pytest.raises(RuntimeError, match="traced for 12 perturbations, but now the layer draws 14: trace again"):
+        traced(X)
+    with torch.no_grad():
+        value = make_fx(layer)(X)
+    del layer
+    for graph in (traced, value):
+        with pytest.raises(RuntimeError, match=r"calls black box number.*keep the layer for as long as the graph"):
+            graph(X)
+
+
+@pytest.mark.usefixtures("memory")
+def test_fake_tensors_have_the_shapes_of_real_ones() -> None:
+    layer = BlackBox(F, S)
+    with FakeTensorMode():
+        x = torch.empty(4, N, dtype=torch.float64, requires_grad=True)
+        y = layer(x)
+        (gradient,) = torch.autograd.grad(y.sum(), x, create_graph=True)
+        (product,) = torch.autograd.grad(gradient.sum(), x)
+    assert (y.shape, gradient.shape, product.shape) == ((4,), (4, N), (4, N))
+
+
+@pytest.mark.usefixtures("memory")
+@pytest.mark.parametrize("proposal", ["aggregate", "optimal"])
+def test_symbolic_traces_compute_what_they_traced(proposal: str) -> None:
+    layer, x = BlackBox(F, S.replace(proposal=proposal)), BATCH[1]
+    for f in (torch.func.grad(layer), torch.func.hessian(layer)):
+        torch.testing.assert_close(make_fx(f, tracing_mode="symbolic")(X)(x), f(x))
+
+
+def doubles(*shape: int) -> Tensor:
+    return spread(torch.Size(shape).numel(), -1.0, 1.0).view(shape)
+
+
+ROWS = proposals.pick_rows(1, 0, 8, N, proposals.SECOND_ORDER)
+RECIPE = (ROWS, BATCH, doubles(N), True, False)
+OPERATORS = {
+    "pick_rows": (1, 0, 8, N, 1),
+    "draw": (ROWS, N),
+    "draw in single precision": (ROWS, N, True),
+    "sample": (1, 3, BATCH, doubles(N), True, proposals.FIRST_ORDER, True, True),
+    "sample in single precision": (1, 3, BATCH.float(), doubles(N), False, proposals.UNIFORM, False, False),
+    "place": (doubles(8, N), BATCH, doubles(N), True, True, proposals.GAUSSIAN),
+    "project": (doubles(4, 2, N), doubles(4, 5, N)),
+    "accumulate": (doubles(4, 2, N), doubles(4, 5, 2), True),
+    "hessian": (doubles(4, 2, N), doubles(4, 5, 2)),
+    "mirror": (doubles(2, N, N),),
+    "project_drawn": (*RECIPE, doubles(4, 5, N)),
+    "accumulate_drawn": (*RECIPE, doubles(4, 5, 4), False),
+}
+
+
+@pytest.mark.skipif(not extension.available, reason="the operators are those of the extension")
+@pytest.mark.parametrize("name", OPERATORS)
+def test_operators_of_the_extension(name: str) -> None:
+    torch.library.opcheck(getattr(ops, name.split()[0]).default, OPERATORS[name])
+
+
+@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize("proposal", ["aggregate", "optimal", "fr22"])
+def test_operators_that_call_a_black_box(proposal: str, keep: bool) -> None:
+    layer = BlackBox(lambda z: torch.stack([F(z), z[:, 0]], 1), S.replace(proposal=proposal))
+    K = layer.smoothing.evaluations(N, center=False)
+    torch.library.opcheck(ops.evaluate.default, (layer._handle, K, keep, BATCH.float(), []))
+    torch.library.opcheck(ops.evaluate_center.default, (layer._handle, BATCH, []))
+    with pytest.raises(RuntimeError, match=f"traced for {K + 1} perturbations, but now the layer draws {K}"):
+        ops.evaluate(layer._handle, K + 1, keep, BATCH, [])
+
+
+def test_compiled_code_serves_every_seed_and_sigma() -> None:
+    layer, graphs = BlackBox(F, S.replace(seed=None)), []
+
+    def backend(graph, _):
+        graphs.append(graph)
+        return graph
+
+    compiled = torch.compile(layer, fullgraph=True, backend=backend)
+    for changes in ({}, {"seed": 1}, {"seed": 2**62}, {"sigma": 0.25}, {"sigma": torch.ones(N)}, {"seed": None}):
+        layer.smoothing = layer.smoothing.replace(**changes)
+        compiled(X.clone().requires_grad_()).backward()
+    assert len(graphs) == 1

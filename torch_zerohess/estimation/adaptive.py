@@ -1,0 +1,77 @@
+"""As many batches as a wanted accuracy takes."""
+
+import math
+from collections.abc import Callable
+
+from torch_zerohess.estimation.batch import Batch
+from torch_zerohess.smoothing import Smoothing
+
+MOST = 100_000
+"""Evaluations that a tolerance may take where no other number is given."""
+_STEP = 0x9E3779B97F4A7C15  # from the seed of a batch to that of the next
+
+
+def draw_until(
+    draw: Callable[[Smoothing], Batch],
+    error: Callable[[list[Batch]], float],
+    smoothing: Smoothing,
+    cost: Callable[[Smoothing], int],
+    seed: int,
+    tolerance: float,
+    max_evaluations: int,
+) -> tuple[list[Batch], str]:
+    """Draw batches, each as large as all before it together, until `error` of them is at most the tolerance.
+
+    Args:
+        draw: draws a batch.
+        error: relative error of the batches so far.
+        smoothing: settings of the first batch; the later ones have a multiple of its samples.
+        cost: evaluations of a batch.
+        seed: of the first batch.
+        tolerance: positive.
+        max_evaluations: limit of all batches together.
+
+    Returns:
+        The batches, and which of the two limits ended it, in a sentence.
+
+    Raises:
+        ValueError: the limit does not allow for one batch.
+    """
+    batches: list[Batch] = []
+    used, multiple = 0, 0
+    while True:
+        following = max(1, multiple)
+        while following and used + cost(smoothing.replace(samples=following * smoothing.samples)) > max_evaluations:
+            following = following // 2
+        if not following:
+            break
+        own = smoothing.replace(samples=following * smoothing.samples, seed=(seed + len(batches) * _STEP) % 2**63)
+        batches.append(draw(own))
+        used, multiple = used + cost(own), multiple + following
+        found = error(batches)
+        if found <= tolerance:
+            return batches, f"tolerance: the relative error of the gradient is {found:.2g}, at most {tolerance:g}"
+    if not batches:
+        raise ValueError(
+            f"max_evaluations must be at least {cost(smoothing)}, one batch of the smoothing, got {max_evaluations}"
+        )
+    return batches, (
+        f"max_evaluations: {used} of {max_evaluations} are used, another batch does not fit; the relative error of the "
+        f"gradient is {found:.2g}, above the tolerance {tolerance:g}"
+    )
+
+
+def check_limits(tolerance: float | None, max_evaluations: int | None) -> None:
+    """Raise ValueError or TypeError for limits out of their ranges, or for the second one without the first."""
+    if tolerance is None:
+        if max_evaluations is not None:
+            raise ValueError(
+                f"max_evaluations is the limit of a tolerance: give tolerance too, got {max_evaluations} alone"
+            )
+        return
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)):
+        raise TypeError(f"tolerance must be a positive number, got {tolerance!r}")
+    if not 0 < tolerance < math.inf:
+        raise ValueError(f"tolerance must be positive and finite, a relative error such as 0.1, got {tolerance}")
+    if max_evaluations is not None and (isinstance(max_evaluations, bool) or not isinstance(max_evaluations, int)):
+        raise TypeError(f"max_evaluations must be an integer, got {max_evaluations!r}")

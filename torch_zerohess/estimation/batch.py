@@ -1,0 +1,86 @@
+"""One batch of evaluations inside an estimate: its sums, their standard errors, and their share of the whole."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.estimation.evaluation import Evaluations
+from torch_zerohess.estimation.perturbations import draws
+from torch_zerohess.estimation.stein import Quantity, Stein
+from torch_zerohess.smoothing import Smoothing
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Evaluations, and the settings that they were drawn with. All results are float64 and in units of sigma."""
+
+    evaluations: Evaluations
+    smoothing: Smoothing
+
+    @cached_property
+    def a(self) -> Tensor:
+        """Coefficients [B, P, K], P outputs."""
+        return self.evaluations.expansion.flat.mT.contiguous()
+
+    @property
+    def stein(self) -> Stein:
+        """The family of weights."""
+        return self.evaluations.expansion.stein
+
+    def spread(self, quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the standard error of a sum and its degrees of freedom, in the shape of the sum.
+
+        t: vector of the hvp [B, P, n], in units of sigma. The squares of values from 1e-300 to 1e300 exist only
+        relative to the largest of them, a power of two so that nothing is rounded.
+        """
+        index = draws(self.smoothing, self.evaluations.points.shape[2])
+        unit = _power_of_two(self.a.abs().amax(2, keepdim=True))
+        pooled = self._pooled / unit if self._coupled(quantity) else None
+        length = torch.ones_like(unit) if t is None else _power_of_two(t.abs().amax(2, keepdim=True))
+        t = None if t is None else t / length
+        variance, degrees = self.stein.variance(quantity, self.a / unit, self.evaluations.share, index, t, pooled)
+        shape = (*unit.shape[:2], *(1,) * (variance.dim() - 2))
+        return variance.sqrt() * unit.reshape(shape) * length.reshape(shape), degrees
+
+    def _coupled(self, quantity: Quantity) -> bool:
+        """Whether the baseline makes the draws depend on each other.
+
+        It does not in the gradient of antithetic draws: their kernel is odd, so that every baseline cancels.
+        """
+        return self.smoothing.baseline == "mean" and not (quantity == "gradient" and self.smoothing.antithetic)
+
+    @property
+    def _pooled(self) -> Tensor:
+        """(f - mean of f) * share, [B, P, K]."""
+        share = self.evaluations.share[..., None]
+        f = self.evaluations.values.reshape(*share.shape[:2], -1).double()
+        origin = f[:, :1]  # differences to one of the values keep the precision of a small variation
+        return (((f - origin) - ((f - origin) * share).sum(1, keepdim=True)) * share).mT.contiguous()
+
+
+def combined(batches: Sequence[Batch], of: Callable[[Batch], Tensor]) -> Tensor:
+    """Return the mean of a sum over independent batches, each weighted by its number of rows."""
+    if len(batches) == 1:
+        return of(batches[0])
+    rows = [one.evaluations.points.shape[1] for one in batches]
+    return torch.stack([of(one) * (count / sum(rows)) for one, count in zip(batches, rows, strict=True)]).sum(0)
+
+
+def combined_spread(batches: Sequence[Batch], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the standard error of the mean over independent batches, and its degrees of freedom (Satterthwaite)."""
+    rows = [one.evaluations.points.shape[1] for one in batches]
+    error, inverse = torch.zeros(()), torch.zeros(())
+    for one, count in zip(batches, rows, strict=True):
+        share = count / sum(rows)
+        own, degrees = one.spread(quantity, t)
+        error = torch.hypot(error.to(own), own * share)  # the square of neither is formed
+        inverse = inverse.to(own) + share**2 / degrees  # variances go as one over the number of rows
+    return error, 1 / inverse
+
+
+def _power_of_two(size: Tensor) -> Tensor:
+    """Return the power of two next to each size, 1 for zero."""
+    return torch.where(size > 0, torch.ldexp(torch.ones_like(size), torch.frexp(size).exponent - 1), 1.0)

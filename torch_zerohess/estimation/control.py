@@ -1,0 +1,87 @@
+"""A surrogate as a control variate: what it predicts for the points of a batch, through the head.
+
+The surrogate and the coefficient are those of earlier calls. They do not change while one call is made.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.estimation.head import Head, apply_head
+from torch_zerohess.heads import LocalEntropy, SquaredError
+from torch_zerohess.surrogates.memory import Memory
+
+
+@dataclass(frozen=True)
+class Control:
+    """The memory of a layer during one call."""
+
+    memory: Memory
+    head: Head | None
+    active: bool
+    """Whether the surrogate is subtracted; if not, evaluations are only kept."""
+    coefficient: float
+    """What the surrogate's values are multiplied by."""
+    learning: bool
+    """Whether evaluations are kept."""
+
+    @classmethod
+    def of(cls, memory: Memory, head: Head | None, *, learning: bool) -> "Control":
+        """Return the control variate for a call that begins: the surrogate is fitted if that is due."""
+        if learning:
+            memory.refresh()
+        c = memory.coefficient if memory.ready else 0.0
+        if isinstance(head, LocalEntropy):  # its outer function is not linear: all of the surrogate, or none
+            c = 1.0 if c >= 0.5 else 0.0
+        if memory.fresh == 0 and not memory.ready:
+            raise ValueError("memory with fresh=0 has no surrogate yet: add evaluations and call memory.fit()")
+        return cls(memory, head, c > 0.0, c, learning)
+
+    def references(self, aux: Sequence[Tensor]) -> list[Tensor]:
+        """The auxiliary inputs of the head, without the scales of a local entropy."""
+        return list(aux[:-2] if self._scaled else aux)
+
+    def scales(self, aux: Sequence[Tensor]) -> tuple[Tensor, Tensor] | None:
+        """T and m of a local entropy [B] each, which the surrogate gives; None where it is not used."""
+        return (aux[-2], aux[-1]) if self._scaled else None
+
+    @property
+    def _scaled(self) -> bool:
+        return self.active and isinstance(self.head, LocalEntropy)
+
+    def explain(self, values: Tensor, points: Tensor, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor | None:
+        """Keep new evaluations and return what the surrogate predicts for them, float64 [B, E, *out], if it is used.
+
+        Args:
+            values: [B, E, *out].
+            points: [B, E, n].
+            outputs: of the black box [B, E, *outputs].
+            aux: of the batch elements [B, ...].
+        """
+        predicted = None
+        if self.memory.ready:
+            predicted = predict(self.memory.surrogate, self.head, points, self.references(aux)).double()
+            if not bool(torch.isfinite(predicted).all()):
+                raise ValueError("the surrogate of the memory predicted a value that is not finite")
+        if self.learning:
+            if predicted is not None:
+                self.memory.observe(values, predicted)
+            self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
+        return predicted if self.active else None
+
+
+def predict(surrogate: Callable[[Tensor], Tensor] | Any, head: Head | None, z: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    """Return h(g(z), r) [B, E, *out] for points z [B, E, n] and aux r [B, ...], differentiable in z."""
+    B, E = z.shape[:2]
+    if isinstance(head, LocalEntropy):
+        head = head.head
+    space = getattr(surrogate, "space", None)
+    if isinstance(head, SquaredError) and space is not None:
+        known, outside = space.split(aux[0])
+        coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
+        return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
+    outputs = surrogate(z.flatten(0, 1)).unflatten(0, (B, E))
+    return outputs if head is None else apply_head(head, outputs, aux)

@@ -1,0 +1,51 @@
+"""The white box after a black box: a head turns outputs into losses, for every point of a batch.
+
+A head `head(outputs [K, *out], *aux [K, ...]) -> [K]` sees the auxiliary inputs, the black box does not. Auxiliary
+inputs are never copied: the head is called once per sample with the whole batch, or once per batch element with
+expanded views, whichever takes fewer calls.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+Head = Callable[..., Tensor]
+"""(outputs [K, *out], *aux [K, ...]) -> [K], made of differentiable torch operations."""
+
+
+def checked_head(head: Any) -> Head | None:
+    """Return the head, or raise TypeError or ValueError if it cannot serve."""
+    if head is not None and not callable(head):
+        raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {head!r}")
+    if isinstance(head, nn.Module) and any(one.requires_grad for one in head.parameters()):
+        raise ValueError(
+            "head has parameters that require grad, but the layer is differentiated with respect to x alone: "
+            "call head.requires_grad_(False) first"
+        )
+    return head
+
+
+def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    """Return the losses [B, E] of outputs [B, E, *out] with auxiliary inputs [B, ...]."""
+    B, E = outputs.shape[:2]
+    if E <= B:
+        return torch.stack([_called(head, outputs[:, sample], aux) for sample in range(E)], 1)
+    rows = []
+    for element in range(B):
+        views = [one[element].expand(E, *one.shape[1:]) for one in aux]
+        rows.append(_called(head, outputs[element], views))
+    return torch.stack(rows)
+
+
+def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    losses = head(outputs, *aux)
+    if not isinstance(losses, Tensor) or not losses.is_floating_point():
+        raise TypeError(f"head must return a real floating-point tensor, got {getattr(losses, 'dtype', type(losses))}")
+    if losses.shape != outputs.shape[:1]:
+        raise ValueError(
+            f"head must return one loss per output, [{len(outputs)}] for outputs {list(outputs.shape)}, "
+            f"got {list(losses.shape)}"
+        )
+    return losses

@@ -1,0 +1,60 @@
+"""Values of a black box that are not finite: raise, drop the whole antithetic pair, or put a number in their place."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.estimation.stein import Stein
+from torch_zerohess.smoothing import Smoothing
+
+
+def finite_values(
+    values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing, stein: Stein
+) -> tuple[Tensor, Tensor | None]:
+    """Treat values [B, E, *out] that are not finite at points [B, E, n].
+
+    Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
+    """
+    if math.isfinite(float(values.sum())):  # it is not, if one of them is not
+        return values, None
+    bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
+    if not bool(bad.any()):
+        return values, None
+    if on_nonfinite != "drop" or bool(bad[:, K:].any()):
+        where = bad.nonzero()[0]
+        if on_nonfinite == "drop":  # the center cannot be dropped
+            where = torch.tensor([int(bad[:, K].nonzero()[0]), K])
+        rule = "raise" if on_nonfinite == "drop" else on_nonfinite
+        return replaced(values, where, points, rule), None
+    kept = ~bad[:, :K]
+    if smoothing.antithetic:
+        pair = kept[:, : K // 2] & kept[:, K // 2 :]
+        kept = torch.cat([pair, pair], 1)
+    fewest = 2 if smoothing.baseline == "mean" else 1
+    left = int(kept.sum(1).min()) // (2 if smoothing.antithetic else 1)
+    if left < fewest:
+        raise ValueError(
+            f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: fn is not finite "
+            "almost everywhere around x"
+        )
+    if not stein.droppable:
+        raise ValueError(
+            f"on_nonfinite='drop' cannot re-weight the element-wise sets of proposal {smoothing.proposal!r}: give a "
+            "number to put in place of values that are not finite"
+        )
+    return torch.where(bad.reshape(*bad.shape, *[1] * (values.dim() - 2)), 0.0, values), kept
+
+
+def replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
+    """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
+    if isinstance(rule, str):
+        point = points[tuple(where.tolist())]
+        text = ", ".join(f"{float(p):.6g}" for p in point[:8]) + (", ..." if len(point) > 8 else "")
+        value = values[tuple(where.tolist())]
+        wrong = float(value.flatten()[~torch.isfinite(value.flatten())][0])
+        raise ValueError(
+            f"fn returned {wrong} at the point [{text}]; choose on_nonfinite='drop' or a number to go on without it"
+        )
+    # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
+    return torch.where(torch.isfinite(values), values.double(), float(rule))

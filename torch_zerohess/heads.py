@@ -1,0 +1,62 @@
+"""Heads: white boxes that turn the outputs of a black box into losses, behind one layer.
+
+A head gets outputs [K, *out] and the auxiliary inputs [K, ...] of the layer, and returns losses [K]. Any torch function
+of this form is a head. A render then serves every reference, because the black box does not see the reference:
+
+    layer = zh.BlackBox(render, zh.Smoothing(sigma=0.1), head=zh.heads.SquaredError(), memory=zh.Memory())
+    loss = layer(network(images), images).mean()
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+__all__ = ["LocalEntropy", "SquaredError"]
+
+
+@dataclass(frozen=True)
+class SquaredError:
+    """Mean squared difference of outputs [K, *out] and references [K, *out].
+
+    With a memory whose surrogate knows the outputs by coordinates, the losses of predicted outputs come from the
+    coordinates alone, and no predicted output is formed.
+    """
+
+    def __call__(self, outputs: Tensor, references: Tensor) -> Tensor:
+        """Return the mean squared differences [K]."""
+        if outputs.shape[1:] != references.shape[1:]:
+            raise ValueError(
+                f"references must be [K, *out] with out = {list(outputs.shape[1:])}, the shape of one output, "
+                f"got {list(references.shape)}"
+            )
+        return (outputs - references).flatten(1).square().mean(1)
+
+
+@dataclass(frozen=True)
+class LocalEntropy:
+    """The local entropy -T log E exp(-loss / T) of a head's losses, in place of the mean E loss.
+
+    The mean averages a narrow valley away: its gradient vanishes where the valley is rarely hit. exp(-loss / T) keeps
+    the valley, so that the gradient points to it from as far as it is hit at all (Chaudhari et al. 2017, "Entropy-SGD",
+    equation 5). T = `temperature` times the mean loss under the smoothing, for each element of the batch: it needs no
+    scale, and vanishes with the loss. T is not differentiated. For a large temperature the local entropy is the mean.
+
+    Args:
+        head: of which the losses are.
+        temperature: T over the mean loss.
+    """
+
+    head: Callable[..., Tensor] | Any
+    temperature: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not callable(self.head):
+            raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {self.head!r}")
+        if not 0.0 < self.temperature < float("inf"):
+            raise ValueError(f"temperature must be positive and finite, got {self.temperature}")
+
+    def __call__(self, outputs: Tensor, *aux: Tensor) -> Tensor:
+        """Return the losses [K] themselves; the layer takes the local entropy over its samples."""
+        return self.head(outputs, *aux)

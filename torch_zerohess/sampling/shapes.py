@@ -1,0 +1,69 @@
+"""Shapes and types of what the C++ operators return, for tensors without numbers: fake tensors, tracers, compilers.
+
+Shapes: B batch, S samples, K = S or 2 S evaluations per x, n parameters, M vectors; see `csrc/ops.cpp`.
+"""
+
+import torch
+from torch import Tensor
+
+
+def pick_rows(seed: int, first: int, count: int, n: int, proposal: int) -> Tensor:
+    return torch.empty(count, 5, dtype=torch.int64)
+
+
+def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
+    return rows.new_empty(rows.shape[0], n, dtype=torch.float32 if single else torch.float64)
+
+
+def sample(
+    seed: int, S: int, x: Tensor, sigma: Tensor, antithetic: bool, proposal: int, center: bool, keep: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    B, n = x.shape
+    K = 2 * S if antithetic else S
+    rows = x.new_empty(B * S, 5, dtype=torch.int64)
+    u = sigma.new_empty(B if keep else 0, K, n)
+    return rows, x.new_empty(B, K + center, n), u, sigma.new_empty(B, K)
+
+
+def place(
+    u: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, proposal: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    B, n = x.shape
+    K = u.shape[0] // B * (2 if antithetic else 1)
+    points = u.new_empty(B, K, n, dtype=torch.float32 if single else torch.float64)
+    return points, u.new_empty(B, K, n), u.new_empty(B, K)
+
+
+def project(u: Tensor, t: Tensor) -> Tensor:
+    return t.new_empty(t.shape[0], t.shape[1], u.shape[1])
+
+
+def accumulate(u: Tensor, a: Tensor, squares: bool) -> Tensor:
+    return a.new_empty(a.shape[0], a.shape[1], u.shape[2])
+
+
+def hessian(u: Tensor, a: Tensor) -> Tensor:
+    return a.new_empty(a.shape[0], a.shape[1], u.shape[2], u.shape[2])
+
+
+def project_drawn(rows: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, t: Tensor) -> Tensor:
+    return t.new_empty(t.shape[0], t.shape[1], rows.shape[0] // x.shape[0] * (2 if antithetic else 1))
+
+
+def accumulate_drawn(
+    rows: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, a: Tensor, squares: bool
+) -> Tensor:
+    return a.new_empty(a.shape[0], a.shape[1], x.shape[1])
+
+
+def mirror(matrices: Tensor) -> None:
+    return None
+
+
+OPERATORS = (pick_rows, draw, sample, place, project, accumulate, hessian, mirror, project_drawn, accumulate_drawn)
+
+
+def register() -> None:
+    """Tell torch the shapes; to be called once, after the operators were loaded."""
+    for one in OPERATORS:
+        torch.library.register_fake(f"torch_zerohess::{one.__name__}", one)

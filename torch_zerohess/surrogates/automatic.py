@@ -1,0 +1,77 @@
+"""A surrogate chosen by the evaluations: a Gaussian process or an affine map, whichever predicts held-out ones better.
+
+Outputs of many elements are represented by coordinates in the span of some of them (`LowRank`).
+"""
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.low_rank import LowRank
+from torch_zerohess.surrogates.process import ProcessSurrogate
+from torch_zerohess.surrogates.surrogate import Surrogate, checked
+
+_PROCESS = 32
+"""Parameters up to which a Gaussian process is tried; in more, distances say little."""
+_HELD_OUT = 5
+"""One point in so many is held out to compare the two."""
+_WIDE = 64
+"""Elements of an output above which it is represented by coordinates."""
+
+
+class AutomaticSurrogate:
+    """The surrogate of a `Memory` that was given none; a `Surrogate` itself.
+
+    Args:
+        rank: coordinates of an output, at most.
+        capacity: points that are used, the latest ones.
+    """
+
+    def __init__(self, *, rank: int = 128, capacity: int = 4000) -> None:
+        if rank < 1:
+            raise ValueError(f"rank must be at least 1, got {rank}")
+        self.rank, self.capacity = rank, capacity
+        self.space: LowRank | None = None
+        """The coordinates of the latest fit; None where outputs have few elements."""
+        self.model: Surrogate | None = None
+        """The model of the coordinates, or of the outputs where they have few elements."""
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
+        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        self.space = LowRank.of(outputs, self._rank(points)) if outputs[0].numel() > _WIDE else None
+        known = outputs if self.space is None else self.space.encode(outputs)
+        models = self._candidates(points)
+        if len(models) > 1:
+            index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1)).to(points.device)
+            part = max(1, len(points) // _HELD_OUT)
+            held, rest = index[:part], index[part:]
+            errors = []
+            for model in models:
+                model.fit(points[rest], known[rest])
+                errors.append(float((model(points[held]) - known[held]).square().sum()))
+            models = [models[errors.index(min(errors))]]
+        models[0].fit(points, known)
+        self.model = models[0]
+
+    def _rank(self, points: Tensor) -> int:
+        """An affine map in n dimensions has outputs of rank n, which may be more than `rank`."""
+        return self.rank if points.shape[1] <= _PROCESS else max(self.rank, min(len(points), points.shape[1] + 1))
+
+    def _candidates(self, points: Tensor) -> list[Surrogate]:
+        linear = LinearSurrogate(capacity=self.capacity)
+        if points.shape[1] > _PROCESS:
+            return [linear]
+        process = ProcessSurrogate(capacity=self.capacity)
+        return [process, linear] if len(points) > max(_HELD_OUT, points.shape[1] + 2) else [process]
+
+    def coordinates(self, z: Tensor) -> Tensor:
+        """Coordinates [K, r] of the expected outputs at z [K, n], where `space` is not None."""
+        if self.model is None:
+            raise RuntimeError("fit the surrogate to evaluations before it is used")
+        return self.model(z)
+
+    def __call__(self, z: Tensor) -> Tensor:
+        """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
+        known = self.coordinates(z)
+        return known if self.space is None else self.space.decode(known).to(z.dtype)

@@ -1,0 +1,215 @@
+"""Evaluations that are kept, and the surrogate fitted to them: a control variate for later estimates."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.surrogate import Surrogate
+
+_GROWTH = 1.3
+"""The surrogate is fitted again when there are this times as many evaluations as at the last fit."""
+_FEWEST = 8
+"""Evaluations at the first fit."""
+_EXCESS = 1.05
+"""Evaluations over the capacity at which they are thinned."""
+_FORGET = 0.8
+"""Weight of what the coefficient knows, at every new call."""
+
+
+class Memory:
+    """Evaluations of a black box, and a surrogate g of it, as a control variate of `BlackBox` and `estimate`.
+
+    With a head h after the black box f and a coefficient c,
+
+        F(x, r) = c E h(g(x + sigma u), r)  +  E[ h(f(x + sigma u), r) - c h(g(x + sigma u), r) ].
+
+    The first term takes no evaluations; its derivatives are those of h and g. The second one is estimated from the
+    evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g, provided that
+    h(g(z), r) is differentiable in z (once for gradients, and with a continuous derivative for Hessians). A bad g
+    costs variance, and c falls to zero.
+
+    Args:
+        surrogate: an object with `fit(points [P, n], outputs [P, *out])` and a differentiable
+            `__call__(z [K, n]) -> [K, *out]`; an `nn.Module` without `fit`, which the caller trains; or None: a
+            Gaussian process or an affine map, of the coordinates of large outputs, chosen by held-out evaluations.
+        capacity: evaluations that are kept. Beyond it, of the points closest to each other the older ones are dropped.
+            Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
+        fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
+            None: all of them. 0: none; the estimate is then that of g, and biased towards it.
+        order: highest derivative that new evaluations enter. 1: second derivatives are those of the surrogate alone,
+            without noise, and biased towards it; values and gradients stay unbiased.
+        draws: points per element at which the surrogate's term is evaluated.
+
+    Raises:
+        TypeError, ValueError: an argument is not as described.
+
+    Example:
+        >>> memory = Memory()
+        >>> z = torch.linspace(-2, 2, 30)[:, None]
+        >>> memory.add(z, z.square())
+        >>> memory.fit()
+        >>> memory.evaluations, abs(float(memory.surrogate(torch.tensor([[1.0]]))) - 1.0) < 0.01
+        (30, True)
+    """
+
+    def __init__(
+        self,
+        surrogate: Surrogate | nn.Module | None = None,
+        *,
+        capacity: int = 4000,
+        fresh: int | None = None,
+        order: int = 2,
+        draws: int = 64,
+    ) -> None:
+        for name, number, least in (("capacity", capacity, 2), ("fresh", fresh, 0), ("draws", draws, 2)):
+            if number is None and name == "fresh":
+                continue
+            if isinstance(number, bool) or not hasattr(number, "__index__"):
+                raise TypeError(f"{name} must be an integer, got {number!r}")
+            if number < least:
+                raise ValueError(f"{name} must be at least {least}, got {number}")
+        if surrogate is not None and not callable(surrogate):
+            raise TypeError(f"surrogate must have fit(points, outputs) and __call__(z), got {surrogate!r}")
+        if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):
+            raise TypeError(f"surrogate must have fit(points, outputs), got {type(surrogate).__name__} without it")
+        self.surrogate: Any = AutomaticSurrogate(capacity=capacity) if surrogate is None else surrogate
+        if order not in (1, 2):
+            raise ValueError(f"order must be 1 or 2, got {order}")
+        self.capacity, self.fresh, self.order, self.draws = capacity, fresh, order, draws
+        self.evaluations = 0
+        """Evaluations taken so far, those that are no longer kept included."""
+        self.pathwise: bool | None = None
+        """How the surrogate's term is differentiated, see `estimation.surrogate_term`; None: to be measured."""
+        self._points: list[Tensor] = []
+        self._outputs: list[Tensor] = []
+        self._size = 0
+        self._fitted = 0
+        """Evaluations taken at the last fit."""
+        self._moments = [0.0, 0.0]
+        """Covariance of h(f) and h(g), and variance of h(g), over evaluations that g had not seen."""
+
+    def __len__(self) -> int:
+        """Evaluations that are kept."""
+        return self._size
+
+    @property
+    def points(self) -> Tensor:
+        """Points of the evaluations that are kept, [P, n]."""
+        self._points = [torch.cat(self._points)] if len(self._points) > 1 else self._points
+        return self._points[0] if self._points else torch.empty(0, 0)
+
+    @property
+    def outputs(self) -> Tensor:
+        """Outputs there, [P, *out]."""
+        self._outputs = [torch.cat(self._outputs)] if len(self._outputs) > 1 else self._outputs
+        return self._outputs[0] if self._outputs else torch.empty(0)
+
+    def add(self, points: Tensor, outputs: Tensor) -> None:
+        """Keep outputs [K, *out] at points [K, n]; those that are not finite are left out.
+
+        Raises ValueError if a shape differs from the shapes of earlier evaluations.
+        """
+        if points.dim() != 2 or outputs.dim() < 1 or len(points) != len(outputs):
+            raise ValueError(
+                f"points must be [K, n] and outputs [K, *out], got {list(points.shape)} and {list(outputs.shape)}"
+            )
+        for name, new, kept in (("points", points, self._points), ("outputs", outputs, self._outputs)):
+            if kept and new.shape[1:] != kept[0].shape[1:]:
+                raise ValueError(
+                    f"{name} must be [K, {', '.join(map(str, kept[0].shape[1:]))}] like the earlier ones, "
+                    f"got {list(new.shape)}"
+                )
+        finite = torch.isfinite(points).all(1) & torch.isfinite(outputs.reshape(len(outputs), -1)).all(1)
+        self.evaluations += len(points)
+        if not bool(finite.any()):
+            return
+        self._points.append(points.detach()[finite])
+        self._outputs.append(outputs.detach()[finite])
+        self._size += len(self._points[-1])
+        if self._size > _EXCESS * self.capacity:
+            self._thin()
+
+    def fit(self) -> None:
+        """Fit the surrogate to all evaluations that are kept; a module without `fit` is left as it is.
+
+        Raises ValueError if there are fewer than two.
+        """
+        if self._size < 2:
+            raise ValueError(f"a surrogate is fitted to at least 2 evaluations, the memory has {self._size}: add some")
+        if hasattr(self.surrogate, "fit"):
+            outputs = self.outputs
+            self.surrogate.fit(self.points, outputs if outputs.dim() > 1 else outputs[:, None])
+        self._fitted, self.pathwise = self.evaluations, None
+
+    def refresh(self) -> None:
+        """Fit the surrogate if that is due: `evaluations` has grown by 30 % since the last fit."""
+        if self._size >= _FEWEST and self.evaluations >= _GROWTH * self._fitted:
+            self.fit()
+
+    @property
+    def ready(self) -> bool:
+        """Whether the surrogate can predict."""
+        return self._fitted > 0 or not hasattr(self.surrogate, "fit")
+
+    @property
+    def coefficient(self) -> float:
+        """Coefficient c in [0, 1]: the regression of h(f) on h(g) over evaluations that g had not seen; 0 before."""
+        if self.fresh == 0:
+            return 1.0
+        covariance, variance = self._moments
+        return min(max(covariance / variance, 0.0), 1.0) if variance > 0.0 else 0.0
+
+    def observe(self, losses: Tensor, predicted: Tensor) -> None:
+        """Tell the coefficient the values [B, K, *out] of a call, and what the surrogate predicted for them."""
+        a, b = (one.double().reshape(*one.shape[:2], -1) for one in (losses, predicted))
+        dim = 1 if a.shape[1] > 1 else 0  # the differences within an element make its derivatives
+        a, b = a - a.mean(dim, keepdim=True), b - b.mean(dim, keepdim=True)
+        new = float((a * b).sum()), float(b.square().sum())
+        if all(map(_is_number, new)):
+            self._moments = [_FORGET * old + (1.0 - _FORGET) * one for old, one in zip(self._moments, new, strict=True)]
+        else:  # the surrogate predicts nonsense
+            self._moments = [0.0, 0.0]
+
+    def _thin(self) -> None:
+        """Drop points whose nearest neighbour among later ones is closest, until the capacity is kept."""
+        points, excess = self.points, self._size - self.capacity
+        scale = points.std(0).clamp_min(torch.finfo(points.dtype).tiny)
+        apart = torch.cdist(points / scale, points / scale, compute_mode="donot_use_mm_for_euclid_dist")
+        later = torch.ones_like(apart, dtype=torch.bool).triu(1)
+        nearest = apart.masked_fill(~later, float("inf")).min(1).values
+        kept = nearest.argsort()[excess:].sort().values
+        self._points, self._outputs = [points[kept]], [self.outputs[kept]]
+        self._size = len(kept)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything but the settings: evaluations, the coefficient, and the state of the surrogate if any."""
+        model = self.surrogate.state_dict() if isinstance(self.surrogate, nn.Module) else None
+        return {
+            "points": self.points,
+            "outputs": self.outputs,
+            "evaluations": self.evaluations,
+            "fitted": self._fitted,
+            "moments": list(self._moments),
+            "surrogate": model,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take the evaluations of `state_dict`; a surrogate that is no module is fitted again, to all of them."""
+        points, outputs = state["points"], state["outputs"]
+        self._points, self._outputs = ([points], [outputs]) if len(points) else ([], [])
+        self._size, self.evaluations, self._moments = len(points), state["evaluations"], list(state["moments"])
+        if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
+            self.surrogate.load_state_dict(state["surrogate"])
+        elif state["fitted"]:
+            self.fit()
+        self._fitted = state["fitted"]
+
+    def __repr__(self) -> str:
+        kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"
+        return f"Memory({type(self.surrogate).__name__}, {kept}, coefficient={self.coefficient:.2f})"
+
+
+def _is_number(value: float) -> bool:
+    return value == value and abs(value) != float("inf")

@@ -69,7 +69,7 @@ def extension(torch: Path) -> Extension:
     return Extension(
         "torch_zerohess._C",
         sources=["csrc/ops.cpp"],
-        depends=["csrc/philox.h", "csrc/quantiles.h", "csrc/perturb.h", "csrc/reduce.h"],
+        depends=[f"csrc/{name}.h" for name in ("dispatch", "philox", "quantiles", "single", "perturb", "reduce")],
         include_dirs=[str(torch / "include")],
         library_dirs=[str(torch / "lib")],
         libraries=["torch", "torch_cpu", "c10"],

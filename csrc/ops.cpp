@@ -55,39 +55,41 @@ Tensor pick_rows(int64_t seed, int64_t first, int64_t count, int64_t n, int64_t 
   return rows;
 }
 
-Tensor draw(const Tensor& rows, int64_t n) {
+template <typename T>
+Tensor draw_as(const Tensor& rows, int64_t n, ScalarType type) {
   check_size(n, "n", 0);
   const Row* row = row_data(rows);
-  const int64_t R = rows.size(0);
-  Tensor u = torch::stable::empty({R, n}, ScalarType::Double);
-  double* out = u.mutable_data_ptr<double>();
-  torch::stable::parallel_for(0, R, grain(8 * n), [&](int64_t begin, int64_t end) {
-    double buffer[kBlock];
-    for (int64_t r = begin; r < end; ++r) {
-      for (int64_t first = 0; first < n; first += kBlock) {
-        const int64_t count = std::min(kBlock, n - first);
-        draw_columns(row[r], first, count, buffer);
-        std::copy_n(buffer, count, out + r * n + first);
-      }
-    }
+  Tensor u = torch::stable::empty({rows.size(0), n}, type);
+  T* out = u.mutable_data_ptr<T>();
+  torch::stable::parallel_for(0, rows.size(0), grain(8 * n), [&](int64_t begin, int64_t end) {
+    for (int64_t r = begin; r < end; ++r)
+      for (int64_t first = 0; first < n; first += kBlock)
+        draw_columns(row[r], first, std::min(kBlock, n - first), out + r * n + first);
   });
   return u;
 }
 
-template <typename T>
-void place_rows(
-    const double* u, const double* x, const double* sigma, int64_t B, int64_t S, int64_t K, int64_t n, int64_t proposal,
-    T* points, double* applied, double* weights) {
-  torch::stable::parallel_for(0, B * K, grain(4 * n), [&](int64_t begin, int64_t end) {
-    for (int64_t row = begin; row < end; ++row) {
-      const int64_t b = row / K, k = row % K;
-      const double sign = k < S ? 1.0 : -1.0;
-      const double* source = u + (b * S + k % S) * n;
-      for (int64_t d = 0; d < n; ++d)
-        applied[row * n + d] = place(x[b * n + d], sigma[d], sign * source[d], points + row * n + d);
-      weights[row] = weight(applied + row * n, n, proposal);
-    }
+Tensor draw(const Tensor& rows, int64_t n, bool single) {
+  return single ? draw_as<float>(rows, n, ScalarType::Float) : draw_as<double>(rows, n, ScalarType::Double);
+}
+
+// Places the rows of a batch; u is kept, empty or absent.
+template <class U, class X, class T, class Columns>
+std::tuple<Tensor, Tensor, Tensor> placed(
+    const Tensor& x, const Tensor& sigma, int64_t S, bool antithetic, int64_t proposal, bool center, bool keep,
+    ScalarType type, const Columns& columns) {
+  const int64_t B = x.size(0), n = x.size(1), K = antithetic ? 2 * S : S, E = K + center;
+  Tensor points = torch::stable::empty({B, E, n}, type);
+  Tensor u = torch::stable::empty({keep ? B : 0, K, n}, ScalarType::Double);
+  Tensor weights = torch::stable::empty({B, K}, ScalarType::Double);
+  const Batch<X, T> batch{
+      x.const_data_ptr<X>(), sigma.const_data_ptr<double>(), S, E, n, proposal, antithetic,
+      points.mutable_data_ptr<T>(), keep ? u.mutable_data_ptr<double>() : nullptr, weights.mutable_data_ptr<double>()};
+  torch::stable::parallel_for(0, B * S, grain(8 * n), [&](int64_t begin, int64_t end) {
+    place_rows<U>(batch, begin, end, columns);
   });
+  for (int64_t b = 0; center && b < B; ++b) std::copy_n(batch.x + b * n, n, batch.points + (b * E + K) * n);
+  return {points, u, weights};
 }
 
 std::tuple<Tensor, Tensor, Tensor> place_all(
@@ -97,37 +99,36 @@ std::tuple<Tensor, Tensor, Tensor> place_all(
   check(sigma, "sigma", 1);
   const int64_t B = x.size(0), n = x.size(1);
   STD_TORCH_CHECK(B > 0 && u.size(0) % B == 0 && u.size(1) == n && sigma.size(0) == n, "u, x and sigma do not fit");
-  const int64_t S = u.size(0) / B, K = antithetic ? 2 * S : S;
-  Tensor points = torch::stable::empty({B, K, n}, single ? ScalarType::Float : ScalarType::Double);
-  Tensor applied = torch::stable::empty({B, K, n}, ScalarType::Double);
-  Tensor weights = torch::stable::empty({B, K}, ScalarType::Double);
-  const auto run = [&](auto* out) {
-    place_rows(u.const_data_ptr<double>(), x.const_data_ptr<double>(), sigma.const_data_ptr<double>(), B, S, K, n,
-               proposal, out, applied.mutable_data_ptr<double>(), weights.mutable_data_ptr<double>());
-  };
+  const double* source = u.const_data_ptr<double>();
+  const auto columns = [=](int64_t row, int64_t first, int64_t, double*) { return source + row * n + first; };
+  const int64_t S = u.size(0) / B;
   if (single)
-    run(points.mutable_data_ptr<float>());
-  else
-    run(points.mutable_data_ptr<double>());
-  return {points, applied, weights};
+    return placed<double, double, float>(x, sigma, S, antithetic, proposal, false, true, ScalarType::Float, columns);
+  return placed<double, double, double>(x, sigma, S, antithetic, proposal, false, true, ScalarType::Double, columns);
+}
+
+// Draws and places in one pass, in the precision of x: rows [B * S, 5], points [B, E, n] with x itself as the last one
+// where `center`, u [B, K, n] or [0, K, n] where it is not kept, and weights [B, K].
+std::tuple<Tensor, Tensor, Tensor, Tensor> sample(
+    int64_t seed, int64_t S, const Tensor& x, const Tensor& sigma, bool antithetic, int64_t proposal, bool center,
+    bool keep) {
+  const bool single = x.scalar_type() == ScalarType::Float;
+  check(x, "x", 2, single ? ScalarType::Float : ScalarType::Double);
+  check(sigma, "sigma", 1);
+  STD_TORCH_CHECK(S > 0 && x.size(0) > 0 && sigma.size(0) == x.size(1), "S, x and sigma do not fit");
+  Tensor rows = pick_rows(seed, 0, x.size(0) * S, x.size(1), proposal);
+  const auto columns = [row = row_data(rows)](int64_t r, int64_t first, int64_t count, auto* buffer) {
+    draw_columns(row[r], first, count, buffer);
+    return buffer;
+  };
+  auto [points, u, weights] =
+      single ? placed<float, float, float>(x, sigma, S, antithetic, proposal, center, keep, ScalarType::Float, columns)
+             : placed<double, double, double>(x, sigma, S, antithetic, proposal, center, keep, ScalarType::Double,
+                                              columns);
+  return {rows, points, u, weights};
 }
 
 // `rows_of(b)` gives the rows of U that belong to batch element b.
-template <class RowsOf>
-Tensor project_with(const RowsOf& rows_of, int64_t K, const Tensor& t) {
-  const int64_t B = t.size(0), M = t.size(1), n = t.size(2);
-  Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
-  const double* vectors = t.const_data_ptr<double>();
-  double* out = result.mutable_data_ptr<double>();
-  torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
-    for (int64_t row = begin; row < end; ++row) {
-      const int64_t b = row / K;
-      project_row(rows_of(b), row % K, K, n, M, vectors + b * M * n, out + b * M * K);
-    }
-  });
-  return result;
-}
-
 template <class RowsOf>
 Tensor accumulate_with(const RowsOf& rows_of, int64_t n, bool squares, const Tensor& a) {
   const int64_t B = a.size(0), M = a.size(1), K = a.size(2), blocks = (n + kBlock - 1) / kBlock;
@@ -150,22 +151,32 @@ auto stored(const Tensor& u) {
   };
 }
 
+// Checks what follows divides by.
 auto drawn(const Tensor& rows, const Tensor& x, const Tensor& sigma, bool single) {
   const Row* row = row_data(rows);
-  check(x, "x", 2);
-  check(sigma, "sigma", 1);
+  STD_TORCH_CHECK(x.dim() == 2 && sigma.dim() == 1, "x and sigma must have 2 and 1 dimensions");
   STD_TORCH_CHECK(
-      x.size(0) > 0 && rows.size(0) % x.size(0) == 0 && sigma.size(0) == x.size(1), "rows, x and sigma do not fit");
+      x.size(0) > 0 && rows.size(0) > 0 && rows.size(0) % x.size(0) == 0 && sigma.size(0) == x.size(1),
+      "rows, x and sigma do not fit");
   const int64_t S = rows.size(0) / x.size(0);
-  return [row, px = x.const_data_ptr<double>(), ps = sigma.const_data_ptr<double>(), n = x.size(1), S,
-          single](int64_t b) { return DrawnRows{row + b * S, px + b * n, ps, S, single}; };
+  return [row, S, single](int64_t b) { return DrawnRows{row + b * S, S, single}; };
 }
 
 Tensor project(const Tensor& u, const Tensor& t) {
   const auto rows_of = stored(u);
   check(t, "t", 3);
   STD_TORCH_CHECK(u.size(0) == t.size(0) && u.size(2) == t.size(2), "u and t do not fit");
-  return project_with(rows_of, u.size(1), t);
+  const int64_t B = t.size(0), M = t.size(1), n = t.size(2), K = u.size(1);
+  Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
+  const double* vectors = t.const_data_ptr<double>();
+  double* out = result.mutable_data_ptr<double>();
+  torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      const int64_t b = row / K;
+      project_row(rows_of(b), row % K, K, n, M, vectors + b * M * n, out + b * M * K);
+    }
+  });
+  return result;
 }
 
 Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
@@ -177,17 +188,27 @@ Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
 
 Tensor project_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& t) {
-  const auto rows_of = drawn(rows, x, sigma, single);  // checks what is divided by below
+  const auto rows_of = drawn(rows, x, sigma, single);
   check(t, "t", 3);
   STD_TORCH_CHECK(x.size(0) == t.size(0) && x.size(1) == t.size(2), "x and t do not fit");
-  const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
-  return project_with(rows_of, K, t);
+  const int64_t B = t.size(0), M = t.size(1), n = t.size(2), S = rows.size(0) / B, K = antithetic ? 2 * S : S;
+  Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
+  const double* vectors = t.const_data_ptr<double>();
+  double* out = result.mutable_data_ptr<double>();
+  torch::stable::parallel_for(0, B * S, grain((M + 8) * n), [&](int64_t begin, int64_t end) {
+    for (int64_t next = begin; next < end;) {  // the rows of one batch element at a time
+      const int64_t b = next / S, last = std::min(end, (b + 1) * S);
+      project_drawn_rows(rows_of(b), next - b * S, last - b * S, K, n, M, vectors + b * M * n, out + b * M * K);
+      next = last;
+    }
+  });
+  return result;
 }
 
 Tensor accumulate_drawn(
     const Tensor& rows, const Tensor& x, const Tensor& sigma, bool antithetic, bool single, const Tensor& a,
     bool squares) {
-  const auto rows_of = drawn(rows, x, sigma, single);  // checks what is divided by below
+  const auto rows_of = drawn(rows, x, sigma, single);
   check(a, "a", 3);
   const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
   STD_TORCH_CHECK(x.size(0) == a.size(0) && K == a.size(2), "rows and a do not fit");
@@ -208,23 +229,38 @@ Tensor hessian(const Tensor& u, const Tensor& a) {
       hessian_row(rows + m / M * K * n, i, K, n, coefficients + m * K, out + m * n * n);
     }
   });
-  for (int64_t m = 0; m < B * M; ++m)
-    for (int64_t i = 1; i < n; ++i)
-      for (int64_t j = 0; j < i; ++j) out[(m * n + i) * n + j] = out[(m * n + j) * n + i];
+  for (int64_t m = 0; m < B * M; ++m) mirror_rows(out + m * n * n, n, 0, n);
   return result;
+}
+
+// Makes matrices [B, n, n] symmetric, in place: their lower triangles become copies of the upper ones.
+void mirror(const Tensor& matrices) {
+  check(matrices, "matrices", 3);
+  const int64_t B = matrices.size(0), n = matrices.size(1);
+  STD_TORCH_CHECK(matrices.size(2) == n, "matrices are not square");
+  double* out = matrices.mutable_data_ptr<double>();
+  for (int64_t b = 0; b < B; ++b) {
+    torch::stable::parallel_for(0, n, grain(2 * n), [&](int64_t begin, int64_t end) {
+      mirror_rows(out + b * n * n, n, begin, end);
+    });
+  }
 }
 
 }  // namespace
 
 STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("pick_rows(int seed, int first, int count, int n, int proposal) -> Tensor");
-  m.def("draw(Tensor rows, int n) -> Tensor");
+  m.def("draw(Tensor rows, int n, bool single=False) -> Tensor");
+  m.def(
+      "sample(int seed, int S, Tensor x, Tensor sigma, bool antithetic, int proposal, bool center, bool keep) "
+      "-> (Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "place(Tensor u, Tensor x, Tensor sigma, bool antithetic, bool single, int proposal) "
       "-> (Tensor, Tensor, Tensor)");
   m.def("project(Tensor u, Tensor t) -> Tensor");
   m.def("accumulate(Tensor u, Tensor a, bool squares) -> Tensor");
   m.def("hessian(Tensor u, Tensor a) -> Tensor");
+  m.def("mirror(Tensor(a!) matrices) -> ()");
   m.def(
       "project_drawn(Tensor rows, Tensor x, Tensor sigma, bool antithetic, bool single, Tensor t) "
       "-> Tensor");
@@ -239,10 +275,12 @@ STABLE_TORCH_LIBRARY_IMPL(torch_zerohess, CompositeExplicitAutograd, m) {
 
 STABLE_TORCH_LIBRARY_IMPL(torch_zerohess, CPU, m) {
   m.impl("draw", TORCH_BOX(&draw));
+  m.impl("sample", TORCH_BOX(&sample));
   m.impl("place", TORCH_BOX(&place_all));
   m.impl("project", TORCH_BOX(&project));
   m.impl("accumulate", TORCH_BOX(&accumulate));
   m.impl("hessian", TORCH_BOX(&hessian));
+  m.impl("mirror", TORCH_BOX(&mirror));
   m.impl("project_drawn", TORCH_BOX(&project_drawn));
   m.impl("accumulate_drawn", TORCH_BOX(&accumulate_drawn));
 }

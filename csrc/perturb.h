@@ -2,15 +2,9 @@
 // Literal reference: torch_zerohess/sampling/proposals.py.
 #pragma once
 
-#include "quantiles.h"
+#include <vector>
 
-// One function, compiled for several instruction sets and chosen when the library loads. Without contraction and
-// reassociation all of them return the same bits. Sanitizers run before such a choice can be made.
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__) && !defined(ZH_NO_CLONES)
-#define ZH_CLONES __attribute__((target_clones("avx512f", "avx2", "default")))
-#else
-#define ZH_CLONES
-#endif
+#include "single.h"
 
 namespace zerohess {
 
@@ -40,57 +34,179 @@ inline Row pick(int64_t seed, int64_t index, int64_t n, int64_t proposal) {
   return {seed, index, i == j ? kDiagonalLobe : kOffDiagonalLobe, i, j};
 }
 
-// u of columns first .. first + count of one row; first is even, count <= kBlock, out has room for kBlock numbers.
-ZH_CLONES static inline void draw_columns(const Row& row, int64_t first, int64_t count, double* out) {
-  uniforms(uint64_t(row.seed), uint64_t(row.index), kDimensions, first, (count + 1) / 2, out);
+// Lobes of a row in place of the normal perturbations of columns first .. first + count; p_of(d) is a column's uniform.
+template <class T, class Uniform>
+inline void set_lobes(const Row& row, int64_t first, int64_t count, T* out, const Uniform& p_of) {
   const int64_t i = row.i - first, j = row.j - first;
-  const double p_i = i >= 0 && i < count ? out[i] : 0.5, p_j = j >= 0 && j < count ? out[j] : 0.5;
-  if (row.kind == kBox) {
-    for (int64_t d = 0; d < count; ++d) out[d] = kBoxHalfWidth * (2.0 * out[d] - 1.0);
-  } else if (row.kind == kEveryGradientLobe) {
-    for (int64_t d = 0; d < count; ++d) out[d] = gradient_lobe_quantile(out[d]);
-  } else {
-    normal_quantiles(out, count);
-  }
   const bool has_i = i >= 0 && i < count, has_j = j >= 0 && j < count;
-  if (row.kind == kDiagonalLobe && has_i) out[i] = hessian_lobe_quantile(p_i);
-  if ((row.kind == kGradientLobe || row.kind == kOffDiagonalLobe) && has_i) out[i] = gradient_lobe_quantile(p_i);
-  if (row.kind == kOffDiagonalLobe && has_j) out[j] = gradient_lobe_quantile(p_j);
+  if (row.kind == kDiagonalLobe && has_i) out[i] = T(hessian_lobe_quantile(p_of(i)));
+  if ((row.kind == kGradientLobe || row.kind == kOffDiagonalLobe) && has_i) out[i] = T(gradient_lobe_quantile(p_of(i)));
+  if (row.kind == kOffDiagonalLobe && has_j) out[j] = T(gradient_lobe_quantile(p_of(j)));
 }
 
-// z = x + sigma u in the type of x, and u again. The rounding of z acts as dither: estimates from the u that was drawn
-// have less bias than estimates from (z - x) / sigma, see the reference.
-template <typename T>
-ZH_INLINE double place(double x, double sigma, double u, T* point) {
-  if (point) *point = T(x + sigma * u);
-  return u;
+ZH_INLINE void gradient_lobe_quantiles_generic(const double* p, int64_t count, double* out) {
+  for (int64_t d = 0; d < count; ++d) out[d] = gradient_lobe_quantile(p[d]);
+}
+ZH_VERSIONS(void, gradient_lobe_quantiles, (const double* p, int64_t count, double* out), (p, count, out))
+
+// u of columns first .. first + count of one row; first is a multiple of kBlock, count <= kBlock.
+inline void draw_columns(const Row& row, int64_t first, int64_t count, double* out) {
+  double p[kBlock];
+  uniforms(uint64_t(row.seed), uint64_t(row.index), kDimensions, first, (count + 1) / 2, p);
+  if (row.kind == kBox) {
+    for (int64_t d = 0; d < count; ++d) out[d] = kBoxHalfWidth * (2.0 * p[d] - 1.0);
+  } else if (row.kind == kEveryGradientLobe) {
+    gradient_lobe_quantiles(p, count, out);
+  } else {
+    normal_quantiles(p, count, out);
+    set_lobes(row, first, count, out, [&](int64_t d) { return p[d]; });
+  }
+}
+
+// The same in single precision, from noise of its own: 32 bits for each number.
+inline void draw_columns(const Row& row, int64_t first, int64_t count, float* out) {
+  uint32_t words[kBlock];
+  noise(Counter{uint64_t(row.seed), uint64_t(row.index), kDimensions, uint32_t(first / 4)}, (count + 3) / 4, words);
+  const auto p_of = [&](int64_t d) { return (double(words[d]) + 0.5) * 0x1p-32; };
+  if (row.kind == kBox) {
+    for (int64_t d = 0; d < count; ++d) out[d] = float(kBoxHalfWidth * (2.0 * p_of(d) - 1.0));
+  } else if (row.kind == kEveryGradientLobe) {
+    for (int64_t d = 0; d < count; ++d) out[d] = float(gradient_lobe_quantile(p_of(d)));
+  } else {
+    normal_quantiles(words, count, out);
+    set_lobes(row, first, count, out, p_of);
+  }
+}
+
+// Sums over the perturbations of a row: all that the density of a proposal depends on.
+struct Magnitudes {
+  double l1, l2, hole;
+};
+
+// Adds `count` <= kBlock perturbations. The terms of a block are summed in their own precision, in an order that depends
+// on `count` alone: relative errors are below 2^-20 in single precision.
+template <class T>
+ZH_INLINE void add_magnitudes(const T* u, int64_t count, Magnitudes& sums) {
+  constexpr int64_t kLanes = 8;
+  T l1[kBlock / 2], l2[kBlock / 2], hole[kBlock / 2];
+  if (count == kBlock) {  // a tree: every level is a loop over independent elements
+    for (int64_t d = 0; d < kBlock / 2; ++d) {
+      const T one = u[d], other = u[d + kBlock / 2];
+      l1[d] = std::fabs(one) + std::fabs(other);
+      l2[d] = one * one + other * other;
+      hole[d] = std::fabs(one * one - T(1)) + std::fabs(other * other - T(1));
+    }
+    for (int64_t half = kBlock / 4; half >= kLanes; half /= 2) {
+      for (int64_t d = 0; d < half; ++d) {
+        l1[d] += l1[d + half];
+        l2[d] += l2[d + half];
+        hole[d] += hole[d + half];
+      }
+    }
+  } else {
+    for (int64_t lane = 0; lane < kLanes; ++lane) l1[lane] = l2[lane] = hole[lane] = T(0);
+    for (int64_t d = 0; d < count; d += kLanes) {
+      const int64_t lanes = count - d < kLanes ? count - d : kLanes;
+      for (int64_t lane = 0; lane < lanes; ++lane) {
+        const T one = u[d + lane];
+        l1[lane] += std::fabs(one);
+        l2[lane] += one * one;
+        hole[lane] += std::fabs(one * one - T(1));
+      }
+    }
+  }
+  for (int64_t lane = 0; lane < kLanes; ++lane) {
+    sums.l1 += double(l1[lane]);
+    sums.l2 += double(l2[lane]);
+    sums.hole += double(hole[lane]);
+  }
 }
 
 // Density ratio N(u) / p(u) of one row of n perturbations.
-ZH_CLONES static inline double weight(const double* u, int64_t n, int64_t proposal) {
+inline double density_ratio(const Magnitudes& sums, int64_t n, int64_t proposal) {
   if (proposal == kGaussian || proposal == kSignedLobes) return 1.0;
-  double first[8] = {}, second[8] = {}, hole[8] = {};
-  for (int64_t d = 0; d < n; d += 8) {
-    const int64_t lanes = n - d < 8 ? n - d : 8;
-    for (int64_t lane = 0; lane < lanes; ++lane) {
-      const double square = u[d + lane] * u[d + lane];
-      first[lane] += std::fabs(u[d + lane]);
-      second[lane] += square;
-      hole[lane] += std::fabs(square - 1.0);
-    }
-  }
-  double l1 = 0.0, l2 = 0.0, l3 = 0.0;
-  for (int lane = 0; lane < 8; ++lane) {
-    l1 += first[lane];
-    l2 += second[lane];
-    l3 += hole[lane];
-  }
-  const double size = double(n);
+  const double size = double(n), l1 = sums.l1, l2 = sums.l2;
   if (proposal == kUniform) return std::exp(size * kLogBox - 0.5 * l2);
   const double gradient = kSqrtHalfPi * (l1 / size);
   if (proposal == kFirstOrder) return 2.0 / (1.0 + gradient);
-  const double hessian = (kHalfPi * (l1 * l1 - l2) + kDiagonalLobeScale * l3) / (size * size);
+  const double hessian = (kHalfPi * (l1 * l1 - l2) + kDiagonalLobeScale * sums.hole) / (size * size);
   return 3.0 / (1.0 + gradient + hessian);
+}
+
+// Where the numbers of one block of a row go, and of the row with the opposite sign; null where nobody wants them.
+template <class T>
+struct Places {
+  T *points, *mirrored_points;
+  double *u, *mirrored_u;
+};
+
+// Points x + sigma u in the type of x, and the perturbations u that they are made of: the rounding of a point acts as
+// dither, see the reference.
+template <class U, class X, class T>
+ZH_INLINE void place_generic(
+    const U* u, int64_t count, const X* x, const double* sigma, bool weigh, const Places<T>& to, Magnitudes& sums) {
+  T* const __restrict points = to.points;
+  for (int64_t d = 0; d < count; ++d) points[d] = T(double(x[d]) + sigma[d] * double(u[d]));
+  if (T* const __restrict mirrored = to.mirrored_points)
+    for (int64_t d = 0; d < count; ++d) mirrored[d] = T(double(x[d]) - sigma[d] * double(u[d]));
+  if (double* const __restrict kept = to.u)
+    for (int64_t d = 0; d < count; ++d) kept[d] = double(u[d]);
+  if (double* const __restrict kept = to.mirrored_u)
+    for (int64_t d = 0; d < count; ++d) kept[d] = -double(u[d]);
+  if (weigh) add_magnitudes(u, count, sums);
+}
+ZH_VERSIONS(void, place,
+            (const float* u, int64_t count, const float* x, const double* sigma, bool weigh, const Places<float>& to,
+             Magnitudes& sums),
+            (u, count, x, sigma, weigh, to, sums))
+ZH_VERSIONS(void, place,
+            (const double* u, int64_t count, const double* x, const double* sigma, bool weigh,
+             const Places<double>& to, Magnitudes& sums),
+            (u, count, x, sigma, weigh, to, sums))
+ZH_VERSIONS(void, place,
+            (const double* u, int64_t count, const double* x, const double* sigma, bool weigh, const Places<float>& to,
+             Magnitudes& sums),
+            (u, count, x, sigma, weigh, to, sums))
+
+// Where a batch of B estimates with S rows each is placed: points [B, E, n], u [B, K, n] or null, weights [B, K]; K is
+// S, or 2 S where `antithetic`, and E is K or more.
+template <class X, class T>
+struct Batch {
+  const X* x;
+  const double* sigma;
+  int64_t S, E, n, proposal;
+  bool antithetic;
+  T* points;
+  double *u, *weights;
+
+  int64_t K() const { return antithetic ? 2 * S : S; }
+};
+
+// Rows begin .. end of B * S, block by block, so that x and sigma stay in the cache. columns(row, first, count, buffer)
+// gives perturbations, in the buffer or elsewhere.
+template <class U, class X, class T, class Columns>
+inline void place_rows(const Batch<X, T>& batch, int64_t begin, int64_t end, const Columns& columns) {
+  const bool weigh = batch.proposal != kGaussian && batch.proposal != kSignedLobes;
+  const int64_t S = batch.S, K = batch.K(), n = batch.n;
+  std::vector<Magnitudes> sums(size_t(end - begin), Magnitudes{});
+  for (int64_t first = 0; first < n; first += kBlock) {
+    const int64_t count = n - first < kBlock ? n - first : kBlock;
+    for (int64_t row = begin; row < end; ++row) {
+      U buffer[kBlock];
+      const int64_t b = row / S, s = row % S;
+      T* const points = batch.points + (b * batch.E + s) * n + first;
+      double* const u = batch.u ? batch.u + (b * K + s) * n + first : nullptr;
+      const Places<T> to{points, batch.antithetic ? points + S * n : nullptr, u,
+                         u && batch.antithetic ? u + S * n : nullptr};
+      const U* const drawn = columns(row, first, count, buffer);
+      place(drawn, count, batch.x + b * n + first, batch.sigma + first, weigh, to, sums[size_t(row - begin)]);
+    }
+  }
+  for (int64_t row = begin; row < end; ++row) {
+    double* const weight = batch.weights + row / S * K + row % S;
+    weight[0] = density_ratio(sums[size_t(row - begin)], n, batch.proposal);
+    if (batch.antithetic) weight[S] = weight[0];
+  }
 }
 
 }  // namespace zerohess

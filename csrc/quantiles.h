@@ -78,24 +78,45 @@ ZH_INLINE double log(double x) {
          ((half_square - (log_tail(f, half_square) + e * 1.90821492927058770002e-10)) - f);
 }
 
-// In place over count numbers. The far tail, beyond five standard deviations' logarithm, is rare: a second, scalar pass.
-ZH_INLINE void normal_quantiles(double* p, int64_t count) {
-  double r[kBlock], out[kBlock];
-  for (int64_t i = 0; i < count; ++i) {
-    const double q = p[i] - 0.5, mirrored = 1.0 - p[i];
-    r[i] = std::sqrt(-log(p[i] < mirrored ? p[i] : mirrored));
-    const double central = q * rational(kCentralNumerator, kCentralDenominator, 0.180625 - q * q);
-    const double tail = rational(kMiddleNumerator, kMiddleDenominator, r[i] - 1.6);
-    out[i] = std::fabs(q) <= 0.425 ? central : (q < 0.0 ? -tail : tail);
-  }
-  for (int64_t i = 0; i < count; ++i) {
-    if (r[i] > 5.0) {
-      const double tail = rational(kFarNumerator, kFarDenominator, r[i] - 5.0);
-      out[i] = p[i] < 0.5 ? -tail : tail;
-    }
-    p[i] = out[i];
-  }
+// One of the tails, beyond |p - 1/2| = 0.425; the far one lies beyond a probability of exp(-25).
+ZH_INLINE double tail_quantile(double p) {
+  const double mirrored = 1.0 - p, r = std::sqrt(-log(p < mirrored ? p : mirrored));
+  const double tail = r <= 5.0 ? rational(kMiddleNumerator, kMiddleDenominator, r - 1.6)
+                               : rational(kFarNumerator, kFarDenominator, r - 5.0);
+  return p < 0.5 ? -tail : tail;
 }
+
+// Out of place over count <= kBlock numbers. Three in twenty are in a tail. Those are gathered, worked on together, and
+// put back; the far ones among them, one in 10^10, once more.
+ZH_INLINE void normal_quantiles_generic(const double* p, int64_t count, double* out) {
+  constexpr int64_t kLanes = 8;
+  int64_t index[kBlock + kLanes], tails = 0;
+  double gathered[kBlock + kLanes], furthest[kLanes] = {};
+  for (int64_t i = 0; i < count; ++i) {
+    const double q = p[i] - 0.5;
+    out[i] = q * rational(kCentralNumerator, kCentralDenominator, 0.180625 - q * q);
+  }
+  for (int64_t i = 0; i < count; ++i) {
+    index[tails] = i;
+    tails += std::fabs(p[i] - 0.5) > 0.425;
+  }
+  for (int64_t i = 0; i < tails; ++i) gathered[i] = p[index[i]];
+  for (int64_t i = tails; i % kLanes != 0; ++i) gathered[i] = 0.5;  // whole vectors, no remainder
+  for (int64_t first = 0; first < tails; first += kLanes) {
+    for (int64_t lane = 0; lane < kLanes; ++lane) {
+      const double mine = gathered[first + lane], mirrored = 1.0 - mine;
+      const double r = std::sqrt(-log(mine < mirrored ? mine : mirrored));
+      const double tail = rational(kMiddleNumerator, kMiddleDenominator, r - 1.6);
+      furthest[lane] = r > furthest[lane] ? r : furthest[lane];
+      gathered[first + lane] = mine < 0.5 ? -tail : tail;
+    }
+  }
+  for (int64_t i = 0; i < tails; ++i) out[index[i]] = gathered[i];
+  for (const double r : furthest)
+    if (r > 5.0)
+      for (int64_t i = 0; i < tails; ++i) out[index[i]] = tail_quantile(p[index[i]]);
+}
+ZH_VERSIONS(void, normal_quantiles, (const double* p, int64_t count, double* out), (p, count, out))
 
 ZH_INLINE double gradient_lobe_quantile(double p) {
   const bool left = p <= 0.5;

@@ -14,28 +14,30 @@ struct StoredRows {
   const double* u;
   int64_t n;
 
-  const double* columns(int64_t k, int64_t first, int64_t, double*) const { return u + k * n + first; }
+  const double* columns(int64_t k, int64_t first, int64_t) const { return u + k * n + first; }
 };
 
 // K = (1 + antithetic) * samples rows around one x; the second half repeats the first with the opposite sign.
 struct DrawnRows {
   const Row* rows;
-  const double *x, *sigma;
   int64_t samples;
   bool single;
 
-  const double* columns(int64_t k, int64_t first, int64_t count, double* buffer) const {
-    const double sign = k < samples ? 1.0 : -1.0;
-    draw_columns(rows[k % samples], first, count, buffer);
-    for (int64_t d = 0; d < count; ++d) {
-      const double x_d = x[first + d], sigma_d = sigma[first + d], u = sign * buffer[d];
-      buffer[d] = single ? place<float>(x_d, sigma_d, u, nullptr) : place<double>(x_d, sigma_d, u, nullptr);
+  // Rows begin .. end of the first half, kBlock numbers apart.
+  void draw(int64_t begin, int64_t end, int64_t first, int64_t count, double* out) const {
+    for (int64_t k = begin; k < end; ++k, out += kBlock) {
+      if (single) {
+        float buffer[kBlock];
+        draw_columns(rows[k], first, count, buffer);
+        std::copy_n(buffer, count, out);
+      } else {
+        draw_columns(rows[k], first, count, out);
+      }
     }
-    return buffer;
   }
 };
 
-ZH_CLONES static inline double dot(const double* a, const double* b, int64_t count) {
+ZH_INLINE double dot_generic(const double* a, const double* b, int64_t count) {
   double lanes[8] = {}, rest = 0.0;
   int64_t d = 0;
   for (; d + 8 <= count; d += 8)
@@ -43,41 +45,84 @@ ZH_CLONES static inline double dot(const double* a, const double* b, int64_t cou
   for (; d < count; ++d) rest += a[d] * b[d];
   return ((lanes[0] + lanes[4]) + (lanes[2] + lanes[6])) + ((lanes[1] + lanes[5]) + (lanes[3] + lanes[7])) + rest;
 }
+ZH_VERSIONS(double, dot, (const double* a, const double* b, int64_t count), (a, b, count))
 
-ZH_CLONES static inline void add_scaled(double scale, const double* u, int64_t count, double* out) {
+ZH_INLINE void add_scaled_generic(double scale, const double* u, int64_t count, double* out) {
   for (int64_t d = 0; d < count; ++d) out[d] += scale * u[d];
 }
+ZH_VERSIONS(
+    void, add_scaled, (double scale, const double* u, int64_t count, double* out), (scale, u, count, out))
 
-ZH_CLONES static inline void add_scaled_squares(double scale, const double* u, int64_t count, double* out) {
+ZH_INLINE void add_scaled_squares_generic(double scale, const double* u, int64_t count, double* out) {
   for (int64_t d = 0; d < count; ++d) out[d] += scale * (u[d] * u[d]);
 }
+ZH_VERSIONS(
+    void, add_scaled_squares, (double scale, const double* u, int64_t count, double* out), (scale, u, count, out))
 
-// out[m, k] = sum_d U[k, d] t[m, d] for one row k; t is [M, n], out has stride K.
-template <class Rows>
-void project_row(const Rows& rows, int64_t k, int64_t K, int64_t n, int64_t M, const double* t, double* out) {
-  double buffer[kBlock];
+// out[m, k] = sum_d U[k, d] t[m, d] for one stored row k; t is [M, n], out has stride K.
+inline void project_row(const StoredRows& rows, int64_t k, int64_t K, int64_t n, int64_t M, const double* t,
+                        double* out) {
   for (int64_t m = 0; m < M; ++m) out[m * K + k] = 0.0;
   for (int64_t first = 0; first < n; first += kBlock) {
     const int64_t count = std::min(kBlock, n - first);
-    const double* u = rows.columns(k, first, count, buffer);
+    const double* u = rows.columns(k, first, count);
     for (int64_t m = 0; m < M; ++m) out[m * K + k] += dot(u, t + m * n + first, count);
   }
 }
 
-// out[m, d] = sum_k a[m, k] U[k, d] (or U[k, d]^2) for the columns of one block; a is [M, K], out is [M, n].
-template <class Rows>
-void accumulate_block(
-    const Rows& rows, int64_t first, int64_t K, int64_t n, int64_t M, bool squares, const double* a, double* out) {
-  double buffer[kBlock];
-  const int64_t count = std::min(kBlock, n - first);
-  std::vector<double> sums(size_t(M * count), 0.0);
-  for (int64_t k = 0; k < K; ++k) {
-    const double* u = rows.columns(k, first, count, buffer);
+// The same for rows begin .. end of the first half of drawn rows, and their mirror images in the second. Block by block,
+// so that t stays in the cache.
+inline void project_drawn_rows(const DrawnRows& rows, int64_t begin, int64_t end, int64_t K, int64_t n, int64_t M,
+                               const double* t, double* out) {
+  double u[kBlock];
+  for (int64_t m = 0; m < M; ++m) std::fill(out + m * K + begin, out + m * K + end, 0.0);
+  for (int64_t first = 0; first < n; first += kBlock) {
+    const int64_t count = std::min(kBlock, n - first);
+    for (int64_t k = begin; k < end; ++k) {
+      rows.draw(k, k + 1, first, count, u);
+      for (int64_t m = 0; m < M; ++m) out[m * K + k] += dot(u, t + m * n + first, count);
+    }
+  }
+  for (int64_t k = begin; K > rows.samples && k < end; ++k)
+    for (int64_t m = 0; m < M; ++m) out[m * K + rows.samples + k] = -out[m * K + k];
+}
+
+// out[m, d] += sum_k a[m, k] U[k, d] (or U[k, d]^2) over rows u + k * stride, 0 <= k < count_k; a has stride K.
+inline void accumulate_rows(const double* u, int64_t stride, int64_t rows, int64_t count, int64_t K, int64_t M,
+                            bool squares, double sign, const double* a, double* sums) {
+  for (int64_t k = 0; k < rows; ++k) {
     for (int64_t m = 0; m < M; ++m) {
       if (squares)
-        add_scaled_squares(a[m * K + k], u, count, sums.data() + m * count);
+        add_scaled_squares(a[m * K + k], u + k * stride, count, sums + m * count);
       else
-        add_scaled(a[m * K + k], u, count, sums.data() + m * count);
+        add_scaled(sign * a[m * K + k], u + k * stride, count, sums + m * count);
+    }
+  }
+}
+
+// out[m, d] = sum_k a[m, k] U[k, d] (or U[k, d]^2) for the columns of one block; a is [M, K], out is [M, n].
+inline void accumulate_block(const StoredRows& rows, int64_t first, int64_t K, int64_t n, int64_t M, bool squares,
+                             const double* a, double* out) {
+  const int64_t count = std::min(kBlock, n - first);
+  std::vector<double> sums(size_t(M * count), 0.0);
+  accumulate_rows(rows.columns(0, first, count), n, K, count, K, M, squares, 1.0, a, sums.data());
+  for (int64_t m = 0; m < M; ++m) std::copy_n(sums.data() + m * count, count, out + m * n + first);
+}
+
+constexpr int64_t kHeld = 512;  // drawn rows of a block that are held: one megabyte
+
+// The terms are added in the order of stored rows: all of the first half, then all of the second. Where the rows of a
+// block can be held they are drawn once for both.
+inline void accumulate_block(const DrawnRows& rows, int64_t first, int64_t K, int64_t n, int64_t M, bool squares,
+                             const double* a, double* out) {
+  const int64_t count = std::min(kBlock, n - first), S = rows.samples, part = std::min(S, kHeld);
+  std::vector<double> sums(size_t(M * count), 0.0), u(size_t(part * kBlock));
+  for (int64_t half = 0; half < K / S; ++half) {
+    for (int64_t begin = 0; begin < S; begin += part) {
+      const int64_t end = std::min(S, begin + part);
+      if (half == 0 || part < S) rows.draw(begin, end, first, count, u.data());
+      accumulate_rows(u.data(), kBlock, end - begin, count, K, M, squares, half == 0 ? 1.0 : -1.0,
+                      a + half * S + begin, sums.data());
     }
   }
   for (int64_t m = 0; m < M; ++m) std::copy_n(sums.data() + m * count, count, out + m * n + first);
@@ -87,6 +132,17 @@ void accumulate_block(
 inline void hessian_row(const double* u, int64_t i, int64_t K, int64_t n, const double* a, double* out) {
   std::fill_n(out + i * n + i, n - i, 0.0);
   for (int64_t k = 0; k < K; ++k) add_scaled(a[k] * u[k * n + i], u + k * n + i, n - i, out + i * n + i);
+}
+
+// Copies rows begin .. end of the lower triangle of a matrix [n, n] from its upper triangle, in tiles that fit the cache.
+inline void mirror_rows(double* matrix, int64_t n, int64_t begin, int64_t end) {
+  constexpr int64_t kTile = 32;
+  for (int64_t top = begin; top < end; top += kTile) {
+    const int64_t bottom = std::min(top + kTile, end);
+    for (int64_t left = 0; left < bottom; left += kTile)
+      for (int64_t i = top; i < bottom; ++i)
+        for (int64_t j = left; j < std::min(left + kTile, i); ++j) matrix[i * n + j] = matrix[j * n + i];
+  }
 }
 
 }  // namespace zerohess

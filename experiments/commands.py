@@ -49,7 +49,9 @@ COMMANDS = {
     "robustness": Command("experiments.studies.robustness:robustness", "other starts, samples and noise", long=True),
     "gallery": Command("experiments.studies.gallery:gallery", "pictures and animations of all tasks", long=True),
     "caustic": Command("experiments.studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),
-    "bench": Command("experiments.studies.bench:bench", "time of the extension against pure torch", long=True),
+    "bench": Command(
+        "experiments.studies.bench:bench", "time of the extension against pure torch and torch", long=True
+    ),
     "stability": Command("experiments.studies.stability:stability", "extreme cases against closed forms", long=True),
     "doctor": Command("experiments.commands:doctor", "what this installation can do"),
 }

@@ -20,6 +20,7 @@ import torch_zerohess as zh
 from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
+from experiments.studies.bench_ratios import Ratio, ratios
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import extension, kernels, proposals
 
@@ -59,6 +60,7 @@ class BenchReport:
 
     timings: list[Timing]
     memory: list[Memory]
+    ratios: list[Ratio]
 
 
 def bench(
@@ -67,6 +69,8 @@ def bench(
     sizes: tuple[tuple[int, int], ...] = ((2, 8), (1024, 64)),
     memory_n: int = 100_000,
     memory_samples: int = 64,
+    wide: tuple[int, ...] = (512, 2048),
+    large: int = 1_000_000,
     out: Path | None = None,
     store: str | None = None,
 ) -> BenchReport:
@@ -77,11 +81,14 @@ def bench(
         sizes: pairs of parameters n and antithetic samples.
         memory_n: parameters of the memory measurement; 0 leaves it out.
         memory_samples: its antithetic samples.
+        wide: parameters of the Hessians that are compared with matrix products; empty leaves all ratios out.
+        large: parameters of the gradient and the product that draw their perturbations again.
         out: JSON file to write.
         store: name of a table of the times to keep under experiments/results, for the documents.
     """
     smallest = min((number for pair in sizes for number in pair), default=0)
     given = {"repeats": repeats, "sizes": smallest, "memory_samples": memory_samples, "memory_n": memory_n}
+    given |= {"wide": min(wide, default=1), "large": large}
     for name, value in given.items():
         least = 0 if name == "memory_n" else 1
         if value < least:
@@ -96,18 +103,21 @@ def bench(
             _timing(name, operation, n, samples, repeats, available)
             for n, samples, name, operation in progress(timed, "timings")
         ]
+        compared = ratios(repeats, wide, large) if wide and available else []
     finally:
         torch.set_num_threads(threads)
         extension.available = available
     memory = []
     if memory_n:
         memory = [_memory(name, memory_n, memory_samples) for name in progress(("stored", "redrawn"), "memory")]
-    report = BenchReport(timings, memory)
+    report = BenchReport(timings, memory, compared)
     _print(report)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         rows = [{**asdict(t), "ratio": t.ratio} for t in timings]
-        out.write_text(json.dumps({"timings": rows, "memory": [asdict(m) for m in memory]}, indent=1))
+        against = [{**asdict(r), "ratio": r.ratio} for r in compared]
+        memories = [asdict(m) for m in memory]
+        out.write_text(json.dumps({"timings": rows, "memory": memories, "ratios": against}, indent=1))
     if store is not None:
         print(keep(*_table(report), store))
     return report
@@ -232,6 +242,13 @@ def _table(report: BenchReport) -> tuple[list[str], list[list[object]]]:
 def _print(report: BenchReport) -> None:
     print("Median microseconds without the black box, one thread\n")
     print(table(*_table(report)))
+    if report.ratios:
+        print("\nAgainst what the machine can do: microseconds, and how many times faster the package is\n")
+        rows = [
+            [r.operation, r.n, r.samples, round(1e6 * r.seconds, 1), round(1e6 * r.compared, 1), r.ratio, r.goal]
+            for r in report.ratios
+        ]
+        print(table(["operation", "parameters", "samples", "package [us]", "compared [us]", "ratio", "goal"], rows))
     if report.memory:
         print("\nMiB of a layer: kept by its graph, and peak of forward, backward and one HVP (float32 points)\n")
         memory = [[m.perturbations, m.n, m.samples, round(m.kept), round(m.peak)] for m in report.memory]

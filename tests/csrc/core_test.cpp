@@ -1,5 +1,5 @@
 // Every function of csrc/*.h without torch, at awkward sizes: made to be run under the sanitizers (test_sanitizers.py).
-// g++ -std=c++20 -DZH_NO_CLONES -fsanitize=address,undefined core_test.cpp && ./a.out
+// g++ -std=c++20 -fsanitize=address,undefined core_test.cpp && ./a.out
 #include "../../csrc/reduce.h"
 
 #include <cstdio>
@@ -76,25 +76,44 @@ void test_quantiles() {
     for (double step = 0x1p-50; step < 0.1; step *= 4) p.insert(p.end(), {centre - step, centre + step});
   for (size_t i = p.size(); i-- > 0;) p.push_back(1.0 - p[i]);
   for (size_t i = 0; i < p.size(); ++i) {
-    double normal = p[i];
-    normal_quantiles(&normal, 1);
+    double normal = 0.0;
+    normal_quantiles(&p[i], 1, &normal);
     const double tail = std::min(p[i], 1.0 - p[i]);
     EXPECT(near(0.5 * std::erfc(-normal / std::sqrt(2.0)), p[i], 1e-14 * std::max(tail, 1e-2) + 2e-16));
     EXPECT(near(gradient_lobe_cdf(gradient_lobe_quantile(p[i])), p[i], 4e-16));
     EXPECT(near(hessian_lobe_cdf(hessian_lobe_quantile(p[i])), p[i], 4e-16));
   }
-  // In place, together or alone: the same bits.
+  // Together or alone: the same bits.
   for (int64_t count : {int64_t(1), int64_t(7), kBlock - 1, kBlock}) {
-    std::vector<double> together(p.begin(), p.begin() + count);
-    normal_quantiles(together.data(), count);
+    std::vector<double> together(size_t(count), 0.0);
+    normal_quantiles(p.data(), count, together.data());
     for (int64_t i = 0; i < count; ++i) {
-      double alone = p[size_t(i)];
-      normal_quantiles(&alone, 1);
+      double alone = 0.0;
+      normal_quantiles(&p[size_t(i)], 1, &alone);
       EXPECT(alone == together[size_t(i)]);
     }
   }
   for (const double x : {1e-300, 1e-20, 0.5, 0.7, 1.0 - 0x1p-53, 1.0, 1.5, 2.0, 1e20, 1e300})
     EXPECT(near(zerohess::log(x), std::log(x), 3e-16 * std::fabs(std::log(x))));
+}
+
+void test_single_quantiles() {
+  std::vector<uint32_t> words = {0, 1, 2, kTail - 1, kTail, kTail + 1, 0x7FFFFFFF, 0x7FFFFFFE, 0x7FFFFFC0};
+  for (uint32_t k = 1; k < 31; ++k) words.insert(words.end(), {1u << k, (1u << k) - 1, (1u << k) + (1u << k) / 3});
+  for (size_t i = words.size(); i-- > 0;) words.push_back(~words[i]);
+  const int64_t count = int64_t(words.size());
+  std::vector<float> together(words.size(), 0.0f);
+  normal_quantiles(words.data(), count, together.data());
+  for (int64_t i = 0; i < count; ++i) {
+    const double p = (double(words[size_t(i)]) + 0.5) * 0x1p-32;
+    double exact = 0.0;
+    normal_quantiles(&p, 1, &exact);
+    float alone = 0.0f;
+    normal_quantiles(&words[size_t(i)], 1, &alone);
+    EXPECT(alone == together[size_t(i)]);
+    EXPECT(alone == -together[size_t(count - 1 - i)]);
+    EXPECT(near(alone, exact, 3e-7 * std::fabs(exact)));
+  }
 }
 
 void test_rows() {
@@ -114,25 +133,32 @@ void test_rows() {
 }
 
 // u of a whole row, block by block as the operators do it.
-std::vector<double> drawn(const Row& row, int64_t n) {
-  std::vector<double> out(size_t(n), 0.0);
-  double buffer[kBlock];
-  for (int64_t first = 0; first < n; first += kBlock) {
-    const int64_t count = std::min(kBlock, n - first);
-    draw_columns(row, first, count, buffer);
-    std::copy_n(buffer, count, out.data() + first);
-  }
-  return out;
+template <class T>
+std::vector<double> drawn_as(const Row& row, int64_t n) {
+  std::vector<T> out(size_t(n), T(0));
+  for (int64_t first = 0; first < n; first += kBlock)
+    draw_columns(row, first, std::min(kBlock, n - first), out.data() + first);
+  return std::vector<double>(out.begin(), out.end());
 }
 
-void test_draw() {
+std::vector<double> drawn(const Row& row, int64_t n, bool single = false) {
+  return single ? drawn_as<float>(row, n) : drawn_as<double>(row, n);
+}
+
+double weight(const double* u, int64_t n, int64_t proposal) {
+  Magnitudes sums{};
+  for (int64_t first = 0; first < n; first += kBlock) add_magnitudes(u + first, std::min(kBlock, n - first), sums);
+  return density_ratio(sums, n, proposal);
+}
+
+void test_draw(bool single) {
   for (const int64_t seed : kSeeds) {
     for (const int64_t n : kSizes) {
-      const std::vector<double> normal = drawn({seed, 5, kNormal, 0, 0}, n);
+      const std::vector<double> normal = drawn({seed, 5, kNormal, 0, 0}, n, single);
       for (int64_t kind = kNormal; kind <= kBox; ++kind) {
         for (const int64_t i : {int64_t(0), n / 2, n - 1}) {
           for (const int64_t j : {int64_t(0), n - 1}) {
-            const std::vector<double> u = drawn({seed, 5, kind, i, j}, n);
+            const std::vector<double> u = drawn({seed, 5, kind, i, j}, n, single);
             for (int64_t d = 0; d < n; ++d) {
               EXPECT(std::isfinite(u[size_t(d)]));
               if (kind == kBox) EXPECT(std::fabs(u[size_t(d)]) < kBoxHalfWidth);
@@ -147,12 +173,32 @@ void test_draw() {
 }
 
 void test_place_and_weight() {
-  float single = 0.0f;
-  double twice = 0.0;
-  const double u = place<double>(1.0, 1e-3, 0.7, &twice), v = place<float>(1.0, 1e-3, 0.7, &single);
-  EXPECT(twice == 1.0 + 1e-3 * 0.7 && u == 0.7);
-  EXPECT(single == float(1.0 + 1e-3 * 0.7) && v == 0.7);
-  EXPECT(place<double>(1.0, 1e-3, 0.7, nullptr) == u && place<float>(1.0, 1e-3, 0.7, nullptr) == v);
+  // A batch of two, placed from noise in both precisions and with both signs.
+  const double sigma[3] = {1e-3, 2.0, 0.5}, x[6] = {1.0, -2.0, 3.0, 0.25, 0.0, 7.0};
+  const float x_single[6] = {1.0f, -2.0f, 3.0f, 0.25f, 0.0f, 7.0f};
+  double points[24], u[24], weights[8];
+  float points_single[24];
+  const auto columns = [](int64_t r, int64_t first, int64_t count, auto* buffer) {
+    draw_columns(pick(3, r, 3, kSecondOrder), first, count, buffer);
+    return buffer;
+  };
+  place_rows<double>(Batch<double, double>{x, sigma, 2, 4, 3, kSecondOrder, true, points, u, weights}, 0, 4, columns);
+  place_rows<float>(
+      Batch<float, float>{x_single, sigma, 2, 4, 3, kSecondOrder, true, points_single, nullptr, weights}, 0, 4, columns);
+  for (int64_t b = 0; b < 2; ++b) {
+    for (int64_t k = 0; k < 4; ++k) {
+      const Row row = pick(3, 2 * b + k % 2, 3, kSecondOrder);
+      const std::vector<double> one = drawn(row, 3), other = drawn(row, 3, true);
+      const double sign = k < 2 ? 1.0 : -1.0;
+      for (int64_t d = 0; d < 3; ++d) {
+        const int64_t at = (4 * b + k) * 3 + d;
+        EXPECT(u[at] == sign * one[size_t(d)]);
+        EXPECT(points[at] == x[3 * b + d] + sigma[d] * (sign * one[size_t(d)]));
+        EXPECT(points_single[at] == float(x[3 * b + d] + sigma[d] * (sign * other[size_t(d)])));
+      }
+      EXPECT(near(weights[4 * b + k], weight(other.data(), 3, kSecondOrder), 0x1p-20 * weights[4 * b + k]));
+    }
+  }
   for (const int64_t n : kSizes) {
     const std::vector<double> x = numbers(n, 3);
     double l1 = 0.0, l2 = 0.0, hole = 0.0;
@@ -170,10 +216,18 @@ void test_place_and_weight() {
   }
 }
 
-template <class Rows>
-std::vector<double> projected(const Rows& rows, int64_t K, int64_t n, int64_t M, const std::vector<double>& t) {
+std::vector<double> projected(
+    const StoredRows& rows, int64_t K, int64_t n, int64_t M, const std::vector<double>& t) {
   std::vector<double> out(size_t(M * K), -1.0);
   for (int64_t k = 0; k < K; ++k) project_row(rows, k, K, n, M, t.data(), out.data());
+  return out;
+}
+
+std::vector<double> projected(
+    const DrawnRows& rows, int64_t K, int64_t n, int64_t M, const std::vector<double>& t) {
+  std::vector<double> out(size_t(M * K), -1.0);
+  project_drawn_rows(rows, 0, 2, K, n, M, t.data(), out.data());
+  project_drawn_rows(rows, 2, rows.samples, K, n, M, t.data(), out.data());
   return out;
 }
 
@@ -194,22 +248,14 @@ void test_sums() {
         for (const int64_t K : {S, 2 * S}) {
           std::vector<Row> rows;
           for (int64_t s = 0; s < S; ++s) rows.push_back(pick(seed, s, n, kSecondOrder));
-          std::vector<double> x = numbers(n, 1), sigma = numbers(n, 2);
-          for (double& value : sigma) value = 1.5 + value;
-          if (single)
-            for (double& value : x) value = double(float(value));
           // All perturbations, stored.
           std::vector<double> u;
           for (int64_t k = 0; k < K; ++k) {
-            std::vector<double> row = drawn(rows[size_t(k % S)], n);
-            for (int64_t d = 0; d < n; ++d) {
-              const double turned = k < S ? row[size_t(d)] : -row[size_t(d)];
-              u.push_back(single ? place<float>(x[size_t(d)], sigma[size_t(d)], turned, nullptr)
-                                 : place<double>(x[size_t(d)], sigma[size_t(d)], turned, nullptr));
-            }
+            const std::vector<double> row = drawn(rows[size_t(k % S)], n, single);
+            for (const double one : row) u.push_back(k < S ? one : -one);
           }
           const StoredRows stored{u.data(), n};
-          const DrawnRows again{rows.data(), x.data(), sigma.data(), S, single};
+          const DrawnRows again{rows.data(), S, single};
           const std::vector<double> t = numbers(M * n, 4), a = numbers(M * K, 5);
           const std::vector<double> Ut = projected(stored, K, n, M, t), aU = accumulated(stored, K, n, M, false, a);
           EXPECT(projected(again, K, n, M, t) == Ut);
@@ -259,13 +305,18 @@ void test_small_sums() {
 }  // namespace
 
 int main() {
-  test_philox();
-  test_quantiles();
-  test_rows();
-  test_draw();
-  test_place_and_weight();
-  test_sums();
-  test_small_sums();
+  for (int set = kBaseline; set <= best_instructions(); ++set) {
+    instructions = Instructions(set);
+    test_philox();
+    test_quantiles();
+    test_single_quantiles();
+    test_rows();
+    test_draw(false);
+    test_draw(true);
+    test_place_and_weight();
+    test_sums();
+    test_small_sums();
+  }
   if (failures) std::fprintf(stderr, "%d failures\n", failures);
   return failures ? EXIT_FAILURE : EXIT_SUCCESS;
 }

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.autograd import control_variate, opaque, transforms
+from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.limit import limited
 from torch_zerohess.autograd.linear_map import project
 from torch_zerohess.estimation.control import Control
@@ -162,8 +163,10 @@ class BlackBox(nn.Module):
         if active and self.memory is not None and self.memory.order == 1:
             return lambda x: _tangent(expansion, x, center)
 
+        plain = zero and self.control is None and not entropy  # nothing but the expansion stands between x and values
+
         def estimated(x: Tensor) -> Tensor:
-            result = _value(expansion, x, center, zero=zero)
+            result = _value(expansion, x, center, zero=zero, plain=plain)
             return control_variate.local_entropy_value(result, self.call.value) if entropy else result
 
         return estimated
@@ -215,12 +218,9 @@ class Input(torch.autograd.Function):
     """The identity. It marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
 
     @staticmethod
-    def forward(x: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
         return x.view_as(x)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
@@ -260,8 +260,20 @@ def smooth(
     )
 
 
-def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool) -> Tensor:
-    """Return the expansion around `center` at x [B, n], with a graph; `zero` says that x equals `center` in value."""
+def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool, plain: bool) -> Tensor:
+    """Return the expansion around `center` at x [B, n], with a graph.
+
+    zero: says that x equals `center` in value.
+    plain: allows the closed form where no transform is active; it needs `zero`.
+    """
+    general = functools.partial(_general, expansion, center=center, zero=zero)
+    if plain and not transforms.watched(x) and not transforms.forward_mode_active():
+        result: Tensor = ClosedForm.apply(x, expansion, general)
+        return result
+    return general(x)
+
+
+def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> Tensor:
     stein, c = expansion.stein, expansion.flat
 
     def ratios(d: Tensor, zero: bool) -> Tensor:

@@ -176,8 +176,11 @@ class Estimate:
         """Sums in units of x; one division after another, because the square of a small sigma is zero."""
         if quantity == "value":
             return sums
-        if quantity == "hessian":  # the larger sigma first, for symmetry to the last bit
-            i, j = self._sigma[:, None], self._sigma
+        if quantity == "hessian":
+            one = self._smoothing.sigma
+            if isinstance(one, float):  # in place: a Hessian is large, and the sums are of no other use
+                return sums.div_(one).div_(one)
+            i, j = self._sigma[:, None], self._sigma  # the larger sigma first, for symmetry to the last bit
             return sums / torch.maximum(i, j) / torch.minimum(i, j)
         return sums / self._sigma / self._sigma if quantity == "hessian_diagonal" else sums / self._sigma
 

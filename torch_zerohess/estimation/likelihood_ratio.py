@@ -28,19 +28,19 @@ class LikelihoodRatio(Stein):
     ) -> tuple[Tensor, "LikelihoodRatio"]:
         """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as weights of "uniform" can."""
         B, n = x.shape
-        density, single, x64 = _density(smoothing), x.dtype == torch.float32, x.double().contiguous()
-        if _kept(smoothing, keep):
+        density, single = _density(smoothing), x.dtype == torch.float32
+        if smoothing.sampler == "random":  # of the K rows only the points exist at once unless they are kept
+            rows, points, u, weight = kernels.sample(
+                seed, smoothing.samples, x, sigma, smoothing.antithetic, density, False, keep
+            )
+            made = cls(u if keep else Redrawn(rows, x, sigma, smoothing.antithetic, single), weight)
+        else:
             _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
-            points, u, weight = kernels.place(drawn, x64, sigma, smoothing.antithetic, single, density)
+            points, u, weight = kernels.place(
+                drawn, x.double().contiguous(), sigma, smoothing.antithetic, single, density
+            )
             made = cls(u, weight)
-        else:  # of the K rows only the points exist at once
-            rows = kernels.pick_rows(seed, 0, B * smoothing.samples, n, density, x.device)
-            recipe = Redrawn(rows, x64, sigma, smoothing.antithetic, single)
-            points, weight = x.new_empty(B, recipe.K, n), x64.new_empty(B, recipe.K)
-            for part, _, part_weight, columns in recipe.chunks(density):
-                points[:, columns], weight[:, columns] = part, part_weight
-            made = cls(recipe, weight)
-        if bool((weight == 0).all(1).any()):
+        if density == proposals.UNIFORM and bool((weight == 0).all(1).any()):
             raise ValueError(
                 f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"
             )
@@ -65,7 +65,7 @@ class LikelihoodRatio(Stein):
         if _kept(smoothing, keep):
             return cls(first, weight)
         single = x.dtype == torch.float32
-        return cls(Redrawn(first.flatten(0, 1), x.detach().double(), sigma, smoothing.antithetic, single), weight)
+        return cls(Redrawn(first.flatten(0, 1), x.detach(), sigma, smoothing.antithetic, single), weight)
 
     def value(self, a: Tensor) -> Tensor:
         return total((a * self.weight[:, None]).mT)[:, 0]
@@ -75,11 +75,11 @@ class LikelihoodRatio(Stein):
 
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
         a = a * self.weight[:, None]
-        return kernels.accumulate(self.u, a * kernels.project(self.u, v)) - total(a.mT).mT * v
+        return kernels.accumulate(self.u, a * kernels.project(self.u, v)).addcmul_(total(a.mT).mT, v, value=-1.0)
 
     def hessian_diagonal(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]
-        return kernels.accumulate_squares(self.u, a) - total(a.mT).mT
+        return kernels.accumulate_squares(self.u, a).sub_(total(a.mT).mT)
 
     def hessian(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]

@@ -1,5 +1,7 @@
 """Values of a black box that are not finite: raise, drop the whole antithetic pair, or put a number in their place."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,8 @@ def finite_values(
 
     Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
     """
+    if math.isfinite(float(values.sum())):  # it is not, if one of them is not
+        return values, None
     bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
     if not bool(bad.any()):
         return values, None

@@ -21,6 +21,7 @@ FAMILIES: dict[Proposal, type[Stein]] = {
     "optimal": Elementwise,
     "fr22": SignedLobes,
 }
+_FAR_ABOVE = 4096  # sigmas of more roundings of x need no look at the points
 _ROWS = 64  # compared with x at a time; the first few nearly always settle it
 
 
@@ -44,12 +45,18 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
     range of its dtype, and where the family of the proposal cannot serve this many parameters.
     """
     sigma = smoothing.sigma_vector(x.shape[1], x.device)
+    scalar = smoothing.sigma if isinstance(smoothing.sigma, float) else None
+    largest, limits = float(x.abs().max()), torch.finfo(x.dtype)
+    least, most = (float(sigma.min()), float(sigma.max())) if scalar is None else (scalar, scalar)
     # No perturbation is longer than this: quantiles end at 10, and lengths of directions are sqrt(n) or little more.
-    farthest = x.abs() + (10.0 + x.shape[1] ** 0.5) * sigma
-    if not bool((farthest < torch.finfo(x.dtype).max).all()):
-        raise _out_of_range(x, sigma, farthest)
+    length = 10.0 + x.shape[1] ** 0.5
+    if not largest + length * most < limits.max:  # an x that is not a number included
+        farthest = x.abs() + length * sigma
+        if not bool((farthest < limits.max).all()):
+            raise _out_of_range(x, sigma, farthest)
     points, stein = FAMILIES[smoothing.proposal].draw(x, sigma, smoothing, seed, keep)
-    _check_moved(points, x, sigma)
+    if least < _FAR_ABOVE * limits.eps * largest:
+        _check_moved(points, x, sigma)
     return Perturbations(points, stein, sigma)
 
 

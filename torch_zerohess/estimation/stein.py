@@ -163,5 +163,7 @@ class Stein(ABC):
 def total(a: Tensor) -> Tensor:
     """Sum [B, K, P] over K to [B, 1, P] in blocks of fixed size: the bits do not follow the number of threads."""
     whole = a.shape[1] // _BLOCK * _BLOCK
+    if whole == 0:
+        return a.sum(1, keepdim=True)
     blocks = a[:, :whole].unflatten(1, (-1, _BLOCK)).sum(2).sum(1, keepdim=True)
     return blocks + a[:, whole:].sum(1, keepdim=True)

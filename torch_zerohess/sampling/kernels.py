@@ -5,6 +5,7 @@ a compiler, go to the reference. Both draw the same bits. Their sums of n terms 
 place of the sum of magnitudes at most.
 """
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -15,13 +16,14 @@ from torch_zerohess.sampling import extension, proposals
 
 _MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
 _WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
+_STRIP = 128  # rows of a wide Hessian that one matrix product gives
 _CHUNK = 1 << 22  # elements of drawn rows held at a time
 
 
 class Redrawn(NamedTuple):
     """Rows of perturbations kept as their recipe, O(K + n), instead of their numbers, O(K n).
 
-    rows: int64 [B * S, 5]; x: [B, n], sigma: [n], float64; K = 2 S with `antithetic`, else S.
+    rows: int64 [B * S, 5]; x: [B, n]; sigma: float64 [n]; K = 2 S with `antithetic`, else S; `single`: in float32.
     """
 
     rows: Tensor
@@ -43,11 +45,11 @@ class Redrawn(NamedTuple):
         """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
         rows, x, sigma, antithetic, single = self.arguments()
         B, n = x.shape
-        S = len(rows) // B
+        S, x = len(rows) // B, x.double()
         step = max(1, _CHUNK // (B * n))
         for first in range(0, S, step):
             part = rows.view(B, S, 5)[:, first : first + step]
-            u = draw(part.reshape(-1, 5), n)
+            u = draw(part.reshape(-1, 5), n, single)
             index = torch.arange(first, first + part.shape[1], device=u.device)
             columns = torch.cat([index, index + S]) if antithetic else index
             yield *place(u, x, sigma, antithetic, single, proposal), columns
@@ -58,7 +60,7 @@ Samples = Tensor | Redrawn
 
 
 def _compiled(tensor: Tensor) -> bool:
-    return extension.available and tensor.device.type == "cpu"
+    return extension.available and tensor.is_cpu
 
 
 def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: torch.device) -> Tensor:
@@ -68,9 +70,11 @@ def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: 
     return rows.to(device)
 
 
-def draw(rows: Tensor, n: int) -> Tensor:
+def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
     """See `proposals.draw`."""
-    return torch.ops.torch_zerohess.draw(rows.contiguous(), n) if _compiled(rows) else proposals.draw(rows, n)
+    if _compiled(rows):
+        return torch.ops.torch_zerohess.draw(rows.contiguous(), n, single)
+    return proposals.draw(rows, n, single)
 
 
 def place(
@@ -78,8 +82,33 @@ def place(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """See `proposals.place`."""
     if _compiled(u):
-        return torch.ops.torch_zerohess.place(u.contiguous(), x, sigma, antithetic, single, proposal)
+        return torch.ops.torch_zerohess.place(u.double().contiguous(), x, sigma, antithetic, single, proposal)
     return proposals.place(u, x, sigma, antithetic, single, proposal)
+
+
+def sample(
+    seed: int, S: int, x: Tensor, sigma: Tensor, antithetic: bool, proposal: int, center: bool, keep: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pick rows, draw them in the precision of x and place them around x [B, n], in one pass.
+
+    Returns rows [B * S, 5], points [B, E, n], perturbations [B, K, n], or [0, K, n] unless `keep`, and weights [B, K]:
+    see `proposals.pick_rows`, `proposals.draw` and `proposals.place`. E = K + 1 with x as the last point where
+    `center`, else K.
+    """
+    if _compiled(x):
+        return torch.ops.torch_zerohess.sample(seed, S, x.contiguous(), sigma, antithetic, proposal, center, keep)
+    (B, n), single = x.shape, x.dtype == torch.float32
+    rows = pick_rows(seed, 0, B * S, n, proposal, x.device)
+    recipe = Redrawn(rows, x, sigma, antithetic, single)
+    points, weights = x.new_empty(B, recipe.K + center, n), sigma.new_empty(B, recipe.K)
+    u = sigma.new_empty(B if keep else 0, recipe.K, n)
+    for part, part_u, part_weights, columns in recipe.chunks(proposal):
+        points[:, columns], weights[:, columns] = part, part_weights
+        if keep:
+            u[:, columns] = part_u
+    if center:
+        points[:, -1] = x
+    return rows, points, u, weights
 
 
 def project(u: Samples, t: Tensor) -> Tensor:
@@ -117,9 +146,28 @@ def hessian(u: Samples, a: Tensor) -> Tensor:
             flat = _total(part @ (one[..., :, None] * one[..., None, :]).flatten(2) for one, part in pieces)
             result = flat.unflatten(2, (u.shape[2], u.shape[2]))
         else:
-            result = (u.mT[:, None] * a[:, :, None]) @ u[:, None]
-        return result.triu() + result.triu(1).mT
+            result = _upper(u, a)
+        return _symmetric(result)
     return _total(hessian(chunk, a[..., columns]) for _, chunk, _, columns in u.chunks())
+
+
+def _upper(u: Tensor, a: Tensor) -> Tensor:
+    """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] for i <= j, and numbers below; about half of the whole product."""
+    n = u.shape[2]
+    result = u.new_empty(*a.shape[:2], n, n)
+    for b, m in itertools.product(range(len(u)), range(a.shape[1])):
+        weighted = (a[b, m, :, None] * u[b]).mT
+        for i in range(0, n, _STRIP):
+            torch.mm(weighted[i : i + _STRIP], u[b, :, i:], out=result[b, m, i : i + _STRIP, i:])
+    return result
+
+
+def _symmetric(upper: Tensor) -> Tensor:
+    """Return matrices [..., n, n] of which only the upper triangle is right, made symmetric."""
+    if _compiled(upper):
+        torch.ops.torch_zerohess.mirror(upper.flatten(0, -3))
+        return upper
+    return upper.triu() + upper.triu(1).mT
 
 
 def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:

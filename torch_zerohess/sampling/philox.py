@@ -27,16 +27,29 @@ def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> 
     seed, row: int64 [R]. A value is (k + 1/2) / 2^52 with 52-bit k: never 0 or 1, and exact under 1 - U, 4 U, 4 U - 2.
     One Philox block of four words gives the two columns 2b and 2b + 1.
     """
-    blocks = torch.arange(first // 2, (first + count + 1) // 2, device=row.device)
+    words = _blocks(seed, row, first // 2, (first + count + 1) // 2, stream)
+    pairs = torch.stack([_uniform(words[0], words[1]), _uniform(words[2], words[3])], -1).flatten(1)
+    return pairs[:, first % 2 : first % 2 + count]
+
+
+def words(seed: Tensor, row: Tensor, count: int, stream: int) -> Tensor:
+    """Return words of 32 bits, int64 [R, count], for the columns 0 to count of each row: noise of single precision.
+
+    seed, row: int64 [R]. Column 4b + w is word w of Philox block b.
+    """
+    return torch.stack(_blocks(seed, row, 0, (count + 3) // 4, stream), -1).flatten(1)[:, :count]
+
+
+def _blocks(seed: Tensor, row: Tensor, first: int, end: int, stream: int) -> tuple[Tensor, ...]:
+    """Return the four words of blocks first to end of each row, int64 [R, end - first] each."""
+    blocks = torch.arange(first, end, device=row.device)
     counter = (
         blocks & _MASK,
         row[:, None] & _MASK,
         (row[:, None] >> 32) & _MASK,
         torch.full_like(row[:, None], stream),
     )
-    words = _philox(counter, (seed[:, None] & _MASK, (seed[:, None] >> 32) & _MASK))
-    pairs = torch.stack([_uniform(words[0], words[1]), _uniform(words[2], words[3])], -1).flatten(1)
-    return pairs[:, first % 2 : first % 2 + count]
+    return _philox(counter, (seed[:, None] & _MASK, (seed[:, None] >> 32) & _MASK))
 
 
 def _philox(counter: tuple[Tensor, ...], key: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:

@@ -21,8 +21,9 @@ import math
 import torch
 from torch import Tensor
 
-from torch_zerohess.sampling.philox import DIMENSIONS, PICKS, uniforms
+from torch_zerohess.sampling.philox import DIMENSIONS, PICKS, uniforms, words
 from torch_zerohess.sampling.quantiles import gradient_lobe_quantile, hessian_lobe_quantile, normal_quantile
+from torch_zerohess.sampling.single import normal_quantile_of_words
 
 NORMAL, GRADIENT_LOBE, DIAGONAL_LOBE, OFF_DIAGONAL_LOBE, EVERY_GRADIENT_LOBE, BOX = range(6)
 """Kinds of rows: column 2 of `rows`."""
@@ -58,18 +59,24 @@ def mixture_rows(seeds: Tensor, index: Tensor, p: Tensor, n: int, proposal: int)
     return torch.stack([seeds, index, kind, i, torch.where(plain | (kind == GRADIENT_LOBE), i, j)], 1)
 
 
-def draw(rows: Tensor, n: int) -> Tensor:
-    """Return u, float64 [R, n], for rows as made by `pick_rows`."""
-    p = uniforms(rows[:, 0], rows[:, 1], 0, n, DIMENSIONS)
-    return shape(rows, p)
+def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
+    """Return u, [R, n], for rows as made by `pick_rows`: float64, or float32 from noise of its own where `single`."""
+    seed, index = rows[:, 0], rows[:, 1]
+    if not single:
+        return shape(rows, uniforms(seed, index, 0, n, DIMENSIONS))
+    noise = words(seed, index, n, DIMENSIONS)
+    return shape(rows, (noise.double() + 0.5) * 2.0**-32, normal_quantile_of_words(noise))
 
 
-def shape(rows: Tensor, p: Tensor) -> Tensor:
-    """Turn uniforms p [R, n] into perturbations of the kinds that `rows` ask for."""
-    u = normal_quantile(p)
+def shape(rows: Tensor, p: Tensor, normal: Tensor | None = None) -> Tensor:
+    """Turn uniforms p [R, n] into perturbations of the kinds that `rows` ask for.
+
+    normal: the normal quantiles of p, if they are known; the result has their dtype.
+    """
+    u = normal_quantile(p) if normal is None else normal
     every, box = rows[:, 2] == EVERY_GRADIENT_LOBE, rows[:, 2] == BOX
-    u[every] = gradient_lobe_quantile(p[every])
-    u[box] = BOX_HALF_WIDTH * (2.0 * p[box] - 1.0)
+    u[every] = gradient_lobe_quantile(p[every]).to(u.dtype)
+    u[box] = (BOX_HALF_WIDTH * (2.0 * p[box] - 1.0)).to(u.dtype)
     return with_lobes(rows, u, *(p.gather(1, rows[:, column, None])[:, 0] for column in (3, 4)))
 
 
@@ -84,7 +91,7 @@ def with_lobes(rows: Tensor, u: Tensor, p_i: Tensor, p_j: Tensor) -> Tensor:
         (off_diagonal, j, p_j, gradient_lobe_quantile),
     ):
         row = chosen.nonzero()[:, 0]
-        u[row, dimension[row]] = quantile(p[row])
+        u[row, dimension[row]] = quantile(p[row]).to(u.dtype)
     return u
 
 
@@ -93,7 +100,7 @@ def place(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return points z = x + sigma u [B, K, n] in the type of x, u [B, K, n] with its signs, and weights [B, K].
 
-    u: [B * S, n] float64; with `antithetic` K = 2 S and the second half of the rows has the opposite sign.
+    u: [B * S, n], float64 or float32; with `antithetic` K = 2 S and the second half of the rows has the opposite sign.
     x: [B, n] and sigma: [n], float64; `single` rounds z to float32.
 
     u is returned as it was drawn, not as (z - x) / sigma: the rounding of z acts as dither. With h the distance of x to
@@ -101,7 +108,7 @@ def place(
     at sigma = h, of -0.014 and 0.13 at h / 2, of -0.57 and 0.73 at h / 4. With (z - x) / sigma and Gaussian
     perturbations it would be 0.08 and 0.22 at h, 0.31 and 1.22 at h / 2.
     """
-    u = u.view(len(x), -1, u.shape[1])
+    u = u.double().view(len(x), -1, u.shape[1])
     if antithetic:
         u = torch.cat([u, -u], 1)
     points = x[:, None] + sigma * u

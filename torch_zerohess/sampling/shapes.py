@@ -11,8 +11,18 @@ def pick_rows(seed: int, first: int, count: int, n: int, proposal: int) -> Tenso
     return torch.empty(count, 5, dtype=torch.int64)
 
 
-def draw(rows: Tensor, n: int) -> Tensor:
-    return rows.new_empty(rows.shape[0], n, dtype=torch.float64)
+def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
+    return rows.new_empty(rows.shape[0], n, dtype=torch.float32 if single else torch.float64)
+
+
+def sample(
+    seed: int, S: int, x: Tensor, sigma: Tensor, antithetic: bool, proposal: int, center: bool, keep: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    B, n = x.shape
+    K = 2 * S if antithetic else S
+    rows = x.new_empty(B * S, 5, dtype=torch.int64)
+    u = sigma.new_empty(B if keep else 0, K, n)
+    return rows, x.new_empty(B, K + center, n), u, sigma.new_empty(B, K)
 
 
 def place(
@@ -46,7 +56,11 @@ def accumulate_drawn(
     return a.new_empty(a.shape[0], a.shape[1], x.shape[1])
 
 
-OPERATORS = (pick_rows, draw, place, project, accumulate, hessian, project_drawn, accumulate_drawn)
+def mirror(matrices: Tensor) -> None:
+    return None
+
+
+OPERATORS = (pick_rows, draw, sample, place, project, accumulate, hessian, mirror, project_drawn, accumulate_drawn)
 
 
 def register() -> None:

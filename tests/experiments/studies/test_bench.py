@@ -16,6 +16,8 @@ from torch_zerohess.sampling import extension
         ({"sizes": ((2, 8), (4, 0))}, "sizes must be at least 1, got 0"),
         ({"memory_n": -1}, "memory_n must be at least 0, got -1"),
         ({"memory_samples": 0}, "memory_samples must be at least 1, got 0"),
+        ({"wide": (512, 0)}, "wide must be at least 1, got 0"),
+        ({"large": 0}, "large must be at least 1, got 0"),
     ],
 )
 def test_wrong_arguments_of_bench_are_named(wrong, message) -> None:
@@ -27,9 +29,13 @@ def test_wrong_arguments_of_bench_are_named(wrong, message) -> None:
 def costs(tmp_path_factory) -> BenchReport:
     out = tmp_path_factory.mktemp("bench") / "bench.json"
     before, threads = extension.available, torch.get_num_threads()
-    result = bench(repeats=2, sizes=((2, 8), (256, 32)), memory_n=100_000, memory_samples=32, out=out)
+    result = bench(
+        repeats=2, sizes=((2, 8), (256, 32)), memory_n=100_000, memory_samples=32, wide=(96,), large=5_000, out=out
+    )
     assert (extension.available, torch.get_num_threads()) == (before, threads)
-    assert len(json.loads(out.read_text())["timings"]) == len(result.timings)
+    written = json.loads(out.read_text())
+    assert len(written["timings"]) == len(result.timings)
+    assert [one["ratio"] for one in written["ratios"]] == [one.ratio for one in result.ratios]
     return result
 
 
@@ -43,10 +49,25 @@ def test_the_extension_draws_faster(costs) -> None:
         assert all(t.ratio > 2 for t in costs.timings if t.operation == name)
 
 
+def test_ratios_against_the_machine(costs) -> None:
+    assert [r.operation for r in costs.ratios] == [
+        "noise, float32",
+        "noise, float64",
+        "Hessian",
+        "gradient + HVP, drawn again",
+        "noise, two threads against one",
+    ]
+    assert all(r.ratio == r.compared / r.seconds > 0 for r in costs.ratios)
+    # Half of the goal, for machines that are busy or have fewer instructions.
+    assert costs.ratios[1].ratio > 1
+
+
 def test_bench_without_the_extension(monkeypatch, capsys) -> None:
     monkeypatch.setattr(extension, "available", False)
     (timing,) = (
-        t for t in bench(repeats=1, sizes=((2, 2),), memory_n=0).timings if t.operation == "value + gradient + HVP"
+        t
+        for t in bench(repeats=1, sizes=((2, 2),), memory_n=0, wide=()).timings
+        if t.operation == "value + gradient + HVP"
     )
     assert timing.extension is None
     assert timing.ratio is None

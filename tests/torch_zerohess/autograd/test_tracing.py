@@ -110,10 +110,14 @@ RECIPE = (ROWS, BATCH, doubles(N), True, False)
 OPERATORS = {
     "pick_rows": (1, 0, 8, N, 1),
     "draw": (ROWS, N),
+    "draw in single precision": (ROWS, N, True),
+    "sample": (1, 3, BATCH, doubles(N), True, proposals.FIRST_ORDER, True, True),
+    "sample in single precision": (1, 3, BATCH.float(), doubles(N), False, proposals.UNIFORM, False, False),
     "place": (doubles(8, N), BATCH, doubles(N), True, True, proposals.GAUSSIAN),
     "project": (doubles(4, 2, N), doubles(4, 5, N)),
     "accumulate": (doubles(4, 2, N), doubles(4, 5, 2), True),
     "hessian": (doubles(4, 2, N), doubles(4, 5, 2)),
+    "mirror": (doubles(2, N, N),),
     "project_drawn": (*RECIPE, doubles(4, 5, N)),
     "accumulate_drawn": (*RECIPE, doubles(4, 5, 4), False),
 }
@@ -122,7 +126,7 @@ OPERATORS = {
 @pytest.mark.skipif(not extension.available, reason="the operators are those of the extension")
 @pytest.mark.parametrize("name", OPERATORS)
 def test_operators_of_the_extension(name: str) -> None:
-    torch.library.opcheck(getattr(ops, name).default, OPERATORS[name])
+    torch.library.opcheck(getattr(ops, name.split()[0]).default, OPERATORS[name])
 
 
 @pytest.mark.parametrize("keep", [True, False])

@@ -143,7 +143,7 @@ def test_lists_keep_the_precision_of_what_is_in_them() -> None:
 
 
 @pytest.mark.parametrize("x_dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("returned", "number"), [(torch.float16, 1e6), (torch.float32, 1e39), (torch.bfloat16, 7.001)])
+@pytest.mark.parametrize(("returned", "number"), [(torch.float16, 1e6), (torch.float32, 1e40), (torch.bfloat16, 7.001)])
 def test_the_number_in_place_of_nan_is_kept_in_float64(
     returned: torch.dtype, number: float, x_dtype: torch.dtype
 ) -> None:

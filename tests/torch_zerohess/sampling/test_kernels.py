@@ -12,7 +12,7 @@ from torch_zerohess.sampling import extension, kernels, proposals
 from torch_zerohess.sampling.kernels import Redrawn
 from truths import spread
 
-SIZES = [1, 2, 3, 7, 8, 9, 127, 128, 129, 300, 1024]
+SIZES = [1, 2, 3, 7, 8, 9, 255, 256, 257, 300, 1024]
 DENSITIES = [
     proposals.GAUSSIAN,
     proposals.FIRST_ORDER,
@@ -35,7 +35,7 @@ def test_extension_is_built() -> None:
 
 def every_kind(n: int) -> torch.Tensor:
     """Rows of all kinds, in the first and last dimensions and next to the block boundaries."""
-    places = sorted({0, n // 2, n - 1, min(n - 1, 127), min(n - 1, 128)})
+    places = sorted({0, n // 2, n - 1, min(n - 1, 255), min(n - 1, 256)})
     made = [(kind, i, j) for kind in range(6) for i in places for j in places]
     index = torch.arange(len(made))
     seeds = torch.tensor([0, 1, 2**32, 2**63 - 1]).repeat(len(made))[: len(made)]
@@ -54,7 +54,10 @@ def test_pick_rows_same_bits(density: int, n: int) -> None:
 @pytest.mark.parametrize("n", SIZES)
 def test_draw_same_bits(n: int) -> None:
     rows = every_kind(n)
-    assert torch.equal(ops.draw(rows, n), proposals.draw(rows, n))
+    for single in (False, True):
+        got = ops.draw(rows, n, single)
+        assert got.dtype == (torch.float32 if single else torch.float64)
+        assert torch.equal(got, proposals.draw(rows, n, single))
 
 
 def test_draw_same_bits_of_very_many_numbers() -> None:
@@ -65,6 +68,11 @@ def test_draw_same_bits_of_very_many_numbers() -> None:
         assert torch.equal(ops.draw(rows, 1000), proposals.draw(rows, 1000))
     rows = torch.tensor([[5, r, proposals.DIAGONAL_LOBE, 0, 0] for r in range(100_000)])
     assert torch.equal(ops.draw(rows, 1), proposals.draw(rows, 1))
+    # In single precision one number in 65 536 is in a tail.
+    rows = torch.tensor([[3, r, proposals.NORMAL, 0, 0] for r in range(500)])
+    got = ops.draw(rows, 1000, True)
+    assert int((got.abs() > 4.33).sum()) > 0
+    assert torch.equal(got, proposals.draw(rows, 1000, True))
 
 
 @pytest.mark.parametrize("antithetic", [True, False])
@@ -88,6 +96,78 @@ def test_place_same_bits_and_weights_in_bound(n: int, single: bool, antithetic: 
         # The perturbation that was drawn, whatever rounding left of it in the point.
         drawn = u.view(B, S, n)
         assert torch.equal(got[1], torch.cat([drawn, -drawn], 1) if antithetic else drawn)
+
+
+@pytest.mark.parametrize("antithetic", [True, False])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [1, 3, 256, 257, 700])
+def test_sample_is_pick_draw_and_place(n: int, dtype: torch.dtype, antithetic: bool) -> None:
+    B, S = 2, 5
+    x, sigma = spread(B * n, -3.0, 3.0).view(B, n).to(dtype), spread(n, 1e-9, 2.0)
+    single = dtype == torch.float32
+    for density in DENSITIES:
+        rows = proposals.pick_rows(7, 0, B * S, n, density)
+        u = proposals.draw(rows, n, single)
+        points, u, weights = proposals.place(u, x.double(), sigma, antithetic, single, density)
+        for center in (True, False):
+            for keep in (True, False):
+                got = ops.sample(7, S, x, sigma, antithetic, density, center, keep)
+                assert torch.equal(got[0], rows)
+                assert torch.equal(got[1], torch.cat([points, x[:, None]], 1) if center else points)
+                assert torch.equal(got[2], u if keep else u[:0])
+                # Sums of n terms, in single precision within 2^-20; the box's exponent is n log(.) - |u|^2 / 2.
+                grown = 10 * n if density == proposals.UNIFORM else 1
+                bound = grown * 2.0**-20 if single else (2 * n + grown + 8) * EPS
+                assert bool(((got[3] - weights).abs() <= bound * weights.abs()).all())
+
+
+def test_sample_without_the_extension(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, sigma = spread(20, -3.0, 3.0).view(2, 10).float(), spread(10, 0.1, 2.0)
+    for keep in (True, False):
+        arguments = (7, 5, x, sigma, True, proposals.SECOND_ORDER, True, keep)
+        got = ops.sample(*arguments)
+        with monkeypatch.context() as without:
+            without.setattr(extension, "available", False)
+            without.setattr(kernels, "_CHUNK", 40)  # two rows at a time
+            expected = kernels.sample(*arguments)
+        assert all(torch.equal(one, other) for one, other in zip(got[:3], expected[:3], strict=True))
+        torch.testing.assert_close(got[3], expected[3], rtol=2.0**-20, atol=0.0)
+
+
+SAME_BITS = """
+import hashlib, torch, torch_zerohess
+from torch_zerohess.sampling import extension
+ops, n = torch.ops.torch_zerohess, 700
+assert extension.available
+every = torch.tensor([[3, r, kind, r, 5 * r] for kind in range(6) for r in range(20)])
+t, a = (torch.linspace(-1, 1, size, dtype=torch.float64).sin().view(1, 2, -1) for size in (2 * n, 480))
+half = a[..., :120].contiguous()
+made = []
+for dtype in (torch.float32, torch.float64):
+    made.append(ops.draw(every, n, dtype == torch.float32))
+    x, sigma = torch.linspace(-2, 2, n, dtype=dtype)[None], torch.linspace(0.1, 2, n, dtype=torch.float64)
+    for proposal in range(5):
+        made += ops.sample(2**40 + 1, 6, x, sigma, True, proposal, True, True)
+u = ops.draw(every, n)[None]
+made += [ops.project(u, t), ops.accumulate(u, half, False), ops.hessian(u, half)]
+for single in (True, False):
+    recipe = (every, x, sigma, True, single)
+    made += [ops.project_drawn(*recipe, t), ops.accumulate_drawn(*recipe, a, False)]
+    made += [ops.accumulate_drawn(*recipe, a, True)]
+print(hashlib.sha256(b"".join(one.numpy().tobytes() for one in made)).hexdigest())
+"""
+
+
+def test_every_instruction_set_gives_the_same_bits(capsys: pytest.CaptureFixture) -> None:
+    """A processor that lacks AVX2 or AVX-512 runs the best that it has instead."""
+    exec(SAME_BITS, {})
+    here = capsys.readouterr().out
+    assert len(here.strip()) == 64
+    for instructions in ("baseline", "avx2"):
+        environment = {**os.environ, "TORCH_ZEROHESS_INSTRUCTIONS": instructions}
+        command = [sys.executable, "-c", SAME_BITS]
+        done = subprocess.run(command, cwd=FOLDER, env=environment, capture_output=True, text=True)
+        assert done.stdout == here, instructions + done.stderr
 
 
 def samples(n: int, K: int, M: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -126,6 +206,7 @@ def test_extension_and_matrix_product_agree_within_the_bound(n: int, M: int, mon
             monkeypatch.setattr(kernels, "_MANY_VECTORS", threshold)
             monkeypatch.setattr(kernels, "_WIDE", threshold)
             monkeypatch.setattr(kernels, "_CHUNK", chunk)
+            monkeypatch.setattr(kernels, "_STRIP", 7)
             check(kernels.project(u, t), t @ u.mT, t.abs() @ size.mT, n)
             check(kernels.accumulate(u, a), a @ u, a.abs() @ size, K)
             check(kernels.accumulate_squares(u, a), a @ squares, a.abs() @ squares, K)
@@ -136,13 +217,13 @@ def test_extension_and_matrix_product_agree_within_the_bound(n: int, M: int, mon
 
 @pytest.mark.parametrize("antithetic", [True, False])
 @pytest.mark.parametrize("single", [True, False])
-@pytest.mark.parametrize("n", [1, 7, 128, 129, 300])
+@pytest.mark.parametrize("n", [1, 7, 256, 257, 300])
 def test_redrawn_equals_stored(n: int, single: bool, antithetic: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     B, S, M = 2, 6, 3
     K = S * (1 + antithetic)
     rows = kernels.pick_rows(3, 0, B * S, n, proposals.SECOND_ORDER, CPU)
     x, sigma = spread(B * n, -3.0, 3.0).view(B, n).float().double(), spread(n, 1e-6, 1.0)
-    u = kernels.place(kernels.draw(rows, n), x, sigma, antithetic, single, proposals.GAUSSIAN)[1]
+    u = kernels.place(kernels.draw(rows, n, single), x, sigma, antithetic, single, proposals.GAUSSIAN)[1]
     redrawn = Redrawn(rows, x, sigma, antithetic, single)
     t, a = spread(B * M * n, -1.0, 1.0).view(B, M, n), spread(B * M * K, -1.0, 1.0).view(B, M, K)
     drawn = kernels.project(redrawn, t), kernels.accumulate(redrawn, a), kernels.accumulate_squares(redrawn, a)
@@ -169,10 +250,11 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     def everything() -> list[torch.Tensor]:
         drawn = ops.draw(rows, n)
         points, u, weights = ops.place(drawn, x, sigma, True, False, proposals.SECOND_ORDER)
+        sampled = ops.sample(11, S, x.float(), sigma, True, proposals.SECOND_ORDER, True, True)
         recipe = (rows, x, sigma, True, False)
         sums = [ops.project(u, t), ops.accumulate(u, a, False), ops.accumulate(u, a, True), ops.hessian(u, a)]
         sums += [ops.project_drawn(*recipe, t), ops.accumulate_drawn(*recipe, a, False)]
-        return [drawn, points, u, weights, *sums, ops.accumulate_drawn(*recipe, a, True)]
+        return [drawn, points, u, weights, *sampled, *sums, ops.accumulate_drawn(*recipe, a, True)]
 
     before = torch.get_num_threads()
     try:
@@ -183,6 +265,14 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(p, q) for p, q in zip(one, two, strict=True))
+
+
+@pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 100])
+def test_mirror_copies_the_upper_triangle(n: int) -> None:
+    matrices = spread(2 * n * n, -1.0, 1.0).view(2, n, n)
+    expected = matrices.triu() + matrices.triu(1).mT
+    ops.mirror(matrices)
+    assert torch.equal(matrices, expected)
 
 
 def test_noncontiguous_inputs() -> None:
@@ -228,6 +318,12 @@ WRONG = {
     "accumulate: K": lambda: ops.accumulate(doubles(1, 4, 3), doubles(1, 2, 5), False),
     "accumulate: dimensions": lambda: ops.accumulate(doubles(1, 4, 3), doubles(1, 4), False),
     "hessian: K": lambda: ops.hessian(doubles(1, 4, 3), doubles(1, 2, 5)),
+    "mirror: square": lambda: ops.mirror(doubles(1, 3, 4)),
+    "mirror: dimensions": lambda: ops.mirror(doubles(3, 3)),
+    "sample: no samples": lambda: ops.sample(0, 0, doubles(2, 3), doubles(3), True, 0, True, True),
+    "sample: sigma": lambda: ops.sample(0, 4, doubles(2, 3), doubles(2), True, 0, True, True),
+    "sample: no batch": lambda: ops.sample(0, 4, doubles(0, 3), doubles(3), True, 0, True, True),
+    "sample: type of x": lambda: ops.sample(0, 4, doubles(2, 3).half(), doubles(3), True, 0, True, True),
     "hessian: float32": lambda: ops.hessian(doubles(1, 4, 3).float(), doubles(1, 2, 4)),
     "project_drawn: n": lambda: ops.project_drawn(*recipe(), doubles(2, 1, 4)),
     "project_drawn: sigma": lambda: ops.project_drawn(*recipe(sigma=1), doubles(2, 1, 3)),

@@ -42,6 +42,16 @@ def test_known_answers(counter: str, key: str, result: str) -> None:
     assert got.tolist() == expected
 
 
+def test_words_are_those_of_the_uniforms() -> None:
+    seed, row = torch.tensor([5, 2**63 - 1]), torch.tensor([7, 2**40])
+    got = philox.words(seed, row, 11, philox.DIMENSIONS)
+    first_words = got[:, [0, 2, 4, 6, 8, 10]]  # the leading bits of a uniform of 52 bits
+    uniforms = philox.uniforms(seed, row, 0, 6, philox.DIMENSIONS)
+    assert torch.equal((uniforms * 2**32).long(), first_words)
+    assert torch.equal(philox.words(seed, row, 3, philox.DIMENSIONS), got[:, :3])
+    assert stats.kstest((philox.words(seed, row, SAMPLES, 0)[0] / 2**32).numpy(), "uniform").pvalue > 1e-6
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2**32, 2**63 - 1])
 @pytest.mark.parametrize("stream", [philox.DIMENSIONS, philox.PICKS, philox.EXTRA])
 def test_uniform(seed: int, stream: int) -> None:

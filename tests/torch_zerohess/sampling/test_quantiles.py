@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import integrate
 
-from torch_zerohess.sampling import quantiles
+from torch_zerohess.sampling import quantiles, single
 
 mpmath.mp.dps = 60
 
@@ -62,6 +62,22 @@ def test_quantile_against_exact_arithmetic(quantile, exact, most: float) -> None
     errors = ulps(quantile(torch.tensor(POINTS, dtype=torch.float64)), [exact(p) for p in POINTS])
     worst = int(np.argmax(errors))
     assert errors[worst] <= most, f"{errors[worst]:.1f} ulps at p = {POINTS[worst]!r}"
+
+
+def test_single_quantile_against_exact_arithmetic() -> None:
+    steps = [2**k + d for k in range(31) for d in (-1, 0, 1, 2**k // 3)]  # both ends of every octave, and inside
+    lower = sorted({k for k in steps if k < 2**31} | {2**31 - k for k in steps if 0 < k <= 2**31})
+    words = torch.tensor(lower)
+    got = single.normal_quantile_of_words(words)
+    assert got.dtype == torch.float32
+    exact = [normal((k + 0.5) / 2**32) for k in lower]
+    errors = [
+        float(abs(mpmath.mpf(g) - e)) / float(np.spacing(np.float32(abs(e))))
+        for g, e in zip(got.tolist(), exact, strict=True)
+    ]
+    assert max(errors) <= 4.0, f"{max(errors):.1f} ulps at word {lower[int(np.argmax(errors))]}"
+    assert torch.equal(single.normal_quantile_of_words(0xFFFFFFFF - words), -got)
+    assert bool((got.diff() >= -4 * 2**-24 * got[1:].abs()).all())  # increasing up to rounding
 
 
 @pytest.mark.parametrize("quantile", [case.values[0] for case in CASES])

@@ -1,0 +1,121 @@
+"""The package against what the machine can do: rates and times as ratios, measured in turn in one run.
+
+| row | measured | compared with |
+|---|---|---|
+| noise | picks, perturbations, points and density ratios of proposal "aggregate" | `torch.randn` of the same count |
+| Hessian | `Estimate.hessian` | the bare matrix product of its samples |
+| gradient + HVP | one gradient and one product from perturbations that are drawn again | three passes of noise |
+| threads | the noise with one thread | with two |
+
+A ratio above 1 says that the package is faster, or that two threads are.
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
+from torch_zerohess.sampling import kernels, proposals
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Median seconds of what is measured and of what it is compared with."""
+
+    operation: str
+    n: int
+    samples: int
+    seconds: float
+    compared: float
+    goal: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times faster it is than what it is compared with."""
+        return self.compared / self.seconds
+
+
+def ratios(repeats: int, wide: tuple[int, ...] = (512, 2048), large: int = 1_000_000) -> list[Ratio]:
+    """Measure all rows with one thread, and the scaling with two.
+
+    Args:
+        repeats: timings of which the median is reported.
+        wide: parameters of the Hessians.
+        large: parameters of the gradient and the product that draw their perturbations again.
+    """
+    rows = [_noise(dtype, repeats) for dtype in (torch.float32, torch.float64)]
+    rows += [_hessian(n, repeats) for n in wide]
+    rows.append(_redrawn(large, max(1, repeats // 5)))
+    rows.append(_threads(repeats))
+    return rows
+
+
+def _noise(dtype: torch.dtype, repeats: int, n: int = 1024, samples: int = 64) -> Ratio:
+    x, sigma = torch.zeros(1, n, dtype=dtype), torch.ones(n, dtype=torch.float64)
+    noise = _sampler(x, sigma, samples)
+    seconds, compared = in_turn(noise, lambda: torch.randn(samples, n, dtype=dtype), repeats)
+    return Ratio(f"noise, {str(dtype).removeprefix('torch.')}", n, samples, seconds, compared, 2.0)
+
+
+def _hessian(n: int, repeats: int, samples: int = 64) -> Ratio:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(n, generator=generator, dtype=torch.float64)
+    estimate = zh.estimate(lambda z: z.sin().sum(1), x, zh.Smoothing(sigma=0.1, samples=samples, seed=0))
+    u, a = torch.randn(2 * samples, n, dtype=torch.float64), torch.randn(2 * samples, 1, dtype=torch.float64)
+    seconds, compared = in_turn(estimate.hessian, lambda: u.mT @ (a * u), repeats)
+    return Ratio("Hessian", n, samples, seconds, compared, 0.85)
+
+
+def _redrawn(n: int, repeats: int, samples: int = 32) -> Ratio:
+    x, sigma = torch.zeros(1, n), torch.ones(n, dtype=torch.float64)
+    v, a = torch.ones(1, 1, n, dtype=torch.float64), torch.ones(1, 1, 2 * samples, dtype=torch.float64)
+    rows = kernels.pick_rows(0, 0, samples, n, proposals.SECOND_ORDER, x.device)
+    stein = LikelihoodRatio(kernels.Redrawn(rows, x, sigma, True, True), a[:, 0])
+
+    def derivatives() -> object:
+        return stein.gradient(a), stein.hvp(a, v)
+
+    noise = _sampler(x, sigma, samples)
+    seconds, compared = in_turn(derivatives, noise, repeats)
+    return Ratio("gradient + HVP, drawn again", n, samples, seconds, 3 * compared, 0.6)
+
+
+def _threads(repeats: int, n: int = 4096, samples: int = 256) -> Ratio:
+    noise = _sampler(torch.zeros(1, n), torch.ones(n, dtype=torch.float64), samples)
+    threads = torch.get_num_threads()
+
+    def of(number: int) -> Callable[[], object]:
+        def run() -> object:
+            torch.set_num_threads(number)
+            return noise()
+
+        return run
+
+    try:
+        seconds, compared = in_turn(of(2), of(1), repeats)
+    finally:
+        torch.set_num_threads(threads)
+    return Ratio("noise, two threads against one", n, samples, seconds, compared, 1.6)
+
+
+def _sampler(x: torch.Tensor, sigma: torch.Tensor, samples: int) -> Callable[[], object]:
+    def run() -> object:
+        return kernels.sample(0, samples, x, sigma, False, proposals.SECOND_ORDER, False, False)
+
+    return run
+
+
+def in_turn(first: Callable[[], object], second: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Return the median seconds of two functions that are called in turn, after one call of each."""
+    first(), second()
+    seconds: tuple[list[float], list[float]] = [], []
+    for _ in range(repeats):
+        for function, times in zip((first, second), seconds, strict=True):
+            start = time.perf_counter()
+            function()
+            times.append(time.perf_counter() - start)
+    return statistics.median(seconds[0]), statistics.median(seconds[1])

@@ -66,13 +66,15 @@ def through_memory(
     memory.add(x, trial.image(x))
     if not total:  # everything is known that may be known
         memory.fresh, total = 0, _STEPS
-    optimizer = _newton(network, task.n, radius[0], damping) if steps == "newton" else _adam(network, rate[0])
-    name, (start, end) = ("radius", radius) if steps == "newton" else ("lr", rate)
+    newton, adam = _newton(network, task.n, radius[0], damping), torch.optim.Adam(network.parameters())
+    group, name, (start, end) = (
+        (newton.param_groups[0], "radius", radius) if steps == "newton" else (adam.param_groups[0], "lr", rate)
+    )
     for step in range(total):
         share = min(step / (ANNEALED * total), 1.0)
         sigma = task.sigma[0] * (task.sigma[1] / task.sigma[0]) ** share
         layer.smoothing = layer.smoothing.replace(sigma=sigma)
-        optimizer.param_groups[0][name] = start * (end / start) ** share
+        group[name] = start * (end / start) ** share
         chosen = images[torch.arange(step * batch, (step + 1) * batch) % len(images)]
 
         def closure(chosen: torch.Tensor = chosen) -> tuple[torch.Tensor, torch.Tensor, zh.optim.SampleJacobian]:
@@ -80,12 +82,12 @@ def through_memory(
             return layer(y, chosen).mean(), y, zh.optim.SampleJacobian(network, chosen)
 
         if steps == "newton":
-            loss = optimizer.step(closure)
+            loss = newton.step(closure)
         else:
-            optimizer.zero_grad()
+            adam.zero_grad()
             loss = closure()[0]
             loss.backward()
-            optimizer.step()
+            adam.step()
         every, last = max(1, total // _ROWS), step == total - 1
         if step % every == 0 or last:
             trial.report(sigma=sigma, loss=loss.detach(), measured=last or step % (10 * every) == 0)
@@ -104,10 +106,6 @@ def _newton(network: torch.nn.Module, n: int, radius: float, damping: float) -> 
         damping=damping,
         adapt=False,
     )
-
-
-def _adam(network: torch.nn.Module, rate: float) -> torch.optim.Adam:
-    return torch.optim.Adam(network.parameters(), lr=rate)
 
 
 METHODS = (

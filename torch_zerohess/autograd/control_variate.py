@@ -53,8 +53,8 @@ def around(
         return predict(memory.surrogate, control.head, z, aux)
 
     if not control.active:
-        rest = estimated(center[part], [one[part] for one in aux])
-        return lambda x: spread(rest(x[part]))
+        alone = estimated(center[part], [one[part] for one in aux])
+        return lambda x: spread(alone(x[part]))
     if memory.pathwise is None and not transforms.watched(center):
         memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
     pathwise = len(sigma) > STEIN if memory.pathwise is None else memory.pathwise
@@ -64,7 +64,7 @@ def around(
         at_center = control.coefficient * predicted(center[:, None])[:, 0]
         if entropy:
             losses = predicted((center[:, None] + sigma * u).to(center.dtype))
-            scales = list(local_entropy.scales(losses, entropy.temperature))
+            scales = list(local_entropy.scales(losses, losses.mean(1), entropy.temperature))
     rest = estimated(center[part], [one[part] for one in (*aux, *scales)]) if fresh else None
 
     def values(z: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 The surrogate and the coefficient are those of earlier calls. They do not change while one call is made.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,7 +73,7 @@ class Control:
         return predicted if self.active else None
 
 
-def predict(surrogate: Callable[[Tensor], Tensor] | Any, head: Head | None, z: Tensor, aux: Sequence[Tensor]) -> Tensor:
+def predict(surrogate: Any, head: Head | None, z: Tensor, aux: Sequence[Tensor]) -> Tensor:
     """Return h(g(z), r) [B, E, *out] for points z [B, E, n] and aux r [B, ...], differentiable in z."""
     B, E = z.shape[:2]
     if isinstance(head, LocalEntropy):
@@ -82,6 +82,7 @@ def predict(surrogate: Callable[[Tensor], Tensor] | Any, head: Head | None, z: T
     if isinstance(head, SquaredError) and space is not None:
         known, outside = space.split(aux[0])
         coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
-        return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
-    outputs = surrogate(z.flatten(0, 1)).unflatten(0, (B, E))
+        losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]
+        return losses
+    outputs: Tensor = surrogate(z.flatten(0, 1)).unflatten(0, (B, E))
     return outputs if head is None else apply_head(head, outputs, aux)

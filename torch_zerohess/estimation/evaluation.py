@@ -14,7 +14,7 @@ from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.perturbations import draws, perturb
-from torch_zerohess.estimation.stein import total
+from torch_zerohess.estimation.stein import Stein, total
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
@@ -146,7 +146,7 @@ def evaluate(
     share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
         share = kept / kept.sum(1, keepdim=True).double()
-    rest, rest_center = _remaining(call, values, center, K, everywhere, outputs, aux, control)
+    rest, rest_center = _remaining(call, values, center, share, everywhere, outputs, aux, control, stein)
     values = values[:, :K]
     baseline, coefficients = _coefficients(rest.reshape(B, K, -1), rest_center, share[..., None], smoothing, n)
     # The sum of finite numbers may be infinite, but that of others is never finite.
@@ -173,18 +173,22 @@ def _remaining(
     call: BlackBoxCall,
     values: Tensor,
     center: Tensor | None,
-    K: int,
+    share: Tensor,
     points: Tensor,
     outputs: Tensor,
     aux: Sequence[Tensor],
     control: Control | None,
+    stein: Stein,
 ) -> tuple[Tensor, Tensor | None]:
     """Return what is to be smoothed, [B, K, *out], and the same at the center [B, *out].
 
     These are the values, less what the control variate explains; for a local entropy the packed values.
     """
+    K = share.shape[1]
     if isinstance(call.head, LocalEntropy):
-        T, m = local_entropy.scales(values[:, :K], call.head.temperature)
+        losses = values[:, :K].double()
+        mean = (stein.value((losses * share)[:, None]) / stein.value(share[:, None]))[:, 0]
+        T, m = local_entropy.scales(losses, mean, call.head.temperature)
         if control is not None:
             T, m = control.scales(aux) or (T, m)
         rows, packed_center = local_entropy.packed(values[:, :K], center, T, m)

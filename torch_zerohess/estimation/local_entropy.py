@@ -11,11 +11,10 @@ ELEMENTS = 4
 """Of a packed output."""
 
 
-def scales(losses: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
-    """Return T = `temperature` times the mean of losses [B, K], and m, their minimum: float64 [B] each."""
-    losses = losses.detach().double()
-    T = temperature * losses.mean(1).abs()
-    return T.clamp_min(torch.finfo(torch.float32).tiny), losses.min(1).values
+def scales(losses: Tensor, mean: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+    """Return T = `temperature` times the mean loss [B], and m, the least of losses [B, K]: float64 [B] each."""
+    T = temperature * mean.detach().double().abs()
+    return T.clamp_min(torch.finfo(torch.float32).tiny), losses.detach().double().min(1).values
 
 
 def tempered(losses: Tensor, T: Tensor, m: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ class Memory:
         draws: int = 64,
     ) -> None:
         for name, number, least in (("capacity", capacity, 2), ("fresh", fresh, 0), ("draws", draws, 2)):
-            if number is None and name == "fresh":
+            if number is None:  # of fresh
                 continue
             if isinstance(number, bool) or not hasattr(number, "__index__"):
                 raise TypeError(f"{name} must be an integer, got {number!r}")
@@ -87,6 +87,8 @@ class Memory:
         self._size = 0
         self._fitted = 0
         """Evaluations taken at the last fit."""
+        self._rows = 0
+        """How many of the evaluations that are kept the last fit knew: they come first."""
         self._moments = [0.0, 0.0]
         """Covariance of h(f) and h(g), and variance of h(g), over evaluations that g had not seen."""
 
@@ -138,10 +140,14 @@ class Memory:
         """
         if self._size < 2:
             raise ValueError(f"a surrogate is fitted to at least 2 evaluations, the memory has {self._size}: add some")
-        if hasattr(self.surrogate, "fit"):
-            outputs = self.outputs
-            self.surrogate.fit(self.points, outputs if outputs.dim() > 1 else outputs[:, None])
+        self._rows = self._size
+        self._fit_rows()
         self._fitted, self.pathwise = self.evaluations, None
+
+    def _fit_rows(self) -> None:
+        if hasattr(self.surrogate, "fit"):
+            points, outputs = self.points[: self._rows], self.outputs[: self._rows]
+            self.surrogate.fit(points, outputs if outputs.dim() > 1 else outputs[:, None])
 
     def refresh(self) -> None:
         """Fit the surrogate if that is due: `evaluations` has grown by 30 % since the last fit."""
@@ -181,7 +187,7 @@ class Memory:
         nearest = apart.masked_fill(~later, float("inf")).min(1).values
         kept = nearest.argsort()[excess:].sort().values
         self._points, self._outputs = [points[kept]], [self.outputs[kept]]
-        self._size = len(kept)
+        self._size, self._rows = len(kept), int((kept < self._rows).sum())
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the settings: evaluations, the coefficient, and the state of the surrogate if any."""
@@ -191,20 +197,22 @@ class Memory:
             "outputs": self.outputs,
             "evaluations": self.evaluations,
             "fitted": self._fitted,
+            "rows": self._rows,
+            "pathwise": self.pathwise,
             "moments": list(self._moments),
             "surrogate": model,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take the evaluations of `state_dict`; a surrogate that is no module is fitted again, to all of them."""
+        """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew."""
         points, outputs = state["points"], state["outputs"]
         self._points, self._outputs = ([points], [outputs]) if len(points) else ([], [])
         self._size, self.evaluations, self._moments = len(points), state["evaluations"], list(state["moments"])
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
             self.surrogate.load_state_dict(state["surrogate"])
-        elif state["fitted"]:
-            self.fit()
-        self._fitted = state["fitted"]
+        self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
+        if self._rows > 1:
+            self._fit_rows()
 
     def __repr__(self) -> str:
         kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"

@@ -1,0 +1,95 @@
+"""The local entropy of a layer: its closed form, and the plateau that it leaves."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_zerohess as zh
+from torch_zerohess.estimation import local_entropy
+
+
+def identity(z: Tensor) -> Tensor:
+    return z.double()
+
+
+def square(outputs: Tensor) -> Tensor:
+    return outputs.square().sum(1)
+
+
+def entropy_of_square(x: Tensor, sigma: float, T: float) -> Tensor:
+    """-T log E exp(-(x + sigma u)^2 / T) = x^2 / (1 + 2 sigma^2 / T) + T / 2 log(1 + 2 sigma^2 / T)."""
+    spread = 1.0 + 2.0 * sigma**2 / T
+    return x.square() / spread + 0.5 * T * math.log(spread)
+
+
+@pytest.mark.parametrize("memory", [False, True])
+def test_value_and_derivatives_of_a_square(memory: bool) -> None:
+    sigma, temperature, at = 0.8, 0.5, 1.2
+    x = torch.tensor([[at]], dtype=torch.float64, requires_grad=True)
+    kept = None
+    if memory:
+        kept = zh.Memory(draws=4096)
+        z = torch.linspace(-4, 6, 200, dtype=torch.float64)[:, None]
+        kept.add(z, identity(z))
+        kept.fit()
+        kept._moments = [1.0, 1.0]
+    box = zh.BlackBox(
+        identity,
+        zh.Smoothing(sigma=sigma, samples=16384, seed=0, baseline="mean"),
+        head=zh.heads.LocalEntropy(square, temperature),
+        memory=kept,
+        value="smoothed",
+    ).eval()
+    F = box(x).sum()
+    (g,) = torch.autograd.grad(F, x, create_graph=True)
+    (h,) = torch.autograd.grad(g.sum(), x)
+    T = temperature * (at**2 + sigma**2)
+    exact = x.detach().clone().requires_grad_()
+    expected = entropy_of_square(exact, sigma, T).sum()
+    (slope,) = torch.autograd.grad(expected, exact, create_graph=True)
+    (bend,) = torch.autograd.grad(slope.sum(), exact)
+    torch.testing.assert_close(F.detach(), expected.detach(), rtol=0.03, atol=0.0)
+    torch.testing.assert_close(g.detach(), slope.detach(), rtol=0.05, atol=0.0)
+    torch.testing.assert_close(h, bend, rtol=0.15, atol=0.0)
+
+
+def test_a_high_temperature_is_the_mean() -> None:
+    x = torch.tensor([[0.7], [1.5]], dtype=torch.float64, requires_grad=True)
+    smoothing = zh.Smoothing(sigma=0.5, samples=64, seed=1)
+    mean = zh.BlackBox(identity, smoothing, head=square)
+    entropy = zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(square, 1e6))
+    grads = [torch.autograd.grad(box(x).sum(), x)[0] for box in (mean, entropy)]
+    torch.testing.assert_close(*grads, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(mean(x), entropy(x))
+
+
+def valley(z: Tensor) -> Tensor:
+    """A plateau of height 1 with a rim of height 2 around a narrow valley at 0: the mean is lowest on the plateau."""
+    distance = z.double().abs()
+    return torch.where(distance < 0.2, 5.0 * distance, 1.0 + torch.exp(-(distance - 0.6).square() / 0.08))
+
+
+def test_leads_into_a_valley_that_the_mean_averages_away() -> None:
+    slopes = []
+    for head in (lambda y: y[:, 0], zh.heads.LocalEntropy(lambda y: y[:, 0], 0.1)):
+        x = torch.tensor([[1.0]], dtype=torch.float64, requires_grad=True)
+        box = zh.BlackBox(valley, zh.Smoothing(sigma=0.6, samples=8192, seed=2), head=head)
+        slopes.append(float(torch.autograd.grad(box(x).sum(), x)[0]))
+    assert slopes[0] < -0.1, "the mean leads away from the valley"
+    assert slopes[1] > 0.1, "the local entropy leads into it"
+
+
+def test_wrong_arguments_say_so() -> None:
+    with pytest.raises(ValueError, match="temperature must be positive"):
+        zh.heads.LocalEntropy(square, 0.0)
+    with pytest.raises(TypeError, match="head must be callable"):
+        zh.heads.LocalEntropy(3)
+
+
+def test_tempered_losses_never_overflow() -> None:
+    T, m = torch.tensor([1e-30], dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64)
+    assert bool(
+        torch.isfinite(local_entropy.tempered(torch.tensor([[0.0, 1.0, 1e9]], dtype=torch.float64), T, m)).all()
+    )

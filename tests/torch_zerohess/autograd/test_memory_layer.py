@@ -1,0 +1,272 @@
+"""A layer with a head and a memory: unbiased whatever the surrogate is, exact where it is, and regular in torch."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import torch_zerohess as zh
+
+SIGMA = 0.5
+FREQUENCIES = torch.tensor([[1.0, 0.4], [-0.3, 1.2], [0.7, 0.9]], dtype=torch.float64)  # [m, n]
+
+
+def render(z: Tensor) -> Tensor:
+    """Images [K, 3] of parameters [K, 2]."""
+    return torch.sin(z.double() @ FREQUENCIES.mT)
+
+
+def truth(x: Tensor, r: Tensor) -> Tensor:
+    """E mean((sin(w.(x + sigma u)) - r)^2) in closed form, [B] for x [B, 2] and references r [B, 3]."""
+    phase, power = x @ FREQUENCIES.mT, (SIGMA * FREQUENCIES).square().sum(1)
+    square = 0.5 * (1.0 - torch.cos(2.0 * phase) * torch.exp(-2.0 * power))
+    return (square - 2.0 * r * torch.sin(phase) * torch.exp(-0.5 * power) + r * r).mean(1)
+
+
+class Fixed:
+    """A surrogate that is never fitted."""
+
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        self.function = function
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        pass
+
+    def __call__(self, z: Tensor) -> Tensor:
+        return self.function(z)
+
+
+class Untrained(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(5)
+        self.layers = nn.Sequential(nn.Linear(2, 8), nn.Tanh(), nn.Linear(8, 3)).double()
+
+    def forward(self, z: Tensor) -> Tensor:
+        result: Tensor = self.layers(z.double())
+        return result
+
+
+SURROGATES: dict[str, Callable[[], Any]] = {
+    "good": lambda: Fixed(lambda z: render(z) + 0.01 * torch.cos(z.double()[:, :1])),
+    "bad": lambda: Fixed(lambda z: (z.double() @ torch.ones(2, 3, dtype=torch.float64)).tanh()),
+    "adversarial": lambda: Fixed(lambda z: -3.0 * render(z)),
+    "untrained": Untrained,
+}
+
+
+def layer(memory: zh.Memory | None, samples: int = 2, **more: Any) -> zh.BlackBox:
+    smoothing = zh.Smoothing(sigma=SIGMA, samples=samples, baseline="none")
+    return zh.BlackBox(render, smoothing, head=zh.heads.SquaredError(), memory=memory, **{"value": "smoothed", **more})
+
+
+def remembering(surrogate: Any, coefficient: float = 1.0, **settings: Any) -> zh.Memory:
+    """A memory with a surrogate and a coefficient that stay as they are in evaluation mode."""
+    memory = zh.Memory(surrogate, **settings)
+    memory.add(torch.zeros(2, 2, dtype=torch.float64), render(torch.zeros(2, 2)))
+    memory.fit()
+    memory._moments = [coefficient, 1.0]
+    return memory
+
+
+def point() -> tuple[Tensor, Tensor]:
+    x = torch.tensor([[0.3, -0.2], [0.8, 0.1], [-0.5, 0.6], [0.1, 1.0]], dtype=torch.float64)
+    return x, torch.sin(torch.arange(12.0, dtype=torch.float64)).view(4, 3)
+
+
+@pytest.mark.parametrize("pathwise", [True, False])
+@pytest.mark.parametrize("name", SURROGATES)
+def test_unbiased_for_every_surrogate(name: str, pathwise: bool) -> None:
+    torch.manual_seed(1)
+    x, r = point()
+    memory = remembering(SURROGATES[name](), 0.7, fresh=2)
+    memory.pathwise = pathwise
+    box = layer(memory, samples=16).eval()
+    exact = x.clone().requires_grad_()
+    F = truth(exact, r)
+    (g,) = torch.autograd.grad(F.sum(), exact, create_graph=True)
+    (h,) = torch.autograd.grad(g[:, 0].sum(), exact)
+    values, gradients, bends = [], [], []
+    for _ in range(250):
+        y = x.clone().requires_grad_()
+        value = box(y, r)
+        (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
+        bends.append(torch.autograd.grad(gradient[:, 0].sum(), y)[0])
+        values.append(value.detach())
+        gradients.append(gradient.detach())
+    for sampled, expected in ((values, F), (gradients, g), (bends, h)):
+        each = torch.stack(sampled)
+        z = (each.mean(0) - expected.detach()) / (each.std(0) / math.sqrt(len(each)))
+        assert float(z.abs().max()) < 4.5, "of 20 numbers; false alarms: 1 in 7 000"
+
+
+def test_an_exact_surrogate_leaves_no_noise_of_new_samples() -> None:
+    x, r = point()
+    memory = remembering(Fixed(render), draws=512)
+    box = layer(memory, samples=1).eval()
+    y = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(box(y, r).sum(), y)
+    exact = x.clone().requires_grad_()
+    (g,) = torch.autograd.grad(truth(exact, r).sum(), exact)
+    torch.testing.assert_close(gradient, g, rtol=0.02, atol=0.002)
+    plain = layer(None, samples=1)
+    (alone,) = torch.autograd.grad(plain(y, r).sum(), y)
+    assert float((alone - g).norm()) > 20 * float((gradient - g).norm())
+
+
+def test_memory_lowers_the_error_and_a_bad_one_does_no_harm() -> None:
+    torch.manual_seed(2)
+    x, r = point()
+    exact = x.clone().requires_grad_()
+    (g,) = torch.autograd.grad(truth(exact, r).sum(), exact)
+
+    def error(box: zh.BlackBox) -> float:
+        total = 0.0
+        for call in range(60):
+            y = x.clone().requires_grad_()
+            (gradient,) = torch.autograd.grad(box(y, r).sum(), y)
+            total += float((gradient - g).square().sum()) if call >= 30 else 0.0
+        return math.sqrt(total / 30)
+
+    alone = error(layer(None))
+    assert error(layer(zh.Memory())) < 0.3 * alone
+    noise = Fixed(lambda z: 5.0 * torch.sin(40.0 * z.double() @ FREQUENCIES.mT + 1.0))
+    assert error(layer(zh.Memory(noise))) < 1.3 * alone
+
+
+def test_fn_sees_points_alone_and_one_output_serves_every_reference() -> None:
+    seen: list[tuple[int, ...]] = []
+
+    def counted(*inputs: Tensor) -> Tensor:
+        seen.append(tuple(len(one) for one in inputs))
+        return render(inputs[0])
+
+    x, r = point()
+    box = zh.BlackBox(counted, zh.Smoothing(sigma=SIGMA, samples=3), head=zh.heads.SquaredError())
+    box(x.requires_grad_(), r).sum().backward()
+    assert seen == [(4 * 7,)]
+
+
+def test_a_head_equals_the_same_code_inside_of_the_black_box() -> None:
+    x, r = point()
+    smoothing = zh.Smoothing(sigma=SIGMA, samples=3, seed=1)
+    outside = zh.BlackBox(render, smoothing, head=lambda y, one: (y - one).abs().sum(1))
+    inside = zh.BlackBox(lambda z, one: (render(z) - one).abs().sum(1), smoothing)
+    for one in (outside, inside):
+        assert one(x.clone().requires_grad_(), r).shape == (4,)
+    for batch in (1, 4):  # views per sample, and per element
+        y = x[:batch].clone().requires_grad_()
+        grads = [torch.autograd.grad(box(y, r[:batch]).sum(), y)[0] for box in (outside, inside)]
+        torch.testing.assert_close(*grads)
+
+
+def test_fresh_counts_evaluations() -> None:
+    x, r = point()
+    memory = zh.Memory(fresh=1)
+    box = layer(memory, samples=2)
+    for call in range(1, 4):
+        box(x.clone().requires_grad_(), r).sum().backward()
+        assert memory.evaluations == 4 * call
+    memory.fit()
+    memory.fresh = 0
+    box(x.clone().requires_grad_(), r).sum().backward()
+    assert memory.evaluations == 12
+    box.eval()
+    memory.fresh = 2
+    box(x.clone().requires_grad_(), r).sum().backward()
+    assert memory.evaluations == 12, "after eval() nothing is kept"
+    with pytest.raises(ValueError, match="fresh=0 has no surrogate"):
+        layer(zh.Memory(fresh=0))(x.clone().requires_grad_(), r)
+
+
+def test_center_is_the_value_at_the_center() -> None:
+    x, r = point()
+    box = layer(remembering(SURROGATES["bad"]()), value="center").eval()
+    expected = (render(x) - r).square().mean(1)
+    torch.testing.assert_close(box(x.clone().requires_grad_(), r).detach(), expected)
+    torch.testing.assert_close(box(x, r), expected)
+
+
+def test_transforms_agree() -> None:
+    x, r = point()
+    box = zh.BlackBox(
+        render,
+        zh.Smoothing(sigma=SIGMA, samples=3, baseline="none", seed=4),
+        head=zh.heads.SquaredError(),
+        memory=remembering(SURROGATES["good"]()),
+        value="smoothed",
+    ).eval()
+
+    def total(y: Tensor) -> Tensor:
+        return box(y, r).sum()
+
+    y = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(total(y), y, create_graph=True)
+    torch.testing.assert_close(torch.func.grad(total)(x), gradient.detach())
+    hessian = torch.autograd.functional.hessian(total, x)
+    torch.testing.assert_close(torch.func.hessian(total)(x), hessian)
+    torch.testing.assert_close(torch.func.jacrev(torch.func.jacrev(total))(x), hessian)
+    each = torch.func.vmap(torch.func.grad(lambda one, two: box(one, two)), randomness="different")(x, r)
+    assert each.shape == x.shape
+    frozen = box.freeze(x, r)
+    assert torch.autograd.gradcheck(frozen, (x.clone().requires_grad_(),))
+    assert torch.autograd.gradgradcheck(frozen, (x.clone().requires_grad_(),))
+
+
+def test_state_dict_carries_the_memory() -> None:
+    torch.manual_seed(3)
+    x, r = point()
+    first, second = layer(zh.Memory()), layer(zh.Memory())
+    for _ in range(5):
+        first(x.clone().requires_grad_(), r).sum().backward()
+    second.load_state_dict(first.state_dict())
+    results = []
+    for box in (first, second):
+        box.eval()
+        torch.manual_seed(7)
+        y = x.clone().requires_grad_()
+        results.append(torch.autograd.grad(box(y, r).sum(), y)[0])
+    torch.testing.assert_close(*results, rtol=1e-6, atol=1e-9)
+    with pytest.raises((ValueError, RuntimeError), match="memory"):
+        layer(None).load_state_dict(first.state_dict())
+
+
+def test_first_order_leaves_the_curvature_to_the_surrogate() -> None:
+    x, r = point()
+    bends = []
+    for order in (1, 2):
+        memory = remembering(SURROGATES["bad"](), order=order)
+        box = zh.BlackBox(
+            render,
+            zh.Smoothing(sigma=SIGMA, samples=2, baseline="none", seed=0),
+            head=zh.heads.SquaredError(),
+            memory=memory,
+            value="smoothed",
+        ).eval()
+        y = x.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(box(y, r).sum(), y, create_graph=True)
+        bends.append((gradient.detach(), torch.autograd.grad(gradient.sum(), y)[0]))
+        memory.fresh = 0
+        (gradient,) = torch.autograd.grad(box(y, r).sum(), y, create_graph=True)
+        bends.append((gradient.detach(), torch.autograd.grad(gradient.sum(), y)[0]))
+    torch.testing.assert_close(bends[0][0], bends[2][0])  # the gradient has the new evaluations in both
+    torch.testing.assert_close(bends[0][1], bends[1][1])  # the curvature of order 1 is the surrogate's
+    assert float((bends[2][1] - bends[3][1]).norm()) > 0.01
+
+
+def test_wrong_arguments_say_so() -> None:
+    smoothing = zh.Smoothing(sigma=1.0)
+    with pytest.raises(TypeError, match="memory must be a Memory"):
+        zh.BlackBox(render, smoothing, memory=3)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="head must be callable"):
+        zh.BlackBox(render, smoothing, head=3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="head has parameters"):
+        zh.BlackBox(render, smoothing, head=nn.Linear(3, 1))
+    x, r = point()
+    with pytest.raises(ValueError, match="one loss per output"):
+        zh.BlackBox(render, smoothing, head=lambda y, one: y)(x, r)
+    with pytest.raises(ValueError, match="references must be"):
+        zh.BlackBox(render, smoothing, head=zh.heads.SquaredError())(x, r[:, :2])

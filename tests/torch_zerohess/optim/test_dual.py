@@ -1,0 +1,134 @@
+"""Solvers of NewtonCG behind a network against dense truth: dual, clipped, and the magnitudes of curvature."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import torch_zerohess as zh
+from torch_zerohess.autograd.blocks import SampleJacobian, jacobian, output_blocks
+from torch_zerohess.autograd.curvature import CurvatureOperator
+from torch_zerohess.linalg.dual import clipped, dual_step
+from torch_zerohess.linalg.steihaug import Step
+
+
+def network() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(4, 6), nn.Tanh(), nn.Linear(6, 2)).double()
+
+
+IMAGES = torch.randn(5, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+def losses(y: Tensor) -> Tensor:
+    """Indefinite in y [B, 2]: [B]."""
+    return torch.sin(2.0 * y[:, 0]) + y[:, 0] * y[:, 1] - 0.3 * y[:, 1] ** 2
+
+
+def dense(net: nn.Module) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """J [10, N], the modified curvature A [10, 10], its gradient g [10], and y."""
+    J = SampleJacobian(net, IMAGES)(list(net.parameters()))
+    y = net(IMAGES).detach()
+    hessian = torch.autograd.functional.hessian(lambda z: losses(z).mean(), y)
+    A = torch.zeros(10, 10, dtype=torch.float64)
+    for b in range(5):
+        values, vectors = torch.linalg.eigh(hessian[b, :, b])
+        A[2 * b : 2 * b + 2, 2 * b : 2 * b + 2] = vectors @ values.abs().diag() @ vectors.mT
+    z = y.clone().requires_grad_()
+    (g,) = torch.autograd.grad(losses(z).mean(), z)
+    return J, A, g.flatten(), y
+
+
+def flat(net: nn.Module) -> Tensor:
+    return torch.cat([one.detach().flatten() for one in net.parameters()])
+
+
+@pytest.mark.parametrize("solver", ["dual", "clip", "dual with a Jacobian"])
+@pytest.mark.parametrize("radius", [1e6, 0.05])
+def test_steps_equal_the_dense_solution(solver: str, radius: float) -> None:
+    net, damping = network(), 1e-2
+    J, A, g, _ = dense(net)
+    H = J.mT @ A @ J + damping * torch.eye(J.shape[1], dtype=torch.float64)
+    expected = -torch.linalg.solve(H, J.mT @ g)
+    expected = expected * min(1.0, radius / float(expected.norm()))
+    optimizer = zh.optim.NewtonCG(
+        net.parameters(),
+        radius=radius,
+        curvature="gauss_newton",
+        solver=solver.split()[0],
+        modification="abs",
+        iterations=500,
+        tolerance=1e-13,
+        damping=damping,
+        adapt=False,
+    )
+    before = flat(net)
+
+    def closure() -> object:
+        y = net(IMAGES)
+        loss = losses(y).mean()
+        return (loss, y, SampleJacobian(net, IMAGES)) if "Jacobian" in solver else (loss, y)
+
+    optimizer.step(closure)  # type: ignore[arg-type]
+    torch.testing.assert_close(flat(net) - before, expected, rtol=1e-5, atol=1e-8)
+
+
+def test_jacobians_agree() -> None:
+    net = network()
+    y = net(IMAGES)
+    operator = CurvatureOperator(losses(y).mean(), list(net.parameters()), mode="gauss_newton", through=y)
+    torch.testing.assert_close(jacobian(operator), SampleJacobian(net, IMAGES)(list(net.parameters())))
+    with pytest.raises(ValueError, match="parameters of the network"):
+        SampleJacobian(net, IMAGES)([torch.zeros(3)])
+
+
+def test_coupled_elements_are_refused() -> None:
+    net = network()
+    y = net(IMAGES)
+    operator = CurvatureOperator((y.sum() ** 2), list(net.parameters()), mode="gauss_newton", through=y)
+    with pytest.raises(ValueError, match="couples its elements"):
+        output_blocks(operator)
+
+
+def test_a_gradient_from_elsewhere_is_refused() -> None:
+    net = network()
+    optimizer = zh.optim.NewtonCG(net.parameters(), curvature="gauss_newton", solver="dual", damping=1e-2, adapt=False)
+
+    def closure() -> tuple[Tensor, Tensor]:
+        y = net(IMAGES)
+        return losses(y).square().mean() + flat_norm(net), y
+
+    with pytest.raises(ValueError, match="inputs of black boxes alone"):
+        optimizer.step(closure)
+
+
+def flat_norm(net: nn.Module) -> Tensor:
+    return torch.stack([one.square().sum() for one in net.parameters()]).sum()
+
+
+def test_the_decrease_is_the_decrease_of_the_model() -> None:
+    J, A, g, _ = dense(network())
+    for radius in (0.05, 1e6):
+        step = dual_step(J, A, g, radius, 1e-3)
+        moved = J @ step.s
+        assert step.decrease == pytest.approx(-float(g @ moved + 0.5 * moved @ A @ moved))
+        assert float(step.s.norm()) <= radius * (1 + 1e-12)
+    H, gradient = J.mT @ A @ J, J.mT @ g
+    s = -gradient
+    whole = Step(s, -float(gradient @ s + 0.5 * s @ H @ s), "converged")
+    short = clipped(whole, gradient, 0.1)
+    expected = -float(gradient @ short.s + 0.5 * short.s @ H @ short.s)
+    assert short.decrease == pytest.approx(expected)
+    assert float(short.s.norm()) == pytest.approx(0.1)
+
+
+def test_wrong_settings_say_so() -> None:
+    net = network()
+    for message, settings in (
+        ("solver must be one of", {"solver": "cg"}),
+        ("modification must be None or 'abs'", {"modification": "shift"}),
+        ("needs curvature 'gauss_newton'", {"solver": "dual", "damping": 1.0}),
+        ("needs curvature 'gauss_newton'", {"modification": "abs"}),
+        ("needs a positive damping", {"solver": "dual", "curvature": "gauss_newton"}),
+    ):
+        with pytest.raises(ValueError, match=message):
+            zh.optim.NewtonCG(net.parameters(), **settings)  # type: ignore[arg-type]

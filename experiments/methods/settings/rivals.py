@@ -24,9 +24,10 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
 _ZEROGRADS = {"pairs": 1, "sigma": (1.0, 0.1), "steps": 300, "rate": 0.2, "fit_rate": 0.01, "fits": 30}
 _RELAX = {"samples": 4, "sigma": (1.0, 0.01), "steps": 100, "rate": 0.2, "fit_rate": 0.01, "hidden": (10,)}
 
-# COBYQA, Py-BOBYQA, CMA-ES with bounds, DFO-LS and L-BFGS-B on MUG, SHAD, BUNNY, BOX2, BRDF: `tune TASK --method M
-# --runs 3 --trials 8`, which is all of their space but for Py-BOBYQA (8 of 10); box2, brdf: --evaluations 6000. On MIRROR
-# CMA-ES, COBYQA and DFO-LS. On SHAD not DFO-LS and L-BFGS-B. What is not named here was best at its defaults.
+# COBYQA, Py-BOBYQA, CMA-ES with bounds, DFO-LS and L-BFGS-B on MUG, SHAD, BUNNY, BOX2, BRDF:
+# tune mug --method py_bobyqa --runs 3 --trials 8; the same for the others; box2, brdf: --evaluations 6000
+# That is all of their space but for Py-BOBYQA, 8 of 10. On MIRROR CMA-ES, COBYQA and DFO-LS; on SHAD not DFO-LS and
+# L-BFGS-B. What is not named here was best at its defaults.
 
 TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     # tune bunny --method mitsuba_path --runs 3 --evaluations 120 --over rate=0.3,0.5,1.0; --method mitsuba_projective

@@ -159,7 +159,7 @@ class SurrogateTerm:
                 each = self._by_stein(quantity, v)
         else:
             each = self._along_points(quantity, v)
-        half = len(self.u) // 2
+        each, half = each.detach(), len(self.u) // 2  # a module has parameters that require grad
         return 0.5 * (each[:, :half] + each[:, half:])
 
     def _by_stein(self, quantity: Quantity, v: Tensor | None) -> Tensor:

@@ -156,6 +156,7 @@ def test_an_estimate_stays_as_it_was_when_the_surrogate_changes() -> None:
     module, references = untrained(), R.repeat(2, 1)
     got = estimate(image, X.expand(2, 2), SMOOTHING, references, head=SquaredError(), memory=Whole(module))
     before = got.hessian()
+    assert not before.requires_grad
     with torch.no_grad():
         for one in module.parameters():
             one.add_(1.0)

@@ -14,8 +14,9 @@ from torch_zerohess import adapters, evaluators, heads, losses, optim
 from torch_zerohess.autograd.blackbox import BlackBox, smooth
 from torch_zerohess.autograd.curvature import CurvatureOperator, hvp
 from torch_zerohess.doctor import doctor
-from torch_zerohess.estimation.estimate import Estimate, estimate
+from torch_zerohess.estimation.estimate import estimate
 from torch_zerohess.estimation.finite_differences import finite_difference_hvp
+from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.minimize import Minimum, minimize
 from torch_zerohess.optim.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing

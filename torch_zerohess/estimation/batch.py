@@ -54,9 +54,9 @@ class Batch:
 
     @property
     def _pooled(self) -> Tensor:
-        """(f - mean of f) * share, [B, P, K]."""
+        """(f - mean of f) * share, [B, P, K], where f is what is smoothed."""
         share = self.evaluations.share[..., None]
-        f = self.evaluations.values.reshape(*share.shape[:2], -1).double()
+        f = self.evaluations.rest.reshape(*share.shape[:2], -1).double()
         origin = f[:, :1]  # differences to one of the values keep the precision of a small variation
         return (((f - origin) - ((f - origin) * share).sum(1, keepdim=True)) * share).mT.contiguous()
 

@@ -63,7 +63,8 @@ class Control:
         """
         predicted = None
         if self.memory.ready:
-            predicted = predict(self.memory.surrogate, self.head, points, self.references(aux)).double()
+            with torch.no_grad():  # a module has parameters that require grad
+                predicted = predict(self.memory.surrogate, self.head, points, self.references(aux)).double()
             if not bool(torch.isfinite(predicted).all()):
                 raise ValueError("the surrogate of the memory predicted a value that is not finite")
         if self.learning:

@@ -99,16 +99,21 @@ class Evaluations:
     """f(x), [B, *out], where it was evaluated."""
     share: Tensor
     """Weight of each row in a mean, [B, K]: 1/K; where rows were dropped, zero for them and more for the others."""
+    rest: Tensor
+    """What is smoothed, [B, K, *out]: the values, less what a control variate explains."""
     baseline: Tensor
-    """What was subtracted from f, its mean over the rows, [B, P]."""
+    """What was subtracted from `rest`, its mean over the rows, [B, P]."""
     expansion: Expansion
 
     @property
     def smoothed(self) -> Tensor:
-        """The estimate of F(x), float64 [B, *out], whether or not it is the base of the expansion."""
+        """The smoothed `rest` at x, float64 [B, *out], whether or not it is the base of the expansion.
+
+        Without a control variate this is the estimate of F(x).
+        """
         B, K = self.share.shape
-        values, a = self.values.reshape(B, K, -1), self.expansion.flat.mT
-        return self.expansion.stein.smoothed(values, self.baseline, a).reshape(self.expansion.base.shape)
+        rest, a = self.rest.reshape(B, K, -1), self.expansion.flat.mT
+        return self.expansion.stein.smoothed(rest, self.baseline, a).reshape(self.expansion.base.shape)
 
     @property
     def dropped(self) -> int:
@@ -166,7 +171,7 @@ def evaluate(
         if isinstance(call.head, LocalEntropy):
             base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
     expansion = Expansion(base, coefficients, perturbations.sigma, stein)
-    return Evaluations(points, values, center, share, baseline, expansion)
+    return Evaluations(points, values, center, share, rest, baseline, expansion)
 
 
 def _remaining(

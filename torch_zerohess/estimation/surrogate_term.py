@@ -13,9 +13,11 @@ The points u are a Sobol sequence with a random shift (Cranley and Patterson 197
 and their mirror images: the mean is unbiased, and its error falls faster than the error of independent draws.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -79,9 +81,10 @@ def smoothed(
 class SurrogateTerm:
     """The term at points x [B, n] with auxiliary inputs [B, ...], and its derivatives without autograd.
 
-    Quantities are [B, P] for P outputs, and [B, P, n] where they are derivatives.
+    Quantities are [B, P] for P outputs, [B, P, n] where they are derivatives, and [B, P, n, n] for the "hessian".
     """
 
+    surrogate: Any
     control: Control
     x: Tensor
     aux: Sequence[Tensor]
@@ -91,14 +94,51 @@ class SurrogateTerm:
     """[Q, n], see `nodes`."""
     pathwise: bool
 
+    @classmethod
+    def fixed(
+        cls, control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, seed: int, order: int
+    ) -> "SurrogateTerm":
+        """Return the term with copies of the surrogate and of aux: a later fit or training does not change it."""
+        memory = control.memory
+        u = nodes(seed, memory.draws, x.shape[1]).to(x.device)
+        if memory.pathwise is None:
+            memory.pathwise = prefers_pathwise(control, x, aux, sigma, u, order)
+        copies = [one.clone() for one in aux]
+        return cls(copy.deepcopy(memory.surrogate), control, x, copies, sigma, u, memory.pathwise)
+
     def mean(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
         """Return a quantity; v is the direction [B, n] of the "hvp"."""
-        return self._pairs(quantity, v).mean(1)
+        return self.hessian() if quantity == "hessian" else self._pairs(quantity, v).mean(1)
 
     def variance(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
         """Return the variance of `mean`, from the spread of the pairs as if they were independent: an upper bound."""
+        if quantity == "hessian":
+            return torch.stack([self.variance("hvp", unit.expand_as(self.x)) for unit in self._units], 3)
         pairs = self._pairs(quantity, v)
         return pairs.var(1) / pairs.shape[1]
+
+    def spread(self, error: Tensor, degrees: Tensor, quantity: Quantity, v: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the standard error of the term plus an independent estimate, and its degrees of freedom.
+
+        Args:
+            error: standard error of the independent estimate.
+            degrees: its degrees of freedom; those of the sum are by Satterthwaite.
+            quantity: which.
+            v: [B, n], the vector of the "hvp".
+
+        Raises:
+            ValueError: the memory has fewer than 3 draws, which are fewer than two pairs.
+        """
+        own = len(self.u) // 2 - 1
+        if own < 1:
+            raise ValueError(
+                f"a standard error needs a memory with draws of at least 3, got {self.control.memory.draws}"
+            )
+        mine = self.variance(quantity, v).sqrt()
+        whole = torch.hypot(error, mine)
+        unit = torch.where(whole > 0, whole, 1.0)
+        inverse = (error / unit) ** 4 / degrees + (mine / unit) ** 4 / own
+        return whole, torch.where(whole > 0, 1.0 / inverse, degrees)
 
     def hessian(self) -> Tensor:
         """Return the Hessian [B, P, n, n]."""
@@ -109,7 +149,7 @@ class SurrogateTerm:
     def _each(self, x: Tensor) -> Tensor:
         """Return c h(g(x + sigma u), r) at every point, [B, Q, P]."""
         z = (x[:, None] + self.sigma * self.u).to(self.x.dtype)
-        values = self.control.coefficient * predict(self.control.memory.surrogate, self.control.head, z, self.aux)
+        values = self.control.coefficient * predict(self.surrogate, self.control.head, z, self.aux)
         return values.reshape(*values.shape[:2], -1).double()
 
     def _pairs(self, quantity: Quantity, v: Tensor | None) -> Tensor:
@@ -119,14 +159,14 @@ class SurrogateTerm:
                 each = self._by_stein(quantity, v)
         else:
             each = self._along_points(quantity, v)
-        half = len(self.u) // 2
+        each, half = each.detach(), len(self.u) // 2  # a module has parameters that require grad
         return 0.5 * (each[:, :half] + each[:, half:])
 
     def _by_stein(self, quantity: Quantity, v: Tensor | None) -> Tensor:
         values, u = self._each(self.x.double()), self.u[:, None]
         if quantity == "value":
             return values
-        center = predict(self.control.memory.surrogate, self.control.head, self.x[:, None], self.aux).double()
+        center = predict(self.surrogate, self.control.head, self.x[:, None], self.aux).double()
         change = (values - self.control.coefficient * center.reshape(len(values), 1, -1))[..., None]
         if quantity == "gradient":
             return change * u / self.sigma
@@ -164,6 +204,7 @@ def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: 
     """
     if len(sigma) > STEIN:
         return True
-    few = SurrogateTerm(control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
+    surrogate = control.memory.surrogate
+    few = SurrogateTerm(surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
     quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
     return float(few.variance(quantity).sum()) < float(replace(few, pathwise=False).variance(quantity).sum())

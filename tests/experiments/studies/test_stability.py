@@ -65,5 +65,5 @@ def test_shares_of_intervals_are_told_and_judged(monkeypatch, capsys) -> None:
 def test_standard_errors_of_half_the_size_are_noticed(monkeypatch) -> None:
     settings = {"proposal": "aggregate", "sampler": "random", "baseline": "center"}
     assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["right", "right"]
-    monkeypatch.setattr("torch_zerohess.estimation.estimate.student_factor", lambda level, degrees: 0.5 * degrees**0)
+    monkeypatch.setattr("torch_zerohess.estimation.result.student_factor", lambda level, degrees: 0.5 * degrees**0)
     assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["WRONG", "WRONG"]

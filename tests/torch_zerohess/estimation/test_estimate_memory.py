@@ -1,0 +1,229 @@
+"""Estimates with a head and a memory are unbiased for every surrogate, and a good surrogate makes them more accurate.
+
+The black box is [sin a, cos a] with a = k.z, the head the squared error to r. Its loss is a constant and a wave in a,
+so that F has a closed form.
+"""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torch_zerohess import Memory, Smoothing, estimate
+from torch_zerohess.heads import LocalEntropy, SquaredError
+from truths import deviation, vector
+
+K, X, R, V = vector(1.0, 0.5), vector(0.3, -0.4), vector(0.8, -0.5), vector(0.7, -1.1)
+SIGMA = 0.6
+SMOOTHING = Smoothing(sigma=SIGMA, samples=8, seed=0)
+DECAY = math.exp(-0.5 * SIGMA**2 * float(K @ K))
+SEEDS = [(one * 0x9E3779B97F4A7C15) % 2**63 for one in range(1, 31)]  # generators of near seeds begin alike
+QUANTITIES = ("value", "gradient", "hessian_diagonal", "hessian", "hvp")
+
+
+def image(z: Tensor) -> Tensor:
+    return torch.stack([torch.sin(z @ K), torch.cos(z @ K)], 1)
+
+
+def closed_form() -> dict[str, Tensor]:
+    a = X @ K
+    hessian = torch.outer(K, K) * DECAY * (R[0] * torch.sin(a) + R[1] * torch.cos(a))
+    return {
+        "value": 0.5 * (1 + R @ R) - DECAY * (R[0] * torch.sin(a) + R[1] * torch.cos(a)),
+        "gradient": -K * DECAY * (R[0] * torch.cos(a) - R[1] * torch.sin(a)),
+        "hessian_diagonal": hessian.diagonal(),
+        "hessian": hessian,
+        "hvp": hessian @ V,
+    }
+
+
+class Model(nn.Module):
+    """A surrogate that is never fitted."""
+
+    def __init__(self, function) -> None:
+        super().__init__()
+        self.function = function
+
+    def forward(self, z: Tensor) -> Tensor:
+        return self.function(z)
+
+
+class Whole(Memory):
+    """A memory that subtracts its surrogate whatever it is worth."""
+
+    coefficient = property(lambda self: 1.0)
+
+
+def untrained() -> nn.Module:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return nn.Sequential(nn.Linear(2, 8), nn.Tanh(), nn.Linear(8, 2)).double()
+
+
+SURROGATES = {
+    "good": Model(lambda z: image(z) + 0.05 * z),
+    "bad": Model(lambda z: z @ torch.tensor([[1.3, -0.4], [0.6, 2.1]], dtype=z.dtype) + 1.0),
+    "adversarial": Model(lambda z: -10.0 * image(z)),
+    "untrained": untrained(),
+}
+
+
+def of(got, quantity: str) -> Tensor:
+    if quantity == "hvp":
+        return got.hvp(V)
+    return getattr(got, quantity) if quantity in ("value", "gradient") else getattr(got, quantity)()
+
+
+def estimated(memory: Memory | None, seed: int, *, batch: int = 6, **options):
+    options = {"value": "smoothed", **options}
+    own = SMOOTHING.replace(seed=seed)
+    return estimate(image, X.expand(batch, 2), own, R.expand(batch, 2), head=SquaredError(), memory=memory, **options)
+
+
+@pytest.mark.parametrize("pathwise", [True, False])
+@pytest.mark.parametrize("name", SURROGATES)
+def test_every_surrogate_is_unbiased(name: str, pathwise: bool) -> None:
+    memory = Whole(SURROGATES[name], draws=16, capacity=100)
+    memory.pathwise = pathwise
+    found = [estimated(memory, seed) for seed in SEEDS]
+    for quantity, truth in closed_form().items():
+        # one number per call: the elements of a batch share the points of the surrogate's term
+        samples = torch.stack([of(one, quantity).mean(0) for one in found])
+        assert deviation(samples, truth, rounding=1e-9) < 4.5, quantity
+
+
+@pytest.mark.parametrize("options", [{"proposal": "optimal"}, {"baseline": "mean", "samples": 8}])
+def test_other_families_and_baselines_are_unbiased(options) -> None:
+    memory = Whole(SURROGATES["bad"], draws=16, capacity=100)
+    x, r = X.expand(6, 2), R.expand(6, 2)
+    found = [
+        estimate(
+            image,
+            x,
+            SMOOTHING.replace(seed=seed, **options),
+            r,
+            head=SquaredError(),
+            memory=memory,
+            value="smoothed",
+        )
+        for seed in SEEDS
+    ]
+    for quantity, truth in closed_form().items():
+        samples = torch.stack([of(one, quantity).mean(0) for one in found])
+        assert deviation(samples, truth, rounding=1e-9) < 4.5, quantity
+
+
+def test_a_fitted_surrogate_reduces_error_and_its_intervals_hold() -> None:
+    memory = Memory(draws=256)
+    generator = torch.Generator().manual_seed(3)
+    points = X + 1.2 * torch.randn(60, 2, generator=generator, dtype=torch.float64)
+    memory.add(points, image(points))
+    estimated(memory, 1000, batch=1)  # tells the coefficient
+    assert memory.coefficient > 0.9
+    held = dict.fromkeys(QUANTITIES, 0.0)
+    for seed in SEEDS[:12]:
+        with_memory, plain = estimated(memory, seed, batch=4), estimated(None, seed, batch=4)
+        for quantity, truth in closed_form().items():
+            v = V if quantity == "hvp" else None
+            low, high = with_memory.confidence_interval(quantity, v)
+            held[quantity] += float(((low <= truth) & (truth <= high)).double().mean()) / 12
+            error, without = (one.standard_error(quantity, v).mean() for one in (with_memory, plain))
+            assert error < 0.5 * without, quantity
+    assert min(held.values()) > 0.8, held
+
+
+def test_the_standard_error_counts_both_terms() -> None:
+    """Where the surrogate is the black box, all that is left is the term's own error."""
+    memory = Whole(Model(image), draws=64)
+    got = estimated(memory, 0, batch=1)
+    for quantity in QUANTITIES:
+        v = V if quantity == "hvp" else None
+        term = got._term.variance(quantity, None if v is None else v[None]).sqrt()[:, 0]
+        assert bool((term > 0).all())
+        torch.testing.assert_close(got.standard_error(quantity, v), term, rtol=1e-6, atol=1e-9)
+        low, high = got.confidence_interval(quantity, v)
+        torch.testing.assert_close((low + high) / 2, of(got, quantity))
+
+
+def test_the_value_at_the_center_is_the_head_of_the_output_there() -> None:
+    memory = Whole(SURROGATES["bad"])
+    got = estimated(memory, 0, batch=3, value="center")
+    torch.testing.assert_close(got.value, SquaredError()(image(X.expand(3, 2)), R.expand(3, 2)))
+
+
+def test_an_estimate_stays_as_it_was_when_the_surrogate_changes() -> None:
+    module, references = untrained(), R.repeat(2, 1)
+    got = estimate(image, X.expand(2, 2), SMOOTHING, references, head=SquaredError(), memory=Whole(module))
+    before = got.hessian()
+    assert not before.requires_grad
+    with torch.no_grad():
+        for one in module.parameters():
+            one.add_(1.0)
+    references.zero_()
+    assert torch.equal(got.hessian(), before)
+
+
+def test_the_memory_keeps_every_evaluation_whatever_fresh_is() -> None:
+    memory = Memory(fresh=1)
+    got = estimated(memory, 0, batch=5)
+    assert len(memory) == memory.evaluations == got.evaluations == got.points.shape[:2].numel()
+    torch.testing.assert_close(memory.outputs, image(memory.points))
+    estimated(memory, 1, batch=5)  # fits
+    assert memory.ready
+    assert memory.coefficient > 0.0
+    found = estimated(memory, 2, batch=5)
+    plain = estimated(None, 2, batch=5)
+    assert torch.equal(found.points, plain.points), "the same points as without a memory"
+    torch.testing.assert_close(found.values, plain.values)
+
+
+def test_a_head_gets_aux_by_views() -> None:
+    seen = []
+
+    def head(outputs: Tensor, references: Tensor) -> Tensor:
+        seen.append(references)
+        return (outputs - references).square().mean(1)
+
+    references = torch.randn(3, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    shapes = []
+
+    def fn(*given: Tensor) -> Tensor:
+        shapes.append([list(one.shape) for one in given])
+        return image(*given)
+
+    got = estimate(fn, X.expand(3, 2), SMOOTHING, references, head=head)
+    assert shapes == [[[3 * got.evaluations // 3, 2]]], "fn gets points alone"
+    assert {one.untyped_storage().data_ptr() for one in seen} == {references.untyped_storage().data_ptr()}
+    same = estimate(lambda z, r: (image(z) - r).square().mean(1), X.expand(3, 2), SMOOTHING, references)
+    torch.testing.assert_close(got.gradient, same.gradient)
+    torch.testing.assert_close(got.value, same.value)
+
+
+def test_without_a_head_outputs_keep_their_shape() -> None:
+    got = estimate(image, X, SMOOTHING.replace(samples=256), memory=Whole(Model(lambda z: image(z) + z), draws=256))
+    assert got.gradient.shape == (2, 2)
+    assert got.hessian().shape == (2, 2, 2)
+    a = X @ K
+    slope = DECAY * torch.outer(torch.stack([torch.cos(a), -torch.sin(a)]), K)
+    assert bool(((got.gradient - slope).abs() < 5 * got.standard_error("gradient")).all())
+
+
+def test_float32_stays_float32() -> None:
+    memory = Whole(Model(lambda z: torch.stack([z.sum(1), z[:, 0]], 1)))
+    x, r = X.float(), R.float()
+    got = estimate(lambda z: image(z.double()).float(), x, SMOOTHING, r, head=SquaredError(), memory=memory)
+    assert {of(got, one).dtype for one in QUANTITIES if one != "hvp"} | {got.hvp(V.float()).dtype} == {torch.float32}
+
+
+def test_what_cannot_serve_raises() -> None:
+    with pytest.raises(ValueError, match="use BlackBox"):
+        estimate(image, X, SMOOTHING, R, head=LocalEntropy(SquaredError()))
+    with pytest.raises(ValueError, match=r"tolerance 0\.1"):
+        estimated(Memory(), 0, tolerance=0.1)
+    with pytest.raises(TypeError, match="memory must be a Memory, got dict"):
+        estimated({}, 0)
+    memory = Whole(SURROGATES["good"], draws=2)
+    memory.pathwise = True
+    with pytest.raises(ValueError, match="draws of at least 3, got 2"):
+        estimated(memory, 0).standard_error("gradient")

@@ -1,0 +1,37 @@
+"""The process of chosen points against the exact one."""
+
+import torch
+
+from torch_zerohess.surrogates.gaussian_process import GaussianProcess, gaussian, matern
+from torch_zerohess.surrogates.inducing import InducedProcess
+
+
+def data(P: int = 25):
+    z = torch.randn(P, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return z, torch.stack([z[:, 0].sin(), z.prod(1), z.sum(1)], 1)
+
+
+def test_with_all_points_chosen_it_is_the_exact_posterior() -> None:
+    points, outputs = data()
+    exact = GaussianProcess.condition(points, outputs, matern, 1.0, 1e-3)
+    found = InducedProcess.condition(points, outputs, matern, 1e-3)
+    assert len(found.points) == len(points)
+    x = data(40)[0][25:] * 1.5
+    torch.testing.assert_close(found(x), exact(x), atol=1e-7, rtol=1e-7)
+    torch.testing.assert_close(found.uncertainty(x), exact.uncertainty(exact.covariance(x)), atol=1e-6, rtol=1e-5)
+
+
+def test_it_is_certain_at_the_data_and_not_far_away() -> None:
+    points, outputs = data()
+    found = InducedProcess.condition(points, outputs, matern, 1e-6)
+    assert float(found.uncertainty(points).max()) < 1e-4 * found.variance
+    assert float(found.uncertainty(points[:1] + 100.0)) > 0.9 * found.variance
+
+
+def test_duplicates_are_not_chosen_twice() -> None:
+    points, outputs = data()
+    once = InducedProcess.condition(points, outputs, gaussian, 1e-3)
+    twice = InducedProcess.condition(points.repeat(3, 1), outputs.repeat(3, 1), gaussian, 1e-3)
+    assert len(twice.points) <= len(once.points) + 3
+    assert len(twice.points) <= len(points)
+    torch.testing.assert_close(twice(points), outputs, atol=0.05, rtol=0)

@@ -1,0 +1,123 @@
+"""What a memory keeps, when it fits, and what it thinks of its surrogate."""
+
+import pytest
+import torch
+from torch import nn
+
+from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.memory import Memory
+
+
+def normal(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+class Counting(LinearSurrogate):
+    fits = 0
+
+    def fit(self, points: torch.Tensor, outputs: torch.Tensor) -> None:
+        self.fits += 1
+        super().fit(points, outputs)
+
+
+def test_it_keeps_what_is_added() -> None:
+    memory, z, y = Memory(), normal(6, 2), normal(6, 3, seed=1)
+    memory.add(z[:4], y[:4])
+    memory.add(z[4:], y[4:])
+    assert torch.equal(memory.points, z)
+    assert torch.equal(memory.outputs, y)
+    assert len(memory) == memory.evaluations == 6
+
+
+def test_rows_that_are_not_finite_are_left_out() -> None:
+    memory, z, y = Memory(), normal(4, 2), normal(4, 3, seed=1)
+    y[1, 2], z[3, 0] = float("nan"), float("inf")
+    memory.add(z, y)
+    assert torch.equal(memory.points, z[[0, 2]])
+    assert (len(memory), memory.evaluations) == (2, 4)
+
+
+@pytest.mark.parametrize(("points", "outputs"), [((4, 3), (4, 3)), ((4, 2), (4, 2)), ((4, 2), (3, 3)), ((2,), (2, 3))])
+def test_wrong_shapes_raise(points, outputs) -> None:
+    memory = Memory()
+    memory.add(normal(2, 2), normal(2, 3))
+    with pytest.raises(ValueError, match="must be"):
+        memory.add(normal(*points), normal(*outputs))
+
+
+def test_thinning_drops_older_points_that_are_crowded() -> None:
+    memory = Memory(capacity=10)
+    z = torch.arange(11, dtype=torch.float64)[:, None]
+    z[10] = 2.01  # the newest, next to the third
+    memory.add(z, z)
+    assert len(memory) == 10
+    assert 2.0 not in memory.points
+    assert 2.01 in memory.points
+    assert torch.equal(memory.points, memory.outputs)
+
+
+def test_refresh_fits_only_after_growth() -> None:
+    memory = Memory(Counting())
+    fits = []
+    for seed, count in enumerate((7, 1, 2, 1)):  # 7, 8, 10, 11 evaluations; due at 8 and at 10.4
+        memory.add(normal(count, 2, seed=seed), normal(count, 1, seed=seed + 9))
+        memory.refresh()
+        fits.append(memory.surrogate.fits)
+    assert fits == [0, 1, 1, 2]
+
+
+def test_the_coefficient_follows_the_surrogate() -> None:
+    memory, truth = Memory(), normal(1, 2000)
+    assert memory.coefficient == 0.0
+    memory.observe(truth, truth + 0.01 * normal(1, 2000, seed=1))
+    assert memory.coefficient == pytest.approx(1.0, abs=0.01)
+    unrelated = Memory()
+    unrelated.observe(truth, normal(1, 2000, seed=2))
+    assert unrelated.coefficient < 0.1
+    opposite = Memory()
+    opposite.observe(truth, -truth)
+    assert opposite.coefficient == 0.0
+
+
+def test_a_state_gives_the_same_predictions() -> None:
+    memory, z = Memory(), normal(30, 2)
+    memory.add(z, z.sin())
+    memory.fit()
+    memory.observe(z[None], z[None])
+    other = Memory()
+    other.load_state_dict(memory.state_dict())
+    new = normal(5, 2, seed=1)
+    torch.testing.assert_close(other.surrogate(new), memory.surrogate(new))
+    assert (len(other), other.evaluations, other.coefficient) == (30, 30, memory.coefficient)
+
+
+def test_a_module_without_fit_is_ready_and_never_fitted() -> None:
+    module = nn.Linear(2, 1)
+    memory, before = Memory(module), module.weight.clone()
+    assert memory.ready
+    memory.add(normal(20, 2), normal(20, 1))
+    memory.refresh()
+    assert torch.equal(module.weight, before)
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"capacity": 1}, ValueError),
+        ({"capacity": 2.5}, TypeError),
+        ({"fresh": -1}, ValueError),
+        ({"fresh": True}, TypeError),
+        ({"draws": 1}, ValueError),
+        ({"order": 3}, ValueError),
+        ({"surrogate": 3}, TypeError),
+        ({"surrogate": torch.sin}, TypeError),
+    ],
+)
+def test_wrong_settings_raise(options, error) -> None:
+    with pytest.raises(error, match=next(iter(options))):
+        Memory(**options)
+
+
+def test_a_fit_of_nothing_raises() -> None:
+    with pytest.raises(ValueError, match="at least 2 evaluations, the memory has 0"):
+        Memory().fit()

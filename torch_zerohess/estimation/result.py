@@ -1,0 +1,232 @@
+"""What an estimate says: the value and derivatives, and how far each of them may be from the truth."""
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.estimation.batch import Batch, combined, combined_spread
+from torch_zerohess.estimation.evaluation import Evaluations, ValueMode
+from torch_zerohess.estimation.inputs import short
+from torch_zerohess.estimation.stein import Quantity
+from torch_zerohess.estimation.student import student_factor
+from torch_zerohess.estimation.surrogate_term import SurrogateTerm
+from torch_zerohess.smoothing import Smoothing
+
+_MOST_LEVEL = 0.9999  # up to which the factor of Student's t is right to four digits
+
+
+class ConfidenceInterval(NamedTuple):
+    """Ends of an interval, each in the shape of the estimate."""
+
+    low: Tensor
+    high: Tensor
+
+
+class Estimate:
+    """Estimates of F(x) = E f(x + sigma u) and its derivatives, all from the same samples (Stein's identities).
+
+    `value` and `gradient` are attributes. Second derivatives are methods, because they are formed when asked for:
+    `hvp(v)`, `hessian_diagonal()`, `hessian()`. `standard_error` and `confidence_interval` say how far each may be from
+    the truth. Shapes, for x [*batch, n] and a black box with output [*out]: see each of them. Made by `estimate`.
+
+    All but `evaluations` and `dropped` raise ValueError where a result does not exist in the dtype of x.
+    """
+
+    reason: str
+    """Which limit ended the drawing: of `estimate` with a tolerance."""
+
+    def __init__(
+        self,
+        evaluations: Evaluations,
+        batch: torch.Size,
+        x: Tensor,
+        smoothing: Smoothing,
+        *,
+        more: Sequence[Batch] = (),
+        reason: str = "one batch: no tolerance was given",
+        value: ValueMode = "center",
+        term: SurrogateTerm | None = None,
+    ) -> None:
+        self._batches = [Batch(evaluations, smoothing), *more]
+        self._batch, self._x, self._smoothing, self.reason = batch, x, smoothing, reason
+        self._value_mode, self._term = value, term
+        self._sigma = evaluations.expansion.sigma
+        self._out = evaluations.expansion.base.shape[1:]
+
+    @property
+    def value(self) -> Tensor:
+        """f(x), or the estimate of F(x) where `value="smoothed"`: [*batch, *out]."""
+        B, P = self._batch.numel(), self._out.numel()
+        base = combined(self._batches, lambda one: one.evaluations.expansion.base.reshape(B, P))
+        smoothed = self._value_mode == "smoothed"
+        return self._shaped(self._completed(base, "value") if smoothed else base, "value")
+
+    @cached_property
+    def gradient(self) -> Tensor:
+        """dF/dx_i: [*batch, *out, n]."""
+        sums = combined(self._batches, lambda one: one.stein.gradient(one.a))
+        return self._shaped(self._completed(sums / self._sigma, "gradient"), "gradient")
+
+    def hvp(self, v: Tensor) -> Tensor:
+        """Hessian of F times v [*batch, n] or [n]: [*batch, *out, n], O(K n) without the Hessian."""
+        t = self._vector(v)
+        sums = combined(self._batches, lambda one: one.stein.hvp(one.a, t))
+        return self._shaped(self._completed(sums / self._sigma, "hvp", t), "hvp")
+
+    def hessian_diagonal(self) -> Tensor:
+        """d2F/dx_i2: [*batch, *out, n], O(K n) without the Hessian."""
+        sums = combined(self._batches, lambda one: one.stein.hessian_diagonal(one.a))
+        sums = self._completed(self._in_units(sums, "hessian_diagonal"), "hessian_diagonal")
+        return self._shaped(sums, "hessian_diagonal")
+
+    def hessian(self) -> Tensor:
+        """d2F/dx_i dx_j: [*batch, *out, n, n], symmetric; formed at every call."""
+        sums = combined(self._batches, lambda one: one.stein.hessian(one.a))
+        return self._shaped(self._completed(self._in_units(sums, "hessian"), "hessian"), "hessian")
+
+    def standard_error(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
+        """Standard error of an estimate, in the shape of the estimate, from the spread of its independent draws.
+
+        An antithetic pair is one draw. So are a whole scramble of sampler "sobol" and a block of "orthogonal". Few
+        draws tell their spread badly: for an interval take `confidence_interval`, not a fixed number of standard
+        errors. With baseline "mean" the draws depend on each other, and the error is that of the jackknife.
+
+        Args:
+            quantity: "value" (of the smoothed value), "gradient", "hessian_diagonal", "hessian" or "hvp".
+            v: the vector of the "hvp", [*batch, n] or [n].
+
+        Raises:
+            ValueError: fewer than two independent draws (three with baseline "mean"), an unknown quantity, or an "hvp"
+                without v.
+        """
+        error, _ = self._spread(quantity, self._checked(quantity, v))
+        return self._shaped(error, f"standard error of the {quantity}")
+
+    def confidence_interval(
+        self, quantity: Quantity, v: Tensor | None = None, *, level: float = 0.95
+    ) -> ConfidenceInterval:
+        """Interval that contains a quantity of F with a probability of `level`: estimate -+ t standard errors.
+
+        t is the quantile of Student's distribution, with one degree of freedom less than independent draws: at 95 %
+        12.7 for two draws (sampler "sobol" has two below 32 samples), 3.2 for four, 2.1 for 16, 1.96 for many. For
+        "optimal" the draws are the samples of an element.
+
+        It is exact for normal draws. What draws are is kernel times f: near to normal for f that varies at random or in
+        waves, skewed for f of one sign of curvature, the more the wider the tails of the kernel are ("gaussian" more
+        than "aggregate" and "optimal", the Hessian more than the gradient). With few skewed draws it covers less: four
+        antithetic draws of the Hessian of a parabola 0.67 instead of 0.95.
+
+        Args:
+            quantity: as for `standard_error`; "value" is F(x), also where `value` is f(x).
+            v: the vector of the "hvp", [*batch, n] or [n].
+            level: between 0 and 0.9999.
+
+        Returns:
+            low and high, each in the shape of the estimate.
+
+        Raises:
+            ValueError: as `standard_error`, or a level out of its range.
+        """
+        if not 0 < level <= _MOST_LEVEL:
+            raise ValueError(f"level must be between 0 and {_MOST_LEVEL}, got {level}")
+        t = self._checked(quantity, v)
+        error, degrees = self._spread(quantity, t)
+        half = error * student_factor(level, degrees)
+        if quantity == "value":
+            middle = combined(self._batches, lambda one: one.evaluations.smoothed.reshape(half.shape))
+        else:
+            middle = self._in_units(combined(self._batches, lambda one: one.stein.sums(quantity, one.a, t)), quantity)
+        middle = self._completed(middle, quantity, t)
+        ends = (self._shaped(middle + sign * half, f"interval of the {quantity}") for sign in (-1, 1))
+        return ConfidenceInterval(*ends)
+
+    @property
+    def evaluations(self) -> int:
+        """How often the black box was evaluated, f(x) included."""
+        return self.points.shape[:-1].numel()
+
+    @cached_property
+    def points(self) -> Tensor:
+        """Every point that was evaluated, [*batch, K, n]; x itself is the last one where f(x) was evaluated."""
+        x = self._x.reshape(-1, 1, len(self._sigma))
+        centers = [x for one in self._batches if one.evaluations.center is not None]
+        points = torch.cat([one.evaluations.points for one in self._batches] + centers, 1)
+        return points.reshape((*self._batch, *points.shape[1:]))
+
+    @cached_property
+    def values(self) -> Tensor:
+        """Values at `points`, [*batch, K, *out]."""
+        found = [one.evaluations for one in self._batches]
+        centers = [one.center[:, None] for one in found if one.center is not None]
+        values = torch.cat([one.values for one in found] + centers, 1)
+        return values.reshape((*self._batch, *values.shape[1:]))
+
+    @property
+    def dropped(self) -> int:
+        """Evaluations left out by on_nonfinite="drop". Of an antithetic pair both are left out."""
+        return sum(one.evaluations.dropped for one in self._batches)
+
+    def __repr__(self) -> str:
+        shape = f"x {list(self._x.shape)}, output {[*self._batch, *self._out]}"
+        parts = [shape, f"value={short(self.value)}", f"gradient={short(self.gradient)}"]
+        parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
+        return f"Estimate({', '.join(parts)})"
+
+    def _spread(self, quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the standard error in units of x, and its degrees of freedom."""
+        error, degrees = combined_spread(self._batches, quantity, t)
+        error = self._in_units(error, quantity)
+        if self._term is None:
+            return error, degrees
+        return self._term.spread(error, degrees, quantity, None if t is None else t[:, 0] * self._sigma)
+
+    def _completed(self, rest: Tensor, quantity: Quantity, t: Tensor | None = None) -> Tensor:
+        """Add what the surrogate of a memory explains; t as from `_vector`."""
+        if self._term is None:
+            return rest
+        return rest + self._term.mean(quantity, None if t is None else t[:, 0] * self._sigma)
+
+    def _in_units(self, sums: Tensor, quantity: Quantity) -> Tensor:
+        """Sums in units of x; one division after another, because the square of a small sigma is zero."""
+        if quantity == "value":
+            return sums
+        if quantity == "hessian":
+            one = self._smoothing.sigma
+            if isinstance(one, float):  # in place: a Hessian is large, and the sums are of no other use
+                return sums.div_(one).div_(one)
+            i, j = self._sigma[:, None], self._sigma  # the larger sigma first, for symmetry to the last bit
+            return sums / torch.maximum(i, j) / torch.minimum(i, j)
+        return sums / self._sigma / self._sigma if quantity == "hessian_diagonal" else sums / self._sigma
+
+    def _shaped(self, flat: Tensor, what: str) -> Tensor:
+        """Return [B, P, ...] as [*batch, *out, ...] in the dtype of x; ValueError if it is not finite there."""
+        result = flat.reshape((*self._batch, *self._out, *flat.shape[2:])).to(self._x.dtype)
+        # The sum of finite numbers may be infinite, but that of others is never finite.
+        if not math.isfinite(float(result.sum())) and not bool(torch.isfinite(result).all()):
+            largest = max(float(one.evaluations.values.abs().max()) for one in self._batches)
+            raise ValueError(
+                f"the {what} is not finite in {self._x.dtype}: sigma is {float(self._sigma.min()):g} at least and "
+                f"{float(self._sigma.max()):g} at most, and fn returned up to {largest:.3g}; scale x and sigma, or "
+                "what fn returns"
+            )
+        return result
+
+    def _checked(self, quantity: Quantity, v: Tensor | None) -> Tensor | None:
+        if quantity not in get_args(Quantity):
+            *others, last = map(repr, get_args(Quantity))
+            raise ValueError(f"quantity must be {', '.join(others)} or {last}, got {quantity!r}")
+        if (quantity == "hvp") != (v is not None):
+            raise ValueError("v is the vector of quantity 'hvp': give it there and only there")
+        return None if v is None else self._vector(v)
+
+    def _vector(self, v: Tensor) -> Tensor:
+        n = len(self._sigma)
+        if not isinstance(v, Tensor) or v.shape not in ((n,), (*self._batch, n)):
+            given = list(v.shape) if isinstance(v, Tensor) else type(v).__name__
+            raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")
+        t = (v.detach().to(self._sigma) / self._sigma).expand(*self._batch, n).reshape(-1, 1, n)
+        return t.expand(-1, self._out.numel(), -1).contiguous()

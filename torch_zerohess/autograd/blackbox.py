@@ -96,6 +96,7 @@ class BlackBox(nn.Module):
         dtype, x = checked_input(x).dtype, working(x)
         if x.requires_grad and not transforms.watched(x) and not transforms.has_tangent(x):
             x = Input.apply(x)
+        self._check_aux(aux)
         batch = x.shape[:-1]
         flat, others = x.reshape(-1, x.shape[-1]), folded_aux(_without_grad(aux), batch)
         if self.call.value == "center" and not transforms.derivative_possible(x):
@@ -118,6 +119,7 @@ class BlackBox(nn.Module):
         _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = working(x).detach().reshape(-1, n).clone()
+        self._check_aux(aux)
         around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
         def frozen(z: Tensor) -> Tensor:
@@ -125,6 +127,14 @@ class BlackBox(nn.Module):
             return result.reshape((*batch, *result.shape[1:]))
 
         return frozen
+
+    def _check_aux(self, aux: tuple[Tensor, ...]) -> None:
+        """Refuse auxiliary inputs of fn beside a memory: an output that depends on them serves no other call."""
+        if aux and self.memory is not None and self.call.head is None:
+            raise ValueError(
+                f"aux must be empty for a layer with a memory and no head, got {len(aux)} tensors: fn gets points "
+                "alone, and what depends on aux belongs into head"
+            )
 
     def _around(self, center: Tensor, aux: list[Tensor], *, zero: bool = True) -> Callable[[Tensor], Tensor]:
         """Evaluate around a center [B, n], and return the estimate as a function of x [B, n].

@@ -266,6 +266,8 @@ def test_wrong_arguments_say_so() -> None:
     with pytest.raises(ValueError, match="head has parameters"):
         zh.BlackBox(render, smoothing, head=nn.Linear(3, 1))
     x, r = point()
+    with pytest.raises(ValueError, match="aux must be empty"):
+        zh.BlackBox(render, smoothing, memory=zh.Memory())(x, r)
     with pytest.raises(ValueError, match="one loss per output"):
         zh.BlackBox(render, smoothing, head=lambda y, one: y)(x, r)
     with pytest.raises(ValueError, match="references must be"):

@@ -16,18 +16,18 @@ def _sampled(samples: int, start: float, end: float, steps: int, **more: Any) ->
 
 
 # ZeroGrads and RELAX, each on three starts. Nine settings were tried on MUG, SHAD, BUNNY, MIRROR and BOX2, and of RELAX
-# on BRDF. Eight more settings of ZeroGrads were tried on SHAD, three more on BOX2, one on BRDF. No setting of ZeroGrads
-# gets there on BUNNY and MIRROR, and none of RELAX on MIRROR: these have the settings of MUG.
-# tune mug --method zerograds --runs 3 --trials 8; the same for relax and the others; box2, brdf: --evaluations 6000
+# on BRDF; ZeroGrads on BRDF has had eight. Eight more settings of ZeroGrads were tried on SHAD, three more on BOX2. No
+# setting of ZeroGrads gets there on BUNNY and MIRROR, and none of RELAX on MIRROR: these have the settings of MUG.
+# tune mug --method zerograds --runs 3 --trials 8; the same for relax and the others; box2, brdf: --evaluations 6000, of
+# zerograds on brdf: --evaluations 2000
 # tune shad --method zerograds --runs 3 --trials 7 --seed 1 --over pairs=1,2 "sigma=(1.0,0.1),(1.0,0.03)" \
 #     steps=100,300 rate=0.05,0.1 fit_rate=0.003,0.01 fits=10,30
 _ZEROGRADS = {"pairs": 1, "sigma": (1.0, 0.1), "steps": 300, "rate": 0.2, "fit_rate": 0.01, "fits": 30}
 _RELAX = {"samples": 4, "sigma": (1.0, 0.01), "steps": 100, "rate": 0.2, "fit_rate": 0.01, "hidden": (10,)}
 
-# COBYQA, Py-BOBYQA, CMA-ES with bounds, DFO-LS and L-BFGS-B on MUG, SHAD, BUNNY, BOX2, BRDF:
+# COBYQA, Py-BOBYQA, CMA-ES with bounds, DFO-LS and L-BFGS-B on MUG, SHAD, BUNNY, MIRROR, BOX2, BRDF:
 # tune mug --method py_bobyqa --runs 3 --trials 8; the same for the others; box2, brdf: --evaluations 6000
-# That is all of their space but for Py-BOBYQA, 8 of 10. On MIRROR CMA-ES, COBYQA and DFO-LS; on SHAD not DFO-LS and
-# L-BFGS-B. What is not named here was best at its defaults.
+# That is all of their space but for Py-BOBYQA, 8 of 10. What is not named here was best at its defaults.
 
 TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     # tune bunny --method mitsuba_path --runs 3 --evaluations 120 --over rate=0.3,0.5,1.0; --method mitsuba_projective
@@ -99,6 +99,7 @@ TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     },
     "box10": {"cma_es": {"scale": 1.0}, "cma_es_bounded": {"scale": 1.0}, "dfo_ls": {"scale": 0.1}},
     "brdf": {
+        "zerograds": {"pairs": 5, "sigma": (0.33, 0.33), "steps": 100, "rate": 0.1, "fit_rate": 0.01, "fits": 30},
         "relax": {"samples": 8, "sigma": (0.5, 0.03), "steps": 300, "rate": 0.2, "hidden": (10, 10)},
         "cma_es": {"scale": 0.25},
         "cma_es_bounded": {"scale": 0.25},

@@ -40,7 +40,9 @@ COMMANDS = {
     "store": Command("experiments.reports.store:store", "keep the table of a folder of results, and its origin"),
     "readme": Command("experiments.reports.documents:readme", "write stored tables into the documents, or check them"),
     "tune": Command("experiments.studies.tune:tune", "search settings of a method, on starts of its own", long=True),
-    "error": Command("experiments.studies.estimators:error", "error of every estimator against evaluations", long=True),
+    "variance": Command(
+        "experiments.studies.variance:variance", "error of every estimator against evaluations and samples", long=True
+    ),
     "nonpsd": Command("experiments.studies.nonpsd:nonpsd_error", "error of the Hessian where it is indefinite"),
     "losses": Command("experiments.studies.losses:losses", "a loss inside the black box, or after an image", long=True),
     "gradients": Command(

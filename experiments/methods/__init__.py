@@ -11,7 +11,6 @@ from experiments.methods import (
     mitsuba,
     ours,
     paper,
-    pooled,
     quasi_newton,
     turbo,
 )
@@ -20,7 +19,7 @@ from experiments.methods.method import Method
 METHODS: dict[str, Method] = {
     method.name: method
     for family in (
-        *(paper, ours, memory_networks, block_gauss_newton, pooled, derivative_free, quasi_newton),
+        *(paper, ours, memory_networks, block_gauss_newton, derivative_free, quasi_newton),
         *(bayesian, turbo, learned, analytic, meshes, mitsuba),
     )
     for method in family.METHODS

@@ -15,14 +15,18 @@ Preset = Literal["fast", "paper"]
 
 FITTING = {
     name: f"experiments.problems.tasks.{name}"
-    for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "caustic", "meshfit", "meshfit_color")
+    for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "throw", "caustic", "meshfit", "meshfit_color")
 }
 """Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
 RENDERED = {name: f"experiments.problems.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror")}
 """Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
 FITTING |= RENDERED
-NETWORKS = {name: f"experiments.problems.tasks.{name}" for name in ("cnn", "cnn_wide", "cnn5", "cnn_texture")}
-"""Tasks whose unknowns are the weights of a network before Mitsuba: `task(preset, variant, threads) -> NetworkTask`."""
+RENDERED_NETWORKS = ("cnn", "cnn_wide", "cnn5", "cnn_texture")
+NETWORKS = {name: f"experiments.problems.tasks.{name}" for name in (*RENDERED_NETWORKS, "cnn_throw")}
+"""Tasks whose unknowns are the weights of a network before the black box: modules with
+`task(preset, variant, threads) -> NetworkTask`."""
+SIMULATED = ("throw", "cnn_throw")
+"""Tasks that MuJoCo simulates."""
 TASKS = FITTING | NETWORKS
 
 
@@ -60,10 +64,11 @@ def budgeted(task: Task | NetworkTask, evaluations: int | None) -> Task | Networ
 
 @contextmanager
 def _packages_of(name: str) -> Iterator[None]:
-    """Say what to install for a task; Mitsuba is looked for here, since tasks import it when they first render."""
+    """Say what to install for a task; simulators are looked for here, since tasks import them when they first run."""
     try:
-        if (name in RENDERED or name in NETWORKS) and importlib.util.find_spec("mitsuba") is None:
-            raise ModuleNotFoundError(name="mitsuba")
+        package = "mujoco" if name in SIMULATED else "mitsuba" if name in RENDERED or name in NETWORKS else None
+        if package and importlib.util.find_spec(package) is None:
+            raise ModuleNotFoundError(name=package)
         yield
     except ImportError as error:
         raise ImportError(

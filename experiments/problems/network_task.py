@@ -1,8 +1,8 @@
 """What a network task is: images, a network that predicts the parameters of their renders, and a renderer after it.
 
 The loss of a prediction x is the mean squared difference between the image and the render at x: white box (network),
-black box (render), white box (comparison). Parameters are in units that make them comparable, so that one sigma serves
-all of them.
+black box (render), white box (comparison). What is said of renders holds for any other output [*out] of a black box.
+Parameters are in units that make them comparable, so that one sigma serves all of them.
 """
 
 import math
@@ -179,7 +179,7 @@ class NetworkTask(ABC):
 
     def loss(self, x: Tensor, images: Tensor) -> Tensor:
         """The black box and the loss after it: mean squared difference [K] of the renders of x to `images`."""
-        return (self.image(x) - images).square().mean((1, 2, 3))
+        return (self.image(x) - images).square().flatten(1).mean(1)
 
     def parameter_error(self, encoder: nn.Module) -> float:
         """Mean squared error of the predicted parameters of the held-out images."""

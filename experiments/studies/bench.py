@@ -20,6 +20,7 @@ import torch_zerohess as zh
 from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
+from experiments.studies.bench_memory import memory_ratios
 from experiments.studies.bench_ratios import Ratio, ratios
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import extension, kernels, proposals
@@ -71,6 +72,7 @@ def bench(
     memory_samples: int = 64,
     wide: tuple[int, ...] = (512, 2048),
     large: int = 1_000_000,
+    remembered: int = 4000,
     out: Path | None = None,
     store: str | None = None,
 ) -> BenchReport:
@@ -83,14 +85,15 @@ def bench(
         memory_samples: its antithetic samples.
         wide: parameters of the Hessians that are compared with matrix products; empty leaves all ratios out.
         large: parameters of the gradient and the product that draw their perturbations again.
+        remembered: evaluations in the memory of a layer, timed against renders of MUG; 0 leaves it out.
         out: JSON file to write.
         store: name of a table of the times to keep under experiments/results, for the documents.
     """
     smallest = min((number for pair in sizes for number in pair), default=0)
     given = {"repeats": repeats, "sizes": smallest, "memory_samples": memory_samples, "memory_n": memory_n}
-    given |= {"wide": min(wide, default=1), "large": large}
+    given |= {"wide": min(wide, default=1), "large": large, "remembered": remembered}
     for name, value in given.items():
-        least = 0 if name == "memory_n" else 1
+        least = 0 if name in ("memory_n", "remembered") else 1
         if value < least:
             raise SystemExit(f"{name} must be at least {least}, got {value}")
     if store is not None:
@@ -104,6 +107,7 @@ def bench(
             for n, samples, name, operation in progress(timed, "timings")
         ]
         compared = ratios(repeats, wide, large) if wide and available else []
+        compared += memory_ratios(remembered, max(3, repeats // 5)) if remembered else []
     finally:
         torch.set_num_threads(threads)
         extension.available = available

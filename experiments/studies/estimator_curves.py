@@ -1,4 +1,4 @@
-"""Error of the estimators against evaluations or seconds, as log-log curves with fitted slopes."""
+"""Error of the estimators against evaluations, samples or seconds, as log-log curves with fitted slopes."""
 
 import math
 from collections.abc import Sequence
@@ -16,6 +16,9 @@ mpl.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.ticker import NullFormatter
 
+AXES = {"evaluations": "evaluations", "samples": "samples per element", "seconds": "seconds"}
+"""What errors are drawn against, by the fields of a `Measurement`."""
+
 
 @dataclass(frozen=True)
 class Measurement:
@@ -25,6 +28,8 @@ class Measurement:
     method: str
     budget: int
     evaluations: int
+    samples: int
+    """Of every element of the quantity."""
     seconds: float
     quantity: str
     rmse: float
@@ -34,7 +39,7 @@ class Measurement:
 def curve(
     measurements: Sequence[Measurement], problem: str, method: str, quantity: str, against: str
 ) -> tuple[list[float], list[float]]:
-    """Return evaluations (or seconds) and errors, in order of the budget; each number of evaluations once."""
+    """Return what is on the axis and errors, in order of the budget; each number of evaluations once."""
     chosen = [m for m in measurements if (m.problem, m.method, m.quantity) == (problem, method, quantity)]
     once = {m.evaluations: m for m in reversed(chosen)}
     chosen = [m for m in chosen if once[m.evaluations] is m]
@@ -62,6 +67,8 @@ def _style(method: Method) -> dict[str, Any]:
         "markersize": 4,
         "linewidth": 2.6 if method.name == OURS else 1.3,
     }
+    if method.memory:
+        style |= {"color": "#7b3fa0", "linestyle": "-" if method.memory == "process" else "--"}
     if method.difference:
         style |= {"color": "#2e8b57", "marker": "d" if method.difference == "common" else "D"}
         style["linestyle"] = "-" if method.difference == "common" else ":"
@@ -69,7 +76,7 @@ def _style(method: Method) -> dict[str, Any]:
 
 
 def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], against: str, path: Path) -> None:
-    """Draw a row per problem and a column per quantity; against: evaluations or seconds."""
+    """Draw a row per problem and a column per quantity; against: one of `AXES`."""
     budgets = sorted({m.budget for m in measurements})
     titles = {"value": "value", "gradient": "gradient", "hessian": "Hessian", "hvp": "Hessian-vector product"}
     figure, axes = plt.subplots(len(problems), 4, figsize=(22, 6.2 * len(problems)), squeeze=False)
@@ -81,7 +88,7 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
                     fitted = slope(x, y)
                     label = method.name if math.isnan(fitted) else f"{method.name} ({fitted:+.2f})"
                     axis.plot(x, y, label=label, **_style(method))
-            axis.set(xscale="log", yscale="log", xlabel=against)
+            axis.set(xscale="log", yscale="log", xlabel=AXES[against])
             if against == "evaluations":
                 axis.set_xticks(budgets, [str(budget) for budget in budgets])
             axis.xaxis.set_minor_formatter(NullFormatter())
@@ -95,7 +102,9 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
             )
         row[0].set_ylabel("relative RMSE")
     figure.suptitle(
-        f"Error of the estimators against {against} (slope of the log-log fit in parentheses)", fontsize=15, y=0.995
+        f"Error of the estimators against {AXES[against]} (slope of the log-log fit in parentheses)",
+        fontsize=15,
+        y=0.995,
     )
     height = len(problems)  # fixed margins: leaving room for the legends automatically takes ten times as long
     figure.subplots_adjust(0.03, 0.32 / height, 0.99, 1 - 0.13 / height, wspace=0.14, hspace=0.55)

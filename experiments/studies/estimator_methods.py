@@ -1,12 +1,18 @@
-"""The ways to estimate that `error` compares: where points come from, what is subtracted, how points depend."""
+"""The ways to estimate that `variance` compares: where points come from, what is subtracted, how points depend."""
 
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
+
+import torch
 
 import torch_zerohess as zh
 from experiments.studies.estimator_problems import Function, Problem, Quantities
 
 OURS, PAPER = "aggregate + center", "per-element + none"
+_EARLIER = 4
+"""Calls of 64 evaluations that a memory has seen before it is used."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +25,12 @@ class Method:
     sampler: Literal["random", "sobol", "orthogonal"] = "random"
     antithetic: bool = True
     difference: Literal["independent", "common"] | None = None
+    memory: Literal["process", "untrained"] | None = None
+    """Surrogate of the control variate: a Gaussian process of earlier evaluations, or an untrained random network."""
+
+    def samples(self, budget: int, n: int) -> int:
+        """Return how many evaluations every element of a quantity is a mean of."""
+        return self.smoothing(budget, n, 1.0, 0).samples * (2 if self.antithetic else 1)
 
     def smoothing(self, budget: int, n: int, sigma: float, seed: int) -> zh.Smoothing:
         """Return the settings with the most samples whose evaluations do not exceed the budget, but at least one."""
@@ -37,13 +49,23 @@ class Method:
         each = settings.evaluations(n, center=False) // 2
         return settings.replace(samples=max(1, (budget - (self.baseline == "center")) // each))
 
-    def estimate(self, problem: Problem, fn: Function, budget: int, seed: int) -> Quantities:
-        """Return every quantity this method estimates, from one budget of evaluations of fn."""
+    def estimate(self, problem: Problem, counted: Callable[[Function], Function], budget: int, seed: int) -> Quantities:
+        """Return every quantity this method estimates, from one budget of evaluations.
+
+        Args:
+            problem: with the black box.
+            counted: makes a black box count its evaluations.
+            budget: evaluations at most.
+            seed: of the samples.
+        """
         smoothing = self.smoothing(budget, len(problem.x), problem.sigma, seed)
         if self.difference:
             common = self.difference == "common"
-            return {"hvp": zh.finite_difference_hvp(fn, problem.x, problem.v, smoothing, common=common)}
-        result = zh.estimate(fn, problem.x, smoothing, value="smoothed")
+            return {
+                "hvp": zh.finite_difference_hvp(counted(problem.fn), problem.x, problem.v, smoothing, common=common)
+            }
+        memory = copy.deepcopy(self._remembered(problem)) if self.memory else None
+        result = _estimate(problem, counted, smoothing, memory)
         return {
             "value": result.value,
             "gradient": result.gradient,
@@ -51,11 +73,59 @@ class Method:
             "hvp": result.hvp(problem.v),
         }
 
+    def _remembered(self, problem: Problem) -> zh.Memory:
+        """Return a memory that has served a few estimates at the same point."""
+        assert self.memory is not None
+        if self.memory not in problem.memories:
+            torch.manual_seed(0)
+            shape = torch.Size() if problem.reference is None else problem.reference.shape
+            memory = zh.Memory(_Untrained(len(problem.x), shape) if self.memory == "untrained" else None)
+            for call in range(_EARLIER):
+                smoothing = self.smoothing(64, len(problem.x), problem.sigma, call)
+                _estimate(problem, lambda fn: fn, smoothing, memory)
+            if self.memory == "process":
+                memory.fit()
+            problem.memories[self.memory] = memory
+        return problem.memories[self.memory]
+
+
+def _estimate(
+    problem: Problem, counted: Callable[[Function], Function], smoothing: zh.Smoothing, memory: zh.Memory | None
+) -> zh.Estimate:
+    """Estimate from the loss or, with a memory, from the image where there is one."""
+    if memory is None or problem.image is None or problem.reference is None:
+        return zh.estimate(counted(problem.fn), problem.x, smoothing, value="smoothed", memory=memory)
+    return zh.estimate(
+        counted(problem.image),
+        problem.x,
+        smoothing,
+        problem.reference,
+        head=zh.heads.SquaredError(),
+        value="smoothed",
+        memory=memory,
+    )
+
+
+class _Untrained(torch.nn.Module):
+    """A random network, points [K, n] to outputs [K, *out]."""
+
+    def __init__(self, n: int, shape: torch.Size) -> None:
+        super().__init__()
+        elements = shape.numel()
+        self.layers = torch.nn.Sequential(torch.nn.Linear(n, 32), torch.nn.Tanh(), torch.nn.Linear(32, elements))
+        self.shape = shape
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        out: torch.Tensor = self.layers(z.float()).reshape(len(z), *self.shape)
+        return out
+
 
 METHODS = (
     Method(OURS, "aggregate", "center"),
     Method("aggregate + center, sobol", "aggregate", "center", sampler="sobol"),
     Method("aggregate + center, orthogonal", "aggregate", "center", sampler="orthogonal"),
+    Method("aggregate + center, memory", "aggregate", "center", memory="process"),
+    Method("aggregate + center, untrained network", "aggregate", "center", memory="untrained"),
     Method("aggregate + mean", "aggregate", "mean"),
     Method("aggregate + none", "aggregate", "none"),
     Method("gaussian + center", "gaussian", "center"),

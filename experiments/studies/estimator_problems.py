@@ -1,24 +1,33 @@
-"""What the estimators are measured on: the BOX tasks and a plane wave, each with the truth at one point.
+"""What the estimators are measured on: the BOX tasks, MUG and plane waves, each with the truth at one point.
 
-The truth of the plane wave is a closed form. The truth of the BOX tasks is a far larger sample of scrambled Sobol
-points, which shares no code with the estimators; its own standard error is reported.
+The truth of a plane wave is a closed form. The loss of MUG is looked up in a table of renders over a whole turn and
+interpolated, and its truth is a quadrature with far more nodes than the table has. The truth of the BOX tasks is a far
+larger sample of scrambled Sobol points, which shares no code with the estimators; its own standard error is reported.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+import torch_zerohess as zh
+from experiments.problems import catalogue
 from experiments.problems.closed_forms import PlaneWave
 from experiments.problems.soft_squares import BoxTask, box2, box10
 
 Function = Callable[[Tensor], Tensor]
 Quantities = dict[str, Tensor]
 QUANTITIES = ("value", "gradient", "hessian", "hvp")
-PROBLEMS = {"BOX2": 2, "BOX10": 10, "WAVE10": 10}
+PROBLEMS = {"BOX2": 2, "BOX10": 10, "MUG": 1, "WAVE2": 2, "WAVE10": 10}
 """Parameters of each."""
+_TURN = 18.0
+"""A turn of MUG, in its units of 20 degrees."""
+_ANGLES = 360
+"""Renders of MUG over a turn."""
+_NODES = 100_001
+"""Of the quadrature, over 9 sigma to each side."""
 _TRUTH_SCRAMBLES = 16
 
 
@@ -34,6 +43,11 @@ class Problem:
     truth: Quantities
     truth_error: dict[str, float]
     """Relative standard error of the truth."""
+    image: Function | None = None
+    """[K, n] -> [K, *out], of which `fn` is the mean squared difference to `reference`, where there is one."""
+    reference: Tensor | None = None
+    memories: dict[str, zh.Memory] = field(default_factory=dict)
+    """Memories that have served earlier estimates at x, by surrogate."""
 
 
 def made_problem(name: str, truth_evaluations: int, side: int, seed: int) -> Problem:
@@ -48,7 +62,17 @@ def made_problem(name: str, truth_evaluations: int, side: int, seed: int) -> Pro
             return task.loss(points.float()).double()  # single precision is far below the noise, and faster
 
         truth, errors = _sampled_truth(fn, task.start, task.sigma, v, truth_evaluations, seed)
-        return Problem(name, fn, task.start, task.sigma, v, truth, errors)
+        squares = task.loss
+        reference = squares.image(squares.target[None])[0].float()
+        return Problem(
+            *(name, fn, task.start, task.sigma, v, truth, errors), lambda z: squares.image(z.float()), reference
+        )
+    if name == "MUG":
+        mug = catalogue.fitting("mug")
+        mug_x, angles = torch.tensor([9.5]).double(), _TURN * torch.arange(_ANGLES).double() / _ANGLES
+        table = looked_up(mug.loss(angles[:, None]), _TURN)
+        truth = quadrature(table, mug_x, mug.sigma, v)
+        return Problem(name, table, mug_x, mug.sigma, v, truth, dict.fromkeys(QUANTITIES, 0.0))
     sigma = 0.5
     k = torch.nn.functional.normalize(torch.randn(n, generator=generator, dtype=torch.float64), dim=0) / sigma
     x = torch.zeros(n, dtype=torch.float64)
@@ -86,3 +110,25 @@ def _sampled_truth(
         for name, values in stacked.items()
     }
     return truth, errors
+
+
+def looked_up(values: Tensor, period: float) -> Function:
+    """Return a periodic function of points [K, 1]: values at equal distances from 0 on, joined by straight lines."""
+
+    def fn(points: Tensor) -> Tensor:
+        place = torch.remainder(points[:, 0].double(), period) / period * len(values)
+        left = place.floor()
+        index = left.long() % len(values)
+        return torch.lerp(values[index], values[(index + 1) % len(values)], place - left)
+
+    return fn
+
+
+def quadrature(fn: Function, x: Tensor, sigma: float, v: Tensor) -> Quantities:
+    """Return the quantities at x [1] for one parameter: Stein's identities by the trapezoid rule."""
+    u = torch.linspace(-9.0, 9.0, _NODES, dtype=torch.float64)
+    weighted = fn(x + sigma * u[:, None]) * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
+    value, first, second = (
+        torch.trapezoid(weighted * kernel, u) for kernel in (torch.ones_like(u), u / sigma, (u * u - 1) / sigma**2)
+    )
+    return {"value": value, "gradient": first[None], "hessian": second[None, None], "hvp": second * v}

@@ -97,7 +97,7 @@ def test_tasks_that_mitsuba_renders_say_that_it_is_missing() -> None:
     "command",
     [
         ["run", "mug"],
-        ["run", "quad", "cnn", "--methods", "descent,pooled"],
+        ["run", "quad", "cnn", "--methods", "descent,memory_newton"],
         ["tune", "mug", "--method", "our_g"],
         ["losses", "--tasks", "mug"],
         ["gradients", "mug"],

@@ -58,9 +58,9 @@ def _check(operator: CurvatureOperator, blocks: list[Tensor]) -> None:
 
 
 def magnitudes(blocks: Tensor) -> Tensor:
-    """Return the blocks [B, n, n] with the magnitudes of their eigenvalues."""
+    """Return the blocks [..., n, n] with the magnitudes of their eigenvalues."""
     values, vectors = torch.linalg.eigh(blocks)
-    return (vectors * values.abs()[:, None]) @ vectors.mT
+    return (vectors * values.abs()[..., None, :]) @ vectors.mT
 
 
 def jacobian(operator: CurvatureOperator) -> Tensor:

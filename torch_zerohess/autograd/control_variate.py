@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation import local_entropy
-from torch_zerohess.estimation.control import Control, predict
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.surrogate_term import STEIN, nodes, prefers_pathwise, smoothed
 from torch_zerohess.heads import LocalEntropy
 
@@ -43,14 +43,14 @@ def around(
     with transforms.outside(), transforms.random_numbers_allowed():
         generator = torch.Generator().manual_seed(seed)
         part = torch.randperm(B, generator=generator)[:fresh].sort().values.to(center.device)
-        u = nodes(seed, memory.draws, center.shape[1]).to(center.device)
+        u = nodes(seed, memory.draws, center.shape[1], B).to(center.device)
 
     def spread(change: Tensor) -> Tensor:
         """Put the values [fresh, *out] of the fresh elements into the batch, with their weight."""
         return change.new_zeros(B, *change.shape[1:]).index_add(0, part, B / fresh * change)
 
     def predicted(z: Tensor) -> Tensor:
-        return predict(memory.surrogate, control.head, z, aux)
+        return control.predict(memory.surrogate, z, aux)
 
     if not control.active:
         alone = estimated(center[part], [one[part] for one in aux])
@@ -61,7 +61,7 @@ def around(
     entropy = control.head if isinstance(control.head, LocalEntropy) else None
     scales: list[Tensor] = []
     with torch.no_grad():
-        at_center = control.coefficient * predicted(center[:, None])[:, 0]
+        at_center = control.coefficient * predicted(center[:, None])[:, 0] if value == "center" else center[:, 0]
         if entropy:
             losses = predicted((center[:, None] + sigma * u).to(center.dtype))
             scales = list(local_entropy.scales(losses, losses.mean(1), entropy.temperature))

@@ -3,7 +3,7 @@
 The surrogate and the coefficient are those of earlier calls. They do not change while one call is made.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,7 +52,14 @@ class Control:
     def _scaled(self) -> bool:
         return self.active and isinstance(self.head, LocalEntropy)
 
-    def explain(self, values: Tensor, points: Tensor, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor | None:
+    def explain(
+        self,
+        values: Tensor,
+        points: Tensor,
+        outputs: Tensor,
+        aux: Sequence[Tensor],
+        added: Callable[[Tensor], list[Tensor]],
+    ) -> Tensor | None:
         """Keep new evaluations and return what the surrogate predicts for them, float64 [B, E, *out], if it is used.
 
         Args:
@@ -60,30 +67,47 @@ class Control:
             points: [B, E, n].
             outputs: of the black box [B, E, *outputs].
             aux: of the batch elements [B, ...].
+            added: what values [B, E, *out] add to the derivatives of the estimate, by order.
         """
         predicted = None
         if self.memory.ready:
             with torch.no_grad():  # a module has parameters that require grad
-                predicted = predict(self.memory.surrogate, self.head, points, self.references(aux)).double()
+                predicted = self.predict(self.memory.surrogate, points, self.references(aux)).double()
+            if predicted.shape != values.shape:
+                raise ValueError(
+                    f"the surrogate of the memory must return [K, {_listed(outputs.shape[2:])}] like the black box, "
+                    f"got a prediction of {list(predicted.shape)} for values of {list(values.shape)}"
+                )
             if not bool(torch.isfinite(predicted).all()):
                 raise ValueError("the surrogate of the memory predicted a value that is not finite")
         if self.learning:
             if predicted is not None:
-                self.memory.observe(values, predicted)
+                self.memory.observe(values, predicted, list(zip(added(values), added(predicted), strict=True)))
             self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
         return predicted if self.active else None
 
+    def predict(self, surrogate: Any, z: Tensor, aux: Sequence[Tensor]) -> Tensor:
+        """Return h(g(z), r) [B, E, *out] for points z [B, E, n] and aux r [B, ...], differentiable in z.
 
-def predict(surrogate: Any, head: Head | None, z: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    """Return h(g(z), r) [B, E, *out] for points z [B, E, n] and aux r [B, ...], differentiable in z."""
-    B, E = z.shape[:2]
-    if isinstance(head, LocalEntropy):
-        head = head.head
-    space = getattr(surrogate, "space", None)
-    if isinstance(head, SquaredError) and space is not None:
-        known, outside = space.split(aux[0])
-        coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
-        losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]
-        return losses
-    outputs: Tensor = surrogate(z.flatten(0, 1)).unflatten(0, (B, E))
-    return outputs if head is None else apply_head(head, outputs, aux)
+        Args:
+            surrogate: g, of the memory or a copy.
+            z: points [B, E, n].
+            aux: r, [B, ...] each.
+        """
+        B, E = z.shape[:2]
+        head = self.head.head if isinstance(self.head, LocalEntropy) else self.head
+        space = getattr(surrogate, "space", None)
+        if isinstance(head, SquaredError) and space is not None:
+            known, outside = space.split(aux[0])
+            coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
+            losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]
+            return losses
+        outputs: Tensor = surrogate(z.flatten(0, 1))
+        if self.memory.scalar and outputs.shape[1:] == (1,):  # it was fitted to a column
+            outputs = outputs[:, 0]
+        outputs = outputs.unflatten(0, (B, E))
+        return outputs if head is None else apply_head(head, outputs, aux)
+
+
+def _listed(shape: Sequence[int]) -> str:
+    return ", ".join(map(str, shape))

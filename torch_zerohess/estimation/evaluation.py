@@ -3,12 +3,14 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.estimation import local_entropy
+from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
@@ -151,7 +153,14 @@ def evaluate(
     share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
         share = kept / kept.sum(1, keepdim=True).double()
-    rest, rest_center = _remaining(call, values, center, share, everywhere, outputs, aux, control, stein)
+
+    def added(all_values: Tensor) -> list[Tensor]:
+        rows = all_values.reshape(*all_values.shape[:2], -1)
+        a = _coefficients(rows[:, :K], rows[:, K] if with_center else None, share[..., None], smoothing, n)[1]
+        return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
+
+    explain = None if control is None else partial(control.explain, values, everywhere, outputs, aux, added)
+    rest, rest_center = _remaining(call, values, center, share, aux, control, explain, stein)
     values = values[:, :K]
     baseline, coefficients = _coefficients(rest.reshape(B, K, -1), rest_center, share[..., None], smoothing, n)
     # The sum of finite numbers may be infinite, but that of others is never finite.
@@ -179,10 +188,9 @@ def _remaining(
     values: Tensor,
     center: Tensor | None,
     share: Tensor,
-    points: Tensor,
-    outputs: Tensor,
     aux: Sequence[Tensor],
     control: Control | None,
+    explain: Callable[[], Tensor | None] | None,
     stein: Stein,
 ) -> tuple[Tensor, Tensor | None]:
     """Return what is to be smoothed, [B, K, *out], and the same at the center [B, *out].
@@ -197,15 +205,13 @@ def _remaining(
         if control is not None:
             T, m = control.scales(aux) or (T, m)
         rows, packed_center = local_entropy.packed(values[:, :K], center, T, m)
-        if control is None:
-            return rows, packed_center
-        predicted = control.explain(values, points, outputs, aux)
+        predicted = None if explain is None else explain()
         if predicted is not None:
             rows[..., 0] -= local_entropy.tempered(predicted[:, :K], T, m)
             if packed_center is not None:
                 packed_center[:, 0] -= local_entropy.tempered(predicted[:, K:], T, m)[:, 0]
         return rows, packed_center
-    predicted = control.explain(values, points, outputs, aux) if control else None
+    predicted = None if explain is None else explain()
     if control is None or predicted is None:
         return values[:, :K], center
     rest = values.double() - control.coefficient * predicted

@@ -22,13 +22,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.control import Control, predict
+from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.stein import Quantity
 
 _SOBOL = 64
 """Parameters up to which points are quasi-random; beyond them a sequence of few points is not even."""
 STEIN = 8
 """Parameters up to which Stein's sums are tried."""
+_POINTS = 1024
+"""Points of a call with few parameters, shared by the elements of its batch."""
+_FEWEST = 64
+"""Points per element at least."""
+_FEW = 32
+"""Parameters that are few."""
+_PAIRS = 2
+"""Pairs of points per element with many parameters, of which the surrogate is affine. Derivatives of a loss that is
+quadratic in an affine map are exact from one pair, and two pairs tell an error."""
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
 _EDGE = 1e-9
@@ -40,8 +49,13 @@ def _even(count: int, n: int) -> Tensor:
     return torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(count, dtype=torch.float64)
 
 
-def nodes(seed: int, count: int, n: int) -> Tensor:
-    """Return normal points [2 * ceil(count / 2), n] float64: the second half mirrors the first."""
+def nodes(seed: int, count: int | None, n: int, batch: int) -> Tensor:
+    """Return normal points [2 * ceil(count / 2), n] float64: the second half mirrors the first.
+
+    Without a count they are 4 for more than 32 parameters, otherwise 1024 / batch and at least 64.
+    """
+    if count is None:
+        count = max(_POINTS // max(batch, 1), _FEWEST) if n <= _FEW else 2 * _PAIRS
     half = (count + 1) // 2
     generator = torch.Generator().manual_seed(seed)
     if n > _SOBOL:
@@ -100,7 +114,7 @@ class SurrogateTerm:
     ) -> "SurrogateTerm":
         """Return the term with copies of the surrogate and of aux: a later fit or training does not change it."""
         memory = control.memory
-        u = nodes(seed, memory.draws, x.shape[1]).to(x.device)
+        u = nodes(seed, memory.draws, x.shape[1], len(x)).to(x.device)
         if memory.pathwise is None:
             memory.pathwise = prefers_pathwise(control, x, aux, sigma, u, order)
         copies = [one.clone() for one in aux]
@@ -131,9 +145,7 @@ class SurrogateTerm:
         """
         own = len(self.u) // 2 - 1
         if own < 1:
-            raise ValueError(
-                f"a standard error needs a memory with draws of at least 3, got {self.control.memory.draws}"
-            )
+            raise ValueError(f"a standard error needs a memory with draws of at least 3, got {len(self.u)}")
         mine = self.variance(quantity, v).sqrt()
         whole = torch.hypot(error, mine)
         unit = torch.where(whole > 0, whole, 1.0)
@@ -149,7 +161,7 @@ class SurrogateTerm:
     def _each(self, x: Tensor) -> Tensor:
         """Return c h(g(x + sigma u), r) at every point, [B, Q, P]."""
         z = (x[:, None] + self.sigma * self.u).to(self.x.dtype)
-        values = self.control.coefficient * predict(self.surrogate, self.control.head, z, self.aux)
+        values = self.control.coefficient * self.control.predict(self.surrogate, z, self.aux)
         return values.reshape(*values.shape[:2], -1).double()
 
     def _pairs(self, quantity: Quantity, v: Tensor | None) -> Tensor:
@@ -166,7 +178,7 @@ class SurrogateTerm:
         values, u = self._each(self.x.double()), self.u[:, None]
         if quantity == "value":
             return values
-        center = predict(self.surrogate, self.control.head, self.x[:, None], self.aux).double()
+        center = self.control.predict(self.surrogate, self.x[:, None], self.aux).double()
         change = (values - self.control.coefficient * center.reshape(len(values), 1, -1))[..., None]
         if quantity == "gradient":
             return change * u / self.sigma

@@ -3,6 +3,7 @@
 from torch_zerohess.autograd.blocks import SampleJacobian
 from torch_zerohess.optim.newton import Newton
 from torch_zerohess.optim.newton_cg import NewtonCG
+from torch_zerohess.optim.newton_targets import NewtonTargets
 from torch_zerohess.optim.nonlinear_cg import NonlinearCG
 from torch_zerohess.search.block_gauss_newton import BlockGaussNewton
 from torch_zerohess.search.descent import Descent
@@ -15,6 +16,7 @@ __all__ = [
     "GaussianProcessSearch",
     "Newton",
     "NewtonCG",
+    "NewtonTargets",
     "NonlinearCG",
     "SampleJacobian",
     "TrustRegion",

@@ -7,8 +7,6 @@ from torch_zerohess.surrogates.surrogate import checked
 
 _RIDGE = 1e-9
 """Added to the squares of the points, in units of their mean: enough to be solvable."""
-_INVERSE_RIDGE = 1e-6
-"""The same of the slopes, when outputs are inverted."""
 
 
 class LinearSurrogate:
@@ -50,15 +48,6 @@ class LinearSurrogate:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         predicted = self._mean + (z.double() - self._middle) @ self._slope
         return predicted.unflatten(1, self._shape).to(z.dtype)
-
-    def invert(self, outputs: Tensor) -> Tensor:
-        """Points [N, n] whose expected outputs are closest to outputs [N, *out] in the sense of least squares.
-
-        Where outputs do not determine a point it is close to the mean of the fitted points.
-        """
-        change = outputs.flatten(1).double() - self._mean
-        step = _solve(self._slope @ self._slope.mT, self._slope @ change.mT, _INVERSE_RIDGE).mT
-        return (self._middle + step).to(outputs.dtype)
 
 
 def _solve(square: Tensor, right: Tensor, ridge: float) -> Tensor:

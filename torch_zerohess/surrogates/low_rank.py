@@ -94,9 +94,3 @@ class LowRankSurrogate:
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         return self.space.decode(self.coordinates(z)).to(z.dtype)
-
-
-def mean_square_differences(a: Tensor, b: Tensor) -> Tensor:
-    """Mean squared differences [A, B] of the outputs with coordinates a [A, r] and b [B, r]."""
-    squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
-    return squares.clamp_min(0.0)

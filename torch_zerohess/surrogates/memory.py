@@ -1,5 +1,6 @@
 """Evaluations that are kept, and the surrogate fitted to them: a control variate for later estimates."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -40,7 +41,8 @@ class Memory:
             None: all of them. 0: none; the estimate is then that of g, and biased towards it.
         order: highest derivative that new evaluations enter. 1: second derivatives are those of the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
-        draws: points per element at which the surrogate's term is evaluated.
+        draws: points per element at which the surrogate's term is evaluated. None: 4 for more than 32 parameters,
+            otherwise 1024 / B and at least 64.
 
     Raises:
         TypeError, ValueError: an argument is not as described.
@@ -61,10 +63,10 @@ class Memory:
         capacity: int = 4000,
         fresh: int | None = None,
         order: int = 2,
-        draws: int = 64,
+        draws: int | None = None,
     ) -> None:
         for name, number, least in (("capacity", capacity, 2), ("fresh", fresh, 0), ("draws", draws, 2)):
-            if number is None:  # of fresh
+            if number is None:  # of fresh and draws
                 continue
             if isinstance(number, bool) or not hasattr(number, "__index__"):
                 raise TypeError(f"{name} must be an integer, got {number!r}")
@@ -89,8 +91,9 @@ class Memory:
         """Evaluations taken at the last fit."""
         self._rows = 0
         """How many of the evaluations that are kept the last fit knew: they come first."""
-        self._moments = [0.0, 0.0]
-        """Covariance of h(f) and h(g), and variance of h(g), over evaluations that g had not seen."""
+        self._moments: list[list[float]] = []
+        """Covariance of h(f) and h(g), and variance of h(g), over evaluations that g had not seen: of the values, then
+        of what they add to first and second derivatives."""
 
     def __len__(self) -> int:
         """Evaluations that are kept."""
@@ -107,6 +110,11 @@ class Memory:
         """Outputs there, [P, *out]."""
         self._outputs = [torch.cat(self._outputs)] if len(self._outputs) > 1 else self._outputs
         return self._outputs[0] if self._outputs else torch.empty(0)
+
+    @property
+    def scalar(self) -> bool:
+        """Whether the black box returns one number per point, [K]. A surrogate is then fitted to outputs [P, 1]."""
+        return bool(self._outputs) and self._outputs[0].dim() == 1
 
     def add(self, points: Tensor, outputs: Tensor) -> None:
         """Keep outputs [K, *out] at points [K, n]; those that are not finite are left out.
@@ -161,22 +169,37 @@ class Memory:
 
     @property
     def coefficient(self) -> float:
-        """Coefficient c in [0, 1]: the regression of h(f) on h(g) over evaluations that g had not seen; 0 before."""
+        """Coefficient c in [0, 1]: the regression of h(f) on h(g) over evaluations that g had not seen; 0 before.
+
+        The regressions of what evaluations add to the derivatives of the estimate differ: a surrogate may explain
+        values and no curvature. c is the smallest of them, so that no derivative becomes noisier.
+        """
         if self.fresh == 0:
             return 1.0
-        covariance, variance = self._moments
-        return min(max(covariance / variance, 0.0), 1.0) if variance > 0.0 else 0.0
+        ratios = [covariance / variance if variance > 0.0 else 0.0 for covariance, variance in self._moments]
+        return min(max(min(ratios, default=0.0), 0.0), 1.0)
 
-    def observe(self, losses: Tensor, predicted: Tensor) -> None:
-        """Tell the coefficient the values [B, K, *out] of a call, and what the surrogate predicted for them."""
+    def observe(self, losses: Tensor, predicted: Tensor, derivatives: Sequence[tuple[Tensor, Tensor]] = ()) -> None:
+        """Tell the coefficient the values of a call, and what the surrogate predicted for them.
+
+        Args:
+            losses: values [B, K, *out].
+            predicted: the same by the surrogate.
+            derivatives: for each order what the values, and the predicted ones, add to it: [B, *] each.
+        """
         a, b = (one.double().reshape(*one.shape[:2], -1) for one in (losses, predicted))
         dim = 1 if a.shape[1] > 1 else 0  # the differences within an element make its derivatives
-        a, b = a - a.mean(dim, keepdim=True), b - b.mean(dim, keepdim=True)
-        new = float((a * b).sum()), float(b.square().sum())
-        if all(map(_is_number, new)):
-            self._moments = [_FORGET * old + (1.0 - _FORGET) * one for old, one in zip(self._moments, new, strict=True)]
-        else:  # the surrogate predicts nonsense
-            self._moments = [0.0, 0.0]
+        pairs = [(a - a.mean(dim, keepdim=True), b - b.mean(dim, keepdim=True)), *derivatives]
+        new = [[float((one * other).sum()), float(other.square().sum())] for one, other in pairs]
+        if not all(_is_number(one) for moments in new for one in moments):  # the surrogate predicts nonsense
+            self._moments = []
+            return
+        if len(self._moments) != len(new):
+            self._moments = [[0.0, 0.0] for _ in new]
+        self._moments = [
+            [_FORGET * old + (1.0 - _FORGET) * one for old, one in zip(kept, moments, strict=True)]
+            for kept, moments in zip(self._moments, new, strict=True)
+        ]
 
     def _thin(self) -> None:
         """Drop points whose nearest neighbour among later ones is closest, until the capacity is kept."""
@@ -199,7 +222,7 @@ class Memory:
             "fitted": self._fitted,
             "rows": self._rows,
             "pathwise": self.pathwise,
-            "moments": list(self._moments),
+            "moments": [list(one) for one in self._moments],
             "surrogate": model,
         }
 
@@ -207,7 +230,8 @@ class Memory:
         """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew."""
         points, outputs = state["points"], state["outputs"]
         self._points, self._outputs = ([points], [outputs]) if len(points) else ([], [])
-        self._size, self.evaluations, self._moments = len(points), state["evaluations"], list(state["moments"])
+        self._size, self.evaluations = len(points), state["evaluations"]
+        self._moments = [list(one) for one in state["moments"]]
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
             self.surrogate.load_state_dict(state["surrogate"])
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]

@@ -16,21 +16,3 @@ SEARCH = {task: dict.fromkeys(SEARCHES, one) for task, one in _SIGMAS.items()}
 
 The defaults of the engines (batches, thresholds of misfit and gain, weights) were chosen on runs from 1000 upward of
 QUAD, BOX2, BOX10, BRDF, NONPSD and TEXTURE, on BRDF again after a look at the reported runs."""
-
-_POOLED: dict[str, dict[str, Any]] = {
-    # By hand, without a command.
-    "cnn": {"temperature": 0.1, "steps": 1500, "rank": 64},
-    "cnn_wide": {"temperature": 0.1, "steps": 1500, "rank": 64},
-    "cnn5": {"temperature": 0.03},
-    "cnn_texture": {
-        "surrogate": "linear",
-        "temperature": 1.0,
-        "steps": 900,
-        "rank": 1100,
-        "rate": (3e-3, 2e-4),
-        "first": 1100,
-    },
-}
-POOLED = {task: {"pooled": one} for task, one in _POOLED.items()}
-"""Prior knowledge of each task: the temperature of the local entropy, the number of steps, the rank of its images, and
-that the image of cnn_texture is linear in the texture."""

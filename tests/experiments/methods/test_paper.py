@@ -177,7 +177,6 @@ def test_table_3_in_the_units_of_the_tasks():
         ("cma_es", "quad", {"scale": 0.5}),
         ("descent", "brdf", {"sigma": 0.5}),
         ("gaussian_process_loss", "nonpsd", {"sigma": 0.7}),
-        ("pooled", "cnn_texture", {"surrogate": "linear", "rank": 1100}),
     ],
 )
 def test_settings_replace_table_3_only_where_they_say_so(method, task, expected):

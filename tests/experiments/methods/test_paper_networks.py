@@ -17,7 +17,6 @@ from experiments.runs.network_trial import NetworkTrial
 RENDERS = {"fr22": 2 * 3, "our_g": 2 * 3, "our_h": 4 * 7, "our_hvp": 4 * 7, "our_hvpa": 4 * 3}
 """Of a step: images of a batch, times pairs of samples (two renders each; those of our_h for gradient, Hessian and
 value, of our_hvp for three gradients) and f(x)."""
-POOLED = {"temperature": 0.1, "steps": 300, "rank": 64}
 
 
 def run(name, task=BUMP, number=0, settings=None):
@@ -74,28 +73,29 @@ def test_the_image_error_of_a_row_is_the_mean_of_the_last_twentieth():
     assert [row.image_error for row in trial.rows[3:]] == pytest.approx([sum(losses[k : k + 3]) / 3 for k in range(58)])
 
 
-@pytest.mark.parametrize("name", ["our_g", "our_hvpa", "pooled"])
+@pytest.mark.parametrize("name", ["our_g", "our_hvpa"])
 def test_methods_learn(name):
     """Each divides the parameter error by ten."""
     task = Bump(Size(16, 1, 2, evaluations=1500, images=256, held_out=32))
-    _, trial = run(name, task, settings=POOLED if name == "pooled" else {})
+    _, trial = run(name, task)
     assert task.parameter_error(trial.encoder) < 0.1 * trial.rows[0].parameter_error
     assert task.image_error(trial.encoder) < 0.2 * trial.rows[0].image_error
 
 
 def test_where_methods_apply():
     known = {
-        name: [method for method in (*RENDERS, "pooled") if METHODS[method].unusable(catalogue.load(name)) is None]
+        name: [method for method in RENDERS if METHODS[method].unusable(catalogue.load(name)) is None]
         for name in catalogue.NETWORKS
     }
-    most = [*RENDERS, "pooled"]
+    most = list(RENDERS)
     assert known == {
         "cnn": most,
         "cnn_wide": most,
         "cnn5": [name for name in most if name != "our_hvp"],
-        "cnn_texture": ["fr22", "our_g", "pooled"],
+        "cnn_texture": ["fr22", "our_g"],
+        "cnn_throw": [name for name in most if name != "our_hvp"],
     }
-    assert METHODS["pooled"].unusable(catalogue.load("quad")) == "trains networks only"
+    assert METHODS["memory_newton"].unusable(catalogue.load("quad")) == "trains networks only"
     assert METHODS["cobyqa"].unusable(BUMP) == "trains no networks"
     with pytest.raises(AssertionError, match="cobyqa trains no networks"):
         METHODS["cobyqa"](NetworkTrial(BUMP, "cobyqa", 0), {})

@@ -18,7 +18,7 @@ from experiments.reports.store import store
 from experiments.reports.trained_network import Result
 from experiments.runs.records import Files, Log, Outcome, Record, read_outcome, write_outcome
 from experiments.studies.bench import bench
-from experiments.studies.estimators import error
+from experiments.studies.variance import variance
 
 COMMIT = "0123456789abcdef"
 
@@ -83,14 +83,14 @@ def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
 def test_networks_have_a_row_per_method(tmp_path, results):
     folder = tmp_path / "runs"
     for run in range(3):
-        write(folder, "cnn", "pooled", run, [40.0, 9.0, 2.0], each=10)
-    with pytest.raises(SystemExit, match=r"held_out.csv has 0 of 3 runs of pooled: call the same `run` again"):
+        write(folder, "cnn", "memory_adam", run, [40.0, 9.0, 2.0], each=10)
+    with pytest.raises(SystemExit, match=r"held_out.csv has 0 of 3 runs of memory_adam: call the same `run` again"):
         store(folder, name="networks")
     errors = [((40.0, 2.0), (8.0, 0.02)), ((40.0, 5.0), (8.0, 0.125)), ((40.0, 5.0), (8.0, 0.125))]
-    ended = [Result("pooled", run, None, None, 1.0, 20, *pair) for run, pair in enumerate(errors)]
+    ended = [Result("memory_adam", run, None, None, 1.0, 20, *pair) for run, pair in enumerate(errors)]
     _remember(held_out("cnn", ended[:2]), folder / "cnn" / HELD_OUT)
     _remember(held_out("cnn", ended[1:]), folder / "cnn" / HELD_OUT)
-    files = Files(folder / "cnn" / "pooled", 2)
+    files = Files(folder / "cnn" / "memory_adam", 2)
     write_outcome(replace(read_outcome(files.outcome), status="failed"), files)
     store(folder, name="networks")
     (row,) = rows(results, "networks")
@@ -232,7 +232,7 @@ def test_studies_are_kept_as_they_are(results):
 
 def test_a_study_is_refused_before_it_measures(results, monkeypatch):
     monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": False})
-    for study, given in ((bench, {"repeats": 10**9}), (error, {"runs": 10**9})):
+    for study, given in ((bench, {"repeats": 10**9}), (variance, {"runs": 10**9})):
         with pytest.raises(SystemExit, match="a stored table must be made by the code of a commit"):
             study(**given, store="study")
         with pytest.raises(SystemExit, match="name must be a word"):

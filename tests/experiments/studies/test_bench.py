@@ -18,6 +18,7 @@ from torch_zerohess.sampling import extension
         ({"memory_samples": 0}, "memory_samples must be at least 1, got 0"),
         ({"wide": (512, 0)}, "wide must be at least 1, got 0"),
         ({"large": 0}, "large must be at least 1, got 0"),
+        ({"remembered": -1}, "remembered must be at least 0, got -1"),
     ],
 )
 def test_wrong_arguments_of_bench_are_named(wrong, message) -> None:
@@ -30,7 +31,14 @@ def costs(tmp_path_factory) -> BenchReport:
     out = tmp_path_factory.mktemp("bench") / "bench.json"
     before, threads = extension.available, torch.get_num_threads()
     result = bench(
-        repeats=2, sizes=((2, 8), (256, 32)), memory_n=100_000, memory_samples=32, wide=(96,), large=5_000, out=out
+        repeats=2,
+        sizes=((2, 8), (256, 32)),
+        memory_n=100_000,
+        memory_samples=32,
+        wide=(96,),
+        large=5_000,
+        remembered=30,
+        out=out,
     )
     assert (extension.available, torch.get_num_threads()) == (before, threads)
     written = json.loads(out.read_text())
@@ -56,6 +64,11 @@ def test_ratios_against_the_machine(costs) -> None:
         "Hessian",
         "gradient + HVP, drawn again",
         "noise, two threads against one",
+        *(
+            f"memory of 30: a {what}"
+            for _ in range(3)
+            for what in ("step against a render", "fit against as many renders")
+        ),
     ]
     assert all(r.ratio == r.compared / r.seconds > 0 for r in costs.ratios)
     # Half of the goal, for machines that are busy or have fewer instructions.
@@ -66,7 +79,7 @@ def test_bench_without_the_extension(monkeypatch, capsys) -> None:
     monkeypatch.setattr(extension, "available", False)
     (timing,) = (
         t
-        for t in bench(repeats=1, sizes=((2, 2),), memory_n=0, wide=()).timings
+        for t in bench(repeats=1, sizes=((2, 2),), memory_n=0, wide=(), remembered=0).timings
         if t.operation == "value + gradient + HVP"
     )
     assert timing.extension is None

@@ -68,7 +68,7 @@ def remembering(surrogate: Any, coefficient: float = 1.0, **settings: Any) -> zh
     memory = zh.Memory(surrogate, **settings)
     memory.add(torch.zeros(2, 2, dtype=torch.float64), render(torch.zeros(2, 2)))
     memory.fit()
-    memory._moments = [coefficient, 1.0]
+    memory._moments = [[coefficient, 1.0]]
     return memory
 
 

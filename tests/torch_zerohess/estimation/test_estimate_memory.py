@@ -227,3 +227,31 @@ def test_what_cannot_serve_raises() -> None:
     memory.pathwise = True
     with pytest.raises(ValueError, match="draws of at least 3, got 2"):
         estimated(memory, 0).standard_error("gradient")
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+def test_a_black_box_of_one_number_per_point(fitted: bool) -> None:
+    """[K] and not [K, 1]: sin(k.z) with a Gaussian process, and with a module that returns [K, 1]."""
+    torch.manual_seed(3)
+    points = X + SIGMA * torch.randn(80, 2, dtype=torch.float64)
+    memory = Memory() if fitted else Memory(Model(lambda z: torch.sin(z @ K)[:, None] + 0.01))
+    memory.add(points, torch.sin(points @ K))
+    if fitted:
+        memory.fit()
+    true = {"value": DECAY * torch.sin(X @ K), "gradient": DECAY * torch.cos(X @ K) * K}
+    true["hessian"] = -torch.outer(K, K) * true["value"]
+    for seed in SEEDS[:3]:  # the first one measures the coefficient
+        found = estimate(lambda z: torch.sin(z @ K), X, SMOOTHING.replace(seed=seed), value="smoothed", memory=memory)
+    torch.testing.assert_close(found.value, true["value"], rtol=0, atol=0.01)
+    torch.testing.assert_close(found.gradient, true["gradient"], rtol=0, atol=0.05)
+    torch.testing.assert_close(found.hessian(), true["hessian"], rtol=0, atol=0.1)
+    scaled = estimate(
+        lambda z: torch.sin(z @ K), X, SMOOTHING, R[0], head=lambda y, r: r * y, memory=memory, value="smoothed"
+    )
+    torch.testing.assert_close(scaled.value, R[0] * true["value"], rtol=0, atol=0.01)
+
+
+def test_a_surrogate_of_another_shape_says_so() -> None:
+    memory = Memory(Model(lambda z: z[:, :1]))
+    with pytest.raises(ValueError, match=r"the surrogate of the memory must return \[K, 2\] like the black box"):
+        estimate(image, X, SMOOTHING, memory=memory)

@@ -47,33 +47,6 @@ def test_noise_is_averaged_by_least_squares():
     torch.testing.assert_close(model(points), expected, atol=1e-6, rtol=0)
 
 
-def test_inverting_finds_the_points():
-    points, truth = normal(12, 6) + 3.0, normal(4, 6, seed=5) + 3.0
-    model = LinearSurrogate()
-    model.fit(points, images(points))
-    torch.testing.assert_close(model.invert(images(truth)), truth, atol=1e-3, rtol=0)
-
-
-def test_contrasts_of_one_to_a_hundred_are_inverted():
-    """The weakest parameter changes the image a hundredth as much as the strongest."""
-    contrast = torch.logspace(-2, 0, 6, dtype=torch.float64)
-    points, truth = normal(12, 6), normal(4, 6, seed=5)
-    model = LinearSurrogate()
-    model.fit(points, images(points * contrast))
-    torch.testing.assert_close(model.invert(images(truth * contrast)), truth, atol=0.05, rtol=0)
-
-
-def test_a_parameter_that_is_not_seen_stays_at_the_mean():
-    points = normal(12, 6) + 3.0
-    hidden = points.clone()
-    hidden[:, 2] = 0.0
-    model = LinearSurrogate()
-    model.fit(points, images(hidden))
-    found = model.invert(images(hidden[:1]))[0]
-    assert float(found[2]) == pytest.approx(float(points[:, 2].mean()), abs=1e-3)
-    torch.testing.assert_close(found[[0, 1, 3, 4, 5]], points[0, [0, 1, 3, 4, 5]], atol=1e-3, rtol=0)
-
-
 def test_types_capacity_and_outputs_that_do_not_change():
     points = normal(12, 6).float()
     model = LinearSurrogate(capacity=8)
@@ -84,6 +57,5 @@ def test_types_capacity_and_outputs_that_do_not_change():
     torch.testing.assert_close(model(points[4:]), outputs[4:], atol=1e-4, rtol=0)
     model.fit(points[:1].expand(3, 6), torch.ones(3, 2))
     torch.testing.assert_close(model(points), torch.ones(12, 2))
-    assert bool(torch.isfinite(model.invert(torch.ones(1, 2))).all())
     with pytest.raises(ValueError, match="capacity must be at least 2, got 1"):
         LinearSurrogate(capacity=1)

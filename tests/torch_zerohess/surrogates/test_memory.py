@@ -121,3 +121,12 @@ def test_wrong_settings_raise(options, error) -> None:
 def test_a_fit_of_nothing_raises() -> None:
     with pytest.raises(ValueError, match="at least 2 evaluations, the memory has 0"):
         Memory().fit()
+
+
+def test_the_coefficient_is_the_smallest_over_values_and_derivatives() -> None:
+    memory, truth = Memory(), normal(1, 2000)
+    slope, bend = normal(1, 500, seed=1), normal(1, 500, seed=2)
+    memory.observe(truth, truth, [(slope, slope), (0.25 * bend, bend)])
+    assert memory.coefficient == pytest.approx(0.25)
+    memory.observe(truth, truth, [(slope, slope), (-bend, bend)])
+    assert memory.coefficient < 0.25

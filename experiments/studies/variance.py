@@ -1,8 +1,15 @@
 """Error of the estimators against evaluations and seconds: how much variance each choice of sampling leaves.
 
 Relative root-mean-square errors of value, gradient, Hessian and Hessian-vector product over independent runs, on the
-BOX tasks and on a plane wave. The truth is closed-form for the plane wave; for the BOX tasks it is a far larger sample
-of scrambled Sobol points that shares no code with the estimators, and its own standard error is reported.
+BOX tasks, MUG and plane waves. The truth is closed-form for plane waves and a fine quadrature for MUG. For the BOX
+tasks it is a far larger sample of scrambled Sobol points that shares no code with the estimators, and its own standard
+error is reported.
+
+The source plots variance against samples per element (its figure 11). A Hessian with a sample set per element then
+costs n (n + 1) / 2 times as many evaluations as one with a set for all elements. Both axes are drawn.
+
+Methods with a memory know 256 earlier evaluations around the same point, which the budget does not count. On the BOX
+tasks these are images, not losses.
 
 Methods take turns within every run, so that whatever else the machine does falls on all of them alike.
 
@@ -24,9 +31,9 @@ from experiments.problems.catalogue import chosen
 from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
-from experiments.studies.estimator_curves import Measurement, curve, draw, slope
+from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
 from experiments.studies.estimator_methods import METHODS, OURS, Method
-from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Problem, made_problem
+from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
 
 _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest budget
 
@@ -44,8 +51,8 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class ErrorReport:
-    """Everything `error` measured."""
+class VarianceReport:
+    """Everything `variance` measured."""
 
     runs: int
     budgets: tuple[int, ...]
@@ -59,28 +66,30 @@ class ErrorReport:
         return next(m for m in self.measurements if (m.problem, m.method, m.budget, m.quantity) == wanted)
 
     def slope(self, problem: str, method: str, quantity: str, *, against: str = "evaluations") -> float:
-        """Slope of the straight line through log error over log evaluations or seconds; NaN with fewer than two."""
+        """Slope of the straight line through log error over log evaluations; NaN with fewer than two."""
         return slope(*curve(self.measurements, problem, method, quantity, against))
 
 
-def error(
+def variance(
     *,
     runs: int = 100,
     seed: int = 0,
-    out: Path = Path("results/error"),
+    out: Path = Path("results/variance"),
     budgets: tuple[int, ...] = (32, 128, 512, 2048),
     problems: tuple[str, ...] = tuple(PROBLEMS),
+    methods: tuple[str, ...] = tuple(method.name for method in METHODS),
     side: int = 64,
     store: str | None = None,
-) -> ErrorReport:
+) -> VarianceReport:
     """Measure the relative RMSE of the estimators against evaluations and seconds, and plot it.
 
     Args:
         runs: independent estimates per method and budget.
         seed: of everything random.
-        out: folder for error.json, error_evaluations.png and error_seconds.png.
+        out: folder for variance.json, variance_evaluations.png, variance_samples.png and variance_seconds.png.
         budgets: black-box evaluations of one estimate, f(x) included.
-        problems: any of box2, box10 and wave10.
+        problems: any of box2, box10, mug, wave2 and wave10.
+        methods: names of the ways to estimate.
         side: pixels along the image side of the BOX tasks.
         store: name of a table to keep under experiments/results, for the documents.
     """
@@ -91,19 +100,21 @@ def error(
     if store is not None:
         may_keep(store)
     names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
+    picked = chosen("methods", methods, [method.name for method in METHODS])
+    compared = [method for method in METHODS if method.name in picked]
     made = [made_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in progress(names, "truth")]
-    tallies = [_Tally(one, method, budget) for one in made for method in METHODS for budget in budgets]
+    tallies = [_Tally(one, method, budget) for one in made for method in compared for budget in budgets]
     for run in progress(range(runs), "runs"):
         for tally in tallies:
             tally.add((seed << 32) + 1 + run)
     measurements = [measurement for tally in tallies for measurement in tally.measurements()]
     truth_error = {one.name: one.truth_error for one in made}
-    report = ErrorReport(runs, tuple(budgets), measurements, _ratios(measurements), truth_error)
+    report = VarianceReport(runs, tuple(budgets), measurements, _ratios(measurements), truth_error)
     out.mkdir(parents=True, exist_ok=True)
     settings = {"seed": seed, "side": side, "threads": torch.get_num_threads()}
-    (out / "error.json").write_text(json.dumps({**settings, **asdict(report)}, indent=1))
-    for against in ("evaluations", "seconds"):
-        draw(measurements, made, against, out / f"error_{against}.png")
+    (out / "variance.json").write_text(json.dumps({**settings, **asdict(report)}, indent=1))
+    for against in AXES:
+        draw(measurements, made, against, out / f"variance_{against}.png")
     headers, rows = _table(report)
     print(f"Relative RMSE of {report.runs} runs\n\n{table(headers, rows)}\n")
     _print_checks(report)
@@ -130,9 +141,12 @@ class _Tally:
             truth = self.problem.truth[name]
             self.squares.setdefault(name, []).append(float((value - truth).norm() / truth.norm()) ** 2)
 
-    def _counted(self, points: Tensor) -> Tensor:
-        self.evaluations += len(points)
-        return self.problem.fn(points)
+    def _counted(self, fn: Function) -> Function:
+        def counted(points: Tensor) -> Tensor:
+            self.evaluations += len(points)
+            return fn(points)
+
+        return counted
 
     def measurements(self) -> list[Measurement]:
         runs, seconds = len(self.seconds), statistics.median(self.seconds)
@@ -141,7 +155,8 @@ class _Tally:
             rmse = math.sqrt(statistics.fmean(squares))
             rmse_error = statistics.stdev(squares) / math.sqrt(runs) / (2 * rmse) if rmse else 0.0
             setting = self.problem.name, self.method.name, self.budget, self.evaluations // runs
-            found.append(Measurement(*setting, seconds, name, rmse, rmse_error))
+            samples = self.method.samples(self.budget, len(self.problem.x))
+            found.append(Measurement(*setting, samples, seconds, name, rmse, rmse_error))
         return found
 
 
@@ -149,7 +164,7 @@ def _ratios(measurements: list[Measurement]) -> list[Ratio]:
     hessian = {(m.problem, m.budget, m.method): m for m in measurements if m.quantity == "hessian"}
     ratios = []
     for (problem, budget, method), theirs in hessian.items():
-        if method.startswith("per-element"):
+        if method.startswith("per-element") and (problem, budget, OURS) in hessian:
             ours = hessian[problem, budget, OURS]
             ratio = theirs.rmse / ours.rmse
             spread = ratio * math.hypot(theirs.rmse_error / theirs.rmse, ours.rmse_error / ours.rmse)
@@ -157,7 +172,7 @@ def _ratios(measurements: list[Measurement]) -> list[Ratio]:
     return ratios
 
 
-def _table(report: ErrorReport) -> tuple[list[str], list[list[object]]]:
+def _table(report: VarianceReport) -> tuple[list[str], list[list[object]]]:
     """Return headers and rows: a row per problem, method and budget."""
     rows: dict[tuple[str, str, int], dict[str, Measurement]] = {}
     for m in report.measurements:
@@ -176,7 +191,7 @@ def _table(report: ErrorReport) -> tuple[list[str], list[list[object]]]:
     return ["problem", "method", "budget", "evaluations", "ms", *QUANTITIES], body
 
 
-def _print_checks(report: ErrorReport) -> None:
+def _print_checks(report: VarianceReport) -> None:
     print("Relative standard error of the truth\n")
     truth = [[name, *errors.values()] for name, errors in report.truth_error.items()]
     print(table(["problem", *QUANTITIES], truth))

@@ -1,0 +1,112 @@
+"""The study of estimators, run small: slopes, ratios and truths must be right, not just there."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from experiments.problems.closed_forms import PlaneWave
+from experiments.studies.estimator_methods import METHODS, OURS, PAPER
+from experiments.studies.estimator_problems import looked_up, quadrature
+from experiments.studies.variance import VarianceReport, variance
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> VarianceReport:
+    out = tmp_path_factory.mktemp("variance")
+    alone = tuple(method.name for method in METHODS if not method.memory)
+    result = variance(runs=16, budgets=(32, 128, 512), problems=("BOX2", "WAVE10"), methods=alone, side=32, out=out)
+    result_files = {path.name: path for path in out.iterdir()}
+    pictures = ["variance_evaluations.png", "variance_samples.png", "variance_seconds.png"]
+    assert sorted(result_files) == ["variance.json", *pictures]
+    written = json.loads(result_files["variance.json"].read_text())
+    assert len(written["measurements"]) == len(result.measurements)
+    assert written["runs"] == 16
+    for name in pictures:
+        assert result_files[name].read_bytes().startswith(b"\x89PNG")
+    return result
+
+
+@pytest.mark.parametrize("quantity", ["value", "gradient", "hessian", "hvp"])
+def test_error_of_random_samples_falls_with_the_root_of_evaluations(report, quantity) -> None:
+    slope = report.slope("WAVE10", OURS, quantity)
+    # The RMSE of a normal number over 16 runs has a relative standard deviation of 1/sqrt(32) = 0.18; the slope between
+    # two of them, log(16) apart, one of 0.18 sqrt(2) / 2.8 = 0.09. Four of these are allowed.
+    assert slope == pytest.approx(-0.5, abs=0.36)
+    assert report.slope("WAVE10", "aggregate + center, sobol", quantity) < -0.4
+
+
+def test_shared_samples_beat_a_sample_set_per_element(report) -> None:
+    ratio = next(r for r in report.ratios if (r.problem, r.budget, r.method) == ("BOX2", 128, PAPER))
+    assert ratio.evaluations <= 128
+    assert ratio.ratio > 10
+    assert ratio.ratio_error < ratio.ratio / 3
+
+
+def test_budgets_are_kept_and_nearly_used(report) -> None:
+    for m in report.measurements:
+        samples_of_one_per_element = 2 * (1 + 10 + 55) + 1
+        if m.method.startswith("per-element") and m.problem == "WAVE10" and m.budget < samples_of_one_per_element:
+            assert m.evaluations in (66, 132, 133)
+        else:
+            assert m.evaluations <= m.budget
+            assert m.evaluations > 0.7 * m.budget
+
+
+def test_the_truth_is_far_better_than_what_it_judges(report) -> None:
+    best = min(m.rmse for m in report.measurements if m.problem == "BOX2" and m.quantity == "hessian")
+    assert report.truth_error["BOX2"]["hessian"] < best / 5
+    assert report.truth_error["WAVE10"]["hessian"] == 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"problems": ("box3",)}, "problems must be some of BOX2, BOX10, MUG, WAVE2, WAVE10, got BOX3"),
+        ({"methods": ("ours",)}, "methods must be some of aggregate"),
+        ({"runs": 1}, "runs must be at least 2, got 1"),
+        ({"budgets": (32, 8)}, "budgets must be at least 16, got 8"),
+        ({"budgets": ()}, "budgets must be at least 16, got 0"),
+        ({"side": 0}, "side must be at least 1, got 0"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
+    ],
+)
+def test_wrong_arguments_are_named(tmp_path, wrong, message) -> None:
+    with pytest.raises(SystemExit, match=message):
+        variance(**{"runs": 2, "out": tmp_path, **wrong})
+
+
+def test_problems_have_lower_case_names_too(tmp_path) -> None:
+    found = variance(runs=2, budgets=(32,), problems=("wave10", "WAVE10"), out=tmp_path)
+    assert {m.problem for m in found.measurements} == {"WAVE10"}
+
+
+def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path) -> None:
+    methods = tuple(OURS + more for more in ("", ", memory", ", untrained network"))
+    problems = ("BOX2", "WAVE2")
+    report = variance(runs=16, budgets=(32,), problems=problems, methods=methods, side=32, out=tmp_path)
+    for quantity in ("value", "gradient", "hessian", "hvp"):
+        for problem, gain in (("WAVE2", 0.2), ("BOX2", 1.2)):  # images of BOX2 are hard to predict
+            plain, memory, untrained = (report.get(problem, name, 32, quantity).rmse for name in methods)
+            assert memory < gain * plain
+            assert untrained < 1.2 * plain
+
+
+def test_samples_per_element_are_fewer_where_every_element_has_its_own(report) -> None:
+    ours, theirs = (report.get("BOX2", name, 512, "hessian") for name in (OURS, PAPER))
+    assert ours.evaluations - 2 <= ours.samples <= 512
+    # a pair for the gradient's and the Hessian's elements each: 2 (1 + 2 + 3) evaluations
+    assert theirs.samples == 2 * (theirs.evaluations // 12)
+
+
+def test_quadrature_and_table_agree_with_a_closed_form() -> None:
+    wave, sigma = PlaneWave(torch.tensor([2.0], dtype=torch.float64), phase=0.3), 0.4
+    x, v = torch.tensor([0.7], dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64)
+    table = looked_up(wave(math.pi * torch.arange(4000)[:, None].double() / 4000), math.pi)
+    scale = torch.tensor([sigma], dtype=torch.float64)
+    for fn, error in ((wave, 1e-9), (table, 1e-5)):
+        found = quadrature(fn, x, sigma, v)
+        torch.testing.assert_close(found["value"], wave.value(x, scale).squeeze(), rtol=0, atol=error)
+        torch.testing.assert_close(found["gradient"], wave.gradient(x, scale), rtol=0, atol=error)
+        torch.testing.assert_close(found["hessian"], wave.hessian(x, scale), rtol=0, atol=error)

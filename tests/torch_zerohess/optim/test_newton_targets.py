@@ -1,0 +1,109 @@
+"""Newton targets against the minima of quadratics, dense solves with `torch.func.hessian`, and a network's training."""
+
+import pytest
+import torch
+from torch.func import grad, hessian, vmap
+
+import torch_zerohess as zh
+from torch_zerohess.optim.newton_targets import NewtonTargets
+
+
+def quadratics(n, seed=0):
+    """Matrices [3, n, n] of condition 1e4, minima [3, n], and the losses of rows."""
+    generator = torch.Generator().manual_seed(seed)
+    bases = torch.linalg.qr(torch.randn(3, n, n, generator=generator, dtype=torch.float64))[0]
+    matrices = bases * torch.logspace(0, 4, n, dtype=torch.float64)[:, None] @ bases.mT
+    minima = torch.randn(3, n, generator=generator, dtype=torch.float64)
+
+    def losses(y):
+        d = y - minima[: len(y)]
+        return 0.5 * torch.einsum("bi,bij,bj->b", d, matrices[: len(y)], d)
+
+    return matrices, minima, losses
+
+
+@pytest.mark.parametrize("n", [1, 5, 16])
+def test_few_outputs_reach_the_minima_of_quadratics(n):
+    _, minima, losses = quadratics(n)
+    found = NewtonTargets(damping=1e-12)(losses, torch.zeros(3, n, dtype=torch.float64))
+    torch.testing.assert_close(found, minima, rtol=1e-5, atol=1e-5)
+
+
+def test_many_outputs_of_one_curvature_take_one_iteration():
+    matrices, minima, _ = quadratics(40)
+    losses = lambda y: 0.5 * torch.einsum("bi,ij,bj->b", y - minima, matrices[0], y - minima)  # noqa: E731
+    targets = NewtonTargets(damping=1e-12, iterations=1)
+    torch.testing.assert_close(targets(losses, torch.zeros(3, 40, dtype=torch.float64)), minima, rtol=1e-4, atol=1e-4)
+
+
+def test_many_outputs_of_different_curvature_are_those_of_the_dense_solve():
+    _, _, losses = quadratics(24)
+    y = torch.ones(3, 24, dtype=torch.float64)
+    targets = NewtonTargets(damping=0.1, iterations=400)
+    found = targets(losses, y)
+    matrices = quadratics(24)[0]
+    shift = 0.1 * matrices.mean(0).diagonal().abs().mean()
+    (gradient,) = torch.autograd.grad(losses(y.requires_grad_()).sum(), y)
+    expected = y - torch.linalg.solve(matrices + shift * torch.eye(24, dtype=torch.float64), gradient)
+    torch.testing.assert_close(found, expected.detach(), rtol=0.05, atol=0.05)
+
+
+def test_negative_curvature_is_descended():
+    losses = lambda y: (y[:, 0] ** 2 - 3 * y[:, 1] ** 2) / 2 + y[:, 1] ** 4  # noqa: E731
+    y = torch.tensor([[0.5, 0.1], [-0.5, -0.1]], dtype=torch.float64)
+    found = NewtonTargets(damping=1e-9)(losses, y)
+    h, g = vmap(hessian(lambda p: losses(p[None])[0]))(y), vmap(grad(lambda p: losses(p[None])[0]))(y)
+    torch.testing.assert_close(found, y - g / h.diagonal(dim1=1, dim2=2).abs())
+    many = lambda y: (y[:, ::2] ** 2).sum(1) - 0.5 * (y[:, 1::2] ** 2).sum(1)  # noqa: E731
+    start = torch.full((2, 20), 0.1, dtype=torch.float64)
+    assert bool((many(NewtonTargets()(many, start)) < many(start)).all())
+
+
+def test_steps_are_at_most_the_radius():
+    _, minima, losses = quadratics(5)
+    found = NewtonTargets(damping=1e-12, radius=0.25)(losses, torch.zeros(3, 5, dtype=torch.float64))
+    torch.testing.assert_close(found, 0.25 * minima / minima.norm(dim=1, keepdim=True), rtol=1e-4, atol=1e-4)
+
+
+def test_a_network_learns_through_an_ill_conditioned_layer():
+    """The same steps of Adam: on the loss itself the weak output is not learned."""
+    scale, inputs = torch.tensor([1.0, 1e-3]), torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
+    truth = inputs @ torch.tensor([[1.0, 0.5], [-0.5, 1.0], [0.2, -1.0]])
+    errors = []
+    for newton in (False, True):
+        torch.manual_seed(0)
+        network, targets = torch.nn.Linear(3, 2), NewtonTargets(damping=1e-8)
+        layer = zh.BlackBox(lambda z: scale * z, zh.Smoothing(sigma=0.1, samples=16, order=2))
+        optimizer = torch.optim.SGD(network.parameters(), lr=0.3)
+        for _ in range(60):
+            y = network(inputs)
+            losses = lambda q, layer=layer: (layer(q) - scale * truth).square().sum(1)  # noqa: E731
+            loss = 0.5 * (y - targets(losses, y)).square().sum(1).mean() if newton else losses(y).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        errors.append(float((network(inputs).detach() - truth)[:, 1].square().mean()))
+    assert errors[1] < 0.05 < 0.5 < errors[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"damping": 0.0}, "damping must be positive, got 0.0"),
+        ({"radius": -1.0}, "radius must be positive, got -1.0"),
+        ({"iterations": 0}, "iterations must be an integer of at least 1, got 0"),
+    ],
+)
+def test_settings_are_checked(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        NewtonTargets(**arguments)
+
+
+def test_losses_and_outputs_are_checked():
+    targets = NewtonTargets()
+    with pytest.raises(ValueError, match=r"y must be \[B, n\], got \[3\]"):
+        targets(lambda y: y, torch.zeros(3))
+    with pytest.raises(ValueError, match=r"losses\(y\) must be \[2\], one for each element, got \[\]"):
+        targets(lambda y: y.square().mean(), torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="is not finite"):
+        targets(lambda y: (y * torch.inf).square().sum(1), torch.ones(2, 3))

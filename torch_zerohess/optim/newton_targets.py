@@ -1,0 +1,171 @@
+"""Targets for the outputs of a network: a Newton step on the loss of every element of a batch, in the outputs alone."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.autograd.blocks import magnitudes
+
+_DENSE = 16
+"""Outputs up to which the Hessian of every element is formed and solved."""
+_TOLERANCE = 1e-2
+"""Residual of conjugate gradients, relative to the gradient."""
+_PATIENCE = 100
+"""Calls between two preconditioners at least."""
+
+
+class NewtonTargets:
+    """Replaces the losses of a batch by squared distances to the ends of Newton steps (Petersen et al. 2024).
+
+    For losses l of outputs y [B, n] with gradient g and Hessian H of every element,
+
+        t = y - (H + damping * h I)^-1 g,    h = mean of |diagonal of H|
+
+    `0.5 * (network(images) - t).square().sum(1)` has the gradient of l where H is the identity. Any first-order
+    optimizer of the weights then trains as if the loss were well-conditioned in y. Convergence no longer depends on the
+    condition of the black box. For a batch much smaller than the weights this needs no curvature of the network.
+
+    Up to 16 outputs H is formed, and the magnitudes of its eigenvalues are used. For more outputs the system is solved
+    by conjugate gradients on Hessian-vector products. Their preconditioner is a mixture of the Hessians of one batch,
+    made again when the solution takes too many iterations. An affine black box with a quadratic loss takes one.
+
+    Args:
+        damping: relative to h; positive.
+        iterations: of conjugate gradients at most.
+        radius: longest step |t - y| of an element, in units of y.
+
+    Example:
+        >>> scale = torch.tensor([1.0, 100.0])
+        >>> targets = NewtonTargets(damping=1e-9)
+        >>> targets(lambda y: (scale * (y - 3.0)).square().sum(1), torch.zeros(1, 2))
+        tensor([[3.0000, 3.0000]])
+
+    Source: Petersen, Sutter, Borgelt, Huh, Kuehne, Sun, Deussen: Newton Losses, NeurIPS 2024, equation 2.
+    """
+
+    def __init__(self, *, damping: float = 1e-3, iterations: int = 16, radius: float = math.inf) -> None:
+        for name, value in (("damping", damping), ("radius", radius)):
+            if not value > 0.0:
+                raise ValueError(f"{name} must be positive, got {value}")
+        if not isinstance(iterations, int) or iterations < 1:
+            raise ValueError(f"iterations must be an integer of at least 1, got {iterations!r}")
+        self.damping, self.iterations, self.radius = damping, iterations, radius
+        self.losses: Tensor | None = None
+        """[B], of the last call."""
+        self._factor: Tensor | None = None
+        self._age = 0
+
+    def __repr__(self) -> str:
+        return f"NewtonTargets(damping={self.damping}, iterations={self.iterations}, radius={self.radius})"
+
+    def __call__(self, losses: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
+        """Return the targets [B, n], without a graph.
+
+        Raises ValueError for y that is not [B, n], for losses that are not [B], and for a gradient or curvature that is
+        not finite.
+
+        Args:
+            losses: outputs [B, n] -> losses [B], twice differentiable, each of its own element.
+            y: outputs [B, n].
+        """
+        if y.ndim != 2:
+            raise ValueError(f"y must be [B, n], got {list(y.shape)}")
+        at = y.detach().requires_grad_()
+        with torch.enable_grad():
+            values = losses(at)
+            if values.shape != at.shape[:1]:
+                raise ValueError(f"losses(y) must be [{len(at)}], one for each element, got {list(values.shape)}")
+            (g,) = torch.autograd.grad(values.sum(), at, create_graph=True)
+        self.losses = values.detach()
+        gradient = g.detach()
+
+        _check(gradient)
+
+        def product(v: Tensor) -> Tensor:
+            if not g.requires_grad:  # a loss that is linear in y
+                return torch.zeros_like(v)
+            (hv,) = torch.autograd.grad(g, at, v, retain_graph=True, materialize_grads=True)
+            return hv
+
+        step = self._dense(product, gradient) if y.shape[1] <= _DENSE else self._iterate(product, gradient)
+        _check(step)
+        length = step.norm(dim=1, keepdim=True)
+        return y.detach() - step * (self.radius / length.clamp_min(self.radius) if self.radius < math.inf else 1.0)
+
+    def _dense(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
+        n = gradient.shape[1]
+        units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
+        columns = [product(unit.expand_as(gradient)) for unit in units]
+        h = _magnitudes(torch.stack(columns, 2).double())
+        h = h + self._shift(h)[:, None, None] * torch.eye(n, dtype=h.dtype, device=h.device)
+        return torch.linalg.solve(h, gradient.double()).to(gradient.dtype)
+
+    def _shift(self, h: Tensor) -> Tensor:
+        """Return the damping [...] of Hessians [..., n, n]; 1 for a Hessian of zeros."""
+        size = h.diagonal(dim1=-2, dim2=-1).abs().mean(-1)
+        return torch.where(size > 0, self.damping * size, 1.0)
+
+    def _iterate(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
+        if self._factor is None or self._factor.shape[0] != gradient.shape[1]:
+            self._precondition(product, gradient)
+        step, converged = self._solve(product, gradient)
+        self._age += 1
+        if not converged and self._age > _PATIENCE:
+            self._precondition(product, gradient)
+            step, _ = self._solve(product, gradient)
+        return step
+
+    def _precondition(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> None:
+        """Factorise a mixture of the Hessians of the batch: column i is of element i modulo B."""
+        n = gradient.shape[1]
+        units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
+        columns = []
+        for part in units.split(len(gradient)):
+            v = torch.zeros_like(gradient)
+            v[: len(part)] = part
+            columns.append(product(v)[: len(part)])
+        h = _magnitudes(torch.cat(columns).double())
+        self._damping = float(self._shift(h))
+        self._factor = torch.linalg.cholesky(h + self._damping * torch.eye(n, dtype=h.dtype, device=h.device))
+        self._age = 0
+
+    def _solve(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> tuple[Tensor, bool]:
+        """Solve (H + damping I) s = g for all elements; an element ends at its tolerance or at negative curvature."""
+        factor = self._factor
+        assert factor is not None
+
+        def precondition(r: Tensor) -> Tensor:
+            return torch.cholesky_solve(r.double().mT, factor).mT.to(r.dtype)
+
+        s, r = torch.zeros_like(gradient), gradient
+        z = precondition(r)
+        p, rz = z, (r * z).sum(1, keepdim=True)
+        going = gradient.norm(dim=1, keepdim=True) > 0
+        for iteration in range(self.iterations):
+            hp = product(p) + self._damping * p
+            bend = (p * hp).sum(1, keepdim=True)
+            if not iteration:
+                s = torch.where(going & (bend <= 0), p, s)  # the gradient, in the metric of the preconditioner
+            going = going & (bend > 0)
+            length = torch.where(going, rz / bend.clamp_min(torch.finfo(bend.dtype).tiny), 0.0)
+            s, r = s + length * p, r - length * hp
+            going = going & (r.norm(dim=1, keepdim=True) > _TOLERANCE * gradient.norm(dim=1, keepdim=True))
+            if not bool(going.any()):
+                return s, True
+            z = precondition(r)
+            before, rz = rz, (r * z).sum(1, keepdim=True)
+            p = z + rz / before * p
+        return s, False
+
+
+def _magnitudes(h: Tensor) -> Tensor:
+    """Return Hessians [..., n, n], symmetric and with the magnitudes of their eigenvalues."""
+    _check(h)
+    return magnitudes(0.5 * (h + h.mT))
+
+
+def _check(x: Tensor) -> None:
+    if not bool(torch.isfinite(x).all()):
+        raise ValueError("the gradient or the curvature of the losses is not finite")

@@ -15,6 +15,10 @@ from torch import Tensor
 SECONDS = 2.0
 """Simulated time; most cubes lie still after it."""
 _STEP = 0.01
+_PARTS = 10
+"""Parts of the simulated time, after each of which it is seen whether the cube lies still."""
+_STILL = 1e-3
+"""Velocity [m/s] and spin [rad/s] of a cube that lies still."""
 _SCENE = f"""
 <mujoco>
   <option timestep="{_STEP}" integrator="implicitfast"/>
@@ -60,6 +64,9 @@ class ThrownCube:
         for end, launch in zip(ends, launches, strict=True):
             mujoco.mj_resetData(model, data)
             data.qvel[:5] = launch
-            mujoco.mj_step(model, data, nstep=round(SECONDS / _STEP))
+            for _ in range(_PARTS):
+                mujoco.mj_step(model, data, nstep=round(SECONDS / _STEP / _PARTS))
+                if abs(data.qvel).max() < _STILL:
+                    break
             end[:] = data.qpos[:2]
         return torch.from_numpy(ends)

@@ -22,7 +22,7 @@ FLOOR = ((0.0, 8.0), (-4.0, 4.0))
 SPOT = 0.5
 """Radius of the spot [m]."""
 SIZES = {
-    "fast": Size(32, 1, 1, evaluations=4000, images=512, held_out=64),
+    "fast": Size(32, 1, 1, evaluations=4000, images=512, held_out=32),
     "paper": Size(64, 1, 1, evaluations=20000, images=4096, held_out=256),
 }
 

@@ -9,6 +9,7 @@ With few outputs of the network, Newton steps are on its weights. With many outp
 are on the outputs alone (`zh.optim.NewtonTargets`), and Adam fits the network to their ends.
 """
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -95,7 +96,7 @@ def through_memory(
             adam.zero_grad()
             y = network(chosen)
             if second:
-                ends = targets(lambda y, chosen=chosen: layer(y, chosen), y)
+                ends = targets(partial(_losses, layer, chosen), y)
                 assert targets.losses is not None
                 loss, objective = targets.losses.mean(), (y - ends).square().mean()
             else:
@@ -105,6 +106,11 @@ def through_memory(
         every, last = max(1, total // _ROWS), step == total - 1
         if step % every == 0 or last:
             trial.report(sigma=sigma, loss=loss.detach(), measured=last or step % (10 * every) == 0)
+
+
+def _losses(layer: zh.BlackBox, images: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    losses: torch.Tensor = layer(y, images)
+    return losses
 
 
 def _newton(network: torch.nn.Module, radius: float, damping: float) -> zh.optim.NewtonCG:

@@ -140,3 +140,4 @@ METHODS = (
     Method("differences, independent", "aggregate", "center", difference="independent"),
     Method("differences, common", "aggregate", "center", difference="common"),
 )
+NAMES = tuple(method.name for method in METHODS)

@@ -32,7 +32,7 @@ from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
-from experiments.studies.estimator_methods import METHODS, OURS, Method
+from experiments.studies.estimator_methods import METHODS, NAMES, OURS, Method
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
 
 _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest budget
@@ -77,7 +77,7 @@ def variance(
     out: Path = Path("results/variance"),
     budgets: tuple[int, ...] = (32, 128, 512, 2048),
     problems: tuple[str, ...] = tuple(PROBLEMS),
-    methods: tuple[str, ...] = tuple(method.name for method in METHODS),
+    methods: tuple[str, ...] = NAMES,
     side: int = 64,
     store: str | None = None,
 ) -> VarianceReport:
@@ -100,7 +100,7 @@ def variance(
     if store is not None:
         may_keep(store)
     names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
-    picked = chosen("methods", methods, [method.name for method in METHODS])
+    picked = chosen("methods", methods, NAMES)
     compared = [method for method in METHODS if method.name in picked]
     made = [made_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in progress(names, "truth")]
     tallies = [_Tally(one, method, budget) for one in made for method in compared for budget in budgets]

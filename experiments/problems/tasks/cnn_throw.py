@@ -1,8 +1,9 @@
 """CNN-THROW: a network that throws a cube at a target that it sees, through a simulator with contacts.
 
 A network sees a picture of the floor from above, with a spot at the target, and predicts the five launch parameters of
-`thrown_cube`. The black box is MuJoCo, the loss after it the squared distance of the cube's end from the target. A wall
-makes the loss discontinuous. Targets are the ends of random launches, so that each can be reached.
+`thrown_cube`. The black box is MuJoCo, the loss after it the squared distance of the cube's end from the target. All
+targets are behind the wall. They are the ends of random launches, so that each can be reached. An untrained network
+throws at the wall, where the loss is a plateau with ripples.
 
 Many launches reach a target, so there is no parameter error: both errors are the mean squared distance on the floor.
 """
@@ -19,6 +20,8 @@ from experiments.problems.scenes.thrown_cube import LOWER, UPPER, ThrownCube
 
 FLOOR = ((0.0, 8.0), (-4.0, 4.0))
 """Range of the picture along x and y [m]."""
+BEHIND = 2.5
+"""Least distance of a target [m]; the wall is at 2."""
 SPOT = 0.5
 """Radius of the spot [m]."""
 SIZES = {
@@ -49,7 +52,7 @@ class Throw(NetworkTask):
     name = "cnn_throw"
     title = "a network that throws a cube over a wall onto a target that it sees"
     n = ThrownCube.n
-    sigma = (1.0, 0.1)
+    sigma = (2.0, 0.2)
     measure = "rms distance from the target [m]"
 
     def encoder(self) -> nn.Module:
@@ -59,8 +62,11 @@ class Throw(NetworkTask):
         return ThrownCube()
 
     def parameters(self, count: int, generator: torch.Generator, *, held_out: bool) -> Tensor:
-        lower, upper = torch.tensor(LOWER), torch.tensor(UPPER)
-        return lower + (upper - lower) * torch.rand(count, self.n, generator=generator)
+        lower, upper, kept = torch.tensor(LOWER), torch.tensor(UPPER), torch.empty(0, self.n)
+        while len(kept) < count:
+            x = lower + (upper - lower) * torch.rand(4 * count, self.n, generator=generator)
+            kept = torch.cat([kept, x[self.image(x)[:, 0] > BEHIND]])
+        return kept[:count]
 
     def image(self, x: Tensor) -> Tensor:
         """Where the cubes of launches [K, 5] come to rest, [K, 2] in metres."""

@@ -208,7 +208,7 @@ def _value(array: Any) -> Any:
 def _tensor(value: Any) -> Tensor:
     """Return an output without a copy where that is possible; it keeps the memory of the output alive."""
     inner = getattr(value, "_ortvalue", value)
-    return torch.from_dlpack(inner) if hasattr(inner, "__dlpack__") else torch.from_numpy(value.numpy())
+    return torch.utils.dlpack.from_dlpack(inner) if hasattr(inner, "__dlpack__") else torch.from_numpy(value.numpy())
 
 
 def _free(dims: Sequence[Any]) -> bool:

@@ -1,12 +1,9 @@
 """A worker process, as its caller sees it."""
 
-import contextlib
 import multiprocessing
-import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -16,9 +13,9 @@ from torch import Tensor
 
 from torch_zerohess.evaluators import transfer, worker
 from torch_zerohess.evaluators.batch import Chunk
+from torch_zerohess.evaluators.lifetime import end_group, one_thread
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
 
-_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _starting = threading.Lock()
 
 
@@ -29,7 +26,7 @@ class Process:
         context = multiprocessing.get_context("spawn")
         mine, theirs = context.Pipe()
         self.process = context.Process(target=worker.main, args=(theirs,), name="torch_zerohess worker", daemon=True)
-        with _starting, _one_thread():
+        with _starting, one_thread():
             self.process.start()
         theirs.close()
         self.messages = Messages(mine)
@@ -109,9 +106,8 @@ class Process:
         """
         if grace:
             wait([self.process.sentinel], grace)
-        if self.process.pid is not None and hasattr(os, "killpg"):
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.process.pid, signal.SIGKILL)  # its group has its number, once it has one
+        if self.process.pid is not None:
+            end_group(self.process.pid)
         self.process.kill()
         self.process.join()
         self.messages.close()
@@ -126,18 +122,3 @@ def ending(code: int) -> str:
         return signal.Signals(-code).name
     except ValueError:
         return f"signal {-code}"
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let processes that start inside have one thread each: libraries read these variables when they are loaded."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

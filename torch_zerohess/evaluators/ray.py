@@ -1,6 +1,7 @@
 """Evaluation on a cluster: actors of Ray that hold the black box."""
 
 import os
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -23,10 +24,10 @@ class Ray(Closing):
     that failed too often: see `ProcessPool`. An exception of the black box is raised here.
 
     A program that has called `ray.init(...)` has chosen its cluster. Otherwise the address in the environment variable
-    RAY_ADDRESS is used, and without one a Ray of this machine alone, which listens on 127.0.0.1 and ends with
-    `close()`.
+    RAY_ADDRESS is used, and without one a Ray of this machine alone, which ends with `close()`.
 
-    A Ray cluster runs any code of whoever may connect to it: it belongs into a network of its own.
+    Ray listens on the addresses of its machines, also a Ray of one machine, and runs any code of whoever may connect:
+    it belongs into a network of its own, or behind its token authentication. `ProcessPool` listens nowhere.
 
     Args:
         actors: number of actors; as many as the cluster has cores if None.
@@ -48,13 +49,15 @@ class Ray(Closing):
             import ray
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError("ray is not installed; pip install ray", name="ray") from error
-        self._ray = ray
+        self._ray: Any = ray
         self.count, self.retries = actors, retries
         self.options = {"num_cpus": 1, "max_restarts": -1, "max_task_retries": 0} | options
         self.lost: dict[int, str] = {}
         """Points of the last call that have no value, by number, and why."""
         self.actors: list[Any] = []
         """Handles of the actors."""
+        self._starting: dict[Any, Any] = {}
+        """Actors that have ended and start again, by what says that they have."""
         self._fn: Callable[..., Any] | None = None
         self._held: Any = None
         """Where the cluster has the black box."""
@@ -77,18 +80,24 @@ class Ray(Closing):
         batch = Batch(points, self.retries, len(self.actors))
         self.lost = batch.lost
         busy: dict[Any, tuple[Any, Chunk]] = {}
-        idle = list(self.actors)
+        idle = [actor for actor in self.actors if actor not in self._starting.values()]
         try:
             while not batch.finished:
                 while idle and batch.waiting:
                     chunk, actor = batch.take(), idle.pop(0)
                     data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
                     busy[actor.evaluate.remote([self._held], data)] = actor, chunk
-                done, _ = self._ray.wait(list(busy), num_returns=1)
+                done, _ = self._ray.wait([*busy, *self._starting], num_returns=1)
                 for one in done:
-                    actor, chunk = busy.pop(one)
-                    idle.append(actor)  # behind the others: it may be about to restart
-                    self._answer(one, chunk, batch)
+                    if one in busy:
+                        actor, chunk = busy.pop(one)
+                        alive = self._answered(one, chunk, batch)
+                    else:
+                        actor, alive = self._started(one)
+                    if alive:
+                        idle.append(actor)
+                    else:  # until it has restarted, it would refuse points
+                        self._starting[actor.ready.options(max_task_retries=-1).remote()] = actor
         finally:
             for one in busy:
                 self._ray.cancel(one)
@@ -110,21 +119,23 @@ class Ray(Closing):
         if os.environ.get("RAY_ADDRESS"):
             self._ray.init()
             return
-        self._ray.init(address="local", include_dashboard=False, _node_ip_address="127.0.0.1", num_cpus=self.count)
+        here = os.pathsep.join(folder or os.getcwd() for folder in sys.path)  # what can be imported here, can be there
+        environment = {"env_vars": {"PYTHONPATH": here}}
+        self._ray.init(address="local", include_dashboard=False, num_cpus=self.count, runtime_env=environment)
         self._own = True
 
     def _staff(self) -> None:
         if not self.actors:
             count = self.count or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-            make = self._ray.remote(Actor).options(**self.options)
-            self.actors = [make.remote() for _ in range(count)]
+            self.actors = [self._new() for _ in range(count)]
 
     def _end_actors(self) -> None:
         for actor in self.actors if self._ray.is_initialized() else ():
             self._ray.kill(actor)
-        self.actors, self._fn, self._held = [], None, None
+        self.actors, self._starting, self._fn, self._held = [], {}, None, None
 
-    def _answer(self, one: Any, chunk: Chunk, batch: Batch) -> None:
+    def _answered(self, one: Any, chunk: Chunk, batch: Batch) -> bool:
+        """Treat what became of a chunk; False if its actor has ended."""
         errors = self._ray.exceptions
         try:
             batch.came(chunk, transfer.unpacked(self._ray.get(one))[0])
@@ -133,6 +144,22 @@ class Ray(Closing):
         except errors.RayError as error:
             reason = str(error).strip().splitlines()
             batch.failed(chunk, f"an actor ended ({type(error).__name__}: {reason[0] if reason else ''})")
+            return False
+        return True
+
+    def _started(self, one: Any) -> tuple[Any, bool]:
+        """Return an actor that has started again, or a new one in its place, and whether it has."""
+        actor = self._starting.pop(one)
+        try:
+            self._ray.get(one)
+        except self._ray.exceptions.RayError:
+            new = self._new()
+            self.actors[self.actors.index(actor)] = new
+            return new, False
+        return actor, True
+
+    def _new(self) -> Any:
+        return self._ray.remote(Actor).options(**self.options).remote()
 
 
 class Actor:
@@ -142,6 +169,9 @@ class Actor:
         torch.set_num_threads(1)
         self._held: Any = None
         self._fn: Any = None
+
+    def ready(self) -> None:
+        """Do nothing, once the actor has started."""
 
     def evaluate(self, held: list[Any], data: bytes) -> bytes:
         """Return the values of a chunk. A reference inside a list is not fetched with every call."""

@@ -1,15 +1,10 @@
 """What runs in a worker process: it gets a black box once, then points, until its pipe is closed."""
 
 import contextlib
-import multiprocessing
-import os
 import pickle
-import signal
 import struct
-import sys
-import threading
 import traceback
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from typing import Any
 
 import torch
@@ -17,6 +12,7 @@ from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.factory import Each, built
+from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
 from torch_zerohess.evaluators.values import checked_values
 
@@ -82,10 +78,7 @@ class Messages:
 
 def main(connection: "Connection[Any, Any]") -> None:
     """Serve until the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the caller's, who ends this process
-    if hasattr(os, "setpgid"):
-        os.setpgid(0, 0)  # so that programs that the black box starts end with it
-    _end_with_parent()
+    end_with_parent()
     _leave_no_core()
     torch.set_num_threads(1)
     messages = Messages(connection)
@@ -137,31 +130,6 @@ def _data(one: Tensor) -> memoryview:
     data = bytearray(one.numel())
     transfer.write([one], transfer.specs([one])[0], data)
     return memoryview(data)
-
-
-def _end_with_parent() -> None:
-    """End this process and what it started when the parent ends, however that ends.
-
-    A thread waits for it. On Linux the kernel does too, because a black box that hangs may keep the thread from
-    running: the parent holds the other end of a pipe, and a signal is sent when that closes.
-    """
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    threading.Thread(target=_follow, args=(parent.sentinel,), daemon=True).start()
-    if sys.platform == "linux":
-        import fcntl
-
-        fcntl.fcntl(parent.sentinel, fcntl.F_SETOWN, -os.getpid())  # the group of this process
-        fcntl.fcntl(parent.sentinel, fcntl.F_SETSIG, signal.SIGKILL)
-        flags = fcntl.fcntl(parent.sentinel, fcntl.F_GETFL)
-        fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, flags | os.O_ASYNC)
-
-
-def _follow(sentinel: int) -> None:
-    wait([sentinel])
-    if hasattr(os, "killpg"):
-        os.killpg(0, signal.SIGKILL)
-    os._exit(1)
 
 
 def _leave_no_core() -> None:

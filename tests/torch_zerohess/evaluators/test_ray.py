@@ -33,13 +33,15 @@ def test_actors_hold_the_black_box(actors, tmp_path):
     fn = Factory(black_boxes.Counted, tmp_path / "made")
     for _ in range(3):
         assert torch.equal(actors(fn, Z), black_boxes.waves(Z))
-    assert len((tmp_path / "made").read_text().split()) == 2
+    made = (tmp_path / "made").read_text().split()
+    assert len(set(made)) == len(made) <= 2  # one that ended in the test before may still be starting
 
 
 @pytest.mark.filterwarnings("ignore")
 def test_errors(actors):
     with pytest.raises(ArithmeticError, match="no value above one half"):
         actors(black_boxes.failing, Z)
+    actors.retries = 0
     with pytest.raises(LostEvaluationError, match="an actor ended"):
         actors(black_boxes.never, torch.zeros(1, 1))
 

@@ -103,4 +103,5 @@ def asleep(z):
     """Hang, and keep every other thread of the process from running."""
     import ctypes
 
+    print("asleep", flush=True)
     ctypes.PyDLL(None).sleep(600)

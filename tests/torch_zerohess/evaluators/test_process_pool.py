@@ -175,6 +175,38 @@ def test_chunks_are_tried_again_and_then_cut():
     torch.testing.assert_close(batch.result(), torch.tensor([0.5, math.nan, 2.5]), equal_nan=True)
 
 
+def test_the_first_error_is_raised_whichever_comes_first():
+    batch = Batch(torch.zeros(4, 1), retries=0)
+    first, second, third, fourth = (batch.take() for _ in range(4))
+    batch.raised(second, KeyError("second"))
+    batch.failed(third, "no matter")
+    assert not batch.finished  # the first may have an error too
+    batch.raised(first, KeyError("first"))
+    batch.raised(fourth, KeyError("fourth"))
+    assert batch.finished
+    with pytest.raises(KeyError, match="first"):
+        batch.result()
+
+
+class Losing:
+    """An evaluator that has no value of the second point."""
+
+    lost: dict[int, str] = {1: "it crashed"}  # noqa: RUF012
+
+    def __call__(self, fn, points, *aux):
+        values = fn(points, *aux)
+        values[1] = torch.nan
+        return values
+
+
+def test_a_head_cannot_hide_a_lost_point():
+    smoothing = S.replace(samples=4, baseline="mean")
+    settings = {"head": lambda out: out.nan_to_num(3.0), "evaluator": Losing(), "value": "smoothed"}
+    assert zh.estimate(black_boxes.waves, vector(0.1, 0.2), smoothing, on_nonfinite="drop", **settings).dropped == 2
+    with pytest.raises(LostEvaluationError, match=r"it crashed, at the point \[.*\], number 1 of 8; 1 without a value"):
+        zh.estimate(black_boxes.waves, vector(0.1, 0.2), smoothing, **settings)
+
+
 def test_kills_and_hangs_change_no_bit(tmp_path):
     z = points(200)
     fn = black_boxes.Disturbed(tmp_path)
@@ -225,7 +257,7 @@ def test_no_worker_outlives_its_parent(end, tmp_path):
         assert parent.stdout is not None
         worker = int(parent.stdout.readline())
         if end != "return":
-            assert alive(worker)
+            assert parent.stdout.readline() == "asleep\n"
             parent.send_signal(getattr(signal, end))
         parent.wait(60)
         until = time.monotonic() + 5

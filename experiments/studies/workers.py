@@ -215,7 +215,7 @@ def _killer(kills: int, chance: random.Random) -> Iterator[list[int]]:
     over = threading.Event()
 
     def kill() -> None:
-        while len(killed) < kills and not over.wait(chance.expovariate(4.0)):
+        while len(killed) < kills and not over.wait(chance.expovariate(1.0)):
             running = [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
             if running and (pid := chance.choice(running).pid) is not None and pid not in killed:
                 os.kill(pid, signal.SIGKILL)

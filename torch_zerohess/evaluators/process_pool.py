@@ -28,8 +28,10 @@ from torch_zerohess.evaluators.process import Process
 from torch_zerohess.evaluators.values import checked_values
 from torch_zerohess.evaluators.worker import ERROR, VALUES
 
-_STARTS = 5
-"""Workers in a row that may end before they evaluated anything."""
+_STARTS = 25
+"""Workers in a row that may end before they have a black box: they are killed from outside."""
+_MAKES = 5
+"""Workers in a row that may end without a value after they got the black box."""
 _LOOK = 0.05
 """Seconds between two looks at the memory of workers."""
 _ALIVE = 1.0
@@ -227,8 +229,10 @@ class ProcessPool(Closing):
             making, data = header
             error = loaded_error(data)
             if making:
-                one.number = None
-                raise _unmade(error)
+                number, one.number = one.number, None
+                if number == self._number:  # not that of an earlier call, which has raised it already
+                    raise _unmade(error)
+                return
             assert chunk is not None
             batch.raised(chunk, error)
         elif kind == VALUES:
@@ -255,7 +259,7 @@ class ProcessPool(Closing):
                 f"a worker process ended with {how} at its start, see its messages above. If they name "
                 '`__main__`: put the main part of the script under `if __name__ == "__main__":`'
             )
-        if self._failed_starts > _STARTS or reason is not None:
+        if self._failed_starts > (_STARTS if number is None else _MAKES) or reason is not None:
             when = "at its start" if number is None else "while it made the black box"
             raise RuntimeError(
                 f"a worker process ended {when}: {reason or how}, {self._failed_starts} times in a row without a value"

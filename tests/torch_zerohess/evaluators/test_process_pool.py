@@ -4,6 +4,7 @@ A worker takes seconds to start, so tests share one pool where they can.
 """
 
 import math
+import multiprocessing
 import os
 import pickle
 import signal
@@ -86,9 +87,13 @@ def test_every_door_takes_the_pool(pool):
         slopes = [torch.func.grad(door(black_boxes.waves, S, evaluator=one))(x) for one in (None, pool)]
         assert torch.equal(*slopes)
     settings = {"sigma": 0.5, "bounds": (-1, 1), "seed": 0, "max_evaluations": 12}
-    fits = [zh.minimize(black_boxes.waves, x, evaluator=one, **settings) for one in (None, pool)]
-    assert torch.equal(fits[0].x, fits[1].x)
-    assert [one.value for one in fits[0].history] == [one.value for one in fits[1].history]
+    before = multiprocessing.active_children()
+    doors = {"evaluator": None}, {"evaluator": pool}, {"workers": 1}
+    fits = [zh.minimize(black_boxes.waves, x, **door, **settings) for door in doors]
+    for fit in fits[1:]:
+        assert torch.equal(fits[0].x, fit.x)
+        assert [one.value for one in fits[0].history] == [one.value for one in fit.history]
+    assert set(multiprocessing.active_children()) <= set(before)
 
 
 def test_a_factory_is_called_once_in_every_worker(pool, tmp_path):
@@ -114,6 +119,7 @@ def test_an_error_comes_with_the_traceback_of_the_worker(pool):
         pool(black_boxes.leaving, z)
     with pytest.raises(OSError, match="the scene is not there"):
         pool(Factory(black_boxes.broken), z)
+    assert torch.equal(pool(black_boxes.waves, z), black_boxes.waves(z))  # the other worker's same error is no news
 
 
 def test_values_of_different_shapes_are_refused(pool):

@@ -54,6 +54,9 @@ COMMANDS = {
     "bench": Command(
         "experiments.studies.bench:bench", "time of the extension against pure torch and torch", long=True
     ),
+    "workers": Command(
+        "experiments.studies.workers:workers", "cost and gain of worker processes, and faults", long=True
+    ),
     "stability": Command("experiments.studies.stability:stability", "extreme cases against closed forms", long=True),
     "doctor": Command("experiments.commands:doctor", "what this installation can do"),
 }

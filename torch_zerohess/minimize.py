@@ -9,6 +9,7 @@ from torch import Tensor
 from torch_zerohess.estimation.evaluation import BlackBoxCall
 from torch_zerohess.estimation.inputs import checked_input, short, working
 from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.optim.second_order import check_count
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.trust_region import Engine, TrustRegion
@@ -62,6 +63,7 @@ def minimize(
     engine: Engine = "auto",
     vectorized: bool = True,
     evaluator: Evaluator | None = None,
+    workers: int | None = None,
     callback: Callable[[Iterate], object] | None = None,
     seed: int | None = None,
     target: float | None = None,
@@ -81,6 +83,8 @@ def minimize(
         engine: "gaussian_process", "descent", or "auto" to choose by the number of parameters and their bounds.
         vectorized: False for an fn of one point, [n] -> scalar or [*out].
         evaluator: where evaluations run; in this process if None.
+        workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
+            does not depend on their number. A point that no process survives has the value NaN.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this.
@@ -95,6 +99,8 @@ def minimize(
         >>> bool((fit.x - 3).abs().max() < 1e-3), fit.evaluations < 50
         (True, True)
     """
+    if evaluator is not None and workers is not None:
+        raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
     x0 = working(checked_input(x0))
     search = TrustRegion(x0, sigma=sigma, bounds=bounds, loss=loss, engine=engine, seed=seed, **settings)
     smallest = len(search.ask()) + 1
@@ -104,7 +110,8 @@ def minimize(
             f"parameters, got {max_evaluations}"
         )
     check_count(max_evaluations=max_evaluations)
-    call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or Inline())
+    own = None if workers is None else ProcessPool(workers)
+    call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or own or Inline())
     history: list[Iterate] = []
     try:
         message = _search(search, call, max_evaluations, target, callback, history)
@@ -112,6 +119,9 @@ def minimize(
         if not history:
             raise
         message = "interrupted"
+    finally:
+        if own is not None:
+            own.close()
     return _minimum(search, history, message)
 
 

@@ -1,10 +1,7 @@
 """Processes that run jobs, one thread each; a process that dies takes only its own job with it."""
 
-import contextlib
 import multiprocessing
-import os
 import signal
-import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -23,8 +20,8 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
+from torch_zerohess.evaluators.lifetime import end_with_parent, one_thread
 
-_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _PROGRESS = 0.2
 """Seconds between two messages about a running job."""
 _OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -102,7 +99,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs,), daemon=True)
-        with _one_thread():
+        with one_thread():
             self.process.start()
         theirs.close()
         self.job: Job | None = None
@@ -148,8 +145,7 @@ def _death(job: Job, code: int) -> Outcome | Trouble:
 
 def _work(connection: Connection) -> None:
     """Run jobs until the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's: it ends this process
-    threading.Thread(target=_follow_parent, daemon=True).start()
+    end_with_parent()  # a parent that was killed may be started again, and writes the same files
     torch.set_num_threads(1)
     connection.send(None)
     while True:
@@ -158,14 +154,6 @@ def _work(connection: Connection) -> None:
         except EOFError:
             return
         connection.send(_execute(job, connection))
-
-
-def _follow_parent() -> None:
-    """End with the parent: a parent that was killed may be started again, and writes the same files."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    wait([parent.sentinel])
-    os._exit(1)
 
 
 def _execute(job: Job, connection: Connection) -> Message:
@@ -201,18 +189,3 @@ def _execute(job: Job, connection: Connection) -> Message:
 @lru_cache(maxsize=1)  # a scene that stays loaded slows down the next
 def _load(name: str, preset: Preset, variant: str, threads: int | None) -> Task | NetworkTask:
     return catalogue.load(name, preset, variant, threads)
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let processes that start inside have one thread each: libraries read these variables when they are loaded."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -17,7 +17,10 @@ from torch_zerohess.estimation.head import Head, apply_head, checked_head
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.perturbations import draws, perturb
 from torch_zerohess.estimation.stein import Stein, total
+from torch_zerohess.evaluators.batch import loss_error
+from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.values import checked_values
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
 
@@ -54,19 +57,8 @@ class BlackBoxCall:
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
-        fn = self.fn if self.vectorized else self._each
-        values = _tensor(self.evaluator(fn, points, *aux))
-        if values.requires_grad:
-            raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")
-        if not values.is_floating_point():
-            raise TypeError(f"fn must return real floating-point values, got {values.dtype}: convert, e.g. .float()")
-        if values.dim() == 0 or len(values) != len(points):
-            raise ValueError(
-                f"fn must return one value per point, [{len(points)}, *out] for points "
-                f"{list(points.shape)}, got {list(values.shape)}"
-                + ("" if self.vectorized else " from single points")
-                + ("; for a function of one point pass vectorized=False" if self.vectorized else "")
-            )
+        fn = self.fn if self.vectorized else Each(self.fn)
+        values = checked_values(self.evaluator(fn, points, *aux), points, self.vectorized)
         return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
 
     def values(self, points: Tensor, aux: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -78,12 +70,21 @@ class BlackBoxCall:
         flat = points.flatten(0, 1).clone()  # the black box may write to its input
         if self.head is None:
             values = self(flat, [one.repeat_interleave(E, 0) for one in aux]).unflatten(0, (B, E))
+            self._lost(flat)
             return values, values
         outputs = self(flat, []).unflatten(0, (B, E))
-        return apply_head(self.head, outputs, aux), outputs
+        values, lost = apply_head(self.head, outputs, aux), self._lost(flat)
+        if lost:  # a head may make a number of NaN
+            values = values.clone()
+            values[torch.tensor(lost) // E, torch.tensor(lost) % E] = torch.nan
+        return values, outputs
 
-    def _each(self, points: Tensor, *aux: Tensor) -> Tensor:
-        return torch.stack([_tensor(self.fn(*one)) for one in zip(points, *aux, strict=True)])
+    def _lost(self, points: Tensor) -> list[int]:
+        """Return which of the points [K, n] of the last call the evaluator has no value of."""
+        lost = getattr(self.evaluator, "lost", None) or {}
+        if lost and self.on_nonfinite == "raise":
+            raise loss_error(lost, points)
+        return sorted(lost)
 
 
 @dataclass(frozen=True)
@@ -263,18 +264,3 @@ def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
         others = (whole - own) / (1.0 - own_share)
         result[:, index] = others[:, :, None].expand(-1, -1, part.shape[1], -1)
     return origin + result
-
-
-def _tensor(result: Any) -> Tensor:
-    try:
-        # Numbers of Python are float64, alone and in lists, whatever the default dtype of torch.
-        leaf = result
-        while isinstance(leaf, (list, tuple)) and len(leaf):
-            leaf = leaf[0]
-        if isinstance(leaf, float):
-            return torch.as_tensor(result, dtype=torch.float64)
-        tensor = torch.as_tensor(result)
-        mixed = isinstance(leaf, int) and tensor.is_floating_point()  # [1, 2.5]
-        return torch.as_tensor(result, dtype=torch.float64) if mixed else tensor
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error

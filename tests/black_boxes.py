@@ -1,0 +1,107 @@
+"""Black boxes at the top of a module, as worker processes need them."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import torch
+
+
+def waves(z, *aux):
+    """[K, n] -> [K]; every row by itself has the same bits as in a batch."""
+    return sum(((z**3).sin().sum(1), *(one.sum(1) for one in aux)))
+
+
+def picture(z):
+    """[K, n] -> [K, 48, 64, 3], far more than goes through a pipe in one message."""
+    return (z.sum(1)[:, None, None, None] * torch.arange(48 * 64 * 3).reshape(48, 64, 3)).cos()
+
+
+def of_one(point):
+    """[n] -> a number of Python."""
+    return float(point[0]) ** 2 - 0.5
+
+
+def process(z):
+    """Number of the process."""
+    return torch.full((len(z),), float(os.getpid()), dtype=torch.float64)
+
+
+def threads(z):
+    """Threads of torch and of libraries that read the environment."""
+    return torch.tensor([[torch.get_num_threads(), float(os.environ["OMP_NUM_THREADS"])]] * len(z))
+
+
+def failing(z):
+    """Raise at every point with a coordinate above one half."""
+    if bool((z > 0.5).any()):
+        raise ArithmeticError(f"no value above one half, got {float(z.max()):.3f}")
+    return z[:, 0].clone()
+
+
+def leaving(z):
+    raise SystemExit("done")
+
+
+def ragged(z):
+    """A shape that depends on the point."""
+    return torch.zeros(len(z), 2 if bool((z[:, 0] > 0.5).any()) else 3)
+
+
+def aborting(z):
+    """End the process at every point with a first coordinate above one half, as a library that aborts."""
+    if bool((z[:, 0] > 0.5).any()):
+        os.abort()
+    return (z**2).sum(1)
+
+
+def never(z):
+    os.abort()
+
+
+def hungry(z):
+    """Take 300 MB for a moment."""
+    return torch.ones(75_000_000).sum() * 0 + z[:, 0]
+
+
+class Disturbed:
+    """Waves, but each file of a folder makes one evaluation kill its process or hang."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __call__(self, z):
+        for file in sorted(self.folder.iterdir()):
+            try:
+                file.unlink()
+            except FileNotFoundError:  # another worker was faster
+                continue
+            if file.name.startswith("hang"):
+                time.sleep(600)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return waves(z)
+
+
+class Counted:
+    """Makes a black box, and leaves a line for it in a file."""
+
+    def __init__(self, file: Path) -> None:
+        with file.open("a") as lines:
+            lines.write(f"{os.getpid()}\n")
+        self.unpicklable = lambda: None
+
+    def __call__(self, z):
+        return waves(z)
+
+
+def broken():
+    raise OSError("the scene is not there")
+
+
+def asleep(z):
+    """Hang, and keep every other thread of the process from running."""
+    import ctypes
+
+    print("asleep", flush=True)
+    ctypes.PyDLL(None).sleep(600)

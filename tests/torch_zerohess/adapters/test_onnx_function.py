@@ -1,0 +1,107 @@
+"""ONNX models: the same numbers as the torch module that they come from, and what they cannot be asked for."""
+
+import pickle
+
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper
+
+import torch_zerohess as zh
+from torch_zerohess.adapters.onnx import OnnxFunction
+from truths import vector
+
+A = torch.tensor([[1.0, -2.0, 0.5], [0.3, 0.7, -1.0]])
+
+
+def model(batch: str | int | None = "K", kind: int = TensorProto.FLOAT) -> onnx.ModelProto:
+    """y = tanh(x A + c), outputs y and its square."""
+    lead = [] if batch is None else [batch]
+    inputs = [helper.make_tensor_value_info("x", kind, [*lead, 2])]
+    inputs += [helper.make_tensor_value_info("c", TensorProto.FLOAT, [*lead, 3])]
+    outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [*lead, 3]) for name in ("y", "square")]
+    nodes = [
+        helper.make_node("Cast", ["x"], ["z"], to=TensorProto.FLOAT),
+        helper.make_node("MatMul", ["z", "A"], ["xA"]),
+        helper.make_node("Add", ["xA", "c"], ["s"]),
+        helper.make_node("Tanh", ["s"], ["y"]),
+        helper.make_node("Mul", ["y", "y"], ["square"]),
+    ]
+    weights = [helper.make_tensor("A", TensorProto.FLOAT, [2, 3], A.flatten().tolist())]
+    graph = helper.make_graph(nodes, "graph", inputs, outputs, weights)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+
+
+def truth(x: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
+    return (x.float() @ A + c.float()).tanh()
+
+
+Z = torch.rand(5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+C = torch.rand(5, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("batch", ["K", 1, None])
+def test_parameters_constants_and_auxiliary_inputs(batch):
+    f = OnnxFunction(model(batch), constants={"c": C[0]} if batch != 1 else {"c": C[:1]}, output="y")
+    assert (f.n, f.parameters) == (2, ("x",))
+    torch.testing.assert_close(f(Z), truth(Z, C[0]))
+    torch.testing.assert_close(f(Z.float()), truth(Z, C[0]))
+    both = OnnxFunction(model(batch), ["c", "x"], output="square")
+    torch.testing.assert_close(both(torch.cat([C, Z], 1)), truth(Z, C).square())
+    each = OnnxFunction(model(batch), aux=("c",), output="y")
+    torch.testing.assert_close(each(Z, C), truth(Z, C))
+
+
+def test_gradient_and_hessian_are_those_of_the_module():
+    """The same samples through onnxruntime and through torch."""
+    f = OnnxFunction(model(), constants={"c": C[0]}, output="y")
+    x, smoothing = vector(0.2, -0.4), zh.Smoothing(sigma=0.5, samples=32, seed=0)
+    one = zh.estimate(lambda z: f(z).square().sum(1), x, smoothing)
+    other = zh.estimate(lambda z: truth(z, C[0]).square().sum(1), x, smoothing)
+    torch.testing.assert_close(one.gradient, other.gradient, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(one.hessian(), other.hessian(), rtol=1e-3, atol=1e-4)
+
+
+def test_the_inputs_of_a_deployed_model_are_found():
+    f = OnnxFunction(model(), constants={"c": C[0]}, output="y")
+    y = truth(Z[:1], C[0])[0].double()
+    loss = lambda out: (out - y).square().mean()  # noqa: E731
+    fit = zh.minimize(f, torch.zeros(2), sigma=0.3, bounds=(-1, 1), loss=loss, seed=0, target=1e-9)
+    torch.testing.assert_close(fit.x, Z[0].float(), atol=1e-3, rtol=0)
+
+
+def test_a_copy_for_another_process(tmp_path):
+    onnx.save(model(), tmp_path / "model.onnx")
+    f = OnnxFunction(tmp_path / "model.onnx", constants={"c": C[0]}, output="y", threads=1)
+    assert torch.equal(pickle.loads(pickle.dumps(f))(Z), f(Z))
+    with pytest.raises(TypeError, match="must be a path or bytes"):
+        pickle.dumps(OnnxFunction(f.session, constants={"c": C[0]}, output="y"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"parameters": ["z"]}, r"parameters: the model has no input 'z', it has \['c', 'x'\]"),
+        ({"parameters": ["x"]}, r"inputs \['c'\] must be parameters, aux or constants"),
+        ({"parameters": ["x", "c"], "aux": ["c"]}, "input 'c' is given twice"),
+        ({"aux": ["x", "c"]}, "parameters must name at least one input"),
+        ({}, r"output must be one of \['y', 'square'\], because the model has several"),
+        ({"output": "w"}, r"output must be one of \['y', 'square'\], got 'w'"),
+    ],
+)
+def test_wrong_names(settings, message):
+    with pytest.raises(ValueError, match=message):
+        OnnxFunction(model(), **settings)
+
+
+def test_wrong_inputs():
+    with pytest.raises(ValueError, match=r"input 'x' is tensor\(int64\), and x is real: give it as one of constants"):
+        OnnxFunction(model(kind=TensorProto.INT64), ["x"], constants={"c": C[0]}, output="y")
+    f = OnnxFunction(model(kind=TensorProto.INT64), ["c"], constants={"x": torch.tensor([1, 2])}, output="y")
+    torch.testing.assert_close(f(C), truth(torch.tensor([1, 2]), C))
+    with pytest.raises(ValueError, match=r"x must have shape \[K, 3\] for c \[3\], got \[5, 2\]"):
+        f(Z)
+    with pytest.raises(ValueError, match=r"aux must be 0 tensors for \[\], got 1"):
+        f(C, Z)
+    with pytest.raises(FileNotFoundError, match=r"there is no file 'no\.onnx'"):
+        OnnxFunction("no.onnx")

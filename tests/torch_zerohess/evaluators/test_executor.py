@@ -1,0 +1,82 @@
+"""Executors of others: the same bits, one error, one making of the black box per process."""
+
+import concurrent.futures
+import multiprocessing
+import warnings
+
+import black_boxes
+import pytest
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.evaluators import Executor, Factory
+from truths import vector
+
+Z = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def threads():
+    with concurrent.futures.ThreadPoolExecutor(2) as executor:
+        yield executor
+
+
+def standard():
+    return concurrent.futures.ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+
+
+def loky():
+    import loky
+
+    return loky.ProcessPoolExecutor(1)
+
+
+@pytest.mark.parametrize("make", [standard, loky])
+def test_pools_of_processes(make, tmp_path):
+    with make() as pool:
+        evaluator = Executor(pool)
+        fn = Factory(black_boxes.Counted, tmp_path / "made")
+        for _ in range(2):
+            assert torch.equal(evaluator(fn, Z), black_boxes.waves(Z))
+        assert len((tmp_path / "made").read_text().split()) == 1
+        with pytest.raises(ArithmeticError, match="no value above one half"):
+            evaluator(black_boxes.failing, Z)
+        with pytest.raises(concurrent.futures.BrokenExecutor):
+            evaluator(black_boxes.never, Z)
+
+
+def test_dask():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # dask's own
+        from distributed import Client
+
+        with Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client:
+            evaluator = Executor(client.get_executor())
+            assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
+            with pytest.raises(ArithmeticError, match="no value above one half"):
+                evaluator(black_boxes.failing, Z)
+
+
+def test_threads_serve_a_layer_and_any_function(threads):
+    x, smoothing = vector(0.3, 0.7), zh.Smoothing(sigma=0.3, samples=8, seed=0)
+    slopes = [
+        torch.func.grad(zh.smooth(lambda z: (z**3).sum(1), smoothing, evaluator=one))(x)
+        for one in (None, Executor(threads))
+    ]
+    assert torch.equal(*slopes)
+
+
+def test_the_error_is_that_of_the_first_point(threads):
+    z = torch.tensor([[0.1], [0.7], [0.9]])
+    with Executor(threads) as evaluator:
+        for _ in range(5):
+            with pytest.raises(ArithmeticError, match=r"got 0\.700"):
+                evaluator(black_boxes.failing, z)
+    with pytest.raises(RuntimeError, match="the Executor is closed"):
+        evaluator(black_boxes.waves, z)
+    assert threads.submit(int).result() == 0  # the executor is the caller's
+
+
+def test_what_is_no_executor_is_refused():
+    with pytest.raises(TypeError, match="executor must have a method submit"):
+        Executor(3)

@@ -1,0 +1,304 @@
+"""Worker processes: the same bits as in this process, and what becomes of black boxes that crash, hang or raise.
+
+A worker takes seconds to start, so tests share one pool where they can.
+"""
+
+import math
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import black_boxes
+import pytest
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
+from torch_zerohess.evaluators.batch import MOST, Batch, cut
+from torch_zerohess.evaluators.process_pool import cores
+from truths import vector
+
+S = zh.Smoothing(sigma=0.3, samples=8, seed=0)
+
+
+def points(count: int, n: int = 3) -> torch.Tensor:
+    return torch.rand(count, n, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with ProcessPool(2, retries=0) as one:
+        yield one
+
+
+def pids(pool: ProcessPool) -> set[int]:
+    return {int(one) for one in pool(black_boxes.process, points(2 * MOST))}
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_values_have_the_bits_of_this_process(pool):
+    for count in (1, 2, 17, MOST + 3):
+        z = points(count)
+        assert torch.equal(pool(black_boxes.waves, z), black_boxes.waves(z))
+        assert torch.equal(pool(black_boxes.waves, z.float()), black_boxes.waves(z.float()))
+    z, aux = points(5), (points(5, 2), torch.ones(5, 1))
+    assert torch.equal(pool(black_boxes.waves, z, *aux), black_boxes.waves(z, *aux))
+
+
+def test_large_values_and_points_go_through_shared_memory(pool):
+    z = points(3)
+    assert torch.equal(pool(black_boxes.picture, z), black_boxes.picture(z))
+    assert any(one.messages.memory is not None for one in pool._staffed)
+    wide = points(3, 20_000)
+    assert torch.equal(pool(black_boxes.waves, wide), black_boxes.waves(wide))
+
+
+def test_workers_are_other_processes_with_one_thread(pool):
+    found = pids(pool)
+    assert 1 <= len(found) <= 2
+    assert os.getpid() not in found
+    assert pool(black_boxes.threads, points(2)).tolist() == [[1.0, 1.0]] * 2
+
+
+def test_the_black_box_may_take_single_points_or_none(pool):
+    call = zh.estimate(black_boxes.of_one, vector(0.3, 0.7), S, vectorized=False, evaluator=pool)
+    assert torch.equal(call.gradient, zh.estimate(black_boxes.of_one, vector(0.3, 0.7), S, vectorized=False).gradient)
+    assert pool(black_boxes.waves, points(0)).shape == (0,)
+
+
+def test_every_door_takes_the_pool(pool):
+    x = vector(0.3, 0.7)
+    here, there = (zh.estimate(black_boxes.waves, x, S, evaluator=one) for one in (None, pool))
+    assert torch.equal(here.gradient, there.gradient)
+    assert torch.equal(here.hessian(), there.hessian())
+    for door in (zh.BlackBox, zh.smooth):
+        slopes = [torch.func.grad(door(black_boxes.waves, S, evaluator=one))(x) for one in (None, pool)]
+        assert torch.equal(*slopes)
+    settings = {"sigma": 0.5, "bounds": (-1, 1), "seed": 0, "max_evaluations": 12}
+    before = multiprocessing.active_children()
+    doors = {"evaluator": None}, {"evaluator": pool}, {"workers": 1}
+    fits = [zh.minimize(black_boxes.waves, x, **door, **settings) for door in doors]
+    for fit in fits[1:]:
+        assert torch.equal(fits[0].x, fit.x)
+        assert [one.value for one in fits[0].history] == [one.value for one in fit.history]
+    assert set(multiprocessing.active_children()) <= set(before)
+
+
+def test_a_factory_is_called_once_in_every_worker(pool, tmp_path):
+    fn = Factory(black_boxes.Counted, tmp_path / "made")
+    for _ in range(3):
+        z = points(40)
+        assert torch.equal(pool(fn, z), black_boxes.waves(z))
+    made = (tmp_path / "made").read_text().split()
+    assert len(made) == len(set(made)) <= 2
+    assert str(os.getpid()) not in made
+    assert torch.equal(Inline()(fn, z), black_boxes.waves(z))
+    assert torch.equal(Inline()(fn, z), black_boxes.waves(z))
+    assert (tmp_path / "made").read_text().split() == [*made, str(os.getpid())]
+
+
+def test_an_error_comes_with_the_traceback_of_the_worker(pool):
+    z = torch.tensor([[0.1], [0.2], [0.7], [0.1], [0.9]])
+    with pytest.raises(ArithmeticError, match=r"got 0\.700") as raised:  # the first point's, whoever is faster
+        pool(black_boxes.failing, z)
+    assert "black_boxes.py" in str(raised.value.__cause__)
+    assert "in failing" in str(raised.value.__cause__)
+    with pytest.raises(SystemExit, match="done"):
+        pool(black_boxes.leaving, z)
+    with pytest.raises(OSError, match="the scene is not there"):
+        pool(Factory(black_boxes.broken), z)
+    assert torch.equal(pool(black_boxes.waves, z), black_boxes.waves(z))  # the other worker's same error is no news
+
+
+def test_values_of_different_shapes_are_refused(pool):
+    with pytest.raises(ValueError, match=r"one shape, got \[3\] for point 0 and \[2\] for point 1, \[0.7\]"):
+        pool(black_boxes.ragged, torch.tensor([[0.1], [0.7]]))
+    with pytest.raises(TypeError, match=r"real floating-point values, got torch\.int64"):
+        pool(torch.Tensor.long, torch.zeros(1, 2))
+
+
+def test_what_cannot_be_pickled_is_named(pool):
+    z, lock = points(1), threading.Lock()
+    for fn, named in [
+        (Factory(lambda: black_boxes.waves), "make must be picklable .*<lambda>"),
+        (Factory(black_boxes.Disturbed, lock), r"args\[0\] of Factory must be picklable .*lock"),
+        (Factory(black_boxes.Disturbed, folder={"a": [lock]}), r"argument 'folder' of Factory\['a'\]\[0\] must"),
+        (lambda z: z, "fn must be picklable .*<lambda>"),
+        (black_boxes.Disturbed(lock), r"fn\.folder must be picklable"),
+    ]:
+        with pytest.raises(TypeError, match=named):
+            pool(fn, z)
+
+
+def test_points_that_end_the_process_are_lost_and_only_they(pool):
+    z = torch.tensor([[0.1, 0.2], [0.7, 0.0], [0.3, 0.4]])
+    values = pool(black_boxes.aborting, z)
+    assert values.isnan().tolist() == [False, True, False]
+    assert torch.equal(values[[0, 2]], (z**2).sum(1)[[0, 2]])
+    assert pool.lost == {1: "the black box ended its process (SIGABRT)"}
+    layer = zh.BlackBox(black_boxes.aborting, S.replace(samples=1), evaluator=pool)
+    with pytest.raises(LostEvaluationError, match=r"ended its process \(SIGABRT\), at the point \[0\.9, 0\], number 0"):
+        layer(vector(0.9, 0.0))
+
+
+def test_no_value_at_all_needs_a_known_shape(pool):
+    with pytest.raises(LostEvaluationError, match="SIGABRT"):
+        pool(black_boxes.never, torch.zeros(1, 2))
+    values = pool(black_boxes.aborting, torch.zeros(1, 2))
+    assert values.tolist() == [0.0]
+    assert pool(black_boxes.aborting, torch.ones(1, 2)).isnan().tolist() == [True]  # the shape is known by now
+
+
+def test_chunks_are_tried_again_and_then_cut():
+    assert [len(one) for one in cut(5)] == [1] * 5
+    assert sum(len(one) for one in cut(1000)) == 1000
+    assert len(cut(1000)) <= MOST
+    batch = Batch(torch.zeros(3, 1), retries=1, most=1)
+    for tries in range(2):
+        chunk = batch.take()
+        assert (chunk.start, chunk.stop, chunk.tries) == (0, 3, tries)
+        batch.failed(chunk, "why")
+    assert [(one.start, one.stop) for one in batch.waiting] == [(0, 1), (1, 2), (2, 3)]
+    batch.came(batch.take(), torch.tensor([0.5]))
+    for _ in range(2):
+        batch.failed(batch.take(), "why")
+    assert not batch.finished
+    batch.came(batch.take(), torch.tensor([2.5]))
+    assert batch.finished
+    assert batch.lost == {1: "why in each of 2 tries"}
+    torch.testing.assert_close(batch.result(), torch.tensor([0.5, math.nan, 2.5]), equal_nan=True)
+
+
+def test_the_first_error_is_raised_whichever_comes_first():
+    batch = Batch(torch.zeros(4, 1), retries=0)
+    first, second, third, fourth = (batch.take() for _ in range(4))
+    batch.raised(second, KeyError("second"))
+    batch.failed(third, "no matter")
+    assert not batch.finished  # the first may have an error too
+    batch.raised(first, KeyError("first"))
+    batch.raised(fourth, KeyError("fourth"))
+    assert batch.finished
+    with pytest.raises(KeyError, match="first"):
+        batch.result()
+
+
+class Losing:
+    """An evaluator that has no value of the second point."""
+
+    lost: dict[int, str] = {1: "it crashed"}  # noqa: RUF012
+
+    def __call__(self, fn, points, *aux):
+        values = fn(points, *aux)
+        values[1] = torch.nan
+        return values
+
+
+def test_a_head_cannot_hide_a_lost_point():
+    smoothing = S.replace(samples=4, baseline="mean")
+    settings = {"head": lambda out: out.nan_to_num(3.0), "evaluator": Losing(), "value": "smoothed"}
+    assert zh.estimate(black_boxes.waves, vector(0.1, 0.2), smoothing, on_nonfinite="drop", **settings).dropped == 2
+    with pytest.raises(LostEvaluationError, match=r"it crashed, at the point \[.*\], number 1 of 8; 1 without a value"):
+        zh.estimate(black_boxes.waves, vector(0.1, 0.2), smoothing, **settings)
+
+
+def test_kills_and_hangs_change_no_bit(tmp_path):
+    z = points(200)
+    fn = black_boxes.Disturbed(tmp_path)
+    with ProcessPool(2, timeout=20.0, retries=5) as pool:
+        assert torch.equal(pool(fn, z), black_boxes.waves(z))
+        pool.timeout = 1.0  # of one evaluation, once the workers are there
+        for name in ("kill-0", "kill-1", "hang-0"):
+            (tmp_path / name).touch()
+        assert torch.equal(pool(fn, z), black_boxes.waves(z))
+        assert not list(tmp_path.iterdir())
+        assert pool.lost == {}
+        children = {one.process.pid for one in pool._staffed}
+    assert not [pid for pid in children if alive(pid)]
+
+
+def test_a_worker_that_takes_too_much_memory_is_replaced_and_one_that_is_old_too():
+    with ProcessPool(1, retries=0, recycle=2, memory_limit=10**10) as pool:
+        first, second, third = pool(black_boxes.process, points(3)).tolist()
+        assert first == second != third
+        pool.recycle = None
+        pool.memory_limit = pool._staffed[0].bytes_used() + 150_000_000
+        with pytest.raises(LostEvaluationError, match=r"took .* bytes, more than memory_limit="):
+            pool(black_boxes.hungry, torch.zeros(1, 2))
+
+
+ORPHAN = """
+import os, sys, time
+import torch
+import black_boxes
+from torch_zerohess.evaluators import ProcessPool
+if __name__ == "__main__":
+    pool = ProcessPool(1)
+    print(int(pool(black_boxes.process, torch.zeros(1, 1, dtype=torch.float64))), flush=True)
+    if sys.argv[1] == "sleep":
+        pool(black_boxes.asleep, torch.zeros(1, 1))
+"""
+
+
+@pytest.mark.parametrize("end", ["return", "SIGINT", "SIGKILL"])
+def test_no_worker_outlives_its_parent(end, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(ORPHAN)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    program = [sys.executable, str(script), "return" if end == "return" else "sleep"]
+    with subprocess.Popen(
+        program, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        if end != "return":
+            assert parent.stdout.readline() == "asleep\n"
+            parent.send_signal(getattr(signal, end))
+        parent.wait(60)
+        until = time.monotonic() + 5
+        while alive(worker) and time.monotonic() < until:
+            time.sleep(0.02)
+        assert not alive(worker)
+
+
+def test_arguments_are_checked():
+    for wrong, message in [
+        ({"workers": 0}, "workers must be an integer >= 1 or None, got 0"),
+        ({"timeout": 0}, "timeout must be seconds > 0 or None, got 0"),
+        ({"retries": -1}, "retries must be an integer >= 0, got -1"),
+        ({"recycle": 0}, "recycle must be an integer >= 1 or None, got 0"),
+        ({"memory_limit": 0}, "memory_limit must be bytes > 0 or None, got 0"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            ProcessPool(**wrong)
+    assert ProcessPool().workers == cores()
+    with pytest.raises(TypeError, match="make must be callable"):
+        Factory(3)
+    with pytest.raises(TypeError, match=r"make must return a black box, which is callable, got 0\.0"):
+        Factory(float)(torch.zeros(1, 1))
+    with pytest.raises(ValueError, match="give workers or evaluator, not both"):
+        zh.minimize(black_boxes.waves, torch.zeros(2), sigma=1.0, workers=2, evaluator=Inline())
+
+
+def test_a_pool_is_closed_for_good_and_copied_by_its_settings():
+    with ProcessPool(3, timeout=2.0, retries=4) as pool:
+        copy = pickle.loads(pickle.dumps(pool))
+        assert (
+            repr(copy)
+            == repr(pool)
+            == "ProcessPool(workers=3, timeout=2.0, retries=4, recycle=None, memory_limit=None)"
+        )
+    with pytest.raises(RuntimeError, match="the ProcessPool is closed"):
+        pool(black_boxes.waves, points(1))
+    pool.close()

@@ -1,0 +1,53 @@
+"""Actors on a cluster: the same bits, also when an actor ends in the middle of a batch."""
+
+import warnings
+
+import black_boxes
+import pytest
+import torch
+
+from torch_zerohess.evaluators import Factory, LostEvaluationError, Ray
+
+Z = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def actors():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Ray's own
+        with Ray(2, retries=1) as one:
+            yield one
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_actor_that_ends_costs_no_bit(actors, tmp_path):
+    assert torch.equal(actors(black_boxes.waves, Z), black_boxes.waves(Z))
+    (tmp_path / "kill-0").touch()
+    assert torch.equal(actors(black_boxes.Disturbed(tmp_path), Z), black_boxes.waves(Z))
+    assert not list(tmp_path.iterdir())
+    assert actors.lost == {}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_actors_hold_the_black_box(actors, tmp_path):
+    fn = Factory(black_boxes.Counted, tmp_path / "made")
+    for _ in range(3):
+        assert torch.equal(actors(fn, Z), black_boxes.waves(Z))
+    made = (tmp_path / "made").read_text().split()
+    assert len(set(made)) == len(made) <= 2  # one that ended in the test before may still be starting
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_errors(actors):
+    with pytest.raises(ArithmeticError, match="no value above one half"):
+        actors(black_boxes.failing, Z)
+    actors.retries = 0
+    with pytest.raises(LostEvaluationError, match="an actor ended"):
+        actors(black_boxes.never, torch.zeros(1, 1))
+
+
+def test_arguments_are_checked():
+    with pytest.raises(ValueError, match="actors must be an integer >= 1, got 0"):
+        Ray(0)
+    with pytest.raises(ValueError, match="retries must be an integer >= 0, got -1"):
+        Ray(retries=-1)

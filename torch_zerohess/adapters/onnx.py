@@ -1,0 +1,215 @@
+"""An ONNX model in onnxruntime as a black box."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_TYPES = {
+    "tensor(float)": torch.float32,
+    "tensor(double)": torch.float64,
+    "tensor(float16)": torch.float16,
+    "tensor(int64)": torch.int64,
+    "tensor(int32)": torch.int32,
+    "tensor(int16)": torch.int16,
+    "tensor(int8)": torch.int8,
+    "tensor(uint8)": torch.uint8,
+    "tensor(bool)": torch.bool,
+}
+
+
+class OnnxFunction:
+    """The outputs of an ONNX model as a function of some of its inputs: x [K, n], *aux [K, ...] -> [K, *out].
+
+    x holds the elements of the inputs that are parameters, one input after the other, each flattened. An input whose
+    first dimension is free is a batch: if all parameters and auxiliary inputs are, the model runs once for all points.
+    Otherwise (first dimension 1, or an input without a batch) it runs once per point. x may be float32 or float64
+    whatever the model takes; it is converted. Tensors go to and from onnxruntime without a copy where their type and
+    layout allow it.
+
+    An `OnnxFunction` can be pickled, for `evaluators.ProcessPool`, if its model is a path, bytes or a ModelProto.
+
+    Args:
+        model: path, bytes, `onnx.ModelProto`, or an `onnxruntime.InferenceSession`.
+        parameters: names of the inputs that x fills, in this order; all that are neither constants nor aux if None.
+        constants: further inputs by name, tensors or arrays of the model's shape. Where that has a free first
+            dimension, one element is enough.
+        aux: names of the inputs that auxiliary inputs of the black box fill, in this order.
+        output: name of the output; may be None if the model has one.
+        threads: of onnxruntime; its own choice if None. Take 1 in worker processes.
+        providers: execution providers of onnxruntime, such as ("CUDAExecutionProvider", "CPUExecutionProvider").
+
+    Raises:
+        ModuleNotFoundError: onnxruntime or NumPy is not installed.
+        FileNotFoundError: there is no such model file.
+        ValueError: a name is unknown, an input is given twice or not at all, a parameter is of an integer type, or has
+            free dimensions beside the first.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        parameters: Sequence[str] | None = None,
+        *,
+        constants: Mapping[str, Any] | None = None,
+        aux: Sequence[str] = (),
+        output: str | None = None,
+        threads: int | None = None,
+        providers: Sequence[str] = ("CPUExecutionProvider",),
+    ) -> None:
+        if hasattr(model, "SerializeToString"):
+            model = model.SerializeToString()
+        if isinstance(model, (str, os.PathLike)) and not Path(model).is_file():
+            raise FileNotFoundError(f"model: there is no file {os.fspath(model)!r}")
+        self._arguments = (model, parameters, constants, aux, output, threads, providers)
+        self.session = _session(model, threads, providers)
+        """The session of onnxruntime."""
+        self._inputs = {one.name: one for one in self.session.get_inputs()}
+        fixed = dict(constants or {})
+        self.aux = tuple(aux)
+        names = [name for name in self._inputs if name not in fixed and name not in self.aux]
+        self.parameters = tuple(names if parameters is None else parameters)
+        """Names of the inputs that x fills."""
+        self._check_names(fixed)
+        self.output = self._output(output)
+        """Name of the output."""
+        self.shapes = {name: self._shape(name) for name in self.parameters}
+        """Shape of each parameter without the batch."""
+        self.n = sum(math.prod(shape) for shape in self.shapes.values())
+        """Number of parameters."""
+        self._batched = all(_free(self._inputs[name].shape[:1]) for name in (*self.parameters, *self.aux))
+        self._constants = {name: torch.as_tensor(one).to(self._type(name)) for name, one in fixed.items()}
+
+    def __repr__(self) -> str:
+        parameters = ", ".join(f"{name} {list(shape)}" for name, shape in self.shapes.items())
+        return f"OnnxFunction(n={self.n}, parameters=[{parameters}], output={self.output!r})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if not isinstance(self._arguments[0], (str, os.PathLike, bytes)):
+            raise TypeError("model must be a path or bytes to be sent to another process, got an InferenceSession")
+        return _again, self._arguments
+
+    def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
+        """Evaluate at points [K, n] with auxiliary inputs [K, ...].
+
+        Raises ValueError if x has another number of columns, or if there are not as many auxiliary inputs as names.
+        """
+        if x.ndim != 2 or x.shape[1] != self.n:
+            parts = ", ".join(f"{name} {list(shape)}" for name, shape in self.shapes.items())
+            raise ValueError(f"x must have shape [K, {self.n}] for {parts}, got {list(x.shape)}")
+        if len(aux) != len(self.aux):
+            raise ValueError(f"aux must be {len(self.aux)} tensors for {list(self.aux)}, got {len(aux)}")
+        if self._batched and len(x):
+            return self._run(x, aux).to(x.device)
+        rows = [self._one(x[k : k + 1], tuple(one[k : k + 1] for one in aux)) for k in range(len(x))]
+        return torch.stack(rows).to(x.device) if rows else x.new_empty(0)
+
+    def _one(self, x: Tensor, aux: tuple[Tensor, ...]) -> Tensor:
+        values = self._run(x, aux)
+        return values[0] if values.ndim and len(values) == 1 else values
+
+    def _run(self, x: Tensor, aux: tuple[Tensor, ...]) -> Tensor:
+        K, feeds = len(x), {}
+        for name, part in zip(
+            self.parameters, x.split([math.prod(one) for one in self.shapes.values()], 1), strict=True
+        ):
+            feeds[name] = part.reshape(self._full(name, self.shapes[name], K))
+        for name, one in zip(self.aux, aux, strict=True):
+            wanted = self._inputs[name].shape
+            feeds[name] = one if self._batched or one.ndim == len(wanted) else one[0]
+        for name, one in self._constants.items():
+            wanted = self._inputs[name].shape
+            if wanted and _free(wanted[:1]):
+                one = one if one.ndim == len(wanted) else one[None]
+                one = one.expand(K, *one.shape[1:]) if len(one) == 1 else one
+            feeds[name] = one
+        arrays = {name: one.detach().to("cpu", self._type(name)).contiguous().numpy() for name, one in feeds.items()}
+        (value,) = self.session.run_with_ort_values([self.output], {name: _value(one) for name, one in arrays.items()})
+        return _tensor(value)
+
+    def _full(self, name: str, shape: tuple[int, ...], K: int) -> tuple[int, ...]:
+        return (K, *shape) if _free(self._inputs[name].shape[:1]) else shape
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an input without a free first dimension."""
+        dims = self._inputs[name].shape
+        own = dims[1:] if _free(dims[:1]) else dims
+        if _free(own):
+            raise ValueError(f"parameters: input {name!r} has shape {dims}, whose sizes must be known: export it so")
+        return tuple(own)
+
+    def _type(self, name: str) -> torch.dtype:
+        kind = self._inputs[name].type
+        if kind not in _TYPES:
+            raise ValueError(f"input {name!r} is of type {kind}, possible are {', '.join(_TYPES)}")
+        return _TYPES[kind]
+
+    def _check_names(self, constants: Mapping[str, Any]) -> None:
+        given = (*self.parameters, *self.aux, *constants)
+        for argument, some in (("parameters", self.parameters), ("aux", self.aux), ("constants", constants)):
+            for name in some:
+                if name not in self._inputs:
+                    raise ValueError(f"{argument}: the model has no input {name!r}, it has {sorted(self._inputs)}")
+                if given.count(name) > 1:
+                    raise ValueError(f"{argument}: input {name!r} is given twice")
+        if missing := [name for name in self._inputs if name not in given]:
+            raise ValueError(f"inputs {missing} must be parameters, aux or constants")
+        if not self.parameters:
+            raise ValueError("parameters must name at least one input, all others are constants or aux")
+        for name in self.parameters:
+            if not self._type(name).is_floating_point:
+                raise ValueError(
+                    f"parameters: input {name!r} is {self._inputs[name].type}, and x is real: give it as one of "
+                    "constants or aux, or put a Cast before it in the model"
+                )
+
+    def _output(self, name: str | None) -> str:
+        names = [one.name for one in self.session.get_outputs()]
+        if name is None and len(names) > 1:
+            raise ValueError(f"output must be one of {names}, because the model has several, got None")
+        if name is not None and name not in names:
+            raise ValueError(f"output must be one of {names}, got {name!r}")
+        return name or names[0]
+
+
+def _again(*arguments: Any) -> OnnxFunction:
+    model, parameters, constants, aux, output, threads, providers = arguments
+    return OnnxFunction(
+        model, parameters, constants=constants, aux=aux, output=output, threads=threads, providers=providers
+    )
+
+
+def _session(model: Any, threads: int | None, providers: Sequence[str]) -> Any:
+    if hasattr(model, "run_with_ort_values"):
+        return model
+    try:
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "onnxruntime is not installed; pip install onnxruntime", name="onnxruntime"
+        ) from error
+    options = onnxruntime.SessionOptions()
+    if threads is not None:
+        options.intra_op_num_threads = options.inter_op_num_threads = threads
+    source = os.fspath(model) if isinstance(model, os.PathLike) else model
+    return onnxruntime.InferenceSession(source, options, providers=list(providers))
+
+
+def _value(array: Any) -> Any:
+    import onnxruntime
+
+    return onnxruntime.OrtValue.ortvalue_from_numpy(array)
+
+
+def _tensor(value: Any) -> Tensor:
+    """Return an output without a copy where that is possible; it keeps the memory of the output alive."""
+    inner = getattr(value, "_ortvalue", value)
+    return torch.utils.dlpack.from_dlpack(inner) if hasattr(inner, "__dlpack__") else torch.from_numpy(value.numpy())
+
+
+def _free(dims: Sequence[Any]) -> bool:
+    return any(not isinstance(one, int) for one in dims)

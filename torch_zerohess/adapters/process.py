@@ -1,0 +1,277 @@
+"""An external program as a black box, over its standard input and output."""
+
+import contextlib
+import io
+import json
+import shutil
+import subprocess
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import IO, Any
+
+import torch
+from torch import Tensor
+
+_KEPT = 50
+"""Lines of the standard error that are shown in an error."""
+
+
+class Program:
+    """A program that reads points and writes values: x [K, n], *aux [K, ...] -> [K, *out].
+
+    | command | what runs | input | output |
+    |---|---|---|---|
+    | list | the program, once per call | all K points | all K values |
+    | list, `server=True` | the program, once, until `close()` | a request per call | an answer per request |
+    | function | `command(point [n])`, once per point | nothing | one value |
+
+    Formats of input and output:
+
+    - "json": a request is the line `{"x": [[...], ...]}`, with `"aux": [...]` where there is aux. The answer is one
+      line, the list of K values. Numbers are written so that float64 is read back exactly.
+    - "npy": a request is the array x, then each aux, as `numpy.save` writes them. The answer is one array.
+    - a function of bytes: makes the value of what the program wrote; the request is that of "json".
+
+    A server flushes its output after each answer, and writes messages to the standard error alone. It ends when its
+    standard input does. A server that ended or took too long is started again by the next call.
+
+    A `Program` can be pickled; a copy starts a program of its own.
+
+    Args:
+        command: program and arguments, or a function that returns them for a point.
+        server: whether the program answers many requests.
+        format: see above.
+        timeout: seconds per point; None for no limit.
+        folder: where the program runs; here if None.
+        environment: variables beside those of this process.
+
+    Raises:
+        FileNotFoundError: there is no such program.
+        ValueError: an argument is wrong; or, from a call, the answer cannot be read.
+        TimeoutError, RuntimeError: from a call, the program took too long, or ended with a code other than 0. The
+            message has what it wrote to the standard error.
+
+    Example:
+        >>> import sys
+        >>> sums = "import json, sys; print([sum(p) for p in json.loads(sys.stdin.readline())['x']])"
+        >>> Program([sys.executable, "-c", sums])(torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
+        tensor([3., 7.], dtype=torch.float64)
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str] | Callable[[Tensor], Sequence[str]],
+        *,
+        server: bool = False,
+        format: str | Callable[[bytes], Any] = "json",
+        timeout: float | None = None,
+        folder: str | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        if isinstance(command, str) or (not callable(command) and not command):
+            raise ValueError(f"command must be a list, the program and its arguments, or a function, got {command!r}")
+        if format not in ("json", "npy") and not callable(format):
+            raise ValueError(f"format must be 'json', 'npy' or a function of bytes, got {format!r}")
+        if server and (callable(command) or callable(format)):
+            raise ValueError("server=True needs a command that is a list, and format 'json' or 'npy'")
+        if timeout is not None and not timeout > 0:
+            raise ValueError(f"timeout must be seconds > 0 or None, got {timeout!r}")
+        self.command, self.server, self.format, self.timeout = command, server, format, timeout
+        self.folder, self.environment = folder, None if environment is None else dict(environment)
+        if not callable(command):
+            _found(command)
+        self._server: _Server | None = None
+
+    def __repr__(self) -> str:
+        return f"Program({self.command!r}, server={self.server}, format={self.format!r})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_server": None}
+
+    def __enter__(self) -> "Program":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the server, if there is one."""
+        if self._server is not None:
+            self._server.end()
+            self._server = None
+
+    def __del__(self) -> None:
+        with contextlib.suppress(Exception):  # at the end of the interpreter
+            self.close()
+
+    def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
+        """Evaluate at points [K, n] with auxiliary inputs [K, ...]."""
+        if callable(self.command):
+            return torch.stack([self._values(self._output(_found(self.command(one)), b"", 1)) for one in x.detach()])
+        request = self._request(x, aux)
+        if not self.server:
+            return self._values(self._output(self.command, request, len(x)))
+        if self._server is not None and not self._server.alive:
+            self.close()
+        if self._server is None:
+            self._server = _Server(self._start(self.command))
+        try:
+            answer = self._server.ask(request, self.format == "npy", self._limit(len(x)))
+            return self._values(answer)
+        except BaseException:  # also Ctrl-C: an answer may be on its way
+            self.close()
+            raise
+
+    def _limit(self, points: int) -> float | None:
+        return None if self.timeout is None else self.timeout * max(1, points)
+
+    def _start(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
+        import os
+
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        variables = None if self.environment is None else os.environ | self.environment
+        return subprocess.Popen(list(command), cwd=self.folder, env=variables, **pipes)
+
+    def _output(self, command: Sequence[str], request: bytes, points: int) -> bytes:
+        limit = self._limit(points)
+        with self._start(command) as process:
+            try:
+                output, errors = process.communicate(request, limit)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise TimeoutError(_late(command, limit, process.communicate()[1])) from None
+            except BaseException:
+                process.kill()
+                raise
+        if process.returncode:
+            raise RuntimeError(_ended(command, process.returncode, errors))
+        return output
+
+    def _request(self, x: Tensor, aux: Sequence[Tensor]) -> bytes:
+        tensors = [one.detach().cpu() for one in (x, *aux)]
+        if self.format == "npy":
+            import numpy as np
+
+            file = io.BytesIO()
+            for one in tensors:
+                np.save(file, one.numpy())
+            return file.getvalue()
+        content: dict[str, Any] = {"x": tensors[0].tolist()}
+        if aux:
+            content["aux"] = [one.tolist() for one in tensors[1:]]
+        return (json.dumps(content) + "\n").encode()
+
+    def _values(self, output: bytes) -> Tensor:
+        if callable(self.format):
+            return torch.as_tensor(self.format(output))
+        try:
+            if self.format == "npy":
+                import numpy as np
+
+                return torch.from_numpy(np.load(io.BytesIO(output), allow_pickle=False))
+            return torch.tensor(json.loads(output), dtype=torch.float64)
+        except (ValueError, TypeError, EOFError, OSError) as error:
+            shown = output[:200].decode(errors="replace")
+            raise ValueError(
+                f"the program must write values as {self.format} and nothing else to its standard output, got "
+                f"{shown!r} ({error}): let it print messages to its standard error"
+            ) from error
+
+
+class _Server:
+    """A program that runs, and threads that read what it writes."""
+
+    def __init__(self, process: "subprocess.Popen[bytes]") -> None:
+        self.process = process
+        self._errors: deque[bytes] = deque(maxlen=_KEPT)
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+
+    @property
+    def alive(self) -> bool:
+        return self.process.poll() is None
+
+    def ask(self, request: bytes, npy: bool, limit: float | None) -> bytes:
+        """Return the answer to a request."""
+        answer: list[bytes] = []
+
+        def exchange() -> None:
+            assert self.process.stdin is not None
+            assert self.process.stdout is not None
+            with contextlib.suppress(OSError, ValueError):
+                self.process.stdin.write(request)
+                self.process.stdin.flush()
+                answer.append(_read_npy(self.process.stdout) if npy else self.process.stdout.readline())
+
+        thread = threading.Thread(target=exchange, daemon=True)
+        thread.start()
+        thread.join(limit)
+        command: Any = self.process.args
+        if thread.is_alive():
+            self.process.kill()
+            thread.join()
+            self._listener.join(1.0)
+            raise TimeoutError(_late(command, limit, b"".join(self._errors)))
+        if not answer or not answer[0]:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(2.0)
+            self.process.kill()
+            self._listener.join(1.0)
+            raise RuntimeError(_ended(command, self.process.wait(), b"".join(self._errors)))
+        return answer[0]
+
+    def end(self) -> None:
+        """Close the input of the program, and kill it if it does not end."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):
+            self.process.stdin.close()
+        try:
+            self.process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self._listener.join(1.0)
+        for pipe in (self.process.stdout, self.process.stderr):
+            assert pipe is not None
+            pipe.close()
+
+    def _listen(self) -> None:
+        assert self.process.stderr is not None
+        with contextlib.suppress(OSError, ValueError):
+            self._errors.extend(self.process.stderr)
+
+
+def _read_npy(file: IO[bytes]) -> bytes:
+    """Return the bytes of one array, or of a line that is none."""
+    start = file.read(6)
+    if start != b"\x93NUMPY":
+        return start + (b"" if b"\n" in start else file.readline())
+    import numpy as np
+
+    version = file.read(2)
+    size = file.read(2 if version[0] == 1 else 4)
+    header = file.read(int.from_bytes(size, "little"))
+    shown = io.BytesIO(size + header)
+    read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(shown)
+    return start + version + size + header + file.read(int(np.prod(shape)) * dtype.itemsize)
+
+
+def _found(command: Sequence[str]) -> Sequence[str]:
+    if shutil.which(str(command[0])) is None:
+        raise FileNotFoundError(f"command: there is no program {str(command[0])!r} that could be run, see PATH")
+    return command
+
+
+def _late(command: Sequence[str], limit: float | None, errors: bytes) -> str:
+    return f"the program {command[0]!r} gave no answer within timeout: {limit:g} s{_shown(errors)}"
+
+
+def _ended(command: Sequence[str], code: int, errors: bytes) -> str:
+    return f"the program {command[0]!r} ended with code {code} and without an answer{_shown(errors)}"
+
+
+def _shown(errors: bytes) -> str:
+    lines = errors.decode(errors="replace").strip().splitlines()[-_KEPT:]
+    return "; it wrote to its standard error:\n" + "\n".join(lines) if lines else ""

@@ -1,0 +1,155 @@
+"""The points of one call, cut into chunks: what waits, what came back, what failed.
+
+Where the cuts are depends on the number of points alone, and values are put together in the order of the points. So
+neither the number of workers nor the order in which they finish changes a bit, if the black box is deterministic. The
+bits are those of one call with all points, if the value of a point does not depend on which points share its call.
+
+A chunk that fails is tried again. A chunk that failed too often is cut into its points, and each of them is tried as
+often: a point that shares a chunk with one that ends the process is not lost. The value of a point that failed too
+often is NaN, and `on_nonfinite` says what becomes of it.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+MOST = 256
+"""Chunks of a call."""
+
+
+class LostEvaluationError(RuntimeError, ValueError):
+    """The black box gave no value of a point: its process ended or took too long, in every try."""
+
+
+@dataclass
+class Chunk:
+    """Points `start` to `stop - 1` of a call."""
+
+    start: int
+    stop: int
+    tries: int = 0
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+
+def cut(count: int, most: int = MOST) -> list[Chunk]:
+    """Return chunks of `count` points, of equal size but for the last one."""
+    size = max(1, -(-count // most))
+    return [Chunk(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+@dataclass
+class Batch:
+    """The state of one call."""
+
+    points: Tensor
+    """[K, n]."""
+    retries: int
+    """Further tries of a chunk, and of a point, after one that failed."""
+    most: int = MOST
+    """Chunks of the call."""
+    waiting: deque[Chunk] = field(default_factory=deque)
+    busy: set[int] = field(default_factory=set)
+    """Where the chunks start that are being evaluated."""
+    lost: dict[int, str] = field(default_factory=dict)
+    """Points without a value, and why."""
+    _values: dict[int, Tensor] = field(default_factory=dict)
+    _error: tuple[int, BaseException] | None = None
+
+    def __post_init__(self) -> None:
+        self.waiting.extend(cut(len(self.points), self.most))
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing remains to be done: all points are known, or the first error is."""
+        return not self.waiting and not (self.busy if self._error is None else self._before_error)
+
+    @property
+    def _before_error(self) -> list[int]:
+        assert self._error is not None
+        return [start for start in self.busy if start < self._error[0]]
+
+    def take(self) -> Chunk:
+        """Return the next chunk, which is busy from now on."""
+        chunk = self.waiting.popleft()
+        self.busy.add(chunk.start)
+        return chunk
+
+    def came(self, chunk: Chunk, values: Tensor) -> None:
+        """Keep the values of a chunk."""
+        self.busy.discard(chunk.start)
+        self._values[chunk.start] = values
+
+    def failed(self, chunk: Chunk, reason: str) -> None:
+        """Try a chunk again, or cut it, or give up its point."""
+        self.busy.discard(chunk.start)
+        if self._error is not None and chunk.start > self._error[0]:
+            return
+        chunk.tries += 1
+        if chunk.tries <= self.retries:
+            self.waiting.appendleft(chunk)
+        elif len(chunk) > 1:
+            self.waiting.extendleft(Chunk(k, k + 1) for k in reversed(range(chunk.start, chunk.stop)))
+        else:
+            times = "" if chunk.tries == 1 else f" in each of {chunk.tries} tries"
+            self.lost[chunk.start] = reason + times
+
+    def raised(self, chunk: Chunk, error: BaseException) -> None:
+        """Keep the error of the first chunk that has one: which one it is does not depend on who is faster."""
+        self.busy.discard(chunk.start)
+        if self._error is None or chunk.start < self._error[0]:
+            self._error = chunk.start, error
+            self.waiting = deque(one for one in self.waiting if one.start < chunk.start)
+
+    def result(self, known: tuple[torch.dtype, torch.Size] | None = None) -> Tensor:
+        """Return values [K, *out], NaN where points were lost.
+
+        known: type and shape [*out] of earlier values.
+
+        Raises the first error of the black box; ValueError if chunks have different shapes; `LostEvaluationError` if
+        all points are lost and the shape of a value is not known.
+        """
+        if self._error is not None:
+            raise self._error[1]
+        parts = sorted(self._values.items())
+        if not parts:
+            if known is None:
+                raise self.loss()
+            return torch.full((len(self.points), *known[1]), torch.nan, dtype=known[0])
+        first = parts[0][1]
+        for start, values in parts:
+            if values.shape[1:] != first.shape[1:]:
+                raise ValueError(
+                    f"fn must return values of one shape, got {list(first.shape[1:])} for point {parts[0][0]} and "
+                    f"{list(values.shape[1:])} for point {start}, [{numbers(self.points[start])}]"
+                )
+        if not self.lost:
+            return first if len(parts) == 1 else torch.cat([values for _, values in parts])
+        dtype = torch.cat([values[:0] for _, values in parts]).dtype
+        result = torch.full((len(self.points), *first.shape[1:]), torch.nan, dtype=dtype)
+        for start, values in parts:
+            result[start : start + len(values)] = values
+        return result
+
+    def loss(self) -> LostEvaluationError:
+        """Return the error that names the first lost point."""
+        return loss_error(self.lost, self.points)
+
+
+def loss_error(lost: dict[int, str], points: Tensor) -> LostEvaluationError:
+    """Return the error for points [K, n], of which those with the numbers `lost` have no value."""
+    first = min(lost)
+    return LostEvaluationError(
+        f"{lost[first]}, at the point [{numbers(points[first])}], number {first} of {len(points)}; "
+        f"{len(lost)} without a value. on_nonfinite='drop' or a number goes on without them, more retries try again"
+    )
+
+
+def numbers(point: Tensor | Sequence[float]) -> str:
+    """Return the first coordinates of a point as text."""
+    values = [float(one) for one in point[:8]]
+    return ", ".join(f"{one:.6g}" for one in values) + (", ..." if len(point) > 8 else "")

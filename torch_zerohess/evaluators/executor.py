@@ -1,0 +1,100 @@
+"""Evaluation by an executor of somebody else: the standard pools, loky, dask, mpi4py."""
+
+import concurrent.futures
+import threading
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.evaluators import transfer
+from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.factory import Each, same
+from torch_zerohess.evaluators.inline import Closing
+from torch_zerohess.evaluators.values import checked_values
+
+_HELD = 4
+"""Black boxes that a process keeps."""
+_held: dict[str, Callable[..., Any]] = {}
+_lock = threading.Lock()
+
+
+class Executor(Closing):
+    """Calls the black box by an executor, a few points per task.
+
+    The executor says how the black box gets to its workers, and so what it must be: picklable for the standard
+    `ProcessPoolExecutor` (use one with `mp_context` "spawn"), almost anything for loky, dask and threads. It is sent
+    with every task; pass `Factory(make, *args)` for one that is large or slow to make, which each process makes once.
+
+    Values have the same bits as those of `Inline`, see `ProcessPool`. An exception of the black box is raised, that of
+    the first point that has one. An executor whose workers ended raises its own error (`BrokenExecutor`): it has no
+    limit of time and no second try, which `ProcessPool` and `Ray` have.
+
+    The executor is the caller's: `close()` does not shut it down.
+
+    Args:
+        executor: with a method `submit(function, *arguments)` that returns a `concurrent.futures.Future`, such as
+            `concurrent.futures.ProcessPoolExecutor()`, `loky.get_reusable_executor()`, dask's `client.get_executor()`.
+
+    Example:
+        >>> with concurrent.futures.ThreadPoolExecutor(2) as threads:
+        ...     Executor(threads)(lambda z: z.sum(1), torch.ones(2, 3))
+        tensor([3., 3.])
+    """
+
+    def __init__(self, executor: concurrent.futures.Executor) -> None:
+        if not callable(getattr(executor, "submit", None)):
+            raise TypeError(f"executor must have a method submit, as concurrent.futures.Executor has, got {executor!r}")
+        self.executor = executor
+        self._fn: Callable[..., Any] | None = None
+        self._name = ""
+        self._closed = False
+
+    def __repr__(self) -> str:
+        return f"Executor({self.executor!r})"
+
+    def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Tensor:
+        """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
+        if self._closed:
+            raise RuntimeError("the Executor is closed: make another one")
+        if not same(self._fn, fn):
+            self._fn, self._name = fn, uuid.uuid4().hex
+        if len(points) == 0:
+            return checked_values(fn(points, *aux), points)
+        batch = Batch(points, 0)
+        futures = []
+        try:
+            while batch.waiting:
+                chunk = batch.take()
+                data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
+                futures.append((chunk, self.executor.submit(evaluated, self._name, fn, data)))
+            for chunk, future in futures:  # in order, so that the first error is that of the first point
+                batch.came(chunk, transfer.unpacked(future.result())[0])
+        finally:
+            for _, future in futures:
+                future.cancel()
+        return batch.result().to(points.device)
+
+    def close(self) -> None:
+        """Take no further points; the executor stays as it is."""
+        self._closed = True
+        self._fn = None
+
+
+def evaluated(name: str, fn: Callable[..., Any], data: bytes) -> bytes:
+    """Return the values of a chunk, in a worker. The first fn with a name stays: what comes later is a copy of it."""
+    with _lock:
+        fn = _held.setdefault(name, fn)
+        while len(_held) > _HELD:
+            _held.pop(next(iter(_held)))
+    return values_of(fn, data)
+
+
+def values_of(fn: Callable[..., Any], data: bytes) -> bytes:
+    """Return the values of points and auxiliary inputs, all as bytes."""
+    tensors = transfer.unpacked(data)
+    with torch.no_grad():
+        values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+    return transfer.packed([values])

@@ -1,0 +1,124 @@
+"""A worker process, as its caller sees it."""
+
+import multiprocessing
+import signal
+import threading
+import time
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.evaluators import transfer, worker
+from torch_zerohess.evaluators.batch import Chunk
+from torch_zerohess.evaluators.lifetime import end_group, one_thread
+from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
+
+_starting = threading.Lock()
+
+
+class Process:
+    """A worker: it starts, gets a black box, and then evaluates one chunk at a time."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        mine, theirs = context.Pipe()
+        self.process = context.Process(target=worker.main, args=(theirs,), name="torch_zerohess worker", daemon=True)
+        with _starting, one_thread():
+            self.process.start()
+        theirs.close()
+        self.messages = Messages(mine)
+        self.ready = False
+        """Whether it waits for a black box or points."""
+        self.number: int | None = None
+        """Number of the black box that it has."""
+        self.chunk: Chunk | None = None
+        """What it evaluates."""
+        self.deadline: float | None = None
+        self.evaluations = 0
+
+    @property
+    def connection(self) -> "Connection[Any, Any]":
+        return self.messages.connection
+
+    @property
+    def handles(self) -> list[Any]:
+        """What becomes ready with a message, or when the process ends."""
+        return [self.connection, self.process.sentinel]
+
+    def give_function(self, number: int, payload: bytes) -> None:
+        """Send a black box."""
+        self.ready, self.number = False, number
+        data = torch.frombuffer(bytearray(payload), dtype=torch.uint8)
+        self.messages.send(FUNCTION, None, (data,), shared=self._room((data,)))
+
+    def give(self, chunk: Chunk, tensors: tuple[Tensor, ...], timeout: float | None) -> None:
+        """Send the points of a chunk."""
+        self.ready, self.chunk = False, chunk
+        self.messages.send(EVALUATE, None, tensors, shared=self._room(tensors))
+        self.deadline = None if timeout is None else time.monotonic() + timeout * len(chunk)
+
+    def receive(self) -> tuple[int, Any, list[Tensor]]:
+        """Return the next message; EOFError or OSError if the process has ended."""
+        kind, header, tensors = self.messages.receive()
+        if kind == ROOM:
+            self._enlarge(header)
+        elif kind != READY and self.chunk is not None:
+            self.evaluations += len(self.chunk)
+            self.chunk = self.deadline = None
+        self.ready = kind != ROOM
+        return kind, header, tensors
+
+    def _room(self, tensors: tuple[Tensor, ...]) -> bool:
+        """Make room in the memory for tensors; False if they are small enough for the pipe."""
+        _, size = transfer.specs(tensors)
+        if size <= transfer.PIPE or not transfer.can_share():
+            return False
+        if not self.messages.fits(size):
+            self._enlarge(size)
+        return True
+
+    def _enlarge(self, size: int) -> None:
+        if self.messages.memory is not None:
+            self.messages.memory.close()
+        self.messages.memory = transfer.Memory(size + size // 4)
+        self.messages.send(ROOM, self.messages.memory.size)
+        self.messages.memory.send(self.connection, self.process.pid or 0)
+
+    def bytes_used(self) -> int:
+        """Most resident bytes so far; 0 for a process that has ended. Linux only."""
+        try:
+            lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
+        except OSError:
+            return 0
+        return next((1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)
+
+    def leave(self) -> None:
+        """Let it end by itself, as soon as it waits for a message."""
+        self.messages.close()
+
+    def end(self, grace: float = 0.0) -> str:
+        """End it, with the programs that it started, and return how it ended.
+
+        grace: seconds that it has to end by itself.
+        """
+        if grace:
+            wait([self.process.sentinel], grace)
+        if self.process.pid is not None:
+            end_group(self.process.pid)
+        self.process.kill()
+        self.process.join()
+        self.messages.close()
+        return ending(self.process.exitcode or 0)
+
+
+def ending(code: int) -> str:
+    """Return an exit code in words."""
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        return signal.Signals(-code).name
+    except ValueError:
+        return f"signal {-code}"

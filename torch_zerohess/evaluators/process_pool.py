@@ -1,0 +1,305 @@
+"""Evaluation in processes of this machine, which may crash, hang, or take too much memory.
+
+Why not loky, or another `concurrent.futures` pool, as the carrier: their unit of failure is the whole pool. When one
+worker of loky ends, all futures of its executor fail, and which point was at fault is not known; a task has no time
+limit and no memory limit of its own, and a task that runs cannot be stopped. Here each worker has its own pipe, so its
+end concerns its own chunk alone.
+"""
+
+import atexit
+import multiprocessing.util  # noqa: F401 its own end of processes is registered first, hence runs after ours
+import os
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from multiprocessing.connection import wait
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.factory import same
+from torch_zerohess.evaluators.inline import Closing
+from torch_zerohess.evaluators.payload import dumped, loaded_error
+from torch_zerohess.evaluators.process import Process
+from torch_zerohess.evaluators.values import checked_values
+from torch_zerohess.evaluators.worker import ERROR, VALUES
+
+_STARTS = 25
+"""Workers in a row that may end before they have a black box: they are killed from outside."""
+_MAKES = 5
+"""Workers in a row that may end without a value after they got the black box."""
+_LOOK = 0.05
+"""Seconds between two looks at the memory of workers."""
+_ALIVE = 1.0
+"""Seconds after which a wait looks again."""
+_GRACE = 2.0
+"""Seconds that a worker has to end by itself."""
+
+
+class ProcessPool(Closing):
+    """Calls the black box in worker processes, a few points at a time.
+
+    Workers are new Python processes (spawn) with one thread each, so that a black box with its own threads does not
+    take more cores than there are. They start with the first call, and stay. The black box is sent to a worker once;
+    what it holds stays there. Pass `Factory(make, *args)` for one that cannot be pickled, or that takes long to make.
+    What the caller changes in a black box afterwards does not reach the workers.
+
+    A script that makes a pool has its main part under `if __name__ == "__main__":`, because workers import the script.
+
+    A worker that ends, takes too long or takes too much memory is replaced, and its points are tried again, see
+    `evaluators.batch`. Points that failed too often have the value NaN: `on_nonfinite` of `BlackBox` and `estimate`
+    says what becomes of them, "raise" names the point and how the worker ended. An exception of the black box is not
+    tried again. It is raised here, with the worker's traceback as its cause.
+
+    Values have the same bits as those of `Inline` for every number of workers, if the black box is deterministic and
+    its value of a point does not depend on which points share its call. (Matrix products, and some functions of torch
+    such as `sigmoid`, may round differently in the last bit when a call has fewer points. The number of workers makes
+    no difference to them either.) fn gets tensors on the CPU.
+
+    The pool ends when it is closed, with the interpreter, and on Linux at once when the interpreter is killed.
+
+    Args:
+        workers: number of processes; as many as there are cores for this process if None.
+        timeout: seconds that an evaluation of one point may take, the making of the black box not counted.
+        retries: further tries of a point whose worker ended.
+        recycle: evaluations after which a worker is replaced, for black boxes that leak.
+        memory_limit: resident bytes that a worker may take, with the 3e8 to 6e8 of Python and torch. Linux only.
+
+    Raises:
+        ValueError: an argument is out of range.
+        TypeError: the black box cannot be pickled; the message names the object in it.
+        RuntimeError: workers end before they evaluate anything.
+
+    Example:
+        >>> import operator
+        >>> with ProcessPool(workers=1) as pool:
+        ...     pool(operator.methodcaller("sum", 1), torch.ones(2, 3))
+        tensor([3., 3.])
+    """
+
+    def __init__(
+        self,
+        workers: int | None = None,
+        *,
+        timeout: float | None = None,
+        retries: int = 2,
+        recycle: int | None = None,
+        memory_limit: int | None = None,
+    ) -> None:
+        _check("workers", workers, 1)
+        _check("retries", retries, 0, none=False)
+        _check("recycle", recycle, 1)
+        if timeout is not None and not timeout > 0:
+            raise ValueError(f"timeout must be seconds > 0 or None, got {timeout!r}")
+        if memory_limit is not None and not memory_limit > 0:
+            raise ValueError(f"memory_limit must be bytes > 0 or None, got {memory_limit!r}")
+        if memory_limit is not None and sys.platform != "linux":
+            raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
+        self.workers = workers or cores()
+        self.timeout, self.retries, self.recycle, self.memory_limit = timeout, retries, recycle, memory_limit
+        self.lost: dict[int, str] = {}
+        """Points of the last call that have no value, by number, and why."""
+        self._lock = threading.Lock()
+        self._forget()
+        self._fn: Callable[..., Any] | None = None
+        self._payload = b""
+        self._number = 0
+        self._known: tuple[torch.dtype, torch.Size] | None = None
+        self._closed = False
+        _pools.add(self)
+
+    def __repr__(self) -> str:
+        settings = f"workers={self.workers}, timeout={self.timeout}, retries={self.retries}"
+        return f"ProcessPool({settings}, recycle={self.recycle}, memory_limit={self.memory_limit})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        settings = {"timeout": self.timeout, "retries": self.retries}
+        settings |= {"recycle": self.recycle, "memory_limit": self.memory_limit}
+        return _again, (self.workers, settings)
+
+    def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Tensor:
+        """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
+        with self._lock:
+            if self._closed:
+                raise RuntimeError("the ProcessPool is closed: make another one")
+            if self._process != os.getpid():
+                self._forget()  # after a fork, workers and pipes belong to the other process
+            if len(points) == 0:
+                return checked_values(fn(points, *aux), points)
+            self._take(fn)
+            tensors = tuple(one.detach().cpu() for one in (points, *aux))
+            batch = Batch(tensors[0], self.retries)
+            self.lost = batch.lost
+            try:
+                while not batch.finished:
+                    self._staff(batch)
+                    self._assign(batch, tensors)
+                    self._listen(batch)
+                values = batch.result(self._known)
+            finally:  # after an error, or Ctrl-C, nobody waits for what they do
+                for one in [one for one in self._staffed if one.chunk is not None]:
+                    self._remove(one)
+            self._known = values.dtype, values.shape[1:]
+            return values.to(points.device)
+
+    def close(self) -> None:
+        """End all workers. A worker that does not end by itself is killed."""
+        self._closed = True
+        if self._process != os.getpid():
+            return
+        every = self._staffed + [one for one, _ in self._leaving]
+        for one in self._staffed:
+            one.leave()
+        until = time.monotonic() + _GRACE
+        for one in every:
+            one.end(0.0 if one.chunk is not None or one.number is None else max(0.0, until - time.monotonic()))
+        self._forget()
+
+    def _forget(self) -> None:
+        self._process = os.getpid()
+        self._staffed: list[Process] = []
+        self._leaving: list[tuple[Process, float]] = []
+        self._failed_starts = 0
+
+    def _take(self, fn: Callable[..., Any]) -> None:
+        """Remember the black box, and what to send to workers."""
+        if not same(self._fn, fn):
+            self._payload = dumped(fn)
+            self._fn, self._known = fn, None
+            self._number += 1
+
+    def _staff(self, batch: Batch) -> None:
+        """Have a worker for every chunk, as far as they may be, and none that is due to be replaced."""
+        for one in [one for one in self._staffed if one.ready and self.recycle and one.evaluations >= self.recycle]:
+            self._staffed.remove(one)
+            one.leave()
+            self._leaving.append((one, time.monotonic() + _GRACE))
+        for pair in [pair for pair in self._leaving if not pair[0].process.is_alive() or time.monotonic() > pair[1]]:
+            self._leaving.remove(pair)
+            pair[0].end()
+        wanted = min(self.workers, len(batch.waiting) + len(batch.busy))
+        while len(self._staffed) < wanted:
+            self._staffed.append(Process())
+
+    def _assign(self, batch: Batch, tensors: tuple[Tensor, ...]) -> None:
+        for one in self._staffed:
+            if not one.ready or not batch.waiting:
+                continue
+            try:
+                if one.number != self._number:
+                    one.give_function(self._number, self._payload)
+                else:
+                    chunk = batch.take()
+                    one.give(chunk, tuple(part[chunk.start : chunk.stop] for part in tensors), self.timeout)
+            except (BrokenPipeError, ConnectionResetError):
+                pass  # its end is seen by who listens
+
+    def _listen(self, batch: Batch) -> None:
+        """Wait until something happens, and treat it."""
+        seconds = _ALIVE if self.memory_limit is None else _LOOK
+        for one in self._staffed:
+            if one.deadline is not None:
+                seconds = min(seconds, max(0.0, one.deadline - time.monotonic()))
+        ready = set(wait([handle for one in self._staffed for handle in one.handles], seconds))
+        for one in list(self._staffed):
+            if one.connection in ready:
+                self._hear(one, batch)
+            elif one.process.sentinel in ready or (not ready and not one.process.is_alive()):
+                self._lose(one, batch, None)
+            elif one.deadline is not None and time.monotonic() > one.deadline:
+                self._lose(one, batch, f"the black box took longer than timeout={self.timeout:g} s per point")
+            elif too_large := self._too_large(one):
+                self._lose(one, batch, too_large)
+
+    def _hear(self, one: Process, batch: Batch) -> None:
+        chunk = one.chunk
+        try:
+            kind, header, tensors = one.receive()
+        except (EOFError, OSError):
+            self._lose(one, batch, None)
+            return
+        if too_large := self._too_large(one):
+            one.chunk = chunk
+            self._lose(one, batch, too_large)
+        elif kind == ERROR:
+            making, data = header
+            error = loaded_error(data)
+            if making:
+                number, one.number = one.number, None
+                if number == self._number:  # not that of an earlier call, which has raised it already
+                    raise _unmade(error)
+                return
+            assert chunk is not None
+            batch.raised(chunk, error)
+        elif kind == VALUES:
+            assert chunk is not None
+            self._failed_starts = 0
+            batch.came(chunk, tensors[0])
+
+    def _too_large(self, one: Process) -> str:
+        """Return that a worker takes too much memory, or nothing."""
+        if self.memory_limit is None or (used := one.bytes_used()) <= self.memory_limit:
+            return ""
+        return f"the process of the black box took {used:.4g} bytes, more than memory_limit={self.memory_limit:.4g}"
+
+    def _lose(self, one: Process, batch: Batch, reason: str | None) -> None:
+        """Remove a worker that ended, or that must; its chunk has failed."""
+        chunk, number = one.chunk, one.number
+        how = self._remove(one, _GRACE if reason is None else 0.0)  # it ends, so let it say how
+        if chunk is not None:
+            batch.failed(chunk, reason or f"the black box ended its process ({how})")
+            return
+        self._failed_starts += 1
+        if number is None and how.startswith("exit code"):
+            raise RuntimeError(
+                f"a worker process ended with {how} at its start, see its messages above. If they name "
+                '`__main__`: put the main part of the script under `if __name__ == "__main__":`'
+            )
+        if self._failed_starts > (_STARTS if number is None else _MAKES) or reason is not None:
+            when = "at its start" if number is None else "while it made the black box"
+            raise RuntimeError(
+                f"a worker process ended {when}: {reason or how}, {self._failed_starts} times in a row without a value"
+            )
+
+    def _remove(self, one: Process, grace: float = 0.0) -> str:
+        self._staffed.remove(one)
+        return one.end(grace)
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _check(name: str, value: int | None, least: int, *, none: bool = True) -> None:
+    if value is None and none:
+        return
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name} must be an integer >= {least}{' or None' if none else ''}, got {value!r}")
+
+
+def _unmade(error: BaseException) -> BaseException:
+    """Return an error of a worker that could not make the black box, with what to do about it."""
+    text = str(error)
+    if isinstance(error, AttributeError) and "__main__" in text:
+        hint = RuntimeError(f"fn could not be loaded in a worker ({text}): put it into a module, a .py file")
+        hint.__cause__ = error.__cause__
+        return hint
+    return error
+
+
+def _again(workers: int, settings: dict[str, Any]) -> ProcessPool:
+    return ProcessPool(workers, **settings)
+
+
+_pools: "weakref.WeakSet[ProcessPool]" = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    for pool in list(_pools):
+        pool.close()

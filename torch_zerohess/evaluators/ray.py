@@ -1,0 +1,183 @@
+"""Evaluation on a cluster: actors of Ray that hold the black box."""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.evaluators import transfer
+from torch_zerohess.evaluators.batch import Batch, Chunk
+from torch_zerohess.evaluators.executor import values_of
+from torch_zerohess.evaluators.factory import same
+from torch_zerohess.evaluators.inline import Closing
+from torch_zerohess.evaluators.values import checked_values
+
+
+class Ray(Closing):
+    """Calls the black box in actors of Ray, on one machine or many, one chunk per actor and call.
+
+    An actor holds the black box from call to call. An actor that ends, with its process or its machine, is restarted by
+    Ray, which makes the black box again, and its points are tried again, by it or by another. What becomes of points
+    that failed too often: see `ProcessPool`. An exception of the black box is raised here.
+
+    A program that has called `ray.init(...)` has chosen its cluster. Otherwise the address in the environment variable
+    RAY_ADDRESS is used, and without one a Ray of this machine alone, which ends with `close()`.
+
+    Ray listens on the addresses of its machines, also a Ray of one machine, and runs any code of whoever may connect:
+    it belongs into a network of its own, or behind its token authentication. `ProcessPool` listens nowhere.
+
+    Args:
+        actors: number of actors; as many as the cluster has cores if None.
+        retries: further tries of a chunk, and then of its points, after one that failed.
+        **options: of the actors, such as `num_cpus=1`, `num_gpus=0.5`, `resources={"render": 1}`, `runtime_env`, see
+            `ray.actor.ActorClass.options`.
+
+    Raises:
+        ModuleNotFoundError: Ray is not installed.
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(self, actors: int | None = None, *, retries: int = 2, **options: Any) -> None:
+        for name, value, least in (("actors", actors, 1), ("retries", retries, 0)):
+            given = isinstance(value, int) and not isinstance(value, bool) and value >= least
+            if not given and not (name == "actors" and value is None):
+                raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
+        try:
+            import ray
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("ray is not installed; pip install ray", name="ray") from error
+        self._ray: Any = ray
+        self.count, self.retries = actors, retries
+        self.options = {"num_cpus": 1, "max_restarts": -1, "max_task_retries": 0} | options
+        self.lost: dict[int, str] = {}
+        """Points of the last call that have no value, by number, and why."""
+        self.actors: list[Any] = []
+        """Handles of the actors."""
+        self._starting: dict[Any, Any] = {}
+        """Actors that have ended and start again, by what says that they have."""
+        self._fn: Callable[..., Any] | None = None
+        self._held: Any = None
+        """Where the cluster has the black box."""
+        self._known: tuple[torch.dtype, torch.Size] | None = None
+        self._own = self._closed = False
+
+    def __repr__(self) -> str:
+        return f"Ray(actors={self.count}, retries={self.retries}, options={self.options})"
+
+    def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Tensor:
+        """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
+        if self._closed:
+            raise RuntimeError("the Ray evaluator is closed: make another one")
+        if len(points) == 0:
+            return checked_values(fn(points, *aux), points)
+        self._connect()
+        self._staff()
+        if self._held is None or not same(self._fn, fn):
+            self._fn, self._known, self._held = fn, None, self._ray.put(fn)
+        batch = Batch(points, self.retries, len(self.actors))
+        self.lost = batch.lost
+        busy: dict[Any, tuple[Any, Chunk]] = {}
+        idle = [actor for actor in self.actors if actor not in self._starting.values()]
+        try:
+            while not batch.finished:
+                while idle and batch.waiting:
+                    chunk, actor = batch.take(), idle.pop(0)
+                    data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
+                    busy[actor.evaluate.remote([self._held], data)] = actor, chunk
+                done, _ = self._ray.wait([*busy, *self._starting], num_returns=1)
+                for one in done:
+                    if one in busy:
+                        actor, chunk = busy.pop(one)
+                        alive = self._answered(one, chunk, batch)
+                    else:
+                        actor, alive = self._started(one)
+                    if alive:
+                        idle.append(actor)
+                    else:  # until it has restarted, it would refuse points
+                        self._starting[actor.ready.options(max_task_retries=-1).remote()] = actor
+        finally:
+            for one in busy:
+                self._ray.cancel(one)
+        values = batch.result(self._known)
+        self._known = values.dtype, values.shape[1:]
+        return values.to(points.device)
+
+    def close(self) -> None:
+        """End the actors, and a Ray that was started for them alone."""
+        self._closed = True
+        self._end_actors()
+        if self._own:
+            self._own = False
+            self._ray.shutdown()
+
+    def _connect(self) -> None:
+        if self._ray.is_initialized():
+            return
+        if os.environ.get("RAY_ADDRESS"):
+            self._ray.init()
+            return
+        here = os.pathsep.join(folder or os.getcwd() for folder in sys.path)  # what can be imported here, can be there
+        environment = {"env_vars": {"PYTHONPATH": here}}
+        self._ray.init(address="local", include_dashboard=False, num_cpus=self.count, runtime_env=environment)
+        self._own = True
+
+    def _staff(self) -> None:
+        if not self.actors:
+            count = self.count or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+            self.actors = [self._new() for _ in range(count)]
+
+    def _end_actors(self) -> None:
+        for actor in self.actors if self._ray.is_initialized() else ():
+            self._ray.kill(actor)
+        self.actors, self._starting, self._fn, self._held = [], {}, None, None
+
+    def _answered(self, one: Any, chunk: Chunk, batch: Batch) -> bool:
+        """Treat what became of a chunk; False if its actor has ended."""
+        errors = self._ray.exceptions
+        try:
+            batch.came(chunk, transfer.unpacked(self._ray.get(one))[0])
+        except errors.RayTaskError as error:
+            batch.raised(chunk, error)
+        except errors.RayError as error:
+            reason = str(error).strip().splitlines()
+            batch.failed(chunk, f"an actor ended ({type(error).__name__}: {reason[0] if reason else ''})")
+            return False
+        return True
+
+    def _started(self, one: Any) -> tuple[Any, bool]:
+        """Return an actor that has started again, or a new one in its place, and whether it has."""
+        actor = self._starting.pop(one)
+        try:
+            self._ray.get(one)
+        except self._ray.exceptions.RayError:
+            new = self._new()
+            self.actors[self.actors.index(actor)] = new
+            return new, False
+        return actor, True
+
+    def _new(self) -> Any:
+        return self._ray.remote(Actor).options(**self.options).remote()
+
+
+class Actor:
+    """What runs on the cluster: it fetches a black box once, and holds it."""
+
+    def __init__(self) -> None:
+        torch.set_num_threads(1)
+        self._held: Any = None
+        self._fn: Any = None
+
+    def ready(self) -> None:
+        """Do nothing, once the actor has started."""
+
+    def evaluate(self, held: list[Any], data: bytes) -> bytes:
+        """Return the values of a chunk. A reference inside a list is not fetched with every call."""
+        if held[0] != self._held:
+            import ray
+
+            self._fn = None
+            self._fn, self._held = ray.get(held[0]), held[0]
+        return values_of(self._fn, data)

@@ -1,0 +1,139 @@
+"""What runs in a worker process: it gets a black box once, then points, until its pipe is closed."""
+
+import contextlib
+import pickle
+import struct
+import traceback
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.evaluators import transfer
+from torch_zerohess.evaluators.factory import Each, built
+from torch_zerohess.evaluators.lifetime import end_with_parent
+from torch_zerohess.evaluators.payload import dumped_error
+from torch_zerohess.evaluators.values import checked_values
+
+READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
+"""Kinds of messages: see `Messages`."""
+_HEAD = struct.Struct("<BI")
+
+
+class Messages:
+    """One end of a pipe, and the memory that both of its ends map.
+
+    A message is a kind, a header and tensors. Tensors beyond `transfer.PIPE` bytes lie in the memory, which belongs to
+    the side that sends points. A worker with values that do not fit asks for more of it (ROOM).
+
+    | kind | from | header | tensors |
+    |---|---|---|---|
+    | READY | worker | None | |
+    | FUNCTION | caller, then worker | None | the pickled black box; none |
+    | EVALUATE | caller | None | points, aux |
+    | VALUES | worker | None | values |
+    | ROOM | worker, then caller | bytes | |
+    | ERROR | worker | whether fn could not be made, and the error | |
+    """
+
+    def __init__(self, connection: "Connection[Any, Any]") -> None:
+        self.connection = connection
+        self.memory: transfer.Memory | None = None
+
+    def send(self, kind: int, header: Any = None, tensors: tuple[Tensor, ...] = (), *, shared: bool = False) -> None:
+        """Send a message; `shared` puts its tensors into the memory."""
+        where, size = transfer.specs(tensors)
+        text = pickle.dumps((header, where, shared))
+        message = bytearray(_HEAD.size + len(text) + (0 if shared else size))
+        _HEAD.pack_into(message, 0, kind, len(text))
+        message[_HEAD.size : _HEAD.size + len(text)] = text
+        if shared:
+            assert self.memory is not None
+            transfer.write(tensors, where, self.memory.data)
+        else:
+            transfer.write(tensors, where, message, _HEAD.size + len(text))
+        self.connection.send_bytes(message)
+
+    def receive(self) -> tuple[int, Any, list[Tensor]]:
+        """Return kind, header and tensors of the next message; EOFError or OSError if there is none."""
+        message = bytearray(self.connection.recv_bytes())
+        kind, length = _HEAD.unpack_from(message)
+        header, where, shared = pickle.loads(memoryview(message)[_HEAD.size : _HEAD.size + length])
+        if shared:
+            assert self.memory is not None
+            return kind, header, transfer.read(where, self.memory.data)
+        return kind, header, transfer.read(where, message, _HEAD.size + length)
+
+    def fits(self, size: int) -> bool:
+        """Whether so many bytes fit into the memory."""
+        return self.memory is not None and size <= self.memory.size
+
+    def close(self) -> None:
+        self.connection.close()
+        if self.memory is not None:
+            self.memory.close()
+            self.memory = None
+
+
+def main(connection: "Connection[Any, Any]") -> None:
+    """Serve until the pipe is closed."""
+    end_with_parent()
+    _leave_no_core()
+    torch.set_num_threads(1)
+    messages = Messages(connection)
+    fn: Any = None
+    messages.send(READY)
+    while True:
+        try:
+            kind, header, tensors = messages.receive()
+            if kind == ROOM:
+                _map(messages, header)
+                continue
+        except (EOFError, OSError):
+            return
+        values = None
+        try:
+            if kind == FUNCTION:
+                fn = None  # what it holds is given back before the next one is made
+                fn = pickle.loads(_data(tensors[0]))
+                built(fn)
+            else:
+                with torch.no_grad():
+                    values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+        except BaseException as error:  # SystemExit too: it is the black box's, not this process's
+            messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
+        else:
+            _answer(messages, values)
+
+
+def _answer(messages: Messages, values: Tensor | None) -> None:
+    if values is None:
+        messages.send(FUNCTION)
+        return
+    _, size = transfer.specs([values])
+    shared = size > transfer.PIPE and transfer.can_share()
+    if shared and not messages.fits(size):
+        messages.send(ROOM, size)
+        _, room, _ = messages.receive()
+        _map(messages, room)
+    messages.send(VALUES, tensors=(values,), shared=shared)
+
+
+def _map(messages: Messages, size: int) -> None:
+    if messages.memory is not None:
+        messages.memory.close()
+    messages.memory = transfer.Memory.receive(messages.connection, size)
+
+
+def _data(one: Tensor) -> memoryview:
+    data = bytearray(one.numel())
+    transfer.write([one], transfer.specs([one])[0], data)
+    return memoryview(data)
+
+
+def _leave_no_core() -> None:
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))

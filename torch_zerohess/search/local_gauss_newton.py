@@ -1,0 +1,241 @@
+"""Gauss-Newton for outputs whose elements depend on few parameters each: thousands of parameters, few evaluations.
+
+The start and a few dozen samples of all parameters at once tell a sparse Jacobian of the smoothed output, row by row
+(`surrogates.sparse_fit`). It takes about s log n samples for s parameters per row, where a dense Jacobian takes n.
+
+An iteration fits the Jacobian J to new samples, with the old J as the prior, and evaluates steps of several lengths.
+Each minimises the model g J s + s J^T H J s / 2 within its length, where g and H are gradient and Hessian of the loss
+after the output, by conjugate gradients. The best of them is taken if it lowers the loss; its length is the next
+radius. Where the output of that step was predicted well, the next steps use the same J. Sigma is a share of the radius.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.krylov import krylov_steps
+from torch_zerohess.search.draws import normal, reflect
+from torch_zerohess.search.protocol import AskTell, Method, Settings
+from torch_zerohess.search.space import Bounds
+from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+
+LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
+"""Of the steps that are tried, in units of the radius."""
+_REFUSED = 0.4
+"""Factor of the radius where no step lowers the loss."""
+_ENDLESS = 10
+"""Batches in a row with values that are not finite, after which the search ends."""
+_TRUSTED = 0.9
+"""Share of the held-out change from which on the first radius is that of the samples, 1."""
+_FAITHFUL = 0.1
+"""Squared error of a predicted output, over its squared change, up to which the Jacobian needs no new samples."""
+_ITERATIONS = 100
+"""Products of the Hessian for a step."""
+_FULL = 1000
+"""Parameters up to which `model_at_best` forms the Hessian."""
+
+
+@dataclass(frozen=True)
+class LocalSettings:
+    """Settings that only this search has; see `LocalGaussNewton`."""
+
+    samples: int = 48
+    radius: float = 0.5
+    share: float = 0.5
+    least_sigma: float = 0.05
+    sparse: SparseSettings = SparseSettings(keep=16)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalProgress(Progress):
+    """An output, the sparse Jacobian there, and what is asked for to go on."""
+
+    phase: Literal["sample", "trial"] = "sample"
+    """What is asked for: samples, after the start itself at first, or steps."""
+    radius: float
+    """Root mean square over the parameters."""
+    output: Tensor
+    """At the center [m], float64; empty before the first values."""
+    jacobian: SparseJacobian | None = None
+    """float32: errors of sampling are far above its rounding."""
+    refused: int = 0
+    """Batches in a row without a finite value."""
+
+
+class LocalMethod(Method[LocalProgress]):
+    """The search of `LocalGaussNewton`, in units of its sigma."""
+
+    engine = "local"
+    progress = LocalProgress
+
+    def __init__(self, settings: Settings, own: LocalSettings | None = None) -> None:
+        super().__init__(settings)
+        self.own = own or LocalSettings()
+
+    def first(self, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
+        """Ask for the start and samples around it."""
+        known = self.begun()
+        start = self.settings.start
+        return known, torch.cat([start[None], self._samples(known, generator)])
+
+    def begun(self) -> LocalProgress:
+        """Return what is known before the first values."""
+        start = self.settings.start
+        return LocalProgress(best=Best(start), center=start, radius=self.own.radius, output=start.new_empty(0))
+
+    def next(
+        self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[LocalProgress, Tensor]:
+        """Fit the Jacobian to samples, or take the best step; then ask for what follows."""
+        finite = evaluated.finite
+        known = replace(
+            known,
+            shape=evaluated.shape,
+            evaluations=known.evaluations + len(evaluated),
+            refused=0 if bool(finite.any()) else known.refused + 1,
+        )
+        if known.refused >= _ENDLESS:
+            message = f"{_ENDLESS} batches in a row had no finite value"
+            return replace(known, done=True, message=message), known.center[None][:0]
+        if known.phase == "sample":
+            known = self._fitted(known, evaluated)
+            return self._try(known) if known.phase == "trial" else (known, self._samples(known, generator))
+        known = self._taken(known, evaluated.those(finite))
+        if known.done:
+            return known, known.center[None][:0]
+        return self._try(known) if known.phase == "trial" else (known, self._samples(known, generator))
+
+    def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
+        """The model of the latest Jacobian, without standard errors; None for more than a thousand parameters."""
+        n = self.settings.n
+        if known.jacobian is None or n > _FULL:
+            return None
+        gradient, product = self._derivatives(known, known.jacobian)
+        hessian = torch.stack([product(one) for one in torch.eye(n).to(known.center)])
+        sigma, unknown = known.sigma, torch.full_like(known.center, math.inf)
+        model = LocalModel(known.best.loss, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
+        return model, sigma
+
+    def _samples(self, known: LocalProgress, generator: torch.Generator) -> Tensor:
+        """Draw samples from N(center, sigma^2), mirrored into the bounds."""
+        u = normal(generator, known.center, self.own.samples, self.settings.n)
+        return reflect(known.center + known.sigma * u, self.settings.lower, self.settings.upper)
+
+    def _fitted(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Fit the Jacobian to samples, the first of which is the start at the beginning."""
+        assert evaluated.outputs is not None
+        first = not len(known.output)
+        if first:
+            output = evaluated.outputs[0].clone()
+            if len(output) == 1:
+                raise ValueError(
+                    "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
+                    "number: use engine='descent'"
+                )
+            known = replace(known, output=output, best=replace(known.best, loss=float(evaluated.losses[0])))
+            evaluated = evaluated.those(torch.arange(1, len(evaluated)))
+        told = evaluated.those(evaluated.finite)
+        assert told.outputs is not None
+        if len(told) < self.fewest:
+            return known  # ask again
+        u = ((told.points - known.center) / known.sigma).float()
+        changes = ((told.outputs - known.output) / known.sigma).float()
+        jacobian = fit_sparse(u, changes, known.shape, self.own.sparse, known.jacobian)
+        if first and jacobian.explained > _TRUSTED:
+            known = replace(known, radius=max(1.0, known.radius))
+        return replace(known, jacobian=jacobian, phase="trial")
+
+    @property
+    def fewest(self) -> int:
+        """Samples that a fit needs."""
+        return 8
+
+    def _try(self, known: LocalProgress) -> tuple[LocalProgress, Tensor]:
+        """Ask for steps of all lengths."""
+        assert known.jacobian is not None
+        gradient, product = self._derivatives(known, known.jacobian)
+        lower, upper, x = self.settings.lower, self.settings.upper, known.center
+        held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+        free = (~held).to(gradient)
+        radii = gradient.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
+        steps = krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
+        return replace(known, phase="trial"), (x + steps).clamp(lower, upper)
+
+    def _taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Go to the best of the steps with finite values if it lowers the loss."""
+        assert known.jacobian is not None
+        known = replace(known, iterations=known.iterations + 1, phase="sample")
+        k = int(evaluated.losses.argmin()) if len(evaluated) else -1
+        if k >= 0 and float(evaluated.losses[k]) < known.best.loss:
+            assert evaluated.outputs is not None
+            point, output = evaluated.points[k].clone(), evaluated.outputs[k].clone()
+            step, change = point - known.center, output - known.output
+            radius = float(step.norm()) / math.sqrt(self.settings.n)
+            miss = change - known.jacobian.matvec(step).flatten()
+            faithful = float(miss.square().sum()) <= _FAITHFUL * float(change.square().sum())
+            best = Best(point, float(evaluated.losses[k]), known.sigma)
+            known = replace(known, best=best, center=point, radius=radius, output=output)
+            known = replace(known, phase="trial" if faithful else "sample")
+        else:
+            known = replace(known, radius=_REFUSED * known.radius)
+        if known.radius < self.settings.tolerance:
+            known = self._arrived(known)
+        return replace(known, sigma=min(1.0, max(self.own.share * known.radius, self.own.least_sigma)))
+
+    def _arrived(self, known: LocalProgress) -> LocalProgress:
+        """Start again with the first radius and sigma, or end."""
+        rounds = known.rounds + 1
+        if rounds > self.settings.restarts:
+            message = f"steps were below {self.settings.tolerance} of sigma, {rounds} times"
+            return replace(known, rounds=rounds, done=True, message=message)
+        return replace(known, rounds=rounds, radius=self.own.radius, phase="sample")
+
+    def _derivatives(
+        self, known: LocalProgress, jacobian: SparseJacobian
+    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
+        assert self.settings.loss is not None
+        loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
+        gradient = jacobian.rmatvec(loss.slope)
+        return gradient, lambda v: jacobian.rmatvec(loss.product(jacobian.matvec(v)))
+
+
+class LocalGaussNewton(AskTell[LocalProgress]):
+    """Gauss-Newton for a black box [n] -> [*out] whose outputs depend on few of thousands of parameters each.
+
+    TODO
+    """
+
+    def __init__(
+        self,
+        x0: Tensor,
+        *,
+        sigma: float | Tensor,
+        loss: Callable[[Tensor], Tensor],
+        bounds: Bounds | None = None,
+        grid: tuple[int, ...] | None = None,
+        samples: int = 48,
+        keep: int = 16,
+        rate: float = 0.1,
+        radius: float = 0.5,
+        share: float = 0.5,
+        least_sigma: float = 0.05,
+        restarts: int = 10,
+        tolerance: float = 5e-4,
+        seed: int | None = None,
+    ) -> None:
+        self._own = LocalSettings(
+            samples, radius, share, least_sigma, SparseSettings(keep, rate, grid=None if grid is None else (*grid, 1))
+        )
+        super().__init__(x0, sigma=sigma, bounds=bounds, loss=loss, restarts=restarts, tolerance=tolerance, seed=seed)
+
+    def _make(self, settings: Settings) -> LocalMethod:
+        return LocalMethod(settings, self._own)

@@ -12,9 +12,7 @@ _SHIFTS = (1e-10, 1e8)
 _BISECTIONS = 60
 
 
-def krylov_steps(
-    product: Callable[[Tensor], Tensor], gradient: Tensor, radii: Tensor, *, iterations: int
-) -> Tensor:
+def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: Tensor, *, iterations: int) -> Tensor:
     """Return steps s [k, n] that minimise gradient.s + s.Hs/2 within each of the radii [k], H v = product(v).
 
     s = -(H + shift)^-1 gradient (Levenberg-Marquardt) in the space of gradient, H gradient, H^2 gradient, ...: each is

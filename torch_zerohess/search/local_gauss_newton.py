@@ -12,7 +12,7 @@ radius. Where the output of that step was predicted well, the next steps use the
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
-from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
+from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
@@ -47,11 +47,29 @@ _FULL = 1000
 class LocalSettings:
     """Settings that only this search has; see `LocalGaussNewton`."""
 
-    samples: int = 48
+    sparse: SparseSettings
+    samples: int = 32
     radius: float = 0.5
-    share: float = 0.5
-    least_sigma: float = 0.05
-    sparse: SparseSettings = SparseSettings(keep=16)
+    share: float = 0.35
+    least_sigma: float = 0.03
+
+    @classmethod
+    def checked(
+        cls, settings: Settings, *, keep: int = 16, rate: float = 0.1, grid: tuple[int, ...] | None = None, **own: Any
+    ) -> "LocalSettings":
+        """Check what a caller gave; ValueError for a setting out of range."""
+        if not callable(settings.loss):
+            raise ValueError(
+                f"loss must be a function of one output for the engine 'local', got {settings.loss!r}: without one use "
+                "engine='descent'"
+            )
+        result = cls(SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid), **own)
+        for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
+            value = getattr(result, name)
+            if not 0.0 < value <= most or value == math.inf:
+                raise ValueError(f"{name} must be above 0 and at most {most}, got {value}")
+        check_samples(result.samples, result.sparse.keep)
+        return result
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,9 +94,9 @@ class LocalMethod(Method[LocalProgress]):
     engine = "local"
     progress = LocalProgress
 
-    def __init__(self, settings: Settings, own: LocalSettings | None = None) -> None:
+    def __init__(self, settings: Settings, own: LocalSettings) -> None:
         super().__init__(settings)
-        self.own = own or LocalSettings()
+        self.own = own
 
     def first(self, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
         """Ask for the start and samples around it."""
@@ -107,11 +125,19 @@ class LocalMethod(Method[LocalProgress]):
             return replace(known, done=True, message=message), known.center[None][:0]
         if known.phase == "sample":
             known = self._fitted(known, evaluated)
-            return self._try(known) if known.phase == "trial" else (known, self._samples(known, generator))
-        known = self._taken(known, evaluated.those(finite))
+        else:
+            known = self._taken(known, evaluated.those(finite))
         if known.done:
             return known, known.center[None][:0]
-        return self._try(known) if known.phase == "trial" else (known, self._samples(known, generator))
+        return self.step(known) if known.phase == "trial" else (known, self._samples(known, generator))
+
+    def started(self, evaluated: Evaluated) -> LocalProgress | None:
+        """Return what the start and samples around it at sigma tell; None if that is too little."""
+        if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
+            return None
+        known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated))
+        known = self._fitted(known, evaluated)
+        return known if known.phase == "trial" else None
 
     def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
         """The model of the latest Jacobian, without standard errors; None for more than a thousand parameters."""
@@ -144,7 +170,7 @@ class LocalMethod(Method[LocalProgress]):
             evaluated = evaluated.those(torch.arange(1, len(evaluated)))
         told = evaluated.those(evaluated.finite)
         assert told.outputs is not None
-        if len(told) < self.fewest:
+        if len(told) < FEWEST_SAMPLES:
             return known  # ask again
         u = ((told.points - known.center) / known.sigma).float()
         changes = ((told.outputs - known.output) / known.sigma).float()
@@ -153,12 +179,7 @@ class LocalMethod(Method[LocalProgress]):
             known = replace(known, radius=max(1.0, known.radius))
         return replace(known, jacobian=jacobian, phase="trial")
 
-    @property
-    def fewest(self) -> int:
-        """Samples that a fit needs."""
-        return 8
-
-    def _try(self, known: LocalProgress) -> tuple[LocalProgress, Tensor]:
+    def step(self, known: LocalProgress) -> tuple[LocalProgress, Tensor]:
         """Ask for steps of all lengths."""
         assert known.jacobian is not None
         gradient, product = self._derivatives(known, known.jacobian)
@@ -198,9 +219,7 @@ class LocalMethod(Method[LocalProgress]):
             return replace(known, rounds=rounds, done=True, message=message)
         return replace(known, rounds=rounds, radius=self.own.radius, phase="sample")
 
-    def _derivatives(
-        self, known: LocalProgress, jacobian: SparseJacobian
-    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    def _derivatives(self, known: LocalProgress, jacobian: SparseJacobian) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
         assert self.settings.loss is not None
         loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
@@ -211,7 +230,44 @@ class LocalMethod(Method[LocalProgress]):
 class LocalGaussNewton(AskTell[LocalProgress]):
     """Gauss-Newton for a black box [n] -> [*out] whose outputs depend on few of thousands of parameters each.
 
-    TODO
+    Textures, height fields, vertices and voxels are such parameters, pixels such outputs. Which pixel depends on which
+    parameter need not be known: samples of all parameters at once tell it. It evaluates the start and `samples` points
+    before its first step, and `samples` and six steps per iteration. It needs no derivative of the black box. Where
+    every output depends on every parameter it finds no support and does not move: use `TrustRegion`, which notices.
+
+    A parameter that no output depends on stays where it is; `jacobian.untouched` names these parameters.
+
+    Args:
+        x0: start [n], float32 or float64, within the bounds.
+        sigma: length over which the output changes, in units of the parameters; one value, or one per parameter [n].
+        loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch. It should be
+            convex, as a mean of squares is: directions in which it bends downwards count as straight.
+        bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
+        grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
+            evidence, which helps where outputs depend on patches of parameters. None: they lie in no order.
+        keep: parameters per output, at most.
+        samples: of an iteration, at least keep + 2.
+        rate: of false discoveries among the parameters that are found in a batch.
+        radius: first length of a step, root mean square over the parameters, in units of sigma. It is at least 1 if
+            the first Jacobian predicts 90 % of held-out samples.
+        share: distance of the samples, in units of the radius; the first ones have the distance sigma.
+        least_sigma: least distance of the samples, in units of sigma.
+        restarts: how often to begin again with the first radius after the search has arrived.
+        tolerance: radius, in units of sigma, at which the search has arrived.
+        seed: of the samples; from torch's global generator if None.
+
+    Outputs [h, w] and [h, w, channels] are images, whose neighbouring pixels share evidence.
+
+    Raises ValueError for settings out of range, and from the first `tell` for outputs of one number.
+
+    Example:
+        >>> target = torch.rand(20, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> loss = lambda image: (image - target).square().mean()
+        >>> search = LocalGaussNewton(torch.zeros(400).double(), sigma=1.0, loss=loss, seed=0)
+        >>> while search.evaluations < 39:
+        ...     search.tell(search.ask().view(-1, 20, 20))
+        >>> search.value < 1e-3  # of 0.3
+        True
     """
 
     def __init__(
@@ -222,20 +278,24 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         loss: Callable[[Tensor], Tensor],
         bounds: Bounds | None = None,
         grid: tuple[int, ...] | None = None,
-        samples: int = 48,
         keep: int = 16,
+        samples: int = 32,
         rate: float = 0.1,
         radius: float = 0.5,
-        share: float = 0.5,
-        least_sigma: float = 0.05,
+        share: float = 0.35,
+        least_sigma: float = 0.03,
         restarts: int = 10,
         tolerance: float = 5e-4,
         seed: int | None = None,
     ) -> None:
-        self._own = LocalSettings(
-            samples, radius, share, least_sigma, SparseSettings(keep, rate, grid=None if grid is None else (*grid, 1))
-        )
+        self._own = {"grid": grid, "keep": keep, "samples": samples, "rate": rate}
+        self._own |= {"radius": radius, "share": share, "least_sigma": least_sigma}
         super().__init__(x0, sigma=sigma, bounds=bounds, loss=loss, restarts=restarts, tolerance=tolerance, seed=seed)
 
+    @property
+    def jacobian(self) -> SparseJacobian | None:
+        """The latest smoothed Jacobian, in units of the first sigma per parameter; None before the first one."""
+        return self._state.progress.jacobian
+
     def _make(self, settings: Settings) -> LocalMethod:
-        return LocalMethod(settings, self._own)
+        return LocalMethod(settings, LocalSettings.checked(settings, **self._own))

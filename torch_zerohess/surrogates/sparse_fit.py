@@ -12,6 +12,8 @@ The ridges are those that predict held-out samples best. The support is found an
 the share of the change that is predicted there is honest.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,8 +22,12 @@ from torch import Tensor
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, thresholds
 
-FOLDS = 4
+FEWEST_SAMPLES = 8
+"""That a fit needs."""
+_FOLDS = 4
 """Parts of the samples that are held out in turn."""
+_ROUNDS = 3
+"""In which entries are found where no old ones are known."""
 _RIDGES = ((1e-4, 1e-4), (0.03, 0.03), (0.3, 0.1), (0.3, 0.3), (1.0, 0.3))
 """Squares of the ridge of old and of new entries, in units of the samples."""
 _FEWEST, _BAND = 1024, 4
@@ -34,12 +40,35 @@ _DENSE_RIDGE = 1e-6
 
 @dataclass(frozen=True)
 class SparseSettings:
-    """How rows are fitted; see `sparse_jacobian` for the meaning."""
+    """How rows are fitted."""
 
     keep: int
+    """Entries of a row, at most."""
     rate: float = 0.1
-    rounds: int = 3
+    """Of false discoveries among the entries found in one round."""
     grid: tuple[int, int, int] | None = None
+    """Rows, columns and channels of the parameters; None: they lie in no order."""
+
+    @classmethod
+    def checked(cls, n: int, *, keep: int, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
+        """Check what a caller gave for n parameters; ValueError for a setting out of range."""
+        if not 1 <= keep <= n:
+            raise ValueError(f"keep must be between 1 and the number of parameters, {n}, got {keep}")
+        if not 0.0 < rate < 1.0:
+            raise ValueError(f"rate must be between 0 and 1, got {rate}")
+        if grid is None:
+            return cls(keep, rate)
+        if len(grid) not in (2, 3) or min(grid) < 1 or math.prod(grid) != n:
+            raise ValueError(f"grid must be rows and columns (and channels) of {n} parameters, got {grid}")
+        rows, columns, *channels = grid
+        return cls(keep, rate, (rows, columns, *(channels or [1])))
+
+
+def check_samples(samples: int, keep: int) -> None:
+    """Raise ValueError for fewer samples than the kept entries and a constant need."""
+    least = max(FEWEST_SAMPLES, keep + 2)
+    if samples < least:
+        raise ValueError(f"samples must be at least {least} to fit {keep} parameters per output (keep), got {samples}")
 
 
 def fit_sparse(
@@ -85,10 +114,10 @@ def _validated(
     before = replace(
         previous, index=previous.index[part], values=previous.values[part], standard_error=previous.values[part]
     )
-    fold = torch.arange(len(u), device=u.device) % FOLDS
+    fold = torch.arange(len(u), device=u.device) % _FOLDS
     choices = _RIDGES[:3] if first else _RIDGES
     rests, total, dense = [0.0] * len(choices), 0.0, 0.0
-    for number in range(FOLDS):
+    for number in range(_FOLDS):
         kept, held = fold != number, fold == number
         w = None if weights is None else weights[kept]
         center, middle = _means(u[kept], w), _means(d[kept], w)
@@ -130,7 +159,8 @@ def _support(
     m = d.shape[1]
     index, values = previous.index, previous.values
     used = values != 0
-    for number in range(settings.rounds):
+    rounds = 1 if bool(used.any()) else _ROUNDS
+    for number in range(rounds):
         rest = d - _predicted(index, values, u)
         least = thresholds(u, rest, grids, settings.rate)
         if number and least.own > 1.0 and least.joint > 1.0:
@@ -140,7 +170,7 @@ def _support(
         parts = [(row, index[used], values[used].abs()), *blocks]
         row, column, size = (torch.cat([one[k] for one in parts]) for k in range(3))
         index, used = largest(row, column, size, m, settings.keep)
-        if number + 1 < settings.rounds:
+        if number + 1 < rounds:
             values, _ = _slopes(u, d, index, used, previous, _RIDGES[1])
     return index, used
 
@@ -149,8 +179,8 @@ def _slopes(
     u: Tensor, d: Tensor, index: Tensor, used: Tensor, previous: SparseJacobian, ridges: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
     """Return slopes [m, keep] on a support and their standard errors, with the previous slopes as the prior."""
-    K, (m, keep) = len(u), index.shape
-    rows, values, errors = u.mT.contiguous(), torch.zeros_like(index, dtype=u.dtype), None
+    K, m = len(u), len(index)
+    rows, values = u.mT.contiguous(), torch.zeros_like(index, dtype=u.dtype)
     errors = torch.zeros_like(values)
     # Rows with few used entries have small systems: the used ones come first.
     width = max(1, int(used.sum(1).max()))

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-_BLOCK = 1 << 22
+_BLOCK = 1 << 20
 """Correlations held at a time."""
-_COUNTED = 1 << 22
+_COUNTED = 1 << 20
 """Correlations from which thresholds are taken, at most about."""
 _LEAST_OWN, _LEAST_JOINT = 4.0, 1.25
 """Least thresholds, in units of the 1/K that chance gives on average."""
@@ -56,16 +55,12 @@ class Grids:
 
     def mean(self, squares: Tensor) -> Tensor:
         """Return the mean over neighbours of whole rows of the image, [b, n]."""
-        b, n = squares.shape
+        whole = squares.view(-1, *self.pixels[1:], *(self.parameters or (1, squares.shape[1], 1)))
         if self.pixels[1] > 1:
-            _, columns, channels = self.pixels
-            image = squares.view(-1, columns, channels * n).permute(2, 0, 1)[None]
-            squares = _box(image)[0].permute(1, 2, 0).reshape(b, n)
+            whole = _of_three(_of_three(whole, 0), 1)
         if self.parameters is not None:
-            h, w, c = self.parameters
-            image = squares.view(b, h, w, c).permute(0, 3, 1, 2)
-            squares = _box(image).permute(0, 2, 3, 1).reshape(b, n)
-        return squares
+            whole = _of_three(_of_three(whole, 3), 4)
+        return whole.view_as(squares)
 
 
 @dataclass(frozen=True)
@@ -169,5 +164,15 @@ def _threshold(found: Tensor, decoys: Tensor, rate: float) -> float:
     return float(fine.nonzero()[0]) / _BINS if bool(fine.any()) else 2.0
 
 
-def _box(image: Tensor) -> Tensor:
-    return functional.avg_pool2d(image, 3, 1, 1, count_include_pad=False)
+def _of_three(values: Tensor, dim: int) -> Tensor:
+    """Mean of each entry and its neighbours along a dimension."""
+    length = values.shape[dim]
+    if length == 1:
+        return values
+    total = values.clone()
+    total.narrow(dim, 1, length - 1).add_(values.narrow(dim, 0, length - 1))
+    total.narrow(dim, 0, length - 1).add_(values.narrow(dim, 1, length - 1))
+    total.div_(3.0)
+    for end in (0, length - 1):
+        total.narrow(dim, end, 1).mul_(1.5)
+    return total

@@ -48,6 +48,8 @@ class SparseSettings:
     """Of false discoveries among the entries found in one round."""
     grid: tuple[int, int, int] | None = None
     """Rows, columns and channels of the parameters; None: they lie in no order."""
+    prune: bool = False
+    """Whether entries that are not significant beside the others of their row are left out in the end."""
 
     @classmethod
     def checked(cls, n: int, *, keep: int, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
@@ -146,7 +148,27 @@ def _fitted(
 ) -> SparseJacobian:
     index, used = _support(u, d, grids, settings, previous)
     values, errors = _slopes(u, d, index, used, previous, ridges)
+    if settings.prune:
+        used = used & _significant(values, errors, used, len(u), settings.rate)
+        order = torch.argsort(used.byte(), dim=1, descending=True, stable=True)  # the used ones come first
+        index, used = index.gather(1, order), used.gather(1, order)
+        values, errors = _slopes(u, d, index, used, previous, ridges)
     return replace(previous, index=index, values=values, standard_error=errors)
+
+
+def _significant(values: Tensor, errors: Tensor, used: Tensor, K: int, rate: float) -> Tensor:
+    """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries.
+
+    Student's t with K - 1 - s degrees of freedom, s entries of the row, becomes a normal number (Wallace 1959). The
+    threshold for its probability is that of Benjamini and Hochberg (1995).
+    """
+    nu = (K - 1 - used.sum(1, keepdim=True)).clamp_min(1).double()
+    t = values.double() / errors.double().clamp_min(torch.finfo(torch.float64).tiny)
+    z = (8 * nu + 1) / (8 * nu + 3) * (nu * torch.log1p(t.square() / nu)).sqrt()
+    chance = torch.erfc(z * math.sqrt(0.5))
+    ordered = chance[used].sort().values
+    fine = (ordered <= rate * torch.arange(1, len(ordered) + 1, device=z.device) / max(len(ordered), 1)).nonzero()
+    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
 
 
 def _support(
@@ -191,17 +213,20 @@ def _slopes(
         same = (own[:, :, None] == previous.index[some][:, None]) & (previous.values[some] != 0)[:, None]
         old = (same * previous.values[some][:, None]).sum(2) * live
         A = rows[own] * live[:, :, None]  # [b, width, K]
-        prior = torch.where(old != 0, ridges[0], ridges[1]) * K
+        prior = torch.where(old != 0, ridges[0], ridges[1]) * K * _scale(u, own)
         gram = A @ A.mT
-        gram.diagonal(dim1=1, dim2=2).add_(prior * _scale(u, own))
+        gram.diagonal(dim1=1, dim2=2).add_(prior)
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
         target = d[:, some].mT - (A * old[:, :, None]).sum(1)
         change = (inverse @ (A @ target[:, :, None]))[..., 0]
         values[some, :width] = (old + change) * live
         left = target - (A * change[:, :, None]).sum(1)
-        spent = (live.sum(1) - (inverse.diagonal(dim1=1, dim2=2) * prior * _scale(u, own) * live).sum(1)).clamp_min(0.0)
+        own_part = inverse.diagonal(dim1=1, dim2=2)
+        spent = ((1.0 - own_part * prior) * live).sum(1).clamp_min(0.0)
         variance = left.square().sum(1) / (K - 1 - spent).clamp_min(1.0)
-        errors[some, :width] = (variance[:, None] * inverse.diagonal(dim1=1, dim2=2)).clamp_min(0.0).sqrt() * live
+        shortened = (inverse @ (prior * change)[:, :, None])[..., 0]  # by the ridge
+        square = variance[:, None] * own_part.clamp_min(0.0) + shortened.square()
+        errors[some, :width] = square.sqrt() * live
     return values, errors
 
 

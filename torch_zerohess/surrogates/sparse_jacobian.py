@@ -1,7 +1,7 @@
 """The Jacobian of an output whose elements depend on few parameters each: `keep` entries per element."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -37,6 +37,15 @@ class SparseJacobian:
         size = torch.Size(shape)
         none = like.new_zeros(size.numel(), keep)
         return cls(none.long(), none, none.clone(), n, size)
+
+    def to(self, like: Tensor) -> "SparseJacobian":
+        """Return the same in the type and on the device of `like`."""
+        return replace(
+            self,
+            index=self.index.to(like.device),
+            values=self.values.to(like),
+            standard_error=self.standard_error.to(like),
+        )
 
     @property
     def found(self) -> Tensor:

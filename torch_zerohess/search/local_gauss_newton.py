@@ -37,6 +37,9 @@ _TRUSTED = 0.9
 """Share of the held-out change from which on the first radius is that of the samples, 1."""
 _FAITHFUL = 0.1
 """Squared error of a predicted output, over its squared change, up to which the Jacobian needs no new samples."""
+_SLOW, _FAST, _MOST = 0.02, 0.1, 8
+"""The next batch has twice the samples if the loss fell by less than the first share of it, and half of them if it fell
+by more than the second. It has so many times the first number of samples at most."""
 _ITERATIONS = 100
 """Products of the Hessian for a step."""
 _FULL = 1000
@@ -84,6 +87,8 @@ class LocalProgress(Progress):
     """At the center [m], float64; empty before the first values."""
     jacobian: SparseJacobian | None = None
     """float32: errors of sampling are far above its rounding."""
+    samples: int
+    """Of the next batch."""
     refused: int = 0
     """Batches in a row without a finite value."""
 
@@ -107,7 +112,13 @@ class LocalMethod(Method[LocalProgress]):
     def begun(self) -> LocalProgress:
         """Return what is known before the first values."""
         start = self.settings.start
-        return LocalProgress(best=Best(start), center=start, radius=self.own.radius, output=start.new_empty(0))
+        return LocalProgress(
+            best=Best(start),
+            center=start,
+            radius=self.own.radius,
+            output=start.new_empty(0),
+            samples=self.own.samples,
+        )
 
     def next(
         self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
@@ -152,7 +163,7 @@ class LocalMethod(Method[LocalProgress]):
 
     def _samples(self, known: LocalProgress, generator: torch.Generator) -> Tensor:
         """Draw samples from N(center, sigma^2), mirrored into the bounds."""
-        u = normal(generator, known.center, self.own.samples, self.settings.n)
+        u = normal(generator, known.center, known.samples, self.settings.n)
         return reflect(known.center + known.sigma * u, self.settings.lower, self.settings.upper)
 
     def _fitted(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
@@ -195,6 +206,7 @@ class LocalMethod(Method[LocalProgress]):
         assert known.jacobian is not None
         known = replace(known, iterations=known.iterations + 1, phase="sample")
         k = int(evaluated.losses.argmin()) if len(evaluated) else -1
+        before = known.best.loss
         if k >= 0 and float(evaluated.losses[k]) < known.best.loss:
             assert evaluated.outputs is not None
             point, output = evaluated.points[k].clone(), evaluated.outputs[k].clone()
@@ -207,6 +219,9 @@ class LocalMethod(Method[LocalProgress]):
             known = replace(known, phase="trial" if faithful else "sample")
         else:
             known = replace(known, radius=_REFUSED * known.radius)
+        gain = before - known.best.loss
+        count = known.samples * (2 if gain < _SLOW * abs(before) else 1) // (2 if gain > _FAST * abs(before) else 1)
+        known = replace(known, samples=min(max(count, self.own.samples), _MOST * self.own.samples))
         if known.radius < self.settings.tolerance:
             known = self._arrived(known)
         return replace(known, sigma=min(1.0, max(self.own.share * known.radius, self.own.least_sigma)))
@@ -246,7 +261,8 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
             evidence, which helps where outputs depend on patches of parameters. None: they lie in no order.
         keep: parameters per output, at most.
-        samples: of an iteration, at least keep + 2.
+        samples: of an iteration at first, at least keep + 2. An iteration that hardly lowers the loss doubles them, up
+            to eight times; a good one halves them again.
         rate: of false discoveries among the parameters that are found in a batch.
         radius: first length of a step, root mean square over the parameters, in units of sigma. It is at least 1 if
             the first Jacobian predicts 90 % of held-out samples.

@@ -125,6 +125,9 @@ def _validated(
         center, middle = _means(u[kept], w), _means(d[kept], w)
         train = _centered(u[kept], d[kept], w)
         v, e = u[held] - center, d[held] - middle
+        if weights is not None:
+            root = weights[held].sqrt()[:, None]
+            v, e = v * root, e * root
         index, used = _support(*train, inner, settings, before)
         for k, ridges in enumerate(choices):
             values, _ = _slopes(*train, index, used, before, ridges)

@@ -37,7 +37,7 @@ _TRUSTED = 0.9
 """Share of the held-out change from which on the first radius is that of the samples, 1."""
 _FAITHFUL = 0.1
 """Squared error of a predicted output, over its squared change, up to which the Jacobian needs no new samples."""
-_SLOW, _FAST, _MOST = 0.02, 0.1, 8
+_SLOW, _FAST, _MOST = 0.02, 0.1, 2
 """The next batch has twice the samples if the loss fell by less than the first share of it, and half of them if it fell
 by more than the second. It has so many times the first number of samples at most."""
 _ITERATIONS = 100
@@ -261,8 +261,8 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
             evidence, which helps where outputs depend on patches of parameters. None: they lie in no order.
         keep: parameters per output, at most.
-        samples: of an iteration at first, at least keep + 2. An iteration that hardly lowers the loss doubles them, up
-            to eight times; a good one halves them again.
+        samples: of an iteration at first, at least keep + 2. An iteration that hardly lowers the loss doubles
+            them, once; a good one halves them again.
         rate: of false discoveries among the parameters that are found in a batch.
         radius: first length of a step, root mean square over the parameters, in units of sigma. It is at least 1 if
             the first Jacobian predicts 90 % of held-out samples.

@@ -92,13 +92,13 @@ class EvidenceMethod(Method[EvidenceProgress]):
             return _with(replace(known, descent=descent), descent), points
         known = _gathered(known, evaluated)
         every = Evaluated(known.points, known.losses, known.outputs, known.shape)
-        local = self.local.started(every)
+        start = self.local.started(every)
         told = "nothing: the output is one number, or too few outputs are finite"
-        if local is not None and local.jacobian is not None:
-            sparse, dense = local.jacobian.explained, max(local.jacobian.explained_dense, 0.0)
+        if start is not None and start.jacobian is not None:
+            sparse, dense = start.jacobian.explained, max(start.jacobian.explained_dense, 0.0)
             told = f"{max(sparse, 0.0):.0%} of the change of held-out outputs, a dense one {dense:.0%}"
             if sparse > dense + _MORE and (sparse > _MOST or not len(known.rest)):
-                local, points = self.local.step(local)
+                local, points = self.local.step(start)
                 known = replace(_emptied(known), chosen="local", reason=f"a sparse Jacobian predicts {told}")
                 return _with(replace(known, local=local, descent=None), local), points
         if len(known.rest):

@@ -203,7 +203,8 @@ class LocalMethod(Method[LocalProgress]):
 
     def _taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Go to the best of the steps with finite values if it lowers the loss."""
-        assert known.jacobian is not None
+        jacobian = known.jacobian
+        assert jacobian is not None
         known = replace(known, iterations=known.iterations + 1, phase="sample")
         k = int(evaluated.losses.argmin()) if len(evaluated) else -1
         before = known.best.loss
@@ -212,7 +213,7 @@ class LocalMethod(Method[LocalProgress]):
             point, output = evaluated.points[k].clone(), evaluated.outputs[k].clone()
             step, change = point - known.center, output - known.output
             radius = float(step.norm()) / math.sqrt(self.settings.n)
-            miss = change - known.jacobian.matvec(step).flatten()
+            miss = change - jacobian.matvec(step).flatten()
             faithful = float(miss.square().sum()) <= _FAITHFUL * float(change.square().sum())
             best = Best(point, float(evaluated.losses[k]), known.sigma)
             known = replace(known, best=best, center=point, radius=radius, output=output)
@@ -304,7 +305,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         tolerance: float = 5e-4,
         seed: int | None = None,
     ) -> None:
-        self._own = {"grid": grid, "keep": keep, "samples": samples, "rate": rate}
+        self._own: dict[str, Any] = {"grid": grid, "keep": keep, "samples": samples, "rate": rate}
         self._own |= {"radius": radius, "share": share, "least_sigma": least_sigma}
         super().__init__(x0, sigma=sigma, bounds=bounds, loss=loss, restarts=restarts, tolerance=tolerance, seed=seed)
 

@@ -63,7 +63,7 @@ class SparseSettings:
         if len(grid) not in (2, 3) or min(grid) < 1 or math.prod(grid) != n:
             raise ValueError(f"grid must be rows and columns (and channels) of {n} parameters, got {grid}")
         rows, columns, *channels = grid
-        return cls(keep, rate, (rows, columns, *(channels or [1])))
+        return cls(keep, rate, (rows, columns, channels[0] if channels else 1))
 
 
 def check_samples(samples: int, keep: int) -> None:

@@ -12,6 +12,14 @@ class SparseJacobian:
     """The `keep` largest entries of every row of a Jacobian [*out, n], in the type of `values`.
 
     m is the number of elements of the output. An entry that is not used has the value 0 and the standard error 0.
+
+    Example:
+        >>> index, values = torch.tensor([[0, 3], [2, 0]]), torch.tensor([[1.0, 2.0], [5.0, 0.0]])
+        >>> J = SparseJacobian(index, values, torch.zeros(2, 2), 4, torch.Size([2]))
+        >>> J.matvec(torch.ones(4)).tolist(), J.rmatvec(torch.ones(2)).tolist()
+        ([3.0, 5.0], [1.0, 0.0, 5.0, 2.0])
+        >>> J.untouched.tolist()
+        [False, True, False, False]
     """
 
     index: Tensor

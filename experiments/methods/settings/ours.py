@@ -37,6 +37,6 @@ that the image of cnn_texture is linear in the texture."""
 
 LOCAL: dict[str, dict[str, Any]] = {
     # By hand on run 1000: 16 or 24 entries per pixel end higher; neighbours of the 32x32 coefficients share evidence.
-    "caustic": {"local": {"grid": (32, 32), "keep": 40, "samples": 48}},
+    "caustic": {"local": {"grid": (32, 32), "keep": 40, "samples": 64}},
 }
 """Prior knowledge of CAUSTIC: that its coefficients lie on a grid."""

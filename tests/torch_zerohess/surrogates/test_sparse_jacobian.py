@@ -134,6 +134,19 @@ def test_overlapping_footprints_and_neighbours():
     assert error[True] > 2 * error[False]
 
 
+def test_pruning_keeps_the_rate_where_neighbours_share_evidence():
+    """Neighbours propose texels beside the nine of a pixel; what is not significant beside the others goes."""
+    side = 12
+    eye = torch.eye(side**2).double().view(-1, 1, side, side)
+    A = torch.nn.functional.avg_pool2d(eye, 3, 1, 1).view(side**2, -1).mT.contiguous()
+    u, false = normal(60, side**2, seed=1), {}
+    for prune in (False, True):
+        settings = SparseSettings(16, grid=(side, side, 1), prune=prune)
+        found = fit_sparse(u, u @ A.mT, torch.Size([side, side]), settings).dense().view(side**2, -1) != 0
+        false[prune] = float((found & (A == 0)).sum() / found.sum())
+    assert false[True] < 0.1 < false[False]
+
+
 def test_the_mean_over_neighbours():
     """Against a loop over the 3x3 pixels and the 3x3 parameters."""
     grids = Grids((4, 3, 2), (3, 2, 1))

@@ -17,10 +17,12 @@ from torch_zerohess.doctor import doctor
 from torch_zerohess.estimation.estimate import estimate
 from torch_zerohess.estimation.finite_differences import finite_difference_hvp
 from torch_zerohess.estimation.result import Estimate
+from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
 from torch_zerohess.minimize import Minimum, minimize
 from torch_zerohess.optim.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 __all__ = [
     "BlackBox",
@@ -30,6 +32,7 @@ __all__ = [
     "Memory",
     "Minimum",
     "Smoothing",
+    "SparseJacobian",
     "adapters",
     "doctor",
     "estimate",
@@ -41,4 +44,5 @@ __all__ = [
     "minimize",
     "optim",
     "smooth",
+    "sparse_jacobian",
 ]

@@ -45,7 +45,7 @@ class Minimum:
     message: str
     """Why the search ended."""
     engine: str
-    """Which search it was: "gaussian_process" or "descent"."""
+    """Which search it was: "gaussian_process", "descent" or "local"."""
 
     def __repr__(self) -> str:
         found = f"x={short(self.x)}, value={self.value:.6g}, evaluations={self.evaluations}"
@@ -80,7 +80,8 @@ def minimize(
             there is one, give it: each evaluation then tells as many equations as the output has numbers.
         bounds: lower and upper, numbers or [n].
         max_evaluations: points that fn may be called with.
-        engine: "gaussian_process", "descent", or "auto" to choose by the number of parameters and their bounds.
+        engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
+            and, for an output of 20 parameters or more, by the first evaluations.
         vectorized: False for an fn of one point, [n] -> scalar or [*out].
         evaluator: where evaluations run; in this process if None.
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
@@ -88,7 +89,7 @@ def minimize(
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this.
-        settings: further ones of `TrustRegion`: restarts, tolerance, noise, pool.
+        settings: further ones of `TrustRegion`: restarts, tolerance, noise, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn
     is not caught.

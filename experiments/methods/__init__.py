@@ -6,6 +6,7 @@ from experiments.methods import (
     block_gauss_newton,
     derivative_free,
     learned,
+    local,
     memory_networks,
     meshes,
     mitsuba,
@@ -19,7 +20,7 @@ from experiments.methods.method import Method
 METHODS: dict[str, Method] = {
     method.name: method
     for family in (
-        *(paper, ours, memory_networks, block_gauss_newton, derivative_free, quasi_newton),
+        *(paper, ours, memory_networks, block_gauss_newton, local, derivative_free, quasi_newton),
         *(bayesian, turbo, learned, analytic, meshes, mitsuba),
     )
     for method in family.METHODS

@@ -8,12 +8,14 @@ from torch_zerohess.optim.nonlinear_cg import NonlinearCG
 from torch_zerohess.search.block_gauss_newton import BlockGaussNewton
 from torch_zerohess.search.descent import Descent
 from torch_zerohess.search.gaussian_process_search import GaussianProcessSearch
+from torch_zerohess.search.local_gauss_newton import LocalGaussNewton
 from torch_zerohess.search.trust_region import TrustRegion
 
 __all__ = [
     "BlockGaussNewton",
     "Descent",
     "GaussianProcessSearch",
+    "LocalGaussNewton",
     "Newton",
     "NewtonCG",
     "NewtonTargets",

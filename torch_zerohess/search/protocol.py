@@ -254,7 +254,7 @@ class AskTell(ABC, Generic[P]):
 
     @property
     def _kind(self) -> str:
-        return f"{self.engine} of {'the loss' if self._method.settings.loss is None else 'the output'}"
+        return f"{self._method.engine} of {'the loss' if self._method.settings.loss is None else 'the output'}"
 
     def _after(self, progress: P, asked: Tensor, generator: torch.Generator) -> State[P]:
         return State(progress, self._space.rounded(asked), generator.get_state())

@@ -1,4 +1,4 @@
-"""The door to the searches: chooses one by the number of parameters and their bounds."""
+"""The door to the searches: chooses one by the number of parameters, their bounds, and the first evaluations."""
 
 from collections.abc import Callable
 from typing import Any, Literal
@@ -6,24 +6,28 @@ from typing import Any, Literal
 from torch import Tensor
 
 from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.evidence import FEWEST, EvidenceMethod, EvidenceProgress
 from torch_zerohess.search.gaussian_process_search import process_method
+from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalSettings
 from torch_zerohess.search.protocol import AskTell, Method, Settings
 from torch_zerohess.search.space import Bounds
 
 _MOST = 4
 """Parameters up to which random candidates cover a box."""
 
-Engine = Literal["auto", "gaussian_process", "descent"]
-ENGINES = ("auto", "gaussian_process", "descent")
+Engine = Literal["auto", "gaussian_process", "descent", "local"]
+ENGINES = ("auto", "gaussian_process", "descent", "local")
 
 
 class TrustRegion(AskTell[Any]):
-    """A search that counts evaluations: chooses between `GaussianProcessSearch` and `Descent`. The caller evaluates.
+    """A search that counts evaluations: `GaussianProcessSearch`, `Descent` or `LocalGaussNewton`. The caller evaluates.
 
     - Up to four parameters in a finite box: a Gaussian process, which leaves plateaus and local minima.
+    - 20 parameters or more, an output of many numbers and a `loss`: the first batch tells whether these numbers depend
+      on few parameters each. If they do: Gauss-Newton on a sparse Jacobian.
     - Otherwise: descent by quadratic models in a trust region tied to sigma.
 
-    `engine` says what was chosen, `reason` why. See the two classes for what they do.
+    `engine` says what was chosen, `reason` why. See the three classes for what they do.
 
     Args:
         x0: start [n], float32 or float64, within the bounds.
@@ -32,11 +36,12 @@ class TrustRegion(AskTell[Any]):
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch: `.double()`
             networks in it. None if the black box returns the loss.
-        engine: "auto", "gaussian_process" or "descent".
+        engine: "auto", "gaussian_process", "descent" or "local".
         restarts: how often to go on after the search has arrived at a minimum. 0 for a local search.
         tolerance: length, in units of the first sigma, below which the search has arrived.
         noise: standard deviation of repeated losses at one point, if it is known.
         pool: evaluations kept; a default by the number of parameters if None.
+        grid: rows and columns in which the parameters lie, for the engine "local": see `LocalGaussNewton`.
         seed: of the samples; from torch's global generator if None.
 
     Raises ValueError for settings out of range.
@@ -53,9 +58,6 @@ class TrustRegion(AskTell[Any]):
         True
     """
 
-    reason: str
-    """Why this engine, in a sentence."""
-
     def __init__(
         self,
         x0: Tensor,
@@ -68,11 +70,12 @@ class TrustRegion(AskTell[Any]):
         tolerance: float = 1e-2,
         noise: float = 0.0,
         pool: int | None = None,
+        grid: tuple[int, ...] | None = None,
         seed: int | None = None,
     ) -> None:
         if engine not in ENGINES:
             raise ValueError(f"engine must be one of {ENGINES}, got {engine!r}")
-        self._wanted = engine
+        self._wanted, self._grid = engine, grid
         super().__init__(
             x0,
             sigma=sigma,
@@ -85,9 +88,26 @@ class TrustRegion(AskTell[Any]):
             seed=seed,
         )
 
+    @property
+    def engine(self) -> str:
+        """Which search it is: "gaussian_process", "descent" or "local"; "descent" as long as it is not decided."""
+        known = self._state.progress
+        return known.chosen or "descent" if isinstance(known, EvidenceProgress) else self._method.engine
+
+    @property
+    def reason(self) -> str:
+        """Why this engine, in a sentence."""
+        known = self._state.progress
+        return known.reason if isinstance(known, EvidenceProgress) else self._reason
+
     def _make(self, settings: Settings) -> Method[Any]:
-        engine, self.reason = _chosen(settings) if self._wanted == "auto" else (self._wanted, "the caller chose it")
-        return LocalQuadratics(settings) if engine == "descent" else process_method(settings)
+        engine, self._reason = _chosen(settings) if self._wanted == "auto" else (self._wanted, "the caller chose it")
+        if engine == "gaussian_process":
+            return process_method(settings)
+        if self._wanted == "descent" or (engine == "descent" and (settings.loss is None or settings.n < FEWEST)):
+            return LocalQuadratics(settings)
+        own = LocalSettings.checked(settings, grid=self._grid)
+        return LocalMethod(settings, own) if engine == "local" else EvidenceMethod(settings, own)
 
 
 def _chosen(settings: Settings) -> tuple[str, str]:

@@ -16,3 +16,9 @@ SEARCH = {task: dict.fromkeys(SEARCHES, one) for task, one in _SIGMAS.items()}
 
 The defaults of the engines (batches, thresholds of misfit and gain, weights) were chosen on runs from 1000 upward of
 QUAD, BOX2, BOX10, BRDF, NONPSD and TEXTURE, on BRDF again after a look at the reported runs."""
+
+LOCAL: dict[str, dict[str, Any]] = {
+    # By hand on run 1000: 16 or 24 entries per pixel end higher; neighbours of the 32x32 coefficients share evidence.
+    "caustic": {"local": {"grid": (32, 32), "keep": 40, "samples": 64}},
+}
+"""Prior knowledge of CAUSTIC: that its coefficients lie on a grid."""

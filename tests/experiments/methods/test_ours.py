@@ -91,3 +91,10 @@ def test_block_gauss_newton_is_for_images_of_many_parameters():
     assert method.unusable(catalogue.load("texture")) is None
     assert "made for 100 parameters and more" in method.unusable(catalogue.load("box10"))
     assert "returns the loss only" in method.unusable(catalogue.load("quad"))
+
+
+def test_local_is_for_images_of_twenty_parameters_and_more():
+    method = METHODS["local"]
+    assert method.unusable(catalogue.load("texture")) is None
+    assert "made for 20 parameters and more, the task has 7" in method.unusable(catalogue.load("brdf"))
+    assert "returns the loss only" in method.unusable(catalogue.load("quad"))

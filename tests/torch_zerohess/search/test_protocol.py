@@ -10,7 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from searches import TARGET, bowl, points_of, rays, rays_loss, rosenbrock, run, zeros
 
-from torch_zerohess.optim import BlockGaussNewton, Descent, GaussianProcessSearch, TrustRegion
+from torch_zerohess.optim import (
+    BlockGaussNewton,
+    Descent,
+    GaussianProcessSearch,
+    LocalGaussNewton,
+    TrustRegion,
+)
 from truths import vector
 
 # Every search with and without a loss; restarts keep it busy.
@@ -20,20 +26,34 @@ SEARCHES = {
     "process of the loss": (GaussianProcessSearch, 2, False),
     "process of the output": (GaussianProcessSearch, 2, True),
     "block Gauss-Newton": (BlockGaussNewton, 5, True),
+    "local Gauss-Newton": (LocalGaussNewton, 20, True),
+    "by evidence": (TrustRegion, 20, True),
 }
 
 
 def make(name, *, seed=0, loss=None, **changes):
     """Returns the search of this name."""
     kind, n, with_loss = SEARCHES[name]
-    chosen = (loss or rays_loss(n)) if with_loss else None
+    chosen = (loss or loss_of(name)) if with_loss else None
     return kind(
         zeros(n), **{"sigma": 1.0, "bounds": (-3.0, 4.0), "restarts": 1000, "seed": seed, **changes}, loss=chosen
     )
 
 
+def texels(z):
+    """An output [4, 5] whose numbers depend on one of 20 parameters each."""
+    return (z + 0.3 * torch.sin(z)).unflatten(1, (4, 5))
+
+
 def black_box(name):
-    return rays if SEARCHES[name][2] else rosenbrock
+    return texels if SEARCHES[name][1] == 20 else rays if SEARCHES[name][2] else rosenbrock
+
+
+def loss_of(name):
+    n, with_loss = SEARCHES[name][1:]
+    target = texels(torch.ones(1, 20, dtype=torch.float64))[0]
+    one = (lambda output: (output - target).square().mean()) if n == 20 else rays_loss(n)
+    return one if with_loss else None
 
 
 def same(a, b):
@@ -154,7 +174,7 @@ def test_asking_for_fewer():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_types(name, dtype):
     kind, n, with_loss = SEARCHES[name]
-    loss = rays_loss(n) if with_loss else None
+    loss = loss_of(name)
     search = kind(zeros(n, dtype), sigma=1.0, bounds=(-3.0, 4.0), loss=loss, restarts=1000, seed=0)
     start = black_box(name)(zeros(n)[None])[0]
     run(search, lambda z: black_box(name)(z).to(dtype), 60)
@@ -177,9 +197,9 @@ def test_what_is_rounded_is_what_is_known():
 
 @every_search
 def test_the_callers_tensors_are_not_held(name):
-    kind, n, with_loss = SEARCHES[name]
+    kind, n, _ = SEARCHES[name]
     x0 = zeros(n)
-    search = kind(x0, sigma=1.0, bounds=(-3.0, 4.0), loss=rays_loss(n) if with_loss else None, seed=0)
+    search = kind(x0, sigma=1.0, bounds=(-3.0, 4.0), loss=loss_of(name), seed=0)
     x0 += 5
     asked = search.ask()
     torch.testing.assert_close(asked[0], zeros(n))
@@ -358,7 +378,7 @@ def test_a_loss_that_raises_once_changes_nothing(name):
             raise ZeroDivisionError("in the loss")
         return value
 
-    loss = rays_loss(n)
+    loss = loss_of(name) or rays_loss(n)
     search = make(name, loss=lambda y: loss(failing(y)))
     other, failures = make(name), 0
     for _ in range(15):

@@ -1,0 +1,99 @@
+"""The door `zh.sparse_jacobian`: its samples, units and errors, on maps whose smoothed Jacobian is known.
+
+Random tests have fixed seeds.
+"""
+
+import math
+
+import pytest
+import torch
+
+import torch_zerohess as zh
+
+SIDE = 10
+N = SIDE**2
+SCALES = 1.0 + torch.arange(N).double() / N
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def scaled(z):
+    """Pixels [10, 10] of one texel each; the slope of pixel k is 1 + k / 100."""
+    return (z * SCALES.to(z)).view(-1, SIDE, SIDE)
+
+
+def smoothing(samples=30, **settings):
+    return zh.Smoothing(**({"sigma": 0.1, "samples": samples, "seed": 0} | settings))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("antithetic", [True, False])
+@pytest.mark.parametrize("proposal", ["aggregate", "gaussian"])
+@pytest.mark.parametrize("sampler", ["random", "orthogonal"])
+def test_slopes_in_units_of_the_parameters(dtype, antithetic, proposal, sampler):
+    sigma = 0.05 + 0.1 * torch.rand(N, generator=torch.Generator().manual_seed(1)).double()
+    settings = smoothing(sigma=sigma, antithetic=antithetic, proposal=proposal, sampler=sampler)
+    J = zh.sparse_jacobian(scaled, normal(N).to(dtype), settings, keep=8)
+    assert J.values.dtype == dtype
+    assert J.evaluations == (60 if antithetic else 30)
+    assert J.explained > 0.99
+    torch.testing.assert_close(J.dense().view(N, N).double(), torch.diag(SCALES), atol=3e-3, rtol=0)
+
+
+def test_a_step_has_the_slope_of_its_convolution():
+    """Pixels that are 1 where their texel is above 0: at x = 0 the smoothed slope is 1 / (sigma sqrt(2 pi))."""
+    J = zh.sparse_jacobian(lambda z: (z > 0).double().view(-1, SIDE, SIDE), torch.zeros(N).double(), smoothing(300))
+    slopes, errors = J.dense().view(N, N).diagonal(), J.standard_error[J.found]
+    truth = 1 / (0.1 * math.sqrt(2 * math.pi))
+    assert bool((slopes > 0).all())
+    assert float((slopes.mean() - truth).abs()) < 5 * float(slopes.std()) / math.sqrt(N) + 0.02 * truth
+    assert float(slopes.std()) == pytest.approx(float(errors.max()), rel=0.5)
+
+
+def test_an_earlier_jacobian_helps_and_is_in_the_same_units():
+    before = zh.sparse_jacobian(scaled, torch.zeros(N).double(), smoothing(60))
+    f = lambda z: 1.05 * scaled(z) + 0.3 * normal(len(z), SIDE, SIDE, seed=len(z)) * 0.1  # noqa: E731
+    alone = zh.sparse_jacobian(f, torch.zeros(N).double(), smoothing(18, seed=1))
+    both = zh.sparse_jacobian(f, torch.zeros(N).double(), smoothing(18, seed=1, sigma=0.2), previous=before)
+    truth = torch.diag(1.05 * SCALES)
+    assert float((both.dense().view(N, N) - truth).norm()) < 0.7 * float((alone.dense().view(N, N) - truth).norm())
+
+
+def test_pixels_that_are_not_finite():
+    def hole(z):
+        return torch.where((z[:, :1] > 0.2)[:, :, None], math.nan, scaled(z))
+
+    with pytest.raises(ValueError, match="fn returned nan at the point"):
+        zh.sparse_jacobian(hole, torch.zeros(N).double(), smoothing(100))
+    J = zh.sparse_jacobian(hole, torch.zeros(N).double(), smoothing(100), on_nonfinite="drop")
+    torch.testing.assert_close(J.dense().view(N, N), torch.diag(SCALES), atol=3e-3, rtol=0)
+
+
+def test_one_point_at_a_time():
+    J = zh.sparse_jacobian(lambda z: scaled(z)[0], torch.zeros(N).double(), smoothing(), vectorized=False)
+    assert J.shape == (SIDE, SIDE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fn": lambda z: z.sum(1)}, r"an output of many numbers, .* got shape \[\]: for one number use estimate"),
+        ({"x": torch.zeros(2, N)}, r"x must be one point \[n\], got \[2, 100\]"),
+        ({"smoothing": smoothing(12)}, r"samples must be at least 18 to fit 16 parameters per output \(keep\), got 12"),
+        ({"smoothing": smoothing(proposal="fr22", order=1)}, "proposal must be .* got 'fr22'"),
+        ({"keep": 101}, "keep must be between 1 and the number of parameters, 100, got 101"),
+        ({"grid": (5, 5)}, r"grid must be rows and columns \(and channels\) of 100 parameters, got \(5, 5\)"),
+        (
+            {"previous": zh.sparse_jacobian(lambda z: z[:, :50], torch.zeros(N), smoothing())},
+            r"previous must be a Jacobian of outputs \[10, 10\] of 100 parameters, got one of outputs \[50\] of 100",
+        ),
+    ],
+)
+def test_errors_name_what_is_wrong(changes, message):
+    given = {"fn": scaled, "x": torch.zeros(N), "smoothing": smoothing()} | changes
+    with pytest.raises(ValueError, match=message):
+        zh.sparse_jacobian(given.pop("fn"), given.pop("x"), given.pop("smoothing"), **given)
+    with pytest.raises(TypeError, match="smoothing must be a Smoothing, got float"):
+        zh.sparse_jacobian(scaled, torch.zeros(N), 0.1)

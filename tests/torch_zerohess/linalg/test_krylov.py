@@ -1,0 +1,49 @@
+"""Steps from a Krylov space against dense Levenberg-Marquardt steps."""
+
+import pytest
+import torch
+
+from torch_zerohess.linalg.krylov import krylov_steps
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.3, 2.0])
+def test_steps_solve_the_shifted_system(radius):
+    A, g = normal(30, 20), normal(20, seed=1)
+    H = A.mT @ A
+    (s,) = krylov_steps(lambda v: H @ v, g, g.new_tensor([radius]), iterations=20)
+    newton = -torch.linalg.solve(H, g)
+    if float(newton.norm()) <= radius:
+        torch.testing.assert_close(s, newton, rtol=0, atol=1e-6)
+    else:
+        assert float(s.norm()) == pytest.approx(radius, rel=1e-5)
+        shift = -(H @ s + g) @ s / (s @ s)  # (H + shift) s = -g
+        assert float(shift) > 0
+        torch.testing.assert_close(H @ s + shift * s, -g, rtol=0, atol=1e-6)
+
+
+def test_few_products_are_enough_where_eigenvalues_are_few():
+    Q = torch.linalg.qr(normal(200, 200))[0]
+    values = torch.tensor([1.0, 4.0, 9.0]).double().repeat(67)[:200]
+    H, g, count = (Q * values) @ Q.mT, normal(200, seed=1), 0
+
+    def product(v):
+        nonlocal count
+        count += 1
+        return H @ v
+
+    steps = krylov_steps(product, g, g.new_tensor([1.0, 100.0]), iterations=50)
+    assert count <= 4
+    torch.testing.assert_close(steps[1], -torch.linalg.solve(H, g), rtol=1e-6, atol=1e-9)
+
+
+def test_no_gradient_and_negative_curvature():
+    assert not bool(krylov_steps(lambda v: v, torch.zeros(3).double(), torch.ones(2).double(), iterations=3).any())
+    g = torch.tensor([1.0, 1.0]).double()
+    H = torch.diag(torch.tensor([-1.0, 2.0]).double())
+    (s,) = krylov_steps(lambda v: H @ v, g, g.new_tensor([0.5]), iterations=2)
+    assert float(s.norm()) == pytest.approx(0.5, rel=1e-5)
+    assert float(g @ s) < 0

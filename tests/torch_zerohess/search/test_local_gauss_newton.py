@@ -1,0 +1,192 @@
+"""Local Gauss-Newton, and the choice by evidence, on problems whose solution is known in closed form."""
+
+import math
+
+import pytest
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
+
+SIDE = 12
+N = SIDE**2
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def square(target):
+    return lambda y: (y - target).square().mean()
+
+
+def solve(search, f, most):
+    """Evaluate until the search has used `most` evaluations."""
+    while not search.done and search.evaluations < most:
+        search.tell(f(search.ask(most - search.evaluations)))
+    return search
+
+
+def image(x):
+    """Pixels [12, 12] of one texel each."""
+    return x.view(-1, SIDE, SIDE)
+
+
+def blur(x):
+    """Pixels [12, 12] of nine texels each, as a matrix whose condition number is 2."""
+    return image(x) + torch.nn.functional.avg_pool2d(image(x), 3, 1, 1)
+
+
+def search_for(f, truth, **settings):
+    settings = {"sigma": 1.0, "loss": square(f(truth[None])[0]), "seed": 0} | settings
+    return LocalGaussNewton(torch.zeros(len(truth)).double(), **settings)
+
+
+def test_texels_are_found_after_one_batch_of_samples():
+    """39 evaluations for 144 parameters: the start, 32 samples and the steps."""
+    search = solve(search_for(image, normal(N)), image, 39)
+    assert search.value < 1e-4
+    assert search.jacobian.explained > 0.99
+    torch.testing.assert_close(search.jacobian.dense().view(N, N), torch.eye(N), atol=1e-2, rtol=0)
+
+
+def test_overlapping_footprints():
+    """Seven batches of samples and steps, where a dense Jacobian takes 145 evaluations before the first step."""
+    truth = normal(N)
+    search = solve(search_for(blur, truth, grid=(SIDE, SIDE)), blur, 150)
+    assert search.value < 1e-3 * float(square(blur(truth[None])[0])(torch.zeros(SIDE, SIDE).double()))
+
+
+def test_steps_in_the_output_are_crossed():
+    """Each pixel is a staircase of its texel, whose own derivative is zero."""
+
+    def stairs(x):
+        return (4 * image(x)).round() / 4
+
+    truth = normal(N).clamp(-1.5, 1.5)
+    search = solve(search_for(stairs, truth, least_sigma=0.3, share=1.0), stairs, 300)
+    assert search.value < 0.25**2
+
+
+def test_any_smooth_loss():
+    """A loss whose second derivative is no multiple of the identity: log cosh."""
+    truth = 0.5 * normal(N)
+    loss = lambda y: (y - image(truth[None])[0]).cosh().log().sum()  # noqa: E731
+    search = solve(search_for(image, truth, loss=loss), image, 60)
+    assert float((search.x - truth).abs().max()) < 0.02
+
+
+def test_bounds_are_kept_and_hold_parameters():
+    truth = normal(N)
+    seen = []
+
+    def f(x):
+        seen.append(x)
+        return image(x)
+
+    search = solve(search_for(image, truth, bounds=(-0.5, 0.5)), f, 120)
+    every = torch.cat(seen)
+    assert float(every.abs().max()) <= 0.5
+    torch.testing.assert_close(search.x, truth.clamp(-0.5, 0.5), atol=0.05, rtol=0)
+
+
+def test_parameters_that_no_pixel_depends_on_stay_and_are_named():
+    truth, start = normal(N), torch.full((N + 10,), 0.25).double()
+    search = LocalGaussNewton(start, sigma=1.0, loss=square(image(truth[None])[0]), seed=0)
+    solve(search, lambda x: image(x[:, :N]), 39)
+    assert search.value < 0.05
+    assert set(search.jacobian.untouched.nonzero()[:, 0].tolist()) <= set(range(N, N + 10))
+    left = search.jacobian.untouched
+    assert bool((search.x[left] == 0.25).all())
+
+
+def test_noise():
+    """Pixels with an error of 0.05: the loss ends near its square."""
+    generator, truth = torch.Generator().manual_seed(7), normal(N)
+
+    def noisy(x):
+        return image(x) + 0.05 * torch.randn(len(x), SIDE, SIDE, generator=generator, dtype=torch.float64)
+
+    search = solve(search_for(image, truth), noisy, 150)
+    assert float((search.x - truth).square().mean()) < 4 * 0.05**2
+
+
+def test_values_that_are_not_finite_are_avoided():
+    truth = normal(N)
+
+    def hole(x):
+        return torch.where((x.norm(dim=1) > 1.05 * math.sqrt(N))[:, None, None], math.nan, image(x))
+
+    search = solve(search_for(image, truth), hole, 150)
+    assert search.value < 1e-2
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"loss": None}, "loss must be a function of one output for the engine 'local', got None"),
+        ({"keep": 0}, "keep must be between 1 and the number of parameters, 144, got 0"),
+        ({"keep": 40}, r"samples must be at least 42 to fit 40 parameters per output \(keep\), got 32"),
+        ({"rate": 1.0}, "rate must be between 0 and 1, got 1.0"),
+        ({"grid": (12, 13)}, r"grid must be rows and columns \(and channels\) of 144 parameters, got \(12, 13\)"),
+        ({"radius": 0.0}, "radius must be above 0 and at most inf, got 0.0"),
+        ({"share": 2.0}, "share must be above 0 and at most 1.0, got 2.0"),
+    ],
+)
+def test_settings_out_of_range(settings, message):
+    with pytest.raises(ValueError, match=message):
+        search_for(image, normal(N), **settings)
+
+
+def test_an_output_of_one_number_is_refused():
+    search = LocalGaussNewton(torch.zeros(N).double(), sigma=1.0, loss=torch.sum, seed=0)
+    with pytest.raises(ValueError, match="got an output of one number: use engine='descent'"):
+        search.tell(search.ask().sum(1, keepdim=True))
+
+
+def door(n, loss, **settings):
+    return TrustRegion(torch.zeros(n).double(), sigma=1.0, loss=loss, seed=3, **settings)
+
+
+def test_a_sparse_jacobian_is_chosen_by_evidence():
+    search = door(N, square(image(normal(1, N))[0]))
+    assert search.engine == "descent"
+    assert "are to tell" in search.reason
+    solve(search, image, 39)
+    assert search.engine == "local"
+    assert "100% of the change of held-out outputs, a dense one" in search.reason
+    assert search.value < 1e-4
+    again = door(N, square(image(normal(1, N))[0]))
+    again.load_state_dict(search.state_dict())
+    assert again.engine == "local"
+    assert torch.equal(again.ask(), search.ask())
+
+
+@pytest.mark.parametrize("n", [20, 100])
+def test_a_dense_jacobian_costs_no_evaluation_more_than_before(n):
+    """The points are those of `Descent`, to the last bit."""
+    A, b = normal(150, n), normal(150, seed=1)
+    search, descent = (
+        door(n, square(b)),
+        Descent(torch.zeros(n).double(), sigma=1.0, loss=square(b), seed=3),
+    )
+    points = [[], []]
+    for one, seen in zip((search, descent), points, strict=True):
+        while one.evaluations < n + 20 and not one.done:
+            z = one.ask(n + 20 - one.evaluations)
+            seen.append(z)
+            one.tell(z @ A.mT)
+    assert search.engine == "descent"
+    assert "a sparse Jacobian predicts" in search.reason
+    assert torch.equal(torch.cat(points[0]), torch.cat(points[1]))
+
+
+def test_minimize_takes_it():
+    truth = normal(N)
+    fit = zh.minimize(
+        image, torch.zeros(N).double(), sigma=1.0, loss=square(image(truth[None])[0]), target=1e-4, seed=0
+    )
+    assert fit.engine == "local"
+    assert fit.evaluations <= 45
+    # The loss is mean((x - truth)^2): its Hessian is 2 / n on the diagonal.
+    torch.testing.assert_close(fit.hessian, 2 / N * torch.eye(N).double(), atol=1e-3, rtol=0)

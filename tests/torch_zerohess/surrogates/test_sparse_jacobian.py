@@ -1,0 +1,182 @@
+"""The sparse Jacobian as a matrix, its selection and its regression, on linear maps whose Jacobian is known.
+
+Random tests have fixed seeds. Limits of shares are from binomial errors or stated beside them.
+"""
+
+import pytest
+import torch
+
+from torch_zerohess.surrogates.sparse_fit import SparseSettings, explained_by, fit_sparse
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+from torch_zerohess.surrogates.sparse_selection import Grids, largest, thresholds
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def sparse_map(m, n, s, seed=0):
+    """A map [m, n] with s entries of size 1 to 2 per row."""
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.stack([torch.randperm(n, generator=generator)[:s] for _ in range(m)])
+    sizes = (1 + torch.rand(m, s, generator=generator).double()) * torch.randn(m, s, generator=generator).sign()
+    return torch.zeros(m, n).double().scatter_(1, places, sizes)
+
+
+def random_jacobian():
+    """A Jacobian of outputs [2, 3] of 7 parameters with 3 entries per row, and the same as a matrix [6, 7]."""
+    index, used = largest(torch.arange(6).repeat_interleave(3), torch.arange(18) % 7, torch.ones(18), 6, 4)
+    values = normal(6, 4) * used
+    dense = torch.zeros(6, 7).double()
+    for p in range(6):
+        for j in range(4):
+            dense[p, index[p, j]] += values[p, j]
+    return SparseJacobian(index, values, values.abs(), 7, torch.Size([2, 3])), dense
+
+
+def test_products_are_those_of_the_dense_matrix():
+    J, dense = random_jacobian()
+    v, w = normal(7, seed=1), normal(2, 3, seed=2)
+    torch.testing.assert_close(J.dense(), dense.view(2, 3, 7))
+    torch.testing.assert_close(J.matvec(v).flatten(), dense @ v)
+    torch.testing.assert_close(J.rmatvec(w), dense.mT @ w.flatten())
+    torch.testing.assert_close(J.untouched, (dense == 0).all(0))
+    with pytest.raises(ValueError, match=r"v must have shape \[7\], got \[6\]"):
+        J.matvec(v[:6])
+    with pytest.raises(ValueError, match=r"w must have shape \[2, 3\], got \[6\]"):
+        J.rmatvec(w.flatten())
+
+
+def test_the_largest_entries_of_rows():
+    row, column = torch.tensor([0, 0, 0, 2, 0]), torch.tensor([4, 1, 3, 2, 1])
+    index, used = largest(row, column, torch.tensor([1.0, 0.6, 2.0, 5.0, 0.6]), 3, 2)
+    assert index[0].tolist() == [3, 1]  # 1 counts 0.6 twice
+    assert used.tolist() == [[True, True], [False, False], [True, False]]
+    assert index[2, 0] == 2
+
+
+@pytest.mark.parametrize(("K", "least", "most"), [(16, 0.0, 0.7), (32, 0.8, 1.0), (48, 0.95, 1.0), (96, 0.99, 1.0)])
+def test_recovery_against_the_number_of_samples(K, least, most):
+    """3 of 300 parameters per output: about 2 s log(n / s) = 28 samples recover them."""
+    A, u = sparse_map(100, 300, 3), normal(K, 300, seed=1)
+    J = fit_sparse(u, u @ A.mT, torch.Size([100]), SparseSettings(8, prune=True))
+    found, true = J.dense() != 0, A != 0
+    recalled, false = float((found & true).sum() / true.sum()), float((found & ~true).sum() / found.sum().clamp_min(1))
+    assert least <= recalled <= most
+    assert false <= 0.15  # the rate is 0.1 on average
+    if K >= 48:
+        assert J.explained > 0.9
+        assert float((J.dense() - A).norm() / A.norm()) < 0.25
+
+
+def test_standard_errors_cover_the_truth_under_noise():
+    """The share of entries within 2 standard errors; 0.95 of them for Student's t with 90 degrees of freedom."""
+    A, u = sparse_map(400, 100, 2), normal(100, 100, seed=1)
+    J = fit_sparse(u, u @ A.mT + 0.5 * normal(100, 400, seed=2), torch.Size([400]), SparseSettings(4, prune=True))
+    truth = A.gather(1, J.index)
+    real = J.found & (truth != 0)
+    assert int(real.sum()) > 790  # of 800
+    within = ((J.values - truth).abs() < 2 * J.standard_error)[real].double().mean()
+    assert 0.91 < float(within) < 0.99
+    # sd of a slope is 0.5 / sqrt(100)
+    assert float(J.standard_error[real].mean()) == pytest.approx(0.05, rel=0.1)
+
+
+def test_noise_alone_has_no_support():
+    u = normal(40, 200)
+    J = fit_sparse(u, normal(40, 300, seed=1), torch.Size([300]), SparseSettings(8))
+    assert int(J.found.sum()) < 30  # of 60 000 pairs
+    assert J.explained < 0.02
+    assert bool(J.untouched.sum() > 170)
+
+
+def test_a_dense_map_is_not_explained():
+    """64 samples of 300 parameters: the least norm predicts about 64/300 of a held-out change, the sparse fit less."""
+    u, A = normal(64, 300), normal(200, 300, seed=1)
+    J = fit_sparse(u, u @ A.mT, torch.Size([200]), SparseSettings(16))
+    assert J.explained < 0.05
+    assert J.explained_dense == pytest.approx(48 / 300, abs=0.06)
+
+
+def test_held_out_samples_are_not_used():
+    """The share that is predicted is that of samples which the fit has never seen, not of those that it has."""
+    A, u, v = sparse_map(200, 300, 3), normal(80, 300, seed=1), normal(200, 300, seed=2)
+    noise = 3.0 * normal(280, 200, seed=3)
+    J = fit_sparse(u, u @ A.mT + noise[:80], torch.Size([200]), SparseSettings(8))
+    fresh = explained_by(J, v, v @ A.mT + noise[80:])
+    assert J.explained == pytest.approx(fresh, abs=0.1)
+    assert explained_by(J, u, u @ A.mT + noise[:80]) > J.explained + 0.15
+
+
+def test_an_old_jacobian_is_support_and_prior():
+    """8 new samples tell little of a new map; with the old one, which is 10 % off, they tell it all."""
+    A, u = sparse_map(200, 300, 3), normal(40, 300, seed=1)
+    settings = SparseSettings(6)
+    old = fit_sparse(normal(100, 300, seed=4), normal(100, 300, seed=4) @ A.mT, torch.Size([200]), settings)
+    few = u[:12]
+    alone = fit_sparse(few, few @ (1.1 * A).mT, torch.Size([200]), settings)
+    both = fit_sparse(few, few @ (1.1 * A).mT, torch.Size([200]), settings, old)
+    assert float((alone.dense() - 1.1 * A).norm() / A.norm()) > 0.5
+    assert float((both.dense() - 1.1 * A).norm() / A.norm()) < 0.1
+
+
+def test_overlapping_footprints_and_neighbours():
+    """A blur of 3x3: each pixel sees nine texels. Neighbours find with 40 samples what needs 100 without them."""
+    side = 16
+    eye = torch.eye(side**2).double().view(-1, 1, side, side)
+    A = torch.nn.functional.avg_pool2d(eye, 3, 1, 1).view(side**2, -1).mT.contiguous()  # [pixels, texels]
+    u = normal(40, side**2, seed=1)
+    error = {}
+    for grid in (None, (side, side, 1)):
+        J = fit_sparse(u, u @ A.mT, torch.Size([side, side]), SparseSettings(12, grid=grid))
+        error[grid is None] = float((J.dense().view(side**2, -1) - A).norm() / A.norm())
+    assert error[False] < 0.3
+    assert error[True] > 2 * error[False]
+
+
+def test_pruning_keeps_the_rate_where_neighbours_share_evidence():
+    """Neighbours propose texels beside the nine of a pixel; what is not significant beside the others goes."""
+    side = 12
+    eye = torch.eye(side**2).double().view(-1, 1, side, side)
+    A = torch.nn.functional.avg_pool2d(eye, 3, 1, 1).view(side**2, -1).mT.contiguous()
+    u, false = normal(60, side**2, seed=1), {}
+    for prune in (False, True):
+        settings = SparseSettings(16, grid=(side, side, 1), prune=prune)
+        found = fit_sparse(u, u @ A.mT, torch.Size([side, side]), settings).dense().view(side**2, -1) != 0
+        false[prune] = float((found & (A == 0)).sum() / found.sum())
+    assert false[True] < 0.1 < false[False]
+
+
+def test_the_mean_over_neighbours():
+    """Against a loop over the 3x3 pixels and the 3x3 parameters."""
+    grids = Grids((4, 3, 2), (3, 2, 1))
+    squares = normal(24, 6).square()
+    whole, result = squares.view(4, 3, 2, 3, 2), grids.mean(squares).view(4, 3, 2, 3, 2)
+    near = lambda k, size: slice(max(0, k - 1), min(size, k + 2))  # noqa: E731
+    for r, c, h, w in [(0, 0, 0, 0), (1, 1, 1, 1), (3, 2, 2, 0), (2, 0, 1, 1)]:
+        expected = whole[near(r, 4), near(c, 3), 1, near(h, 3), near(w, 2)]
+        assert float(result[r, c, 1, h, w]) == pytest.approx(float(expected.mean()))
+
+
+def test_thresholds_keep_the_rate():
+    """Of 20 000 pairs with 100 true ones, those above the threshold are true but for about the rate."""
+    A, u = torch.zeros(100, 200).double(), normal(60, 200, seed=1)
+    A[torch.arange(100), torch.arange(100)] = 1.0
+    d = u @ A.mT + 0.8 * normal(60, 100, seed=2)
+    u, d = u - u.mean(0), d - d.mean(0)
+    least = thresholds(u, d, Grids((100, 1, 1)), 0.1).own
+    r = (d / d.norm(dim=0)).mT @ (u / u.norm(dim=0))
+    found = r.square() >= least
+    assert int(found[A != 0].sum()) > 95
+    assert int(found[A == 0].sum()) < 25
+    assert thresholds(u, normal(60, 100, seed=3), Grids((100, 1, 1)), 0.1).own > 1.0  # nothing is there
+
+
+def test_weights_are_those_of_least_squares():
+    """Samples of weight 0 do not count."""
+    A, u = sparse_map(50, 40, 2), normal(60, 40, seed=1)
+    d, weights = u @ A.mT, torch.ones(60).double()
+    d[::3] = 10 * normal(20, 50, seed=2)
+    weights[::3] = 0.0
+    J = fit_sparse(u, d, torch.Size([50]), SparseSettings(6), weights=weights)
+    torch.testing.assert_close(J.dense(), A, atol=0.01, rtol=0)

@@ -1,0 +1,52 @@
+"""Steps of several lengths from one Krylov space: what conjugate gradients would find for each (Gould et al. 1999)."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+_INVARIANT = 1e-10
+"""Length of a new direction, relative to the largest curvature, from which on the space is complete."""
+_SHIFTS = (1e-10, 1e8)
+"""Range of the shift that shortens a step, in units of the largest curvature."""
+_BISECTIONS = 60
+
+
+def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: Tensor, *, iterations: int) -> Tensor:
+    """Return steps s [k, n] that minimise gradient.s + s.Hs/2 within each of the radii [k], H v = product(v).
+
+    s = -(H + shift)^-1 gradient (Levenberg-Marquardt) in the space of gradient, H gradient, H^2 gradient, ...: each is
+    the iterate of conjugate gradients on H + shift after `iterations` products, at the most, which all steps share.
+    Negative curvature counts as none. float64; zeros if the gradient is zero.
+
+    The space is that of Lanczos with full reorthogonalization: iterations n numbers.
+    """
+    length = float(gradient.norm())
+    if length == 0.0:
+        return gradient.new_zeros(len(radii), len(gradient))
+    basis, diagonal, beside, largest = [gradient / length], [], [], 0.0
+    while True:
+        q = basis[-1]
+        image = product(q)
+        diagonal.append(float(q @ image))
+        known = torch.stack(basis)
+        for _ in range(2):  # twice is enough (Kahan)
+            image = image - known.mT @ (known @ image)
+        norm = float(image.norm())
+        largest = max(largest, abs(diagonal[-1]), norm)
+        if len(basis) >= min(iterations, len(gradient)) or norm <= _INVARIANT * largest:
+            break
+        beside.append(norm)
+        basis.append(image / norm)
+    off = gradient.new_tensor(beside)
+    values, vectors = torch.linalg.eigh(
+        torch.diag(gradient.new_tensor(diagonal)) + torch.diag(off, 1) + torch.diag(off, -1)
+    )
+    curvature, slope = values.clamp_min(0.0), length * vectors[0]
+    size = float(curvature.max()) or length
+    low, high = (slope.new_full((len(radii), 1), factor * size) for factor in _SHIFTS)
+    for _ in range(_BISECTIONS):
+        shift = (low * high).sqrt()
+        long = (slope / (curvature + shift)).norm(dim=1, keepdim=True) > radii[:, None]
+        low, high = torch.where(long, shift, low), torch.where(long, high, shift)
+    return -(slope / (curvature + high)) @ vectors.mT @ known

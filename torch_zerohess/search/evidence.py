@@ -1,0 +1,142 @@
+"""The choice between a dense and a sparse model of the output, by how well each predicts held-out samples.
+
+The first batch is that of `Descent`, in two parts. If the sparse Jacobian of the first part predicts most of the
+change of held-out samples, the search goes on as `LocalGaussNewton`. The same holds if the Jacobian of the whole batch
+predicts clearly more than the dense one of least norm. Otherwise the search is `Descent`, with all that was evaluated:
+then it asks for the points that `Descent` alone would ask for.
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.descent_progress import DescentProgress
+from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalProgress, LocalSettings
+from torch_zerohess.search.protocol import Method, Settings
+from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
+
+FEWEST = 20
+"""Parameters from which on a sparse Jacobian may need fewer samples than a dense one."""
+_FIRST = 32
+"""Samples of the first part, at most."""
+_MOST = 0.5
+"""Share of the held-out change that decides at once."""
+_MORE = 0.1
+"""Share by which the sparse Jacobian must predict more than the dense one."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EvidenceProgress(Progress):
+    """What was evaluated before the choice, and after it the search that was chosen."""
+
+    chosen: Literal["", "descent", "local"] = ""
+    """Empty before the choice."""
+    reason: str
+    rest: Tensor
+    """Points of the first batch that were not asked for yet [r, n]."""
+    points: Tensor
+    """Evaluated before the choice [K, n]."""
+    losses: Tensor
+    """[K]"""
+    outputs: Tensor
+    """[K, m]"""
+    descent: DescentProgress | None
+    local: LocalProgress | None = None
+
+
+_SHARED = tuple(field.name for field in fields(Progress))
+
+
+class EvidenceMethod(Method[EvidenceProgress]):
+    """`LocalQuadratics` or `LocalMethod`, for outputs with a loss."""
+
+    engine = "descent or local"
+    progress = EvidenceProgress
+
+    def __init__(self, settings: Settings, own: LocalSettings) -> None:
+        super().__init__(settings)
+        self.descent, self.local = LocalQuadratics(settings), LocalMethod(settings, own)
+
+    def first(self, generator: torch.Generator) -> tuple[EvidenceProgress, Tensor]:
+        """Ask for the start and the first part of the samples."""
+        descent, points = self.descent.first(generator)
+        count = 1 + min(_FIRST, max(FEWEST_SAMPLES, self.settings.n // 2))
+        none = points.new_empty(0)
+        known = EvidenceProgress(
+            best=descent.best,
+            center=descent.center,
+            reason="the first samples are to tell whether outputs depend on few parameters each",
+            rest=points[count:],
+            points=points[:0],
+            losses=none,
+            outputs=none,
+            descent=descent,
+        )
+        return known, points[:count]
+
+    def next(
+        self, known: EvidenceProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[EvidenceProgress, Tensor]:
+        if known.chosen == "local":
+            assert known.local is not None
+            local, points = self.local.next(known.local, evaluated, generator)
+            return _with(replace(known, local=local), local), points
+        if known.chosen == "descent":
+            assert known.descent is not None
+            descent, points = self.descent.next(known.descent, evaluated, generator)
+            return _with(replace(known, descent=descent), descent), points
+        known = _gathered(known, evaluated)
+        every = Evaluated(known.points, known.losses, known.outputs, known.shape)
+        start = self.local.started(every)
+        told = "nothing: the output is one number, or too few outputs are finite"
+        if start is not None and start.jacobian is not None:
+            sparse, dense = start.jacobian.explained, max(start.jacobian.explained_dense, 0.0)
+            told = f"{max(sparse, 0.0):.0%} of the change of held-out outputs, a dense one {dense:.0%}"
+            if sparse > dense + _MORE and (sparse > _MOST or not len(known.rest)):
+                local, points = self.local.step(start)
+                known = replace(_emptied(known), chosen="local", reason=f"a sparse Jacobian predicts {told}")
+                return _with(replace(known, local=local, descent=None), local), points
+        if len(known.rest):
+            return replace(known, rest=known.rest[:0]), known.rest
+        known = replace(_emptied(known), chosen="descent", reason=f"a sparse Jacobian predicts {told}")
+        assert known.descent is not None
+        descent, points = self.descent.next(known.descent, every, generator)
+        return _with(replace(known, descent=descent), descent), points
+
+    def model_at_best(self, known: EvidenceProgress) -> tuple[LocalModel, float] | None:
+        if known.local is not None:
+            return self.local.model_at_best(known.local)
+        return None if known.descent is None else self.descent.model_at_best(known.descent)
+
+
+def _gathered(known: EvidenceProgress, evaluated: Evaluated) -> EvidenceProgress:
+    """Add what was evaluated."""
+    assert evaluated.outputs is not None
+    outputs = torch.cat([known.outputs, evaluated.outputs]) if len(known.outputs) else evaluated.outputs
+    losses = torch.cat([known.losses, evaluated.losses])
+    k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
+    points = torch.cat([known.points, evaluated.points])
+    return replace(
+        known,
+        points=points,
+        losses=losses,
+        outputs=outputs,
+        shape=evaluated.shape,
+        evaluations=len(losses),
+        best=Best(points[k], float(losses[k])),
+    )
+
+
+def _emptied(known: EvidenceProgress) -> EvidenceProgress:
+    """Forget the batch that the search has been given."""
+    return replace(known, points=known.points[:0], losses=known.losses[:0], outputs=known.outputs[:0])
+
+
+def _with(known: EvidenceProgress, inner: Progress) -> EvidenceProgress:
+    """Take what every search knows from the one that was chosen."""
+    return replace(known, **{name: getattr(inner, name) for name in _SHARED})

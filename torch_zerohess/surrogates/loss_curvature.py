@@ -1,0 +1,51 @@
+"""A white-box loss around one output: its value, its slope, and products with its second derivative."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_EIGEN = 1e-12
+"""Relative error to which a Hessian times a vector may be a multiple of that vector."""
+
+
+@dataclass(frozen=True, eq=False)
+class LossCurvature:
+    """loss(output + s) = value + slope.s + s.product(s)/2 to second order, with slope and s of the output's shape."""
+
+    value: float
+    slope: Tensor
+    product: Callable[[Tensor], Tensor]
+
+
+def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurvature:
+    """Expand a loss at an output [*out], float64.
+
+    Derivatives that are not finite, such as the derivative of a norm at zero, count as zero. Where the second
+    derivative is a multiple of the identity, as that of a mean square, products take no call of autograd.
+    """
+    with torch.enable_grad():
+        y = output.detach().requires_grad_(True)
+        value = loss(y)
+        if not value.requires_grad:
+            raise ValueError("loss must be differentiable by torch, got a value that does not depend on its output")
+        (slope,) = torch.autograd.grad(value, y, create_graph=True)
+
+    def product(s: Tensor) -> Tensor:
+        return _finite(torch.autograd.grad(slope, y, s, retain_graph=True, materialize_grads=True)[0])
+
+    fixed = _finite(slope.detach())
+    if not slope.requires_grad:
+        return LossCurvature(float(value.detach()), fixed, torch.zeros_like)
+    # A generic vector is an eigenvector only of a multiple of the identity.
+    probe = torch.cos(torch.arange(1.0, y.numel() + 1.0, dtype=y.dtype, device=y.device)).view_as(y)
+    image, square = product(probe), float(probe.square().sum())
+    scale = float((image * probe).sum()) / square
+    if float((image - scale * probe).norm()) <= _EIGEN * abs(scale) * square**0.5:
+        return LossCurvature(float(value.detach()), fixed, lambda s: scale * s)
+    return LossCurvature(float(value.detach()), fixed, product)
+
+
+def _finite(derivatives: Tensor) -> Tensor:
+    return torch.nan_to_num(derivatives, nan=0.0, posinf=0.0, neginf=0.0)

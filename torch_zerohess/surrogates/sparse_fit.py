@@ -1,0 +1,285 @@
+"""Regression of a Jacobian of few entries per row on the changes of an output along many directions at once.
+
+    d_k = J u_k + e_k,   k = 1 ... K,   J [m, n] with at most `keep` entries per row
+
+K may be far below n. Each row is a regression of its own. Its support is found by `sparse_selection`. On the support
+the slopes J minimise
+
+    |d - A J|^2 + K |ridge (J - J')|^2 ,     A [K, keep] the columns of u,
+
+where J' are the previous slopes, or 0 for an entry that is new. Where an old entry is outside of the support it is 0.
+The ridges are those that predict held-out samples best. The support is found anew without each held-out part, so that
+the share of the change that is predicted there is honest.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, thresholds
+
+FEWEST_SAMPLES = 8
+"""That a fit needs."""
+_FOLDS = 4
+"""Parts of the samples that are held out in turn."""
+_ROUNDS = 3
+"""In which entries are found where no old ones are known."""
+_RIDGES = ((1e-4, 1e-4), (0.03, 0.03), (0.3, 0.1), (0.3, 0.3), (1.0, 0.3))
+"""Squares of the ridge of old and of new entries, in units of the samples."""
+_FEWEST, _BAND = 1024, 4
+"""Elements for the held-out test, at least about, in bands of so many rows of the image."""
+_BLOCK = 1 << 22
+"""Elements of A held at a time."""
+_DENSE_RIDGE = 1e-6
+"""Of the fit of least norm, in units of the mean square of the directions."""
+
+
+@dataclass(frozen=True)
+class SparseSettings:
+    """How rows are fitted."""
+
+    keep: int
+    """Entries of a row, at most."""
+    rate: float = 0.1
+    """Of false discoveries among the entries found in one round."""
+    grid: tuple[int, int, int] | None = None
+    """Rows, columns and channels of the parameters; None: they lie in no order."""
+    prune: bool = False
+    """Whether entries that are not significant beside the others of their row are left out in the end."""
+
+    @classmethod
+    def checked(cls, n: int, *, keep: int, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
+        """Check what a caller gave for n parameters; ValueError for a setting out of range."""
+        if not 1 <= keep <= n:
+            raise ValueError(f"keep must be between 1 and the number of parameters, {n}, got {keep}")
+        if not 0.0 < rate < 1.0:
+            raise ValueError(f"rate must be between 0 and 1, got {rate}")
+        if grid is None:
+            return cls(keep, rate)
+        if len(grid) not in (2, 3) or min(grid) < 1 or math.prod(grid) != n:
+            raise ValueError(f"grid must be rows and columns (and channels) of {n} parameters, got {grid}")
+        rows, columns, *channels = grid
+        return cls(keep, rate, (rows, columns, channels[0] if channels else 1))
+
+
+def check_samples(samples: int, keep: int) -> None:
+    """Raise ValueError for fewer samples than the kept entries and a constant need."""
+    least = max(FEWEST_SAMPLES, keep + 2)
+    if samples < least:
+        raise ValueError(f"samples must be at least {least} to fit {keep} parameters per output (keep), got {samples}")
+
+
+def fit_sparse(
+    u: Tensor,
+    changes: Tensor,
+    shape: torch.Size,
+    settings: SparseSettings,
+    previous: SparseJacobian | None = None,
+    weights: Tensor | None = None,
+) -> SparseJacobian:
+    """Fit the Jacobian of outputs of a shape [*out] to their changes [K, m] along directions u [K, n].
+
+    A constant is part of the fit, so changes need not be zero at u = 0. `weights` [K] multiply the squares of the
+    samples. The type and device of the result are those of u.
+    """
+    grids = Grids.of(shape, settings.grid)
+    before = SparseJacobian.empty(u.shape[1], shape, settings.keep, u) if previous is None else previous
+    ridges, explained, dense = _validated(u, changes, weights, grids, settings, before, previous is None)
+    u, d = _centered(u, changes, weights)
+    found = _fitted(u, d, grids, settings, before, ridges)
+    return replace(found, explained=explained, explained_dense=dense)
+
+
+def explained_by(jacobian: SparseJacobian, u: Tensor, changes: Tensor) -> float:
+    """Return the share of the changes [K, m] along u [K, n], less their mean, that a Jacobian predicts."""
+    u, d = _centered(u, changes, None)
+    rest = d - _predicted(jacobian.index, jacobian.values, u)
+    return 1.0 - float(rest.square().sum()) / max(float(d.square().sum()), torch.finfo(torch.float32).tiny)
+
+
+def _validated(
+    u: Tensor,
+    changes: Tensor,
+    weights: Tensor | None,
+    grids: Grids,
+    settings: SparseSettings,
+    previous: SparseJacobian,
+    first: bool,
+) -> tuple[tuple[float, float], float, float]:
+    """Return the ridges that predict held-out samples best, and the shares that they and a dense fit predict."""
+    part, inner = _subset(grids, len(changes[0]), changes.device)
+    d = changes[:, part]
+    before = replace(
+        previous, index=previous.index[part], values=previous.values[part], standard_error=previous.values[part]
+    )
+    fold = torch.arange(len(u), device=u.device) % _FOLDS
+    choices = _RIDGES[:3] if first else _RIDGES
+    rests, total, dense = [0.0] * len(choices), 0.0, 0.0
+    for number in range(_FOLDS):
+        kept, held = fold != number, fold == number
+        w = None if weights is None else weights[kept]
+        center, middle = _means(u[kept], w), _means(d[kept], w)
+        train = _centered(u[kept], d[kept], w)
+        v, e = u[held] - center, d[held] - middle
+        if weights is not None:
+            root = weights[held].sqrt()[:, None]
+            v, e = v * root, e * root
+        index, used = _support(*train, inner, settings, before)
+        for k, ridges in enumerate(choices):
+            values, _ = _slopes(*train, index, used, before, ridges)
+            rests[k] += float((e - _predicted(index, values, v)).square().sum())
+        total += float(e.square().sum())
+        if first:
+            dense += float((e - _least_norm(*train, v)).square().sum())
+    best = min(range(len(choices)), key=lambda k: rests[k])
+    if total == 0.0:
+        return choices[best], 0.0, 0.0
+    return choices[best], 1.0 - rests[best] / total, 1.0 - dense / total if first else 0.0
+
+
+def _fitted(
+    u: Tensor,
+    d: Tensor,
+    grids: Grids,
+    settings: SparseSettings,
+    previous: SparseJacobian,
+    ridges: tuple[float, float],
+) -> SparseJacobian:
+    index, used = _support(u, d, grids, settings, previous)
+    values, errors = _slopes(u, d, index, used, previous, ridges)
+    if settings.prune:
+        used = used & _significant(values, errors, used, len(u), settings.rate)
+        order = torch.argsort(used.byte(), dim=1, descending=True, stable=True)  # the used ones come first
+        index, used = index.gather(1, order), used.gather(1, order)
+        values, errors = _slopes(u, d, index, used, previous, ridges)
+    return replace(previous, index=index, values=values, standard_error=errors)
+
+
+def _significant(values: Tensor, errors: Tensor, used: Tensor, K: int, rate: float) -> Tensor:
+    """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries.
+
+    Student's t with K - 1 - s degrees of freedom, s entries of the row, becomes a normal number (Wallace 1959). The
+    threshold for its probability is that of Benjamini and Hochberg (1995).
+    """
+    nu = (K - 1 - used.sum(1, keepdim=True)).clamp_min(1).double()
+    t = values.double() / errors.double().clamp_min(torch.finfo(torch.float64).tiny)
+    z = (8 * nu + 1) / (8 * nu + 3) * (nu * torch.log1p(t.square() / nu)).sqrt()
+    chance = torch.erfc(z * math.sqrt(0.5))
+    ordered = chance[used].sort().values
+    fine = (ordered <= rate * torch.arange(1, len(ordered) + 1, device=z.device) / max(len(ordered), 1)).nonzero()
+    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
+
+
+def _support(
+    u: Tensor, d: Tensor, grids: Grids, settings: SparseSettings, previous: SparseJacobian
+) -> tuple[Tensor, Tensor]:
+    """Return the support: parameters [m, keep] and which of them are used.
+
+    What is found in one round is subtracted before the next, which then finds what is weaker.
+    """
+    m = d.shape[1]
+    index, values = previous.index, previous.values
+    used = values != 0
+    rounds = 1 if bool(used.any()) else _ROUNDS
+    for number in range(rounds):
+        rest = d - _predicted(index, values, u)
+        least = thresholds(u, rest, grids, settings.rate)
+        if number and least.own > 1.0 and least.joint > 1.0:
+            break
+        blocks = list(candidates(u, rest, grids, least))
+        row, column = used.nonzero(as_tuple=True)
+        parts = [(row, index[used], values[used].abs()), *blocks]
+        row, column, size = (torch.cat([one[k] for one in parts]) for k in range(3))
+        index, used = largest(row, column, size, m, settings.keep)
+        if number + 1 < rounds:
+            values, _ = _slopes(u, d, index, used, previous, _RIDGES[1])
+    return index, used
+
+
+def _slopes(
+    u: Tensor, d: Tensor, index: Tensor, used: Tensor, previous: SparseJacobian, ridges: tuple[float, float]
+) -> tuple[Tensor, Tensor]:
+    """Return slopes [m, keep] on a support and their standard errors, with the previous slopes as the prior."""
+    K, m = len(u), len(index)
+    rows, values = u.mT.contiguous(), torch.zeros_like(index, dtype=u.dtype)
+    errors = torch.zeros_like(values)
+    # Rows with few used entries have small systems: the used ones come first.
+    width = max(1, int(used.sum(1).max()))
+    size = max(1, _BLOCK // (K * width))
+    for first in range(0, m, size):
+        some = slice(first, first + size)
+        own, live = index[some, :width], used[some, :width]
+        same = (own[:, :, None] == previous.index[some][:, None]) & (previous.values[some] != 0)[:, None]
+        old = (same * previous.values[some][:, None]).sum(2) * live
+        A = rows[own] * live[:, :, None]  # [b, width, K]
+        prior = torch.where(old != 0, ridges[0], ridges[1]) * K * _scale(u, own)
+        gram = A @ A.mT
+        gram.diagonal(dim1=1, dim2=2).add_(prior)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
+        target = d[:, some].mT - (A * old[:, :, None]).sum(1)
+        change = (inverse @ (A @ target[:, :, None]))[..., 0]
+        values[some, :width] = (old + change) * live
+        left = target - (A * change[:, :, None]).sum(1)
+        own_part = inverse.diagonal(dim1=1, dim2=2)
+        spent = ((1.0 - own_part * prior) * live).sum(1).clamp_min(0.0)
+        variance = left.square().sum(1) / (K - 1 - spent).clamp_min(1.0)
+        shortened = (inverse @ (prior * change)[:, :, None])[..., 0]  # by the ridge
+        square = variance[:, None] * own_part.clamp_min(0.0) + shortened.square()
+        errors[some, :width] = square.sqrt() * live
+    return values, errors
+
+
+def _scale(u: Tensor, own: Tensor) -> Tensor:
+    """Mean squares of the directions along parameters."""
+    return u.square().mean(0).clamp_min(torch.finfo(u.dtype).tiny)[own]
+
+
+def _predicted(index: Tensor, values: Tensor, u: Tensor) -> Tensor:
+    """Return the changes [K, m] along u [K, n] that slopes predict."""
+    K, m, rows = len(u), len(index), u.mT.contiguous()
+    live = values != 0
+    if not bool(live.any()):
+        return u.new_zeros(K, m)
+    width = int(live.any(0).nonzero()[-1]) + 1
+    size = max(1, _BLOCK // (K * width))
+    parts = [
+        (rows[index[first : first + size, :width]] * values[first : first + size, :width, None]).sum(1)
+        for first in range(0, m, size)
+    ]
+    return torch.cat(parts).mT.contiguous()
+
+
+def _least_norm(u: Tensor, d: Tensor, v: Tensor) -> Tensor:
+    """Return the changes along v [H, n] that the Jacobian of least norm with the changes d along u predicts."""
+    gram = u @ u.mT
+    gram.diagonal().add_(_DENSE_RIDGE * float(gram.diagonal().mean()) or 1.0)
+    return (v @ u.mT) @ torch.linalg.solve(gram, d)
+
+
+def _subset(grids: Grids, m: int, device: torch.device) -> tuple[Tensor, Grids]:
+    """Return elements in evenly spaced bands of the image, and how these lie."""
+    rows, row = grids.pixels[0], grids.row
+    bands = -(-_FEWEST // (row * _BAND))
+    every = torch.arange(rows, device=device)
+    if bands * _BAND < rows:
+        starts = torch.linspace(0, rows - _BAND, bands, device=device).long()
+        every = (starts[:, None] + torch.arange(_BAND, device=device)).flatten().unique()
+    part = (every[:, None] * row + torch.arange(row, device=device)).flatten()
+    return part, Grids((len(every), *grids.pixels[1:]), grids.parameters)
+
+
+def _means(columns: Tensor, weights: Tensor | None) -> Tensor:
+    return columns.mean(0) if weights is None else (weights @ columns) / weights.sum()
+
+
+def _centered(u: Tensor, d: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Subtract the means of the columns; with weights, multiply rows by their roots."""
+    u, d = u - _means(u, weights), (d - _means(d, weights)).to(u)
+    if weights is None:
+        return u, d
+    root = (weights * (len(weights) / weights.sum())).sqrt()[:, None]
+    return u * root, d * root

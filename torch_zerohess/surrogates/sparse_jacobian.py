@@ -1,0 +1,95 @@
+"""The Jacobian of an output whose elements depend on few parameters each: `keep` entries per element."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class SparseJacobian:
+    """The `keep` largest entries of every row of a Jacobian [*out, n], in the type of `values`.
+
+    m is the number of elements of the output. An entry that is not used has the value 0 and the standard error 0.
+
+    Example:
+        >>> index, values = torch.tensor([[0, 3], [2, 0]]), torch.tensor([[1.0, 2.0], [5.0, 0.0]])
+        >>> J = SparseJacobian(index, values, torch.zeros(2, 2), 4, torch.Size([2]))
+        >>> J.matvec(torch.ones(4)).tolist(), J.rmatvec(torch.ones(2)).tolist()
+        ([3.0, 5.0], [1.0, 0.0, 5.0, 2.0])
+        >>> J.untouched.tolist()
+        [False, True, False, False]
+    """
+
+    index: Tensor
+    """Parameters [m, keep], int64."""
+    values: Tensor
+    """Slopes [m, keep]."""
+    standard_error: Tensor
+    """Of the slopes [m, keep]. The support is taken as given: an entry that was not found has no error here."""
+    n: int
+    """Parameters."""
+    shape: torch.Size
+    """Of the output, [*out]."""
+    explained: float = 0.0
+    """Share of the change of held-out outputs that is predicted: 1 is all of it, 0 or less is nothing."""
+    explained_dense: float = 0.0
+    """The same for the Jacobian of least norm, which has n entries per row, from the same samples."""
+    evaluations: int = 0
+    """Of the black box, for this Jacobian."""
+
+    @classmethod
+    def empty(cls, n: int, shape: Sequence[int], keep: int, like: Tensor) -> "SparseJacobian":
+        """Return a Jacobian without entries, in the type and on the device of `like`."""
+        size = torch.Size(shape)
+        none = like.new_zeros(size.numel(), keep)
+        return cls(none.long(), none, none.clone(), n, size)
+
+    def to(self, like: Tensor) -> "SparseJacobian":
+        """Return the same in the type and on the device of `like`."""
+        return replace(
+            self,
+            index=self.index.to(like.device),
+            values=self.values.to(like),
+            standard_error=self.standard_error.to(like),
+        )
+
+    @property
+    def found(self) -> Tensor:
+        """Which entries are used, [m, keep]."""
+        return self.values != 0
+
+    @property
+    def untouched(self) -> Tensor:
+        """Which parameters no element of the output was found to depend on, [n]."""
+        seen = torch.zeros(self.n, dtype=torch.bool, device=self.values.device)
+        seen[self.index[self.found]] = True
+        return ~seen
+
+    def matvec(self, v: Tensor) -> Tensor:
+        """Return J v [*out] for v [n], in the type of v."""
+        self._check("v", v, torch.Size([self.n]))
+        return (self.values.to(v) * v[self.index]).sum(1).view(self.shape)
+
+    def rmatvec(self, w: Tensor) -> Tensor:
+        """Return J^T w [n] for w [*out], in the type of w."""
+        self._check("w", w, self.shape)
+        products = self.values.to(w) * w.reshape(-1, 1)
+        return w.new_zeros(self.n).index_add_(0, self.index.flatten(), products.flatten())
+
+    def dense(self) -> Tensor:
+        """Return the Jacobian as a tensor [*out, n], m n numbers."""
+        whole = self.values.new_zeros(len(self.values), self.n)
+        return whole.scatter_add_(1, self.index, self.values).view(*self.shape, self.n)
+
+    def __repr__(self) -> str:
+        left = int(self.untouched.sum())
+        return (
+            f"SparseJacobian(shape={[*self.shape, self.n]}, entries={int(self.found.sum())}, "
+            f"explained={self.explained:.3g}, untouched={left} of {self.n} parameters)"
+        )
+
+    def _check(self, name: str, vector: Tensor, shape: torch.Size) -> None:
+        if vector.shape != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, got {list(vector.shape)}")

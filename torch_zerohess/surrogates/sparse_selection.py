@@ -1,0 +1,178 @@
+"""Which parameters an element of an output depends on: correlations that chance does not give.
+
+K directions u [K, n] of all parameters at once and the changes d [K, m] of the outputs along them have the correlations
+r [m, n]. Where an output does not depend on a parameter, r^2 is about 1/K, and the same for every such pair. So the
+largest r^2 that chance gives are those of a decoy: the directions moved on by one sample, which no output depends on.
+An r^2 counts from the threshold t on at which
+
+    (1 + number of decoys with r^2 >= t) / number of pairs with r^2 >= t  <=  rate,
+
+an estimate of the share of false discoveries among them (Barber and Candes 2015, with a decoy for the knockoff).
+
+Neighbouring pixels often depend on the same parameters, or on neighbouring ones. So the mean of r^2 over 3x3 pixels,
+and over 3x3 parameters if these lie on a grid, is a second statistic, with a decoy and a threshold of its own.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_BLOCK = 1 << 20
+"""Correlations held at a time."""
+_COUNTED = 1 << 20
+"""Correlations from which thresholds are taken, at most about."""
+_LEAST_OWN, _LEAST_JOINT = 4.0, 1.25
+"""Least thresholds, in units of the 1/K that chance gives on average."""
+_BINS = 2048
+"""Of the histograms of r^2 between 0 and 1."""
+
+
+@dataclass(frozen=True)
+class Grids:
+    """How the elements of an output, and the parameters, lie beside each other: rows, columns, channels of each."""
+
+    pixels: tuple[int, int, int]
+    parameters: tuple[int, int, int] | None = None
+
+    @classmethod
+    def of(cls, shape: torch.Size, parameters: tuple[int, int, int] | None) -> "Grids":
+        """Take outputs [h, w] and [h, w, c] as images with up to four channels, all others as numbers in no order."""
+        if len(shape) == 2 or (len(shape) == 3 and shape[2] <= 4):
+            return cls((shape[0], shape[1], shape[2] if len(shape) == 3 else 1), parameters)
+        return cls((shape.numel(), 1, 1), parameters)
+
+    @property
+    def joint(self) -> bool:
+        """Whether pixels or parameters have neighbours."""
+        return self.pixels[1] > 1 or self.parameters is not None
+
+    @property
+    def row(self) -> int:
+        """Elements of a row of the image."""
+        return self.pixels[1] * self.pixels[2]
+
+    def mean(self, squares: Tensor) -> Tensor:
+        """Return the mean over neighbours of whole rows of the image, [b, n]."""
+        whole = squares.view(-1, *self.pixels[1:], *(self.parameters or (1, squares.shape[1], 1)))
+        if self.pixels[1] > 1:
+            whole = _of_three(_of_three(whole, 0), 1)
+        if self.parameters is not None:
+            whole = _of_three(_of_three(whole, 3), 4)
+        return whole.view_as(squares)
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Least r^2 that counts: of a pair, and of the mean over its neighbours. Above 1: none does."""
+
+    own: float
+    joint: float
+
+
+def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds:
+    """Return the thresholds at a rate of false discoveries, from evenly spaced rows of the image if there are many.
+
+    u: [K, n], rest: [K, m], both of columns with mean 0.
+    """
+    K, n = u.shape
+    directions, decoys = _normalized(u), _normalized(u.roll(1, 0))
+    counts = [torch.zeros(_BINS, dtype=torch.float64) for _ in range(4)]
+    blocks = list(_blocks(grids, n))
+    for first, last in blocks[:: max(1, round(grids.pixels[0] * grids.row * n / _COUNTED))]:
+        changes = _normalized(rest[:, first * grids.row : last * grids.row])
+        for which, one in enumerate((directions, decoys)):
+            squares = (changes.mT @ one).square_()
+            counts[which] += _histogram(squares, _LEAST_OWN / K)
+            if grids.joint:
+                counts[2 + which] += _histogram(grids.mean(squares), _LEAST_JOINT / K)
+    own, joint = (_threshold(counts[k], counts[k + 1], rate) for k in (0, 2))
+    return Thresholds(own, joint)
+
+
+def candidates(u: Tensor, rest: Tensor, grids: Grids, least: Thresholds) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield element, parameter and size of the pairs that count, block by block in the order of the elements.
+
+    The size is the slope that the correlation stands for, |sum u d| / sum u^2.
+    """
+    n, row = u.shape[1], grids.row
+    directions, lengths = _normalized(u), u.norm(dim=0)
+    for first, last in _blocks(grids, n):
+        low = max(0, first - 1) if grids.joint else first
+        high = min(grids.pixels[0], last + 1) if grids.joint else last
+        part = rest[:, low * row : high * row]
+        squares = (_normalized(part).mT @ directions).square_()
+        inner = slice((first - low) * row, (last - low) * row)
+        counts = squares[inner] >= least.own
+        strength = squares[inner]
+        if grids.joint and least.joint <= 1.0:
+            mean = grids.mean(squares)[inner]
+            near = mean >= least.joint
+            strength = torch.where(counts, strength, torch.zeros_like(strength))
+            strength = torch.maximum(strength, torch.where(near, mean, torch.zeros_like(mean)))
+            counts = counts | near
+        element, parameter = counts.nonzero(as_tuple=True)
+        size = strength[element, parameter].sqrt() * part.norm(dim=0)[inner][element]
+        yield element + first * row, parameter, size / lengths[parameter].clamp_min(torch.finfo(u.dtype).tiny)
+
+
+def largest(row: Tensor, column: Tensor, size: Tensor, m: int, keep: int) -> tuple[Tensor, Tensor]:
+    """Return the `keep` largest of the entries of each of m rows: columns [m, keep] and which of them exist.
+
+    An entry that is given several times counts once, with its sizes added.
+    """
+    span = int(column.max()) + 1 if len(column) else 1
+    pair, where = torch.unique(row * span + column, return_inverse=True)
+    size = size.new_zeros(len(pair)).index_add_(0, where, size)
+    row, column = pair // span, pair % span
+    order = torch.argsort(size, descending=True, stable=True)
+    order = order[torch.argsort(row[order], stable=True)]
+    row, column = row[order], column[order]
+    count = torch.bincount(row, minlength=m)
+    place = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count)[row]
+    kept = place < keep
+    index = row.new_zeros(m, keep)
+    used = torch.zeros(m, keep, dtype=torch.bool, device=row.device)
+    index[row[kept], place[kept]] = column[kept]
+    used[row[kept], place[kept]] = True
+    return index, used
+
+
+def _blocks(grids: Grids, n: int) -> Iterator[tuple[int, int]]:
+    """First and last row of the image, exclusive, of blocks that fit the memory."""
+    rows = grids.pixels[0]
+    size = max(1, _BLOCK // (n * grids.row))
+    for first in range(0, rows, size):
+        yield first, min(rows, first + size)
+
+
+def _normalized(columns: Tensor) -> Tensor:
+    return columns / columns.norm(dim=0).clamp_min(torch.finfo(columns.dtype).tiny)
+
+
+def _histogram(squares: Tensor, least: float) -> Tensor:
+    high = squares[squares >= least]
+    bins = (high * _BINS).long().clamp_(0, _BINS - 1)
+    return torch.bincount(bins, minlength=_BINS).double().cpu()
+
+
+def _threshold(found: Tensor, decoys: Tensor, rate: float) -> float:
+    """Return the least r^2 from which on the estimated share of false discoveries is at most the rate; else 2."""
+    above, false = (one.flip(0).cumsum(0).flip(0) for one in (found, decoys))
+    fine = (1.0 + false) <= rate * above
+    return float(fine.nonzero()[0]) / _BINS if bool(fine.any()) else 2.0
+
+
+def _of_three(values: Tensor, dim: int) -> Tensor:
+    """Mean of each entry and its neighbours along a dimension."""
+    length = values.shape[dim]
+    if length == 1:
+        return values
+    total = values.clone()
+    total.narrow(dim, 1, length - 1).add_(values.narrow(dim, 0, length - 1))
+    total.narrow(dim, 0, length - 1).add_(values.narrow(dim, 1, length - 1))
+    total.div_(3.0)
+    for end in (0, length - 1):
+        total.narrow(dim, end, 1).mul_(1.5)
+    return total

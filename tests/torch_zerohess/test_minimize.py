@@ -298,7 +298,7 @@ def test_values_that_are_not_finite_on_the_way():
     assert float(fit.x[0]) <= 2.0
     assert fit.value < 2.0  # 11.2 at the start, 1.4 at best
     only = zh.minimize(lambda z: torch.where(z.square().sum(1) > 0, math.nan, bowl(z)), zeros(), sigma=2.0, seed=0)
-    assert only.message.endswith("in round 11")
+    assert "10 batches in a row had values that are not finite" in only.message
     assert torch.equal(only.x, zeros())
 
 

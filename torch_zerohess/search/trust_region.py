@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.descent_search import descent_method
 from torch_zerohess.search.gaussian_process_search import process_method
 from torch_zerohess.search.protocol import AskTell, Method, Settings
 from torch_zerohess.search.space import Bounds
@@ -87,7 +87,7 @@ class TrustRegion(AskTell[Any]):
 
     def _make(self, settings: Settings) -> Method[Any]:
         engine, self.reason = _chosen(settings) if self._wanted == "auto" else (self._wanted, "the caller chose it")
-        return LocalQuadratics(settings) if engine == "descent" else process_method(settings)
+        return descent_method(settings) if engine == "descent" else process_method(settings)
 
 
 def _chosen(settings: Settings) -> tuple[str, str]:

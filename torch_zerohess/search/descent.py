@@ -146,6 +146,8 @@ class LocalQuadratics(Method[DescentProgress]):
     ) -> DescentProgress:
         """End, or start another round: at a random point and around the best one in turn."""
         settings, rounds = self.settings, known.rounds + 1
+        if known.refused < _REFUSED and known.sigma < settings.tolerance:
+            known = replace(known, arrived=min(known.arrived, known.lowest.loss))
         if last or rounds > settings.restarts:
             return replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
         center = known.best.point

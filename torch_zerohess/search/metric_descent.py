@@ -147,6 +147,13 @@ class MetricQuadratics(Method[MetricProgress]):
         u, values = (known.points[near] - best.point) / sigma, known.values[near]
         return fit_values(u, values, torch.ones_like(values)), sigma
 
+    def promise(self, known: MetricProgress) -> float:
+        inner = known.wide is None and known.phase == "trial" and known.length < _LONG
+        return known.promised if inner else math.inf
+
+    def width(self, known: MetricProgress) -> Tensor:
+        return known.sigma * known.root.norm(dim=0)
+
     # Rounds.
 
     def _begun(self, best: Best) -> MetricProgress:
@@ -196,6 +203,11 @@ class MetricQuadratics(Method[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """End, or start another round at a random point."""
         settings, rounds = self.settings, known.rounds + 1
+        if known.lost < _LOST:
+            at_best = float((known.lowest.point - known.best.point).norm()) < settings.tolerance
+            lower = known.lowest.loss < known.arrived - settings.tolerance * abs(known.arrived)
+            agreed = (1 if lower else known.agreed + 1) if at_best else 0
+            known = replace(known, arrived=min(known.arrived, known.lowest.loss), agreed=agreed)
         if last or rounds > settings.restarts:
             known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
             return known, known.points[:0]
@@ -208,6 +220,8 @@ class MetricQuadratics(Method[MetricProgress]):
             self._begun(Best(center)),
             best=known.best,
             rounds=rounds,
+            arrived=known.arrived,
+            agreed=known.agreed,
             evaluations=known.evaluations,
             iterations=known.iterations,
         )
@@ -220,12 +234,13 @@ class MetricQuadratics(Method[MetricProgress]):
         pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
         wide = self._wide.go_on(pool, known.lowest, 1.0)
         wide = replace(wide, first=known.first, best=known.best, rounds=known.rounds, evaluations=known.evaluations)
+        wide = replace(wide, arrived=known.arrived)
         wide = wide.sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
     def _widely(self, known: MetricProgress, wide: object, points: Tensor) -> tuple[MetricProgress, Tensor]:
         assert wide is not None
-        names = ("best", "center", "sigma", "evaluations", "iterations", "rounds", "done", "message")
+        names = ("best", "center", "sigma", "evaluations", "iterations", "rounds", "arrived", "done", "message")
         return replace(known, wide=wide, **{name: getattr(wide, name) for name in names}), points
 
     # Models and steps.

@@ -1,6 +1,6 @@
 """The door to the searches: chooses one by the number of parameters and their bounds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from torch import Tensor
@@ -58,9 +58,9 @@ class TrustRegion(AskTell[Any]):
 
     def __init__(
         self,
-        x0: Tensor,
+        x0: Tensor | Sequence[float],
         *,
-        sigma: float | Tensor,
+        sigma: float | Tensor | Sequence[float],
         bounds: Bounds | None = None,
         loss: Callable[[Tensor], Tensor] | None = None,
         engine: Engine = "auto",

@@ -129,23 +129,24 @@ def minimize(
             return "solved", f"the region is within xtol ({xtol}) of x"
         if ftol is not None and search.promise <= ftol:
             return "solved", f"the model promises a decrease of at most ftol ({ftol})"
+        if search.solved and (xtol, ftol) != (None, None):
+            return "solved", "the search has arrived at x, within xtol and ftol"
         if restarts is None and search.agreed >= _AGREED:
             return "solved", f"{search.agreed} rounds in a row have arrived at x"
         if search.evaluations >= max_evaluations:
             return "budget", f"max_evaluations ({max_evaluations}) used up"
-        if time_limit is not None and running.seconds > time_limit:
+        if time_limit is not None and running.history and running.seconds > time_limit:
             return "time", f"time_limit ({time_limit} s) used up"
         return None
 
-    end = ended()
     try:
-        while end is None:
+        while (end := ended()) is None:
             points = search.ask(max_evaluations - search.evaluations)
             search.tell(call(points.clone(), ()))
             iterate = running.noted(points)
-            end = ended()
-            if callback is not None and _is_true(callback(iterate)) and end is None:
+            if callback is not None and _is_true(callback(iterate)) and ended() is None:
                 end = "callback", "the callback asked to end"
+                break
     except KeyboardInterrupt:
         if not running.history:
             raise

@@ -146,7 +146,9 @@ def read(path: Path) -> dict[Job, Reached]:
         return {}
     with path.open(newline="") as file:
         return {
-            Job(*map(int, row[:4]), row[4], int(row[5])): Reached(tuple(map(int, row[7].split())), float(row[6]))
+            Job(int(row[0]), int(row[1]), int(row[2]), int(row[3]), row[4], int(row[5])): Reached(
+                tuple(map(int, row[7].split())), float(row[6])
+            )
             for row in csv.reader(file)
             if row[0] != "n"
         }

@@ -32,30 +32,30 @@ def learned(root: Tensor, hessian: Tensor, rate: float, floor: float = 0.0) -> T
 def region_step(gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """Return s [n] that minimises gradient.s + s.hessian s/2 within |B^-1 s| <= 1 and lower <= s <= upper.
 
-    Parameters that hit a bound stay there, and the others get a new step in what is left of the region. Which ones hit
-    is a guess, and the region is left by a little where bounds cut it obliquely.
+    The parameter that is farthest beyond a bound stays there, and the others get a new step in what is left of the
+    region, until none is beyond. Which ones hit is a guess.
     """
     s = root @ ball_step(root.mT @ gradient, root.mT @ hessian @ root, 1.0)
-    hit = (s < lower) | (s > upper)
-    if not bool(hit.any()):
+    beyond = torch.maximum(lower - s, s - upper)
+    if float(beyond.max()) <= 0.0:
         return s
     inverse = torch.linalg.inv(root)
     metric = inverse.mT @ inverse
-    fixed = torch.zeros_like(hit)
-    while bool(hit.any()):
-        s = s.clamp(lower, upper)
-        fixed |= hit
-        free = ~fixed
+    free = torch.ones_like(s, dtype=torch.bool)
+    fixed = torch.zeros_like(s)
+    while float(beyond.max()) > 0.0:
+        k = int(beyond.argmax())
+        fixed[k] = s[k].clamp(lower[k], upper[k])
+        free[k] = False
+        s = fixed.clone()
         if not bool(free.any()):
             break
-        left = 1.0 - float(s[fixed] @ metric[fixed][:, fixed] @ s[fixed])
-        if left <= 0.0:
-            s = torch.where(free, 0.0, s)
-            break
-        inner = gradient[free] + hessian[free][:, fixed] @ s[fixed]
-        factor = torch.linalg.cholesky(metric[free][:, free])
-        own = torch.linalg.inv(factor).mT
-        s = s.clone()
-        s[free] = own @ ball_step(own.mT @ inner, own.mT @ hessian[free][:, free] @ own, left**0.5)
-        hit = free & ((s < lower) | (s > upper))
+        own = torch.linalg.inv(torch.linalg.cholesky(metric[free][:, free])).mT
+        middle = -own @ (own.mT @ (metric[free] @ fixed))  # the nearest point of the metric's ball, given the fixed
+        s[free] = middle
+        left = 1.0 - float(s @ metric @ s)
+        if left > 0.0:
+            inner = gradient[free] + hessian[free] @ s
+            s[free] = middle + own @ ball_step(own.mT @ inner, own.mT @ hessian[free][:, free] @ own, left**0.5)
+        beyond = torch.where(free, torch.maximum(lower - s, s - upper), 0.0)
     return s.clamp(lower, upper)

@@ -28,7 +28,7 @@ _WIDTH = 0.3
 _PATIENCE, _QUADRATIC_PATIENCE = 3, 5
 """Evaluations over n + 1 in which the process, and the quadratics, must find something better: a curved valley refuses
 several steps in a row."""
-_TURN = 8
+_TURN = 16
 """Evaluations over n + 1 after which it is the turn of the quadratics although the process finds better points."""
 
 

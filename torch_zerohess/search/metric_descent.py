@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.draws import normal, reflect, uniform
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.protocol import Method, Settings
@@ -238,8 +239,8 @@ class MetricQuadratics(Method[MetricProgress]):
         wide = wide.sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
-    def _widely(self, known: MetricProgress, wide: object, points: Tensor) -> tuple[MetricProgress, Tensor]:
-        assert wide is not None
+    def _widely(self, known: MetricProgress, wide: DescentProgress, points: Tensor) -> tuple[MetricProgress, Tensor]:
+        """Return what isotropic quadratics know, and their points."""
         names = ("best", "center", "sigma", "evaluations", "iterations", "rounds", "arrived", "done", "message")
         return replace(known, wide=wide, **{name: getattr(wide, name) for name in names}), points
 

@@ -1,6 +1,7 @@
 """The parameters of a search: their bounds and type, and the units of sigma in which every search works."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,9 +25,7 @@ class Space:
     upper: Tensor
 
     @classmethod
-    def checked(
-        cls, x0: Tensor, sigma: float | Tensor, bounds: tuple[float | Tensor, float | Tensor] | None
-    ) -> "Space":
+    def checked(cls, x0: Tensor, sigma: float | Tensor | Sequence[float], bounds: Bounds | None) -> "Space":
         """Check what a caller gave. ValueError for a wrong shape or type, or a number out of range."""
         return cls(x0.detach().clone(), _unit(sigma, x0), *_bounds(bounds, x0))
 
@@ -60,7 +59,7 @@ def checked_start(x0: Any) -> Tensor:
     return x0
 
 
-def _unit(sigma: float | Tensor, x0: Tensor) -> Tensor:
+def _unit(sigma: float | Tensor | Sequence[float], x0: Tensor) -> Tensor:
     """Return sigma as float64 [n]."""
     unit = torch.as_tensor(sigma, dtype=torch.float64, device=x0.device).detach()
     if unit.shape not in ((), x0.shape) or not bool((torch.isfinite(unit) & (unit > 0)).all()):
@@ -115,8 +114,8 @@ def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
         return columns[0], columns[1]
     if pairs and n == 2 and _in_order(*bounds) and _in_order(*columns):
         raise ValueError(
-            f"bounds of 2 parameters must be (lower, upper) as tensors, or a list of tuples (lower, upper), got {bounds}, "
-            f"which may mean lower = {columns[0]} or lower = {list(bounds[0])}"
+            f"bounds of 2 parameters must be (lower, upper) as tensors, or a list of tuples, got {bounds}, "
+            f"meaning lower = {columns[0]} or lower = {list(bounds[0])}"
         )
     if pairs and (n != 2 or not _in_order(*bounds)):
         return columns[0], columns[1]

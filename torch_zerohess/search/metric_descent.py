@@ -43,6 +43,8 @@ _GROWTH, _SHRINKING = 2.0, 0.6
 """Factors for sigma after a good long step and after a refused one."""
 _STILL, _CLOSING = 1e-3, 0.3
 """Length of a step that is not worth an evaluation, and the factor for sigma after it."""
+_LEAPING, _CONFIRMED = 1e-3, 0.1
+"""The same where a point of the region was as predicted, within this part of its difference from the best point."""
 _CLOSE, _NEAR = 1.5, 2.0
 """Distance within which n + 1 evaluations allow sigma to shrink after a refused step, and after one of no length."""
 _RATE, _FIRST_RATE = 0.3, 0.7
@@ -91,8 +93,10 @@ class MetricQuadratics(Method[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         if known.wide is not None:
             return self._widely(known, *self._wide.next(known.wide, evaluated, generator))
-        before = known.lowest.loss
+        before, missed = known.lowest.loss, float(evaluated.losses[0]) - known.expected
         known = known.remembered(evaluated, self._capacity)
+        risen = known.expected + missed - before
+        known = replace(known, confirmed=known.phase == "geometry" and abs(missed) <= _CONFIRMED * abs(risen))
         if known.lost >= _LOST:
             reason = f"{_LOST} batches in a row had values that are not finite"
             return self._arrived(known, reason, generator, last=known.rounds == 0)
@@ -126,9 +130,9 @@ class MetricQuadratics(Method[MetricProgress]):
                 end = (x + s).clamp(settings.lower, settings.upper)
                 root = self._learned(known, count)
                 return replace(known, root=root, phase="trial", promised=promised, length=length), end[None]
-            if int((known.scaled.norm(dim=1) <= _NEAR).sum()) <= n:
+            if not known.confirmed and int((known.scaled.norm(dim=1) <= _NEAR).sum()) <= n:
                 return self._geometry(known, torch.nn.functional.normalize(normal(generator, x, n), dim=0), generator)
-            known = replace(known, sigma=_CLOSING * known.sigma)
+            known = replace(known, sigma=(_LEAPING if known.confirmed else _CLOSING) * known.sigma, confirmed=False)
         reason = f"sigma fell below {self._finest:g} of the first one"
         return self._arrived(known, reason, generator)
 
@@ -265,7 +269,10 @@ class MetricQuadratics(Method[MetricProgress]):
         """Ask for a point of the region in a direction u [n] or its opposite."""
         step = known.sigma * (known.root @ direction)
         step = -step if float(torch.rand((), generator=generator)) < 0.5 else step
-        return replace(known, phase="geometry"), self._inside((known.lowest.point + step)[None])
+        x = self._inside((known.lowest.point + step)[None])
+        step = x[0] - known.lowest.point
+        expected = known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))
+        return replace(known, phase="geometry", expected=expected), x
 
     def _modelled(self, known: MetricProgress) -> tuple[MetricProgress, int]:
         """Fit a quadratic to the nearest evaluations; return how many they are."""

@@ -1,5 +1,6 @@
 """What a descent in a learned metric knows between two evaluations."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -36,6 +37,10 @@ class MetricProgress(Progress):
     """Decrease that the model promises at the end of the step."""
     length: float = 0.0
     """Of the step, in units of the region."""
+    expected: float = math.inf
+    """Loss that the model predicts at a point for the model."""
+    confirmed: bool = False
+    """Whether the last such point was as predicted."""
     refused: int = 0
     """Steps in a row that were refused."""
     tied: int = 0

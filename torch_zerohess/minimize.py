@@ -139,8 +139,13 @@ def minimize(
             return "time", f"time_limit ({time_limit} s) used up"
         return None
 
+    end: tuple[Status, str]
     try:
-        while (end := ended()) is None:
+        while True:
+            reached = ended()
+            if reached is not None:
+                end = reached
+                break
             points = search.ask(max_evaluations - search.evaluations)
             search.tell(call(points.clone(), ()))
             iterate = running.noted(points)

@@ -32,6 +32,7 @@ class Descent(AskTell[Any]):
     order; evaluations are re-used as in derivative-free least squares (Cartis et al. 2019) and COBYQA.
 
     Example:
+        >>> import torch
         >>> search = Descent(torch.tensor([900.0, 850.0]), sigma=500.0, seed=0, restarts=0)
         >>> while search.evaluations < 9:
         ...     z = search.ask()

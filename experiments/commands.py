@@ -49,6 +49,9 @@ COMMANDS = {
         "experiments.studies.gradients:gradients", "derivatives by the renderer and by sampling", long=True
     ),
     "robustness": Command("experiments.studies.robustness:robustness", "other starts, samples and noise", long=True),
+    "optimizers": Command(
+        "experiments.studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True
+    ),
     "gallery": Command("experiments.studies.gallery:gallery", "pictures and animations of all tasks", long=True),
     "caustic": Command("experiments.studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),
     "bench": Command(

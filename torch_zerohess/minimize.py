@@ -1,62 +1,54 @@
 """Minimise a plain function from a start, without a torch model: `TrustRegion` with its evaluations done for you."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import difflib
+import inspect
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.evaluation import BlackBoxCall
-from torch_zerohess.estimation.inputs import checked_input, short, working
+from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.optim.second_order import check_count
-from torch_zerohess.search.space import Bounds
+from torch_zerohess.search.minimum import Iterate, Minimum, Status
+from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 
+__all__ = ["Iterate", "Minimum", "minimize"]
 
-@dataclass(frozen=True)
-class Iterate:
-    """State after a batch of evaluations: how many there were, the best value so far, and where."""
-
-    evaluations: int
-    value: float
-    x: Tensor
-
-
-@dataclass(frozen=True, repr=False)
-class Minimum:
-    """The best point found, and the smoothed function around it.
-
-    `gradient` [n] and `hessian` [n, n] come from the last quadratic model around x, of width `sigma`. They are on the
-    device and in the type of x. `standard_errors` has their errors by the names "gradient" and "hessian_diagonal",
-    infinite where the evaluations do not tell. All three are None if too few evaluations lie around x.
-    """
-
-    x: Tensor
-    value: float
-    gradient: Tensor | None
-    hessian: Tensor | None
-    standard_errors: dict[str, Tensor] | None
-    sigma: Tensor
-    """Width of the model per parameter [n]."""
-    evaluations: int
-    history: list[Iterate]
-    message: str
-    """Why the search ended."""
-    engine: str
-    """Which search it was: "gaussian_process", "descent" or "local"."""
-
-    def __repr__(self) -> str:
-        found = f"x={short(self.x)}, value={self.value:.6g}, evaluations={self.evaluations}"
-        return f"Minimum({found}, engine={self.engine!r}, message={self.message!r})"
+_AGREED = 3
+"""Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
+_PAUSE = 1.0
+"""Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
+_OTHER_NAMES = {
+    "maxiter": "max_evaluations",
+    "max_iter": "max_evaluations",
+    "maxfev": "max_evaluations",
+    "maxfun": "max_evaluations",
+    "budget": "max_evaluations",
+    "tol": "tolerance, xtol or ftol",
+    "disp": "verbose",
+    "args": "a closure: lambda x: fn(x, ...)",
+    "jac": "nothing: fn is not differentiated",
+    "method": "engine",
+    "options": "keyword arguments",
+}
+"""What other optimizers call it."""
 
 
 def minimize(
     fn: Callable[[Tensor], Any],
-    x0: Tensor,
+    x0: Tensor | Sequence[float],
     *,
-    sigma: float | Tensor,
+    sigma: float | Tensor | Sequence[float],
     loss: Callable[[Tensor], Tensor] | None = None,
     bounds: Bounds | None = None,
     max_evaluations: int = 1000,
@@ -65,20 +57,26 @@ def minimize(
     evaluator: Evaluator | None = None,
     workers: int | None = None,
     callback: Callable[[Iterate], object] | None = None,
+    verbose: bool = False,
     seed: int | None = None,
     target: float | None = None,
+    xtol: float | None = None,
+    ftol: float | None = None,
+    time_limit: float | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    restarts: int | None = None,
     **settings: Any,
 ) -> Minimum:
     """Minimise fn from x0 with `optim.TrustRegion`.
 
     Args:
-        fn: [K, n] -> [K], the loss; or, with `loss`, -> [K, *out], an image or another output. NumPy and anything else
-            that cannot be differentiated is fine.
-        x0: start [n], float32 or float64.
+        fn: [K, n] -> [K] or [K, 1], the loss; or, with `loss`, -> [K, *out], an image or another output. NumPy and
+            anything else that cannot be differentiated is fine.
+        x0: start [n]: a tensor, a NumPy array, a list or a tuple.
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution.
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
             there is one, give it: each evaluation then tells as many equations as the output has numbers.
-        bounds: lower and upper, numbers or [n].
+        bounds: (lower, upper), numbers or [n] or None; a list of n tuples (lower, upper); or `scipy.optimize.Bounds`.
         max_evaluations: points that fn may be called with.
         engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
             and, for an output of 20 parameters or more, by the first evaluations.
@@ -87,92 +85,186 @@ def minimize(
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
             does not depend on their number. A point that no process survives has the value NaN.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
+        verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this.
-        settings: further ones of `TrustRegion`: restarts, tolerance, noise, pool, grid.
+        xtol: the search ends when its region is within this of the best point in every parameter.
+        ftol: the search ends when its model, where it holds, promises a decrease of at most this.
+        time_limit: seconds after which no further batch is evaluated.
+        checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
+            from it: the function and all settings must be the same.
+        restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
+            up or three rounds in a row have arrived at the same point.
+        settings: further ones of `TrustRegion`: tolerance, noise, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn
-    is not caught.
+    passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the message says so.
 
     Example:
         >>> import torch
         >>> fit = minimize(lambda z: ((z - 3) ** 2).sum(1), torch.zeros(2), sigma=2.0, seed=0, restarts=0)
-        >>> bool((fit.x - 3).abs().max() < 1e-3), fit.evaluations < 50
-        (True, True)
+        >>> bool((fit.x - 3).abs().max() < 1e-3), fit.evaluations < 50, fit.status
+        (True, True, 'solved')
     """
+    _check_names(settings)
+    for name, value in (("xtol", xtol), ("ftol", ftol), ("time_limit", time_limit)):
+        if value is not None and not value >= 0.0:
+            raise ValueError(f"{name} must be at least 0, got {value}")
     if evaluator is not None and workers is not None:
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
-    x0 = working(checked_input(x0))
-    search = TrustRegion(x0, sigma=sigma, bounds=bounds, loss=loss, engine=engine, seed=seed, **settings)
+    start = working(checked_input(x0)) if isinstance(x0, Tensor) else checked_start(x0)
+    rounds = max_evaluations if restarts is None else restarts
+    search = TrustRegion(
+        start, sigma=sigma, bounds=bounds, loss=loss, engine=engine, seed=seed, restarts=max(rounds, 0), **settings
+    )
     smallest = len(search.ask()) + 1
     if max_evaluations < smallest:
         raise ValueError(
-            f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(x0)} "
+            f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(start)} "
             f"parameters, got {max_evaluations}"
         )
     check_count(max_evaluations=max_evaluations)
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or own or Inline())
-    history: list[Iterate] = []
+    running = _Running(search, None if checkpoint is None else Path(checkpoint), verbose)
+
+    def ended() -> tuple[Status, str] | None:
+        if search.done:
+            return "solved" if search.solved and not running.flat else "stalled", search.message
+        if target is not None and search.value <= target:
+            return "target", f"the value is at most the target {target}"
+        if xtol is not None and bool((search.width <= xtol).all()):
+            return "solved", f"the region is within xtol ({xtol}) of x"
+        if ftol is not None and search.promise <= ftol:
+            return "solved", f"the model promises a decrease of at most ftol ({ftol})"
+        if search.solved and (xtol, ftol) != (None, None):
+            return "solved", "the search has arrived at x, within xtol and ftol"
+        if restarts is None and search.agreed >= _AGREED:
+            return "solved", f"{search.agreed} rounds in a row have arrived at x"
+        if search.evaluations >= max_evaluations:
+            return "budget", f"max_evaluations ({max_evaluations}) used up"
+        if time_limit is not None and running.history and running.seconds > time_limit:
+            return "time", f"time_limit ({time_limit} s) used up"
+        return None
+
+    end: tuple[Status, str]
     try:
-        message = _search(search, call, max_evaluations, target, callback, history)
+        while True:
+            reached = ended()
+            if reached is not None:
+                end = reached
+                break
+            points = search.ask(max_evaluations - search.evaluations)
+            search.tell(call(points.clone(), ()))
+            iterate = running.noted(points)
+            if callback is not None and _is_true(callback(iterate)) and ended() is None:
+                end = "callback", "the callback asked to end"
+                break
     except KeyboardInterrupt:
-        if not history:
+        if not running.history:
             raise
-        message = "interrupted"
+        end = "interrupted", "interrupted"
+    except Exception as error:
+        if running.history:
+            error.minimum = running.minimum("failed", f"fn raised {error!r}")  # type: ignore[attr-defined]
+        raise
     finally:
+        running.write()
         if own is not None:
             own.close()
-    return _minimum(search, history, message)
+    return running.minimum(*end)
 
 
-def _search(
-    search: TrustRegion,
-    call: BlackBoxCall,
-    most: int,
-    target: float | None,
-    callback: Callable[[Iterate], object] | None,
-    history: list[Iterate],
-) -> str:
-    """Evaluate until something ends the search, and return what."""
-    while not search.done:
-        if search.evaluations >= most:
-            return f"max_evaluations ({most}) used up"
-        points = search.ask(most - search.evaluations)
-        search.tell(call(points.clone(), ()))
-        history.append(Iterate(search.evaluations, search.value, search.x))
-        if target is not None and search.value <= target:
-            return f"the value is at most the target {target}"
-        if callback is not None and _is_true(callback(history[-1])):
-            return "the callback asked to end"
-    return search.message
+class _Running:
+    """A search with all that was evaluated, and the file that it is written to."""
+
+    def __init__(self, search: TrustRegion, path: Path | None, verbose: bool) -> None:
+        self.search, self.history = search, list[Iterate]()
+        self._path, self._verbose = path, verbose
+        self._begun = self._written = self._said = time.monotonic()
+        if path is not None and path.exists():
+            saved = torch.load(path, weights_only=True)
+            search.load_state_dict(saved["search"])
+            self.history = [Iterate(**one) for one in saved["history"]]
+
+    @property
+    def seconds(self) -> float:
+        """Since the search began, or was resumed."""
+        return time.monotonic() - self._begun
+
+    @property
+    def flat(self) -> bool:
+        """Whether all values are equal."""
+        first = self.history[0].values[0] if self.history else math.nan
+        return all(bool((one.values == first).all()) for one in self.history)
+
+    def noted(self, points: Tensor) -> Iterate:
+        """Return what is known after a batch at points [K, n], and write it where it is due."""
+        search = self.search
+        self.history.append(Iterate(search.evaluations, search.value, search.x, points.clone(), search.told.clone()))
+        now = time.monotonic()
+        if self._verbose and now - self._said >= _PAUSE:
+            self._said = now
+            said = f"{search.evaluations} evaluations, value {search.value:.6g}, sigma {search.sigma:.3g}"
+            print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)
+        if now - self._written >= _PAUSE:
+            self.write()
+        return self.history[-1]
+
+    def write(self) -> None:
+        """Write the file; it is never half written."""
+        if self._path is None or not self.history:
+            return
+        self._written = time.monotonic()
+        draft = self._path.with_name(f"{self._path.name}.part")
+        torch.save({"search": self.search.state_dict(), "history": [vars(one) for one in self.history]}, draft)
+        draft.replace(self._path)
+
+    def minimum(self, status: Status, message: str) -> Minimum:
+        """Return the result."""
+        search = self.search
+        x, found = search.x, search.model_at_best()
+        gradient = hessian = errors = None
+        unit = search.unit
+        if found is not None:
+            model, sigma = found
+            unit = unit * sigma
+            gradient = (model.full_gradient() / unit).to(x)
+            hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
+            slope, bend = model.full_errors()
+            errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
+        if self.flat and len(search.unit) < search.evaluations and status != "target":
+            message += f"; all {search.evaluations} values are equal: enlarge sigma"
+        success = status in ("target", "solved") or (search.solved and not self.flat)
+        if success and status in ("budget", "time"):
+            message += "; the search had arrived at x, a minimum at least of its surroundings"
+        return Minimum(
+            x,
+            search.value,
+            gradient,
+            hessian,
+            errors,
+            unit.to(x),
+            search.evaluations,
+            self.history,
+            message,
+            search.engine,
+            success,
+            status,
+        )
+
+
+def _check_names(settings: dict[str, Any]) -> None:
+    """Raise TypeError for a keyword that nothing here has, with those that are near."""
+    known = {*inspect.signature(minimize).parameters, *inspect.signature(TrustRegion).parameters} - {"settings"}
+    for name in settings:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=2)
+            meant = _OTHER_NAMES.get(name.lower()) or " or ".join(near)
+            guess = f"; did you mean {meant}?" if meant else f"; there are {', '.join(sorted(known))}"
+            raise TypeError(f"minimize has no argument {name}{guess}")
 
 
 def _is_true(answer: object) -> bool:
     """Whether a callback returned True. Other truthy values, such as the count of bytes it wrote, do not end."""
     return str(getattr(answer, "dtype", type(answer).__name__)) in ("bool", "torch.bool") and bool(answer)
-
-
-def _minimum(search: TrustRegion, history: list[Iterate], message: str) -> Minimum:
-    x, found = search.x, search.model_at_best()
-    gradient = hessian = errors = None
-    unit = search.unit
-    if found is not None:
-        model, sigma = found
-        unit = unit * sigma
-        gradient = (model.full_gradient() / unit).to(x)
-        hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
-        slope, bend = model.full_errors()
-        errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
-    return Minimum(
-        x,
-        search.value,
-        gradient,
-        hessian,
-        errors,
-        unit.to(x),
-        search.evaluations,
-        history,
-        message,
-        search.engine,
-    )

@@ -1,9 +1,11 @@
 """One call for a function and a start: results against closed forms, and every way to end."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
+import scipy.optimize
 import torch
 
 import torch_zerohess as zh
@@ -108,7 +110,8 @@ def test_never_more_evaluations_than_allowed(n):
         f = Counted(lambda z: z.square().sum(1) + z.sum(1).sin())
         fit = zh.minimize(f, torch.ones(n, dtype=torch.float64), sigma=1.0, seed=0, max_evaluations=most)
         assert fit.evaluations == f.points == most
-        assert fit.message == f"max_evaluations ({most}) used up"
+        assert fit.message.startswith(f"max_evaluations ({most}) used up")
+        assert fit.status == "budget"
 
 
 @pytest.mark.parametrize("most", [-1, 0, 3])
@@ -184,9 +187,12 @@ def test_an_exception_passes():
             raise ZeroDivisionError("in the black box")
         return bowl(z)
 
-    with pytest.raises(ZeroDivisionError, match="in the black box"):
+    with pytest.raises(ZeroDivisionError, match="in the black box") as caught:
         zh.minimize(f, zeros(), sigma=1.0, seed=0)
     assert len(calls) == 4
+    found = caught.value.minimum
+    assert (found.status, found.success, found.evaluations) == ("failed", False, sum(calls[:3]))
+    assert len(found.history) == 3
 
 
 def test_of_one_point_and_of_numpy():
@@ -298,7 +304,7 @@ def test_values_that_are_not_finite_on_the_way():
     assert float(fit.x[0]) <= 2.0
     assert fit.value < 2.0  # 11.2 at the start, 1.4 at best
     only = zh.minimize(lambda z: torch.where(z.square().sum(1) > 0, math.nan, bowl(z)), zeros(), sigma=2.0, seed=0)
-    assert only.message.endswith("in round 11")
+    assert "10 batches in a row had values that are not finite" in only.message
     assert torch.equal(only.x, zeros())
 
 
@@ -306,7 +312,12 @@ def test_values_that_are_not_finite_on_the_way():
     ("wrong", "error", "message"),
     [
         ({"engine": "newton"}, ValueError, "engine must be one of .*, got 'newton'"),
-        ({"x0": [0.0, 0.0]}, TypeError, "x must be a torch tensor"),
+        ({"x0": ["a", 0.0]}, ValueError, "x0 must be a tensor, an array or a list of n numbers"),
+        ({"maxiter": 5}, TypeError, "no argument maxiter; did you mean max_evaluations"),
+        ({"restart": 5}, TypeError, "no argument restart; did you mean restarts"),
+        ({"qqq": 5}, TypeError, "no argument qqq; there are"),
+        ({"xtol": -1.0}, ValueError, "xtol must be at least 0, got -1.0"),
+        ({"bounds": ((-1, 1), (0, 9))}, ValueError, "meaning lower = "),
         ({"x0": torch.zeros(2, dtype=torch.int64)}, TypeError, "float32 or float64"),
         ({"x0": torch.zeros(2, 2)}, ValueError, r"x0 must be a tensor \[n\]"),
         ({"sigma": 0.0}, ValueError, "sigma must be positive"),
@@ -329,5 +340,131 @@ def test_what_is_refused(wrong, error, message):
 def test_a_minimum_says_what_was_found() -> None:
     fit = zh.minimize(bowl, torch.zeros(2, dtype=torch.float64), sigma=2.0, seed=0, restarts=0)
     assert repr(fit).startswith("Minimum(x=[")
-    told = f"value={fit.value:.6g}, evaluations={fit.evaluations}, engine='descent', message={fit.message!r})"
+    told = f"value={fit.value:.6g}, evaluations={fit.evaluations}, engine='descent', success=True, message="
+    told += f"{fit.message!r})"
     assert repr(fit).endswith(told)
+
+
+# How it ends.
+
+
+def test_a_convex_function_ends_when_three_rounds_agree():
+    fit = zh.minimize(bowl, zeros(), sigma=2.0, seed=0)
+    assert (fit.status, fit.success) == ("solved", True)
+    assert fit.message == "3 rounds in a row have arrived at x"
+    assert fit.evaluations < 150
+
+
+def test_the_budget_ends_it_and_success_says_whether_it_has_arrived():
+    few = zh.minimize(bowl, zeros(), sigma=2.0, seed=0, max_evaluations=5)
+    assert (few.status, few.success) == ("budget", False)
+    most = zh.minimize(bowl, zeros(), sigma=2.0, seed=0, max_evaluations=60, restarts=9)
+    assert (most.status, most.success) == ("budget", True)
+    assert "had arrived at x" in most.message
+
+
+@pytest.mark.parametrize("name", ["xtol", "ftol"])
+def test_tolerances_end_it_early(name):
+    fit = zh.minimize(bowl, zeros(), sigma=2.0, seed=0, **{name: 1e-3})
+    assert (fit.status, fit.success) == ("solved", True)
+    assert name in fit.message
+    assert fit.evaluations < 30
+    assert fit.value < 0.5 + 1e-3
+    assert float((fit.x - CENTER).norm()) < 0.03
+
+
+def test_a_time_limit_ends_it():
+    fit = zh.minimize(bowl, zeros(), sigma=2.0, seed=0, time_limit=0.0)
+    assert (fit.status, fit.success) == ("time", False)
+    assert len(fit.history) == 1
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+def test_a_total_plateau_is_said(bounds):
+    fit = zh.minimize(lambda z: torch.ones(len(z)), zeros(3), sigma=0.1, seed=0, bounds=bounds, max_evaluations=40)
+    assert not fit.success
+    assert fit.message.endswith(f"all {fit.evaluations} values are equal: enlarge sigma")
+
+
+# What may be passed.
+
+
+def test_starts_of_lists_and_arrays():
+    fits = [
+        zh.minimize(bowl, x0, sigma=2.0, seed=0, max_evaluations=20)
+        for x0 in (zeros(), [0.0, 0.0], (0, 0), np.zeros(2), np.zeros(2, dtype=int))
+    ]
+    assert all(torch.equal(one.x, fits[0].x) for one in fits)
+    assert (
+        zh.minimize(bowl, np.zeros(2, dtype=np.float32), sigma=2.0, seed=0, max_evaluations=9).x.dtype == torch.float32
+    )
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        (vector(-1.0, 0.0), vector(2.0, 9.0)),
+        (np.array([-1.0, 0.0]), np.array([2.0, 9.0])),
+        [(-1, 2), (0, 9)],
+        scipy.optimize.Bounds([-1, 0], [2, 9]),
+    ],
+    ids=["tensors", "arrays", "pairs", "scipy"],
+)
+def test_bounds_in_every_form(bounds):
+    """The minimum without them is at (3, -1)."""
+    fit = zh.minimize(bowl, vector(0.0, 1.0), sigma=1.0, seed=0, bounds=bounds, max_evaluations=60)
+    points = torch.cat([one.points for one in fit.history])
+    assert bool(((points >= vector(-1.0, 0.0)) & (points <= vector(2.0, 9.0))).all())
+    torch.testing.assert_close(fit.x, vector(2.0, 0.0), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("bounds", [(None, 2.0), (None, vector(2.0, 9.0)), [(None, 2.0), (None, 9.0)]])
+def test_none_is_no_bound_on_a_side(bounds):
+    fit = zh.minimize(bowl, vector(0.0, 1.0), sigma=1.0, seed=0, bounds=bounds, restarts=0)
+    torch.testing.assert_close(fit.x[:1], vector(2.0), rtol=0, atol=1e-4)
+    assert float(fit.x[1]) < 0.0
+
+
+def test_values_in_a_column():
+    plain = zh.minimize(bowl, zeros(), sigma=2.0, seed=0, max_evaluations=20)
+    column = zh.minimize(lambda z: bowl(z)[:, None], zeros(), sigma=2.0, seed=0, max_evaluations=20)
+    assert torch.equal(plain.x, column.x)
+
+
+def test_history_has_every_point_and_value():
+    f = Counted(bowl)
+    fit = zh.minimize(f, zeros(), sigma=2.0, seed=0, max_evaluations=30)
+    points, values = (torch.cat([getattr(one, name) for one in fit.history]) for name in ("points", "values"))
+    assert len(points) == f.points == 30
+    assert torch.equal(values, bowl(points))
+    assert fit.value == float(values.min())
+
+
+def test_a_checkpoint_goes_on_where_it_was(tmp_path):
+    path = tmp_path / "search.pt"
+    whole = zh.minimize(bowl, zeros(), sigma=2.0, seed=0, max_evaluations=40)
+    with pytest.raises(ZeroDivisionError):
+        zh.minimize(raising(bowl, 6), zeros(), sigma=2.0, seed=0, max_evaluations=40, checkpoint=path)
+    f = Counted(bowl)
+    rest = zh.minimize(f, zeros(), sigma=2.0, seed=1, max_evaluations=40, checkpoint=path)
+    assert f.points < 40
+    assert torch.equal(rest.x, whole.x)
+    assert [one.evaluations for one in rest.history] == [one.evaluations for one in whole.history]
+
+
+def raising(fn, call):
+    """Return fn that raises in the given call (from 0)."""
+    count = iter(range(call + 1))
+
+    def counting(z):
+        if next(count) == call:
+            raise ZeroDivisionError
+        return fn(z)
+
+    return counting
+
+
+def test_verbose_says_how_far_it_is(monkeypatch, capsys):
+    monkeypatch.setattr(sys.modules["torch_zerohess.minimize"], "_PAUSE", 0.0)
+    zh.minimize(bowl, zeros(), sigma=2.0, seed=0, max_evaluations=10, verbose=True)
+    assert "10 evaluations, value " in capsys.readouterr().err

@@ -11,7 +11,7 @@ from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.draws import normal, reflect, uniform
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.protocol import AskTell, Method, Settings
+from torch_zerohess.search.protocol import Method, Settings
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -40,7 +40,7 @@ _POOL, _POOL_PER_PARAMETER, _POOL_OF_QUADRATIC = 60, 6, 500
 
 
 class LocalQuadratics(Method[DescentProgress]):
-    """The method of `Descent`."""
+    """The method of `Descent` where there is an output and a loss, noise, or a plateau."""
 
     engine = "descent"
     progress = DescentProgress
@@ -146,6 +146,8 @@ class LocalQuadratics(Method[DescentProgress]):
     ) -> DescentProgress:
         """End, or start another round: at a random point and around the best one in turn."""
         settings, rounds = self.settings, known.rounds + 1
+        if known.refused < _REFUSED and known.sigma < settings.tolerance:
+            known = replace(known, arrived=min(known.arrived, known.lowest.loss))
         if last or rounds > settings.restarts:
             return replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
         center = known.best.point
@@ -223,41 +225,6 @@ class LocalQuadratics(Method[DescentProgress]):
         if self.settings.loss is None or outputs is None or not self._follows:
             return fit_values(u, known.pool.values[near], weights)
         return fit_outputs(u, outputs[near], weights, self.settings.loss, known.shape)
-
-
-class Descent(AskTell[DescentProgress]):
-    """Second-order descent on a smoothed black box, for any number of parameters, with or without bounds.
-
-    Each iteration fits a quadratic model of the smoothed loss to the pool of past evaluations (`Pool`, `fit_values`;
-    `fit_outputs` if the black box returns a tensor and `loss` is given), minimises it within sigma sqrt(n) of x and
-    within the bounds, and asks for that one point. New samples around x are asked for only where the model has
-    predicted badly. Sigma, and with it the region, grows after a long good step and on a plateau, and shrinks after a
-    short or refused one.
-
-    - With the loss alone or n <= 2, it moves to whatever evaluated point is best.
-    - With an output [K, *out] and a white-box `loss`, every evaluation is many equations: it follows the minimum of
-      loss(E f) while sigma goes to zero, also where the loss itself rises for a while.
-
-    Where sigma is below `tolerance` the search has arrived at a minimum, possibly a local one. It then starts again, in
-    turn from a random point and around the best one, with more samples per iteration, up to `restarts` times.
-
-    Settings are those of `AskTell`. Decreases below twice the `noise` do not count. By default the pool keeps 60 or 6 n
-    evaluations, and enough for a full quadratic of a loss alone up to n = 20.
-
-    Source: Wang, Fischer and Ritschel (2025) for the smoothed second order; evaluations are re-used as in
-    derivative-free least squares (Cartis et al. 2019) and COBYQA.
-
-    Example:
-        >>> search = Descent(torch.tensor([900.0, 850.0]), sigma=500.0, seed=0, restarts=0)
-        >>> while search.evaluations < 9:
-        ...     z = search.ask()
-        ...     search.tell(5 * z[:, 0] ** 2 + 5 * z[:, 1] ** 2 + 7.5 * z[:, 0] * z[:, 1])
-        >>> search.value < 1.0  # of 1.3e7
-        True
-    """
-
-    def _make(self, settings: Settings) -> Method[DescentProgress]:
-        return LocalQuadratics(settings)
 
 
 def _capacity(n: int, *, loss_alone: bool) -> int:

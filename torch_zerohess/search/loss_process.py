@@ -1,7 +1,7 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
 The process finds the way over plateaus and out of local minima (`ProcessMethod`), quadratics end it
-(`LocalQuadratics`): a process that is to hold all over the box leaves a millionth of the loss unexplained, a quadratic
+(`MetricQuadratics`): a process that is to hold all over the box leaves a millionth of the loss unexplained, a quadratic
 around a smooth minimum next to nothing.
 """
 
@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.descent import LocalQuadratics
-from torch_zerohess.search.descent_progress import DescentProgress
+from torch_zerohess.search.metric_descent import MetricQuadratics
+from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.process_method import APART, ProcessMethod
 from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.protocol import Settings
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 _NEAR = 0.1
@@ -25,17 +25,18 @@ _STEPS = 2
 """this many in a row, have found a basin."""
 _WIDTH = 0.3
 """First sigma of the quadratics."""
-_PATIENCE = 3
-"""Evaluations over n + 1 in which one model must find something better, or it is the turn of the other."""
-_FINEST = 1e-3
-"""Sigma at which quadratics end, over the tolerance of the search, and the last step with which they have converged."""
+_PATIENCE, _QUADRATIC_PATIENCE = 3, 5
+"""Evaluations over n + 1 in which the process, and the quadratics, must find something better: a curved valley refuses
+several steps in a row."""
+_TURN = 16
+"""Evaluations over n + 1 after which it is the turn of the quadratics although the process finds better points."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LossProgress(ProcessProgress):
     """What the process knows, and what the quadratics know."""
 
-    quadratics: DescentProgress | None = None
+    quadratics: MetricProgress | None = None
     """Also when they have ended."""
     finishing: bool = False
     """Whether it is the turn of the quadratics."""
@@ -45,6 +46,8 @@ class LossProgress(ProcessProgress):
     """Short steps of the process in a row."""
     waited: int = 0
     """Evaluations since something better was found."""
+    searched: int = 0
+    """Evaluations of the process in a row."""
 
 
 class LossProcess(ProcessMethod[LossProgress]):
@@ -54,8 +57,7 @@ class LossProcess(ProcessMethod[LossProgress]):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        tolerance = _FINEST * settings.tolerance
-        self._finish = LocalQuadratics(replace(settings, restarts=0, tolerance=tolerance, pool=self.capacity))
+        self._finish = MetricQuadratics(replace(settings, restarts=0))
         self._patience = _PATIENCE * (settings.n + 1)
 
     def first(self, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
@@ -67,12 +69,10 @@ class LossProcess(ProcessMethod[LossProgress]):
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
         if known.quadratics is not None and known.finishing:
-            known = self._after_quadratics(known, known.quadratics, evaluated, generator)
+            known, points = self._after_quadratics(known, known.quadratics, evaluated, generator)
         else:
-            known = self._after_process(known, evaluated)
-        if known.quadratics is not None and known.finishing and not known.done:
-            return known, self._finish.points(known.quadratics, generator)
-        return self.points(known, generator)
+            known, points = self._after_process(known, evaluated, generator)
+        return (known, points) if known.finishing else self.points(known, generator)
 
     def model_at_best(self, known: LossProgress) -> tuple[LocalModel, float] | None:
         quadratics = known.quadratics
@@ -80,27 +80,33 @@ class LossProcess(ProcessMethod[LossProgress]):
             return self._finish.model_at_best(quadratics)
         return super().model_at_best(known)
 
-    def _after_process(self, known: LossProgress, evaluated: Evaluated) -> LossProgress:
-        """Let quadratics finish where the process has found a new basin, or finds nothing better."""
+    def _after_process(
+        self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[LossProgress, Tensor]:
+        """Let quadratics finish where the process has found a new basin, or finds nothing better for long."""
         before = known.best.loss
         known = self.take(known, evaluated)
         known = replace(
             known,
             steps=known.steps + 1 if known.moved < _NEAR else 0,
             waited=0 if known.best.loss < before else known.waited + len(evaluated),
+            searched=known.searched + len(evaluated),
         )
+        nothing, n = evaluated.points[:0], self.settings.n
         new = float((known.best.point - known.finished).norm()) > APART
-        turn = known.steps >= _STEPS or known.waited >= self._patience
+        turn = known.steps >= _STEPS or known.waited >= self._patience or known.searched >= _TURN * (n + 1)
         if not turn or not new or known.noisy or known.done:
-            return known
-        quadratics = self._finish.go_on(known.pool, Best(known.best.point, known.best.loss), _WIDTH)
-        return replace(known, quadratics=quadratics, finishing=True, steps=0, waited=0)
+            return known, nothing
+        begun = self._finish.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
+        quadratics, points = self._finish.plan(begun, generator)
+        return replace(known, quadratics=quadratics, finishing=True, steps=0, waited=0, searched=0), points
 
     def _after_quadratics(
-        self, known: LossProgress, before: DescentProgress, evaluated: Evaluated, generator: torch.Generator
-    ) -> LossProgress:
+        self, known: LossProgress, before: MetricProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[LossProgress, Tensor]:
         """Let quadratics go on, and return to the process where they find nothing better."""
-        now, finite = self._finish.take(before, evaluated, generator), evaluated.finite
+        finite = evaluated.finite
+        now, points = self._finish.next(before, evaluated, generator)
         known = self.avoiding(known, evaluated.points[~finite])
         for k in finite.nonzero().flatten().tolist():  # what tells the process something new
             if float((known.pool.points - evaluated.points[k]).norm(dim=1).min()) > APART:
@@ -117,10 +123,11 @@ class LossProcess(ProcessMethod[LossProgress]):
             iterations=known.iterations + now.iterations - before.iterations,
             waited=0 if now.best.loss < before.best.loss else known.waited + len(evaluated),
         )
-        if not now.done and known.waited < self._patience:
-            return known
-        converged = now.sigma * float(now.step.norm()) < _FINEST
+        plateau = now.wide is not None  # the process leaves it sooner
+        patient = known.waited < _QUADRATIC_PATIENCE * (self.settings.n + 1)
+        if not now.done and not plateau and patient:
+            return known, points
+        converged = now.done and not now.lost
         solved = best.point if converged else torch.full_like(best.point, math.inf)
         known = replace(known, finishing=False, finished=best.point, solved=solved, waited=0)
-        finest = self._finish.settings.tolerance
-        return self.arrived(known, f"quadratics reached {finest} of sigma or found nothing better for a while")
+        return self.arrived(known, "quadratics have arrived or found nothing better for a while"), points

@@ -21,6 +21,10 @@ _MISLED = 2.0
 """Misfit beyond which the next step needs more samples than the last one."""
 _NARROW, _BY_LENGTH, _WIDER = 0.85, 0.3, 1.05
 """Factor for sigma after a step of no length, its growth with the length, and the largest one."""
+_LONG, _WIDENING = 0.9, 1.5
+"""A faithful step of this length widens sigma by this factor, up to the widest one."""
+_SHORT = 0.3
+"""Length of a step, in units of the radius, up to which it ends at a minimum and not on a plateau."""
 _FEWER = 8
 """Parameters per pair of samples where the model was not far off."""
 _RETRIES = 2
@@ -51,6 +55,8 @@ def after_output(known: DescentProgress, point: Tensor, loss: float, output: Ten
     known = replace(known, center=point, value=loss, retries=0, reach=1.0)
     if misfit < _TOLERABLE and gain > _GAIN * abs(before):
         sigma = known.sigma * _narrowing(length) if misfit > _FAITHFUL else known.sigma
+        if misfit < _FAITHFUL and length > _LONG:
+            sigma = max(sigma, min(_WIDENING * sigma, WIDEST))
         known = replace(known, faithful=True, misled=0, sigma=sigma)
         unknown = known.n - model.rank
         return known.sampling(unknown, paired=False) if misfit < _FAITHFUL and unknown else known.trying()
@@ -60,7 +66,8 @@ def after_output(known: DescentProgress, point: Tensor, loss: float, output: Ten
     narrow = _narrowing(length)
     if min(known.recent) > _FALL * known.earlier:
         narrow *= _HURRY
-    if abs(gain) < _FLAT * abs(before) and misfit > _FAITHFUL and known.patience < _PATIENCE:
+    flat = abs(gain) < _FLAT * abs(before) and length > _SHORT
+    if flat and misfit > _FAITHFUL and known.patience < _PATIENCE:
         known = replace(known, patience=known.patience + 1)
         if known.lowest.loss < _BETTER * before:
             known = replace(known, center=known.lowest.point, value=known.lowest.loss)

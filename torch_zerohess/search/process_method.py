@@ -151,6 +151,7 @@ class ProcessMethod(Method[Q]):
     def arrived(self, known: Q, reason: str) -> Q:
         """End, or explore."""
         known = replace(known, settled=0, exploring=_ROUND * self.settings.n, rounds=known.rounds + 1)
+        known = replace(known, arrived=min(known.arrived, known.best.loss))
         if known.rounds > self.settings.restarts:
             return replace(known, done=True, message=f"{reason}, {known.rounds} times")
         return known

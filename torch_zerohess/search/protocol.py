@@ -11,7 +11,7 @@ To add a search: a subclass of `Progress` with its fields, a subclass of `Method
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic
 
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
-from torch_zerohess.search.space import Bounds, Space, check_start
+from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -77,15 +77,24 @@ class Method(ABC, Generic[P]):
     def model_at_best(self, known: P) -> tuple[LocalModel, float] | None:
         """Return a quadratic model around the best point and its sigma, or None if too little is known there."""
 
+    def promise(self, known: P) -> float:
+        """Return by how much the next step lowers the loss, according to a model that holds there; or infinity."""
+        return math.inf
+
+    def width(self, known: P) -> Tensor:
+        """Return half of the extent of the region along every parameter [n]."""
+        return torch.full_like(known.best.point, known.sigma)
+
 
 class AskTell(ABC, Generic[P]):
     """A search whose evaluations the caller owns: `ask` for points, evaluate them, `tell` their values.
 
     Args:
-        x0: start [n], float32 or float64, within the bounds.
+        x0: start [n], within the bounds: a tensor, float32 or float64, a NumPy array, a list or a tuple.
         sigma: smoothing at the start, in units of the parameters: of the order of the distance to the solution.
             One value, or one per parameter [n] where they have different units.
-        bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
+        bounds: lower and upper, numbers or [n], None for no bound on a side; or a list of n pairs; or
+            `scipy.optimize.Bounds`. No point outside of them is ever asked for.
         loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch: `.double()`
             networks in it. None if the black box returns the loss.
         restarts: how often to go on after the search has arrived at a minimum. 0 for a local search.
@@ -99,9 +108,9 @@ class AskTell(ABC, Generic[P]):
 
     def __init__(
         self,
-        x0: Tensor,
+        x0: Tensor | Sequence[float],
         *,
-        sigma: float | Tensor,
+        sigma: float | Tensor | Sequence[float],
         bounds: Bounds | None = None,
         loss: Callable[[Tensor], Tensor] | None = None,
         restarts: int = 10,
@@ -110,7 +119,7 @@ class AskTell(ABC, Generic[P]):
         pool: int | None = None,
         seed: int | None = None,
     ) -> None:
-        check_start(x0)
+        x0 = checked_start(x0)
         for name, value in (("restarts", restarts), ("noise", noise)):
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} must be finite and at least 0, got {value}")
@@ -126,6 +135,8 @@ class AskTell(ABC, Generic[P]):
         self._state = self._after(*self._method.first(generator), generator)
         self._given = 0
         """How many of the points asked for are out for evaluation: bookkeeping between the two calls, not state."""
+        self.told = torch.empty(0, dtype=torch.float64)
+        """Losses [K] of the points told last."""
 
     @abstractmethod
     def _make(self, settings: Settings) -> Method[P]:
@@ -177,6 +188,27 @@ class AskTell(ABC, Generic[P]):
         return self._state.progress.rounds
 
     @property
+    def solved(self) -> bool:
+        """Whether the best point is one at which the search has arrived: a minimum, possibly a local one."""
+        progress = self._state.progress
+        return progress.rounds > 0 and progress.best.loss <= progress.arrived < math.inf
+
+    @property
+    def agreed(self) -> int:
+        """Rounds in a row, from random points, that have arrived at the best point."""
+        return self._state.progress.agreed
+
+    @property
+    def promise(self) -> float:
+        """By how much the next step lowers the loss, according to a model that holds there; infinite without one."""
+        return self._method.promise(self._state.progress)
+
+    @property
+    def width(self) -> Tensor:
+        """Half of the extent of the current region along every parameter [n], in units of the parameters."""
+        return self._method.width(self._state.progress) * self._space.unit
+
+    @property
     def done(self) -> bool:
         """Whether there is nothing more to ask."""
         return self._state.progress.done
@@ -224,6 +256,7 @@ class AskTell(ABC, Generic[P]):
         evaluated = self._evaluated(values, self._state.asked[: self._given])
         if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
             raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
+        self.told = evaluated.losses
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
@@ -263,6 +296,8 @@ class AskTell(ABC, Generic[P]):
         """Return what was told as losses and outputs."""
         loss, shape = self._method.settings.loss, self._state.progress.shape
         values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
+        if loss is None and values.shape == (len(points), 1):
+            values = values[:, 0]
         if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
             wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
             raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")

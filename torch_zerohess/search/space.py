@@ -1,13 +1,15 @@
 """The parameters of a search: their bounds and type, and the units of sigma in which every search works."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-Bounds = tuple[float | Tensor, float | Tensor]
-"""Lower and upper, numbers or [n]."""
+Bounds = Any
+"""(lower, upper), numbers or [n] or None; a list of n pairs (lower, upper); or `scipy.optimize.Bounds`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +25,7 @@ class Space:
     upper: Tensor
 
     @classmethod
-    def checked(
-        cls, x0: Tensor, sigma: float | Tensor, bounds: tuple[float | Tensor, float | Tensor] | None
-    ) -> "Space":
+    def checked(cls, x0: Tensor, sigma: float | Tensor | Sequence[float], bounds: Bounds | None) -> "Space":
         """Check what a caller gave. ValueError for a wrong shape or type, or a number out of range."""
         return cls(x0.detach().clone(), _unit(sigma, x0), *_bounds(bounds, x0))
 
@@ -42,15 +42,24 @@ class Space:
         return z if self.start.dtype == torch.float64 else self.coordinates(self.parameters(z))
 
 
-def check_start(x0: Tensor) -> None:
-    """Raise ValueError for a start that is not a finite tensor [n], float32 or float64."""
-    if not isinstance(x0, Tensor) or x0.dtype not in (torch.float32, torch.float64) or x0.ndim != 1 or not len(x0):
+def checked_start(x0: Any) -> Tensor:
+    """Return a start as a tensor [n]; ValueError if it is not finite, or neither float32 nor float64.
+
+    A NumPy array of floats keeps its type. Lists, tuples and integers of NumPy become float64.
+    """
+    if not isinstance(x0, Tensor):
+        try:
+            x0 = torch.as_tensor(x0, dtype=None if str(getattr(x0, "dtype", "")) == "float32" else torch.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"x0 must be a tensor, an array or a list of n numbers, got {x0!r}") from error
+    if x0.dtype not in (torch.float32, torch.float64) or x0.ndim != 1 or not len(x0):
         raise ValueError(f"x0 must be a tensor [n], float32 or float64, got {x0!r}")
     if not bool(torch.isfinite(x0).all()):
         raise ValueError(f"x0 must be finite, got {x0}")
+    return x0
 
 
-def _unit(sigma: float | Tensor, x0: Tensor) -> Tensor:
+def _unit(sigma: float | Tensor | Sequence[float], x0: Tensor) -> Tensor:
     """Return sigma as float64 [n]."""
     unit = torch.as_tensor(sigma, dtype=torch.float64, device=x0.device).detach()
     if unit.shape not in ((), x0.shape) or not bool((torch.isfinite(unit) & (unit > 0)).all()):
@@ -66,9 +75,8 @@ def _bounds(bounds: Bounds | None, x0: Tensor) -> tuple[Tensor, Tensor]:
     if bounds is None:
         infinite = torch.full_like(x0.detach(), math.inf)
         return -infinite, infinite
-    if len(bounds) != 2:
-        raise ValueError(f"bounds must be (lower, upper), got {len(bounds)} entries")
-    lower, upper = (torch.as_tensor(one, dtype=torch.float64, device=x0.device).detach() for one in bounds)
+    sides = zip(_sides(bounds, len(x0)), (-math.inf, math.inf), strict=True)
+    lower, upper = (_side(one, none).to(x0.device).detach() for one, none in sides)
     for name, one in (("lower", lower), ("upper", upper)):
         if one.shape not in ((), x0.shape):
             raise ValueError(f"the {name} bound must be a number or [{len(x0)}], got shape {list(one.shape)}")
@@ -89,3 +97,40 @@ def _bounds(bounds: Bounds | None, x0: Tensor) -> tuple[Tensor, Tensor]:
         torch.where(inner[0].double() < lower, inner[0].nextafter(infinite), inner[0]),
         torch.where(inner[1].double() > upper, inner[1].nextafter(-infinite), inner[1]),
     )
+
+
+def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
+    """Return lower and upper of bounds in any form; ValueError if two forms are possible.
+
+    A list of tuples is a list of pairs.
+    """
+    if hasattr(bounds, "lb") and hasattr(bounds, "ub"):  # scipy.optimize.Bounds
+        return bounds.lb, bounds.ub
+    if not isinstance(bounds, (tuple, list)):
+        bounds = tuple(bounds)
+    pairs = len(bounds) == n and all(isinstance(one, (tuple, list)) and len(one) == 2 for one in bounds)
+    columns = [list(one) for one in zip(*bounds, strict=True)] if pairs else []
+    if pairs and isinstance(bounds, list) and all(isinstance(one, tuple) for one in bounds):
+        return columns[0], columns[1]
+    if pairs and n == 2 and _in_order(*bounds) and _in_order(*columns):
+        raise ValueError(
+            f"bounds of 2 parameters must be (lower, upper) as tensors, or a list of tuples, got {bounds}, "
+            f"meaning lower = {columns[0]} or lower = {list(bounds[0])}"
+        )
+    if pairs and (n != 2 or not _in_order(*bounds)):
+        return columns[0], columns[1]
+    if len(bounds) != 2:
+        raise ValueError(f"bounds must be (lower, upper) or a list of {n} pairs, got {len(bounds)} entries")
+    return bounds[0], bounds[1]
+
+
+def _in_order(lower: Any, upper: Any) -> bool:
+    """Whether lower < upper, element by element, where neither is None."""
+    return all(a is None or b is None or a < b for a, b in zip(lower, upper, strict=True))
+
+
+def _side(one: Any, none: float) -> Tensor:
+    """Return a bound as float64; `none` where there is none."""
+    if isinstance(one, (tuple, list)):
+        one = [none if each is None else float(each) for each in one]
+    return torch.as_tensor(none if one is None else one, dtype=torch.float64)

@@ -37,6 +37,10 @@ class Progress:
     """Steps tried."""
     rounds: int = 0
     """Times the search has arrived."""
+    arrived: float = math.inf
+    """Lowest loss at which it has arrived."""
+    agreed: int = 0
+    """Rounds in a row that have arrived at the best point, where rounds begin at random points."""
     done: bool = False
     message: str = ""
     """Why the search is done."""

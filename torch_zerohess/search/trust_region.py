@@ -1,11 +1,11 @@
 """The door to the searches: chooses one by the number of parameters, their bounds, and the first evaluations."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from torch import Tensor
 
-from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.descent_search import descent_method
 from torch_zerohess.search.evidence import FEWEST, EvidenceMethod, EvidenceProgress
 from torch_zerohess.search.gaussian_process_search import process_method
 from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalSettings
@@ -60,9 +60,9 @@ class TrustRegion(AskTell[Any]):
 
     def __init__(
         self,
-        x0: Tensor,
+        x0: Tensor | Sequence[float],
         *,
-        sigma: float | Tensor,
+        sigma: float | Tensor | Sequence[float],
         bounds: Bounds | None = None,
         loss: Callable[[Tensor], Tensor] | None = None,
         engine: Engine = "auto",
@@ -105,7 +105,7 @@ class TrustRegion(AskTell[Any]):
         if engine == "gaussian_process":
             return process_method(settings)
         if self._wanted == "descent" or (engine == "descent" and (settings.loss is None or settings.n < FEWEST)):
-            return LocalQuadratics(settings)
+            return descent_method(settings)
         own = LocalSettings.checked(settings, grid=self._grid)
         return LocalMethod(settings, own) if engine == "local" else EvidenceMethod(settings, own)
 

@@ -38,7 +38,7 @@ def test_leaves_a_plateau(seed):
 
 def test_sigma_grows_on_a_plateau():
     search = Descent(zeros(2), sigma=1.0, seed=0)
-    run(search, lambda z: torch.full((len(z),), 0.1), 5)
+    run(search, lambda z: torch.full((len(z),), 0.1), 10)
     assert search.sigma > 1.0
 
 
@@ -169,11 +169,11 @@ def test_a_wall_of_values_that_are_not_finite(wrong, output):
 def test_a_refused_step_is_shortened():
     search = Descent(zeros(1), sigma=1.0, seed=0)
     search.tell((search.ask()[:, 0] - 5) ** 2)
-    sigma = search.sigma
+    sigma, center = search.sigma, search.center
     search.ask()
     search.tell(vector(math.nan))
     assert search.sigma == 0.5 * sigma
-    assert float(search.center) == 0.0
+    assert torch.equal(search.center, center)
 
 
 def test_finite_only_at_the_start():
@@ -234,23 +234,25 @@ def test_a_round_whose_start_is_not_finite_goes_on_to_what_is():
 
 def kept(search):
     """How many evaluations a search keeps."""
-    return len(search.state_dict()["progress"]["pool"]["values"])
+    progress = search.state_dict()["progress"]
+    return len(progress["values"] if "values" in progress else progress["pool"]["values"])
 
 
 @pytest.mark.parametrize(
     ("n", "with_loss", "pool", "expected"),
     [
-        *[(2, False, None, 60), (8, False, None, 90), (30, False, None, 500), (100, False, None, 600)],
+        *[(2, False, None, 200), (9, False, None, 200), (10, False, None, 228), (100, False, None, 600)],
         *[(3, True, None, 60), (20, True, None, 120), (2, False, 7, 7)],
     ],
 )
-def test_as_many_evaluations_are_kept_as_two_models_take(n, with_loss, pool, expected):
-    """A quadratic of a loss has (n + 1)(n + 2)/2 coefficients, a linear output n + 1."""
+def test_as_many_evaluations_are_kept_as_models_take(n, with_loss, pool, expected):
+    """A quadratic of a loss is fitted to (n + 1)(n + 2)/2 + n evaluations, at most 300; a linear output to n + 1."""
     search = Descent(zeros(n), sigma=1.0, loss=torch.sum if with_loss else None, pool=pool, seed=0)
     while search.evaluations < expected + 10:
         points = search.ask()
         noise = torch.randn(len(points), generator=torch.Generator().manual_seed(search.evaluations)).double()
-        search.tell(noise[:, None] if with_loss else noise)
+        endless = (0.01 * noise + points.sum(1)) if n <= 10 else noise  # the first round does not end
+        search.tell(noise[:, None] if with_loss else endless)
     assert kept(search) == expected
 
 
@@ -268,7 +270,7 @@ def second_round(seed, bounds):
     search = Descent(zeros(3), sigma=2.0, bounds=bounds, seed=seed)
     while search.rounds == 0:
         search.tell(bowl(search.ask()))
-    assert search.sigma == 1.5
+    assert search.sigma == 1.0
     assert torch.equal(search.ask()[0], search.center)
     return search
 
@@ -289,9 +291,9 @@ def test_a_further_round_begins_at_another_point():
 @pytest.mark.parametrize("factor", [1.0, 3.0, 100.0])
 def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
     """Wider by a power of 3/2, up to the seventh; there is none if all evaluations are farther away."""
-    search = Descent(zeros(3), sigma=1.0, seed=0)
+    search = Descent(zeros(3), sigma=1.0, seed=0, loss=torch.sum)
     points = search.ask()
-    search.tell(bowl(points))
+    search.tell(bowl(points)[:, None])
     state = search.state_dict()
     pool = state["progress"]["pool"]
     pool["points"], pool["sigmas"] = search.x + factor * (points - search.x), factor * pool["sigmas"]

@@ -331,7 +331,7 @@ SETTINGS = [
     ({"x0": torch.zeros(0)}, r"x0 must be a tensor \[n\]"),
     ({"x0": torch.zeros(2, dtype=torch.int64)}, "float32 or float64"),
     ({"x0": torch.zeros(2, dtype=torch.float16)}, "float32 or float64"),
-    ({"x0": [0.0, 0.0]}, "float32 or float64"),
+    ({"x0": ["a", 0.0]}, "list of n numbers"),
     ({"x0": vector(0.0, math.nan)}, "x0 must be finite"),
     ({"sigma": 0.0}, "sigma must be positive and finite"),
     ({"sigma": -1.0}, "sigma must be positive and finite"),

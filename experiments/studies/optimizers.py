@@ -1,0 +1,185 @@
+"""`python -m experiments optimizers`: our search and other optimizers on functions that others wrote (BBOB).
+
+A pair is a function instance and one of 51 precisions, 1e2 to 1e-8. A method reaches a pair once it has evaluated a
+point whose value is within the precision of the minimum. The table has the share of pairs reached after 10 n, 30 n and
+100 n evaluations. Every method gets the same starts, the same box and the same size of the first step. A method that
+ends by itself starts again from a random point of the box.
+
+Instances 11 to 15 are for tuning, 1 to 5 for tables.
+"""
+
+import csv
+import itertools
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from experiments.methods import METHODS
+from experiments.methods.keywords import with_settings
+from experiments.methods.method import Method
+from experiments.methods.ours import search
+from experiments.problems import bbob
+from experiments.problems.catalogue import chosen
+from experiments.problems.task import Task
+from experiments.reports.progress import progress
+from experiments.reports.tables import table
+from experiments.runs.attempt import attempt
+from experiments.runs.trial import Trial
+
+OURS = Method("ours", "TrustRegion with its defaults", with_settings(search, output=False))
+RIVALS = ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded")
+BUDGETS = (10, 30, 100)
+"""Evaluations over n after which the table counts."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One method on one function from one start."""
+
+    n: int
+    function: int
+    instance: int
+    run: int
+    method: str
+    budget: int
+    """Evaluations over n."""
+
+    @property
+    def row(self) -> list[str]:
+        """The first cells of its row."""
+        return [str(one) for one in (self.n, self.function, self.instance, self.run, self.method, self.budget)]
+
+
+@dataclass(frozen=True)
+class Reached:
+    """Evaluations until each of `bbob.TARGETS` was reached, as far as they were, and the seconds of the run."""
+
+    evaluations: tuple[int, ...]
+    seconds: float
+
+    def share(self, most: int) -> float:
+        """Share of the targets that were reached within so many evaluations."""
+        return sum(one <= most for one in self.evaluations) / len(bbob.TARGETS)
+
+
+def optimizers(
+    *,
+    n: tuple[int, ...] = (2, 3, 5, 10),
+    functions: tuple[int, ...] = bbob.FUNCTIONS,
+    instances: tuple[int, ...] = (11, 12),
+    methods: str = "all",
+    runs: int = 1,
+    budget: int = BUDGETS[-1],
+    limit: float = 600.0,
+    out: Path = Path("results/optimizers.csv"),
+) -> None:
+    """Print shares of (function, precision) pairs reached; called again it goes on where it was.
+
+    Args:
+        n: numbers of parameters, among 2, 3, 5, 10, 20 and 40.
+        functions: of BBOB, 1 to 24.
+        instances: of every function; 11 to 15 are for tuning.
+        methods: names separated by commas, or all: ours, cobyqa, py_bobyqa, lbfgs_fd, cma_es_bounded; or any that
+            needs the loss alone, see `list`.
+        runs: starts for every function.
+        budget: evaluations over n that a run may use.
+        limit: seconds that a run may take.
+        out: CSV file with a row per run; rows that are there are not run again.
+    """
+    torch.set_num_threads(1)
+    known = {OURS.name: OURS, **METHODS}
+    names = (OURS.name, *RIVALS)
+    wanted = names if methods.strip() == "all" else chosen("methods", methods.split(","), list(known))
+    for name in wanted:
+        if known[name].missing():
+            raise SystemExit(f"{name} needs pip install {' '.join(known[name].missing())}")
+    jobs = [Job(*one, budget) for one in itertools.product(n, functions, instances, range(runs), wanted)]
+    done = read(out)
+    for job in progress([one for one in jobs if one not in done], "runs"):
+        try:
+            task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
+        except (ImportError, ValueError) as error:
+            raise SystemExit(str(error)) from error
+        done[job] = reached(task, known[job.method], job.run, limit)
+        append(out, job, done[job])
+    print(report({job: done[job] for job in jobs}))
+
+
+def reached(task: Task, method: Method, run: int, limit: float = 600.0) -> Reached:
+    """Run a method until the evaluations of the task are used up or the finest target is reached."""
+    hits: list[int] = []
+    count = 0
+
+    def loss(x: Tensor) -> Tensor:
+        nonlocal count
+        values = task.loss(x)
+        for value in values.tolist():
+            count += 1
+            while len(hits) < len(bbob.TARGETS) and value <= bbob.TARGETS[len(hits)]:
+                hits.append(count)
+        return values
+
+    counted = replace(task, loss=loss)
+    begun = time.perf_counter()
+    attempt(counted, method.name, run, lambda trial: _again(trial, method), limit=limit)
+    return Reached(tuple(hits), time.perf_counter() - begun)
+
+
+def _again(trial: Trial, method: Method) -> None:
+    """Start a method again where it ends by itself, from a random point of the box."""
+    for again in itertools.count(1):
+        before = trial.evaluations
+        method(trial, None)
+        if trial.evaluations == before:
+            return  # it evaluates nothing
+        trial.start = trial.task.start(1_000_000 * again + trial.run).double()
+
+
+def read(path: Path) -> dict[Job, Reached]:
+    """Return the rows of a file, none if there is no file."""
+    if not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        return {
+            Job(int(row[0]), int(row[1]), int(row[2]), int(row[3]), row[4], int(row[5])): Reached(
+                tuple(map(int, row[7].split())), float(row[6])
+            )
+            for row in csv.reader(file)
+            if row[0] != "n"
+        }
+
+
+def append(path: Path, job: Job, result: Reached) -> None:
+    """Write a row."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file)
+        if header:
+            writer.writerow(["n", "function", "instance", "run", "method", "budget", "seconds", "evaluations"])
+        writer.writerow([*job.row, f"{result.seconds:.3f}", " ".join(map(str, result.evaluations))])
+
+
+def report(done: Mapping[Job, Reached]) -> str:
+    """Return the table of shares."""
+    groups: dict[tuple[int, str], list[tuple[Job, Reached]]] = defaultdict(list)
+    for job, result in done.items():
+        groups[job.n, job.method].append((job, result))
+    headers = ["n", "method", *(f"{budget} n" for budget in BUDGETS), "ms per evaluation", "runs"]
+    return table(headers, list(_rows(groups)))
+
+
+def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[str]]:
+    for (n, method), group in groups.items():
+        shares = [sum(one.share(min(budget, job.budget) * n) for job, one in group) / len(group) for budget in BUDGETS]
+        # A run that has reached the finest target has ended there.
+        used = sum(
+            one.evaluations[-1] if len(one.evaluations) == len(bbob.TARGETS) else job.budget * n for job, one in group
+        )
+        milliseconds = 1e3 * sum(one.seconds for _, one in group) / used
+        yield [str(n), method, *(f"{share:.3f}" for share in shares), f"{milliseconds:.2f}", str(len(group))]

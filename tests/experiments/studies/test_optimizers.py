@@ -1,0 +1,71 @@
+"""The study on BBOB: its minima, its count of targets, and the command from a file that has half of the rows."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("cocoex")
+
+from experiments.methods import METHODS
+from experiments.problems import bbob
+from experiments.studies.optimizers import OURS, Job, Reached, optimizers, reached, read, report
+
+
+@pytest.mark.parametrize("function", [1, 10, 24])
+def test_no_point_is_below_the_minimum_and_the_sphere_is_a_sphere(function):
+    task = bbob.task(function, 11, 3, 10)
+    points = torch.stack([task.start(run) for run in range(50)])
+    losses = task.loss(points)
+    assert bool((losses > 0).all())
+    if function == 1:  # |x - minimum|^2: second differences are 2
+        e = torch.eye(3, dtype=torch.float64)
+        x = points[:1]
+        torch.testing.assert_close(
+            task.loss(x + e) + task.loss(x - e) - 2 * task.loss(x), torch.full((3,), 2.0).double()
+        )
+
+
+def test_targets_are_counted_as_they_are_reached():
+    found = reached(bbob.task(1, 11, 2, 60), OURS, 0)
+    assert len(found.evaluations) == len(bbob.TARGETS) == 51
+    assert list(found.evaluations) == sorted(found.evaluations)
+    assert found.share(found.evaluations[-1]) == 1.0
+    assert found.share(0) == 0.0
+
+
+def test_a_method_that_ends_starts_again():
+    """COBYQA arrives at a local minimum of a multimodal function long before 300 evaluations."""
+    calls = []
+    task = bbob.task(3, 11, 2, 300)
+
+    def loss(x):
+        calls.append(len(x))
+        return task.loss(x)
+
+    reached(replace(task, loss=loss), METHODS["cobyqa"], 0)
+    # The errors of what is reported are measured with the error of the task, not with its loss.
+    assert sum(calls) == 300
+
+
+def test_the_command_goes_on_where_it_was(tmp_path, capsys):
+    out = tmp_path / "optimizers.csv"
+    settings = {"n": (2,), "functions": (1,), "instances": (11,), "budget": 10, "out": out}
+    optimizers(methods="ours", **settings)
+    before = out.read_text()
+    optimizers(methods="ours,lbfgs_fd", **settings)
+    assert out.read_text().startswith(before)
+    assert len(read(out)) == 2
+    assert "lbfgs_fd" in capsys.readouterr().out
+
+
+def test_the_table_has_shares():
+    jobs = {Job(2, f, 11, 0, "ours", 100): Reached((5,) * count, 1.0) for f, count in ((1, 51), (2, 0))}
+    assert "0.500" in report(jobs)
+
+
+def test_what_is_not_on_the_platform_is_said(tmp_path):
+    with pytest.raises(SystemExit, match="n must be one of"):
+        optimizers(n=(4,), functions=(1,), methods="ours", out=tmp_path / "o.csv")
+    with pytest.raises(SystemExit, match="function must be from 1 to 24, got 25"):
+        optimizers(n=(2,), functions=(25,), methods="ours", out=tmp_path / "o.csv")

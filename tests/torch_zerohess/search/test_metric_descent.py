@@ -1,0 +1,85 @@
+"""Descent in a learned metric: narrow valleys, curved ones, plateaus, holes and rounds."""
+
+import math
+
+import pytest
+import torch
+from searches import plateau, rosenbrock, run, zeros
+
+from torch_zerohess.optim import Descent, TrustRegion
+from truths import vector
+
+
+def ellipsoid(condition, n, seed):
+    """A rotated quadratic with its minimum at ones."""
+    generator = torch.Generator().manual_seed(seed)
+    axes, _ = torch.linalg.qr(torch.randn(n, n, generator=generator, dtype=torch.float64))
+    sizes = condition ** torch.linspace(0, 1, n, dtype=torch.float64)
+    return lambda z: (((z - 1.0) @ axes).square() * sizes).sum(1)
+
+
+def evaluations_to(search, f, level):
+    while search.value > level and search.evaluations < 1000:
+        search.tell(f(search.ask()))
+    return search.evaluations
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("n", "most"), [(2, 60), (5, 160)])
+def test_a_narrow_valley(n, most, seed):
+    """Axes of a million to one, turned at random: from 1e6 to 1e-8."""
+    f = ellipsoid(1e6, n, seed)
+    assert evaluations_to(Descent(zeros(n), sigma=2.0, seed=seed, restarts=0), f, 1e-8) < most
+
+
+def test_a_curved_valley():
+    search = TrustRegion(vector(-1.2, 1.0), sigma=1.0, seed=0, restarts=0)
+    assert evaluations_to(search, rosenbrock, 1e-8) < 120
+
+
+def test_a_linear_function_ends_in_the_corner():
+    search = Descent(zeros(6), sigma=0.5, bounds=(-5.0, 5.0), seed=0, restarts=0)
+    assert evaluations_to(search, lambda z: z @ torch.arange(1.0, 7.0).double(), -105.0 + 1e-9) < 40
+    torch.testing.assert_close(search.x, torch.full((6,), -5.0).double())
+
+
+def test_on_a_plateau_isotropic_quadratics_take_over():
+    search = Descent(vector(2.0, 1.0), sigma=0.5, seed=1)
+    run(search, plateau, 3)
+    assert search.state_dict()["progress"]["wide"] is not None
+    smooth = Descent(vector(2.0, 1.0), sigma=0.5, seed=1)
+    run(smooth, rosenbrock, 60)
+    assert smooth.state_dict()["progress"]["wide"] is None
+
+
+def test_it_goes_on_bit_by_bit_from_a_state_on_a_plateau():
+    search, again = (Descent(vector(2.0, 1.0), sigma=1.5, seed=3) for _ in range(2))
+    run(search, plateau, 20)
+    again.load_state_dict(search.state_dict())
+    for _ in range(10):
+        assert torch.equal(search.ask(), again.ask())
+        search.tell(plateau(search.ask()))
+        again.tell(plateau(again.ask()))
+
+
+def test_a_hole_is_stepped_around():
+    """Nothing where z_1 > 0.2 near the way to the minimum (1, 1, 1)."""
+    f = ellipsoid(10.0, 3, 0)
+
+    def wall(z):
+        return torch.where((z[:, 1] > 0.2) & (z[:, 0] < 0.4), math.nan, f(z))
+
+    search = run(Descent(zeros(3), sigma=1.0, seed=0), wall, 400)
+    assert search.value < 1e-6
+
+
+def test_rounds_that_arrive_at_one_point_agree():
+    search = Descent(zeros(3), sigma=2.0, seed=0, restarts=5)
+    run(search, ellipsoid(10.0, 3, 0), 10_000)
+    assert search.done
+    assert search.solved
+    assert search.agreed == 6
+    two = Descent(zeros(1), sigma=2.0, seed=0, restarts=8, bounds=(-4.0, 4.0))
+    run(two, lambda z: (z[:, 0].square() - 4).square() + z[:, 0], 10_000)  # minima at -2.03 and 1.97
+    assert two.agreed < 3
+    assert float(two.x) == pytest.approx(-2.0305, abs=1e-3)

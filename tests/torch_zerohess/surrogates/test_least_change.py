@@ -1,0 +1,64 @@
+"""The quadratic of least change against closed forms and against a direct minimisation of the change."""
+
+import pytest
+import torch
+
+from torch_zerohess.surrogates.least_change import least_change
+
+
+def quadratic(n, seed):
+    generator = torch.Generator().manual_seed(seed)
+    g = torch.randn(n, generator=generator, dtype=torch.float64)
+    H = torch.randn(n, n, generator=generator, dtype=torch.float64)
+    H = H + H.mT
+    return g, H, lambda u: 2.0 + u @ g + 0.5 * ((u @ H) * u).sum(1)
+
+
+def points(P, n, seed):
+    return torch.randn(P, n, generator=torch.Generator().manual_seed(100 + seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+@pytest.mark.parametrize("more", [0, 4])
+def test_a_quadratic_is_recovered(n, more):
+    g, H, f = quadratic(n, n)
+    u = points((n + 1) * (n + 2) // 2 + more, n, n)
+    value, gradient, hessian = least_change(u, f(u), torch.zeros(n, n, dtype=torch.float64))
+    assert value == pytest.approx(2.0, abs=1e-3)
+    torch.testing.assert_close(gradient, g, rtol=0, atol=1e-3)
+    torch.testing.assert_close(hessian, H, rtol=0, atol=1e-3)
+
+
+def test_the_true_hessian_stays_and_few_points_are_enough_for_the_slope():
+    g, H, f = quadratic(4, 1)
+    u = points(5, 4, 1)
+    _, gradient, hessian = least_change(u, f(u), H)
+    torch.testing.assert_close(gradient, g, rtol=0, atol=1e-6)
+    torch.testing.assert_close(hessian, H, rtol=0, atol=1e-6)
+
+
+def test_no_smaller_change_interpolates():
+    """The change has no component that leaves all values as they are: it is orthogonal to all such matrices."""
+    n, P = 3, 7
+    _, _, f = quadratic(n, 2)
+    u = points(P, n, 2)
+    earlier = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    value, gradient, hessian = least_change(u, f(u), earlier)
+    fitted = value + u @ gradient + 0.5 * ((u @ hessian) * u).sum(1)
+    torch.testing.assert_close(fitted, f(u), rtol=0, atol=1e-5)
+    pairs = [(i, j) for i in range(n) for j in range(i + 1)]
+    columns = [u.new_ones(P), *u.mT, *(u[:, i] * u[:, j] * (0.5 if i == j else 1.0) for i, j in pairs)]
+    design = torch.stack(columns, 1)
+    _, _, rows = torch.linalg.svd(design)
+    for free in rows[P:]:  # changes of the coefficients that no value sees
+        matrix = u.new_zeros(n, n)
+        for k, (i, j) in enumerate(pairs):
+            matrix[i, j] = matrix[j, i] = free[1 + n + k]
+        assert abs(float(((hessian - earlier) * matrix).sum())) < 1e-4
+
+
+def test_near_points_count_more():
+    """Of |u|^3 along a line the slope at 0 is 0; far points alone would tilt it."""
+    u = torch.tensor([0.0, 0.1, -0.1, 0.2, -0.2, 3.0], dtype=torch.float64)[:, None]
+    _, gradient, _ = least_change(u, u[:, 0] ** 3 / 27, torch.zeros(1, 1, dtype=torch.float64))
+    assert abs(float(gradient)) < 0.01

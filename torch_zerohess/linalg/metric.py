@@ -1,0 +1,61 @@
+"""A metric for a trust region, learned from Hessians, and the step of a quadratic inside it and a box."""
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.subproblem import ball_step
+
+_LEAST = 1e-9
+"""Least curvature, relative to the largest one, that a metric takes seriously."""
+_WIDEST = 16.0
+"""Bound on logarithms of squared lengths of a metric: axes differ by a factor of e^16 at most."""
+_SMALLEST = 1e-300
+
+
+def learned(root: Tensor, hessian: Tensor, rate: float, floor: float = 0.0) -> Tensor:
+    """Return the root B [n, n] of a metric after a Hessian: log(B B^T) moves by `rate` towards -log|H|, det B = 1.
+
+    In the metric |u| with x = B u the quadratic of |H| is a multiple of |u|^2. B is symmetric and positive.
+    """
+    curvature, vectors = torch.linalg.eigh(hessian)
+    size = curvature.abs()
+    size = size.clamp_min(max(_LEAST * float(size.max()), floor) + _SMALLEST)
+    wanted = -size.log()
+    wanted = (vectors * (wanted - wanted.mean())) @ vectors.mT
+    spread, axes = torch.linalg.eigh(root)
+    now = (axes * (2.0 * spread.clamp_min(_SMALLEST).log())) @ axes.mT
+    spread, axes = torch.linalg.eigh((1.0 - rate) * now + rate * wanted)
+    spread = (spread - spread.mean()).clamp(-_WIDEST, _WIDEST)
+    return (axes * (0.5 * spread).exp()) @ axes.mT
+
+
+def region_step(gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Return s [n] that minimises gradient.s + s.hessian s/2 within |B^-1 s| <= 1 and lower <= s <= upper.
+
+    The parameter that is farthest beyond a bound stays there, and the others get a new step in what is left of the
+    region, until none is beyond. Which ones hit is a guess.
+    """
+    s = root @ ball_step(root.mT @ gradient, root.mT @ hessian @ root, 1.0)
+    beyond = torch.maximum(lower - s, s - upper)
+    if float(beyond.max()) <= 0.0:
+        return s
+    inverse = torch.linalg.inv(root)
+    metric = inverse.mT @ inverse
+    free = torch.ones_like(s, dtype=torch.bool)
+    fixed = torch.zeros_like(s)
+    while float(beyond.max()) > 0.0:
+        k = int(beyond.argmax())
+        fixed[k] = s[k].clamp(lower[k], upper[k])
+        free[k] = False
+        s = fixed.clone()
+        if not bool(free.any()):
+            break
+        own = torch.linalg.inv(torch.linalg.cholesky(metric[free][:, free])).mT
+        middle = -own @ (own.mT @ (metric[free] @ fixed))  # the nearest point of the metric's ball, given the fixed
+        s[free] = middle
+        left = 1.0 - float(s @ metric @ s)
+        if left > 0.0:
+            inner = gradient[free] + hessian[free] @ s
+            s[free] = middle + own @ ball_step(own.mT @ inner, own.mT @ hessian[free][:, free] @ own, left**0.5)
+        beyond = torch.where(free, torch.maximum(lower - s, s - upper), 0.0)
+    return s.clamp(lower, upper)

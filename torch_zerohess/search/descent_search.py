@@ -1,0 +1,51 @@
+"""Second-order descent: which method it is, and its public class."""
+
+from typing import Any
+
+from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.metric_descent import MOST, MetricQuadratics
+from torch_zerohess.search.protocol import AskTell, Method, Settings
+
+
+class Descent(AskTell[Any]):
+    """Second-order descent on a smoothed black box, for any number of parameters, with or without bounds.
+
+    Each iteration fits a quadratic model to the evaluations made so far, minimises it within a region around x and
+    within the bounds, and asks for that one point.
+
+    - With the loss alone (up to 40 parameters, no noise), the quadratic is the one of least change through the nearest
+      evaluations, and region and samples follow the metric of its Hessian: narrow valleys are as wide as long there.
+    - With an output [K, *out] and a white-box `loss`, every evaluation is many equations: it follows the minimum of
+      loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises for a
+      while.
+    - On a plateau, in noise, and with the loss alone of more parameters the quadratic is one of the smoothed loss, and
+      sigma grows on the plateau. New samples around x are asked for where the model has predicted badly.
+
+    Where sigma is below `tolerance` (with the loss alone a millionth of it) the search has arrived at a minimum,
+    possibly a local one. It then starts again, up to `restarts` times: from a random point, or in turn from a random
+    point and around the best one with more samples per iteration.
+
+    Settings are those of `AskTell`. Decreases below twice the `noise` do not count. By default the pool keeps three
+    times as many evaluations as the quadratic of a loss is fitted to; of an output 60 or 6 n.
+
+    Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
+    order; evaluations are re-used as in derivative-free least squares (Cartis et al. 2019) and COBYQA.
+
+    Example:
+        >>> import torch
+        >>> search = Descent(torch.tensor([900.0, 850.0]), sigma=500.0, seed=0, restarts=0)
+        >>> while search.evaluations < 9:
+        ...     z = search.ask()
+        ...     search.tell(5 * z[:, 0] ** 2 + 5 * z[:, 1] ** 2 + 7.5 * z[:, 0] * z[:, 1])
+        >>> search.value < 1.0  # of 1.3e7
+        True
+    """
+
+    def _make(self, settings: Settings) -> Method[Any]:
+        return descent_method(settings)
+
+
+def descent_method(settings: Settings) -> LocalQuadratics | MetricQuadratics:
+    """Return quadratics in a learned metric for a loss alone, otherwise isotropic ones."""
+    alone = settings.loss is None and settings.noise == 0.0
+    return MetricQuadratics(settings) if alone and settings.n <= MOST else LocalQuadratics(settings)

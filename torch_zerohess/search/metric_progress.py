@@ -1,0 +1,80 @@
+"""What a descent in a learned metric knows between two evaluations."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.descent_progress import DescentProgress
+from torch_zerohess.search.state import Best, Evaluated, Progress
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MetricProgress(Progress):
+    """A round: its evaluations, the last quadratic, and the region best + sigma B u, |u| <= 1."""
+
+    points: Tensor
+    """Evaluations of the round [P, n]."""
+    values: Tensor
+    """[P]"""
+    root: Tensor
+    """B [n, n], symmetric, positive, of determinant 1."""
+    hessian: Tensor
+    """Of the last quadratic [n, n], in units of `size`."""
+    gradient: Tensor
+    """Of the last quadratic at the best point of the round [n], in units of `size`."""
+    size: float = 1.0
+    """Largest difference of the values that the last quadratic was fitted to."""
+    lowest: Best
+    """The best point of the round."""
+    first: Tensor
+    """Where the search began [n]."""
+    phase: Literal["start", "axes", "trial", "geometry"] = "start"
+    """What is asked for: the start and n points, n further ones, the end of a step, or a point for the model."""
+    promised: float = 0.0
+    """Decrease that the model promises at the end of the step."""
+    length: float = 0.0
+    """Of the step, in units of the region."""
+    expected: float = math.inf
+    """Loss that the model predicts at a point for the model."""
+    confirmed: bool = False
+    """Whether the last such point was as predicted."""
+    refused: int = 0
+    """Steps in a row that were refused."""
+    tied: int = 0
+    """Steps in a row whose end has exactly the value of the best point."""
+    lost: int = 0
+    """Batches in a row with values that were not finite."""
+    wide: DescentProgress | None = None
+    """Isotropic descent on the smoothed loss, which takes over on a plateau."""
+
+    @property
+    def scaled(self) -> Tensor:
+        """The evaluations as u [P, n]."""
+        return torch.linalg.solve(self.root, (self.points - self.lowest.point).mT).mT / self.sigma
+
+    def remembered(self, evaluated: Evaluated, capacity: int) -> "MetricProgress":
+        """Add evaluations; a value that is not finite counts as the highest one of the round."""
+        finite = evaluated.finite
+        new = evaluated.those(finite)
+        best, lowest = self.best, self.lowest
+        if len(new):
+            k = int(new.losses.argmin())
+            found = Best(new.points[k], float(new.losses[k]), self.sigma)
+            best, lowest = (found if found.loss < one.loss else one for one in (best, lowest))
+        points, values = torch.cat([self.points, new.points]), torch.cat([self.values, new.losses])
+        if len(values) and len(new) < len(evaluated):
+            holes = evaluated.points[~finite]
+            points, values = torch.cat([points, holes]), torch.cat([values, values.max().expand(len(holes))])
+        return replace(
+            self,
+            best=best,
+            lowest=lowest,
+            center=lowest.point,
+            points=points[-capacity:],
+            values=values[-capacity:],
+            evaluations=self.evaluations + len(evaluated),
+            lost=0 if len(new) == len(evaluated) else self.lost + 1,
+        )

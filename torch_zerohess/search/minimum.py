@@ -1,0 +1,59 @@
+"""What a minimisation tells while it goes on and at its end."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from torch import Tensor
+
+from torch_zerohess.estimation.inputs import short
+
+Status = Literal["target", "solved", "stalled", "budget", "time", "callback", "interrupted", "failed"]
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """State after a batch of evaluations: how many there were, the best value so far, and where."""
+
+    evaluations: int
+    value: float
+    x: Tensor
+    points: Tensor = field(repr=False)
+    """The points of this batch [K, n]."""
+    values: Tensor = field(repr=False)
+    """Their losses [K]."""
+
+
+@dataclass(frozen=True, repr=False)
+class Minimum:
+    """The best point found, and the smoothed function around it.
+
+    `gradient` [n] and `hessian` [n, n] come from the last quadratic model around x, of width `sigma`. They are on the
+    device and in the type of x. `standard_errors` has their errors by the names "gradient" and "hessian_diagonal",
+    infinite where the evaluations do not tell. All three are None if too few evaluations lie around x.
+    """
+
+    x: Tensor
+    value: float
+    gradient: Tensor | None
+    hessian: Tensor | None
+    standard_errors: dict[str, Tensor] | None
+    sigma: Tensor
+    """Width of the model per parameter [n]."""
+    evaluations: int
+    history: list[Iterate]
+    """After every batch, with all points and losses in order."""
+    message: str
+    """Why the search ended."""
+    engine: str
+    """Which search it was: "gaussian_process", "descent" or "local"."""
+    success: bool = False
+    """Whether the target was reached, or x is a point at which the search has arrived."""
+    status: Status = "budget"
+    """target: the value is at most the target. solved: the search has ended at a minimum, possibly a local one.
+    stalled: it has ended without one. budget, time: evaluations or seconds are used up. callback, interrupted: the
+    caller has ended it. failed: the black box has raised."""
+
+    def __repr__(self) -> str:
+        found = f"x={short(self.x)}, value={self.value:.6g}, evaluations={self.evaluations}"
+        said = f"engine={self.engine!r}, success={self.success}, message={self.message!r}"
+        return f"Minimum({found}, {said})"

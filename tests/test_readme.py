@@ -55,6 +55,7 @@ def test_code_runs(name, tmp_path, monkeypatch):
         exec(compile(block, name, "exec"), names)
     if name == "README.md":
         assert names["fit"].value == 0.0
+    if name == "torch_zerohess/README.md":
         assert names["search"].value < 0.05
         assert names["found"].value <= 1e-6
         assert names["found"].evaluations < 100

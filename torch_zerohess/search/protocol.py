@@ -256,11 +256,10 @@ class AskTell(ABC, Generic[P]):
         evaluated = self._evaluated(values, self._state.asked[: self._given])
         if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
             raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
-        self.told = evaluated.losses
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
-        self._given = 0
+        self._given, self.told = 0, evaluated.losses
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a search with the same settings needs to go on exactly as this one would.

@@ -149,7 +149,7 @@ def test_bounds_are_kept_to_the_last_bit(dtype):
             at_bounds += int(((z - lower).abs() < 1e-6).sum() + ((z - upper).abs() < 1e-6).sum())
         assert bool((search.x.double() >= lower).all())
         assert bool((search.x.double() <= upper).all())
-    assert at_bounds > 1000
+    assert at_bounds > 500
 
 
 def test_asking_for_fewer():
@@ -300,8 +300,8 @@ def test_a_state_is_not_changed_by_the_search_it_came_from():
 
 
 def test_the_settings_stay_those_of_the_search_that_loads():
-    search = run(Descent(zeros(2), sigma=1.0, pool=60, seed=0), bowl, 40)
-    copy = Descent(zeros(2), sigma=1.0, pool=5, seed=0)
+    search = run(Descent(zeros(2), sigma=1.0, noise=1e-3, pool=60, seed=0), bowl, 40)
+    copy = Descent(zeros(2), sigma=1.0, noise=1e-3, pool=5, seed=0)
     copy.load_state_dict(search.state_dict())
     copy.tell(bowl(copy.ask()))
     assert len(copy.state_dict()["progress"]["pool"]["values"]) == 5
@@ -407,7 +407,7 @@ def test_values_that_cannot_be_taken_change_nothing():
         return loss(output) if wrong is None else wrong(output)
 
     search = Descent(zeros(3), sigma=1.0, loss=switch, seed=0)
-    for _ in range(12):
+    for _ in range(8):  # a loss is differentiated where a step follows, and these steps all do
         points, before = search.ask(), search.state_dict()
         values = rays(points)
         for bad in (values[:-1], torch.cat([values, values]), values[0, 0, 0]):
@@ -441,10 +441,12 @@ def test_values_before_points():
 def test_losses_of_a_wrong_shape():
     search = Descent(zeros(2), sigma=1.0, seed=0)
     search.ask()
-    for wrong in (torch.zeros(2), torch.zeros(3, 1), torch.tensor(0.0)):
+    for wrong in (torch.zeros(2), torch.zeros(3, 2), torch.zeros(1, 3), torch.tensor(0.0)):
         with pytest.raises(ValueError, match=r"values must have shape \[3\]"):
             search.tell(wrong)
-    search.tell([1.0, 2.0, 3.0])
+    assert search.told.numel() == 0
+    search.tell([[1.0], [2.0], [3.0]])
+    assert search.told.tolist() == [1.0, 2.0, 3.0]
     assert search.value == 1.0
     search.ask()
     search.tell(np.array([0.5]))

@@ -22,7 +22,7 @@ from experiments.runs.network_trial import NetworkTrial
 
 _STEPS = 1000
 """Steps at most; larger budgets get more fresh images per step."""
-_STEPS_ALONE = 2400
+_STEPS_ALONE = 4000
 """Steps where all evaluations are used before the first step."""
 _ROWS = 200
 """Rows of the log, about."""

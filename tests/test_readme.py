@@ -113,7 +113,7 @@ def test_setup_commands_are_one_line_each():
         assert "\n" not in setup
     main, tests = setups
     assert main.endswith("python -m experiments run cnn --methods our_g,memory_newton --evaluations 400")
-    assert tests.endswith("python -m pytest -q")
+    assert tests.endswith("python -m pytest -q -n 2 --dist loadfile")
 
 
 @pytest.mark.parametrize("name", TEXTS)

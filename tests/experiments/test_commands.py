@@ -84,12 +84,20 @@ def no_mitsuba(monkeypatch) -> None:
 
 @pytest.mark.usefixtures("no_mitsuba")
 def test_tasks_that_mitsuba_renders_say_that_it_is_missing() -> None:
-    for name in (*catalogue.RENDERED, *catalogue.NETWORKS):
+    for name in (*catalogue.RENDERED, *catalogue.RENDERED_NETWORKS):
         with pytest.raises(ImportError, match=rf"task {name} needs mitsuba, .*pip install 'torch_zerohess") as raised:
             catalogue.load(name)
         assert raised.value.name == "mitsuba"
     assert catalogue.load("caustic").name == "caustic"
     assert catalogue.load("meshfit").name == "meshfit"
+    assert catalogue.load("cnn_throw").name == "cnn_throw"
+
+
+def test_tasks_that_mujoco_simulates_say_that_it_is_missing(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    for name in catalogue.SIMULATED:
+        with pytest.raises(ImportError, match=rf"task {name} needs mujoco, .*pip install 'torch_zerohess"):
+            catalogue.load(name)
 
 
 @pytest.mark.usefixtures("no_mitsuba")
@@ -117,7 +125,7 @@ def test_list_and_gallery_show_what_is_missing(monkeypatch, tmp_path, capsys) ->
     monkeypatch.setattr(sys, "argv", ["experiments", "list"])
     main()
     printed = capsys.readouterr().out
-    for name in (*catalogue.RENDERED, *catalogue.NETWORKS):
+    for name in (*catalogue.RENDERED, *catalogue.RENDERED_NETWORKS):
         assert re.search(rf"^{name} +task {name} needs mitsuba, which is not installed", printed, re.MULTILINE)
     monkeypatch.setattr(sys, "argv", ["experiments", "gallery", str(tmp_path), "--tasks", "mug"])
     with pytest.raises(SystemExit, match="no task of this command can be shown"):

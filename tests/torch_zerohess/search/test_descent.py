@@ -135,6 +135,7 @@ def test_the_scale_of_the_loss(size, bounds):
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
 def test_networks_as_losses(bounds):
     """With weights that require grad, and without a second derivative."""
+    torch.manual_seed(0)
     linear = torch.nn.Linear(3, 1).double()
     weights = linear.weight.detach()[0]
 

@@ -15,6 +15,7 @@ and their mirror images: the mean is unbiased, and its error falls faster than t
 
 import copy
 import functools
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -194,18 +195,25 @@ class SurrogateTerm:
             return torch.stack([self._along(x, one) for one in self._units], 3)
         directions = self._units if v is None else [v.to(x)] * x.shape[1]
         parts = [
-            torch.func.jvp(lambda at, one=one: self._along(at, one), (x,), (other.expand_as(x),))[1]
+            _derivative(lambda at, one=one: self._along(at, one), x, other.expand_as(x))
             for one, other in zip(self._units, directions, strict=True)
         ]
         return torch.stack(parts, 3)
 
     def _along(self, x: Tensor, v: Tensor) -> Tensor:
-        result: Tensor = torch.func.jvp(self._each, (x,), (v.expand_as(x),))[1]
-        return result
+        return _derivative(self._each, x, v.expand_as(x))
 
     @property
     def _units(self) -> list[Tensor]:
         return list(torch.eye(len(self.sigma), dtype=torch.float64, device=self.x.device))
+
+
+def _derivative(fn: Callable[[Tensor], Tensor], x: Tensor, v: Tensor) -> Tensor:
+    """Return the derivative of fn at x along v by forward mode."""
+    with warnings.catch_warnings():  # forward mode of torch warns about itself when it is first used
+        warnings.filterwarnings("ignore", "`torch.jit.script", FutureWarning)
+        result: Tensor = torch.func.jvp(fn, (x,), (v,))[1]
+    return result
 
 
 def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int) -> bool:

@@ -23,8 +23,6 @@ _NARROW, _BY_LENGTH, _WIDER = 0.85, 0.3, 1.05
 """Factor for sigma after a step of no length, its growth with the length, and the largest one."""
 _LONG, _WIDENING = 0.9, 1.5
 """A faithful step of this length widens sigma by this factor, up to the widest one."""
-_SHORT = 0.3
-"""Length of a step, in units of the radius, up to which it ends at a minimum and not on a plateau."""
 _FEWER = 8
 """Parameters per pair of samples where the model was not far off."""
 _RETRIES = 2
@@ -66,8 +64,7 @@ def after_output(known: DescentProgress, point: Tensor, loss: float, output: Ten
     narrow = _narrowing(length)
     if min(known.recent) > _FALL * known.earlier:
         narrow *= _HURRY
-    flat = abs(gain) < _FLAT * abs(before) and length > _SHORT
-    if flat and misfit > _FAITHFUL and known.patience < _PATIENCE:
+    if abs(gain) < _FLAT * abs(before) and misfit > _FAITHFUL and known.patience < _PATIENCE:
         known = replace(known, patience=known.patience + 1)
         if known.lowest.loss < _BETTER * before:
             known = replace(known, center=known.lowest.point, value=known.lowest.loss)

@@ -195,7 +195,7 @@ class SurrogateTerm:
             return torch.stack([self._along(x, one) for one in self._units], 3)
         directions = self._units if v is None else [v.to(x)] * x.shape[1]
         parts = [
-            _derivative(lambda at, one=one: self._along(at, one), x, other.expand_as(x))
+            _derivative(functools.partial(self._along, v=one), x, other.expand_as(x))
             for one, other in zip(self._units, directions, strict=True)
         ]
         return torch.stack(parts, 3)

@@ -59,6 +59,7 @@ class Control:
         outputs: Tensor,
         aux: Sequence[Tensor],
         added: Callable[[Tensor], list[Tensor]],
+        kept: Tensor | None,
     ) -> Tensor | None:
         """Keep new evaluations and return what the surrogate predicts for them, float64 [B, E, *out], if it is used.
 
@@ -68,6 +69,7 @@ class Control:
             outputs: of the black box [B, E, *outputs].
             aux: of the batch elements [B, ...].
             added: what values [B, E, *out] add to the derivatives of the estimate, by order.
+            kept: which values were not left out [B, E]; all of them if None.
         """
         predicted = None
         if self.memory.ready:
@@ -82,7 +84,8 @@ class Control:
                 raise ValueError("the surrogate of the memory predicted a value that is not finite")
         if self.learning:
             if predicted is not None:
-                self.memory.observe(values, predicted, list(zip(added(values), added(predicted), strict=True)))
+                derivatives = list(zip(added(values), added(predicted), strict=True))
+                self.memory.observe(values, predicted, derivatives, kept)
             self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
         return predicted if self.active else None
 

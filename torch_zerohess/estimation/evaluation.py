@@ -160,7 +160,8 @@ def evaluate(
         a = _coefficients(rows[:, :K], rows[:, K] if with_center else None, share[..., None], smoothing, n)[1]
         return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
 
-    explain = None if control is None else partial(control.explain, values, everywhere, outputs, aux, added)
+    counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
+    explain = None if control is None else partial(control.explain, values, everywhere, outputs, aux, added, counted)
     rest, rest_center = _remaining(call, values, center, share, aux, control, explain, stein)
     values = values[:, :K]
     baseline, coefficients = _coefficients(rest.reshape(B, K, -1), rest_center, share[..., None], smoothing, n)

@@ -179,17 +179,27 @@ class Memory:
         ratios = [covariance / variance if variance > 0.0 else 0.0 for covariance, variance in self._moments]
         return min(max(min(ratios, default=0.0), 0.0), 1.0)
 
-    def observe(self, losses: Tensor, predicted: Tensor, derivatives: Sequence[tuple[Tensor, Tensor]] = ()) -> None:
+    def observe(
+        self,
+        losses: Tensor,
+        predicted: Tensor,
+        derivatives: Sequence[tuple[Tensor, Tensor]] = (),
+        kept: Tensor | None = None,
+    ) -> None:
         """Tell the coefficient the values of a call, and what the surrogate predicted for them.
 
         Args:
             losses: values [B, K, *out].
             predicted: the same by the surrogate.
             derivatives: for each order what the values, and the predicted ones, add to it: [B, *] each.
+            kept: which values count [B, K]; all of them if None.
         """
         a, b = (one.double().reshape(*one.shape[:2], -1) for one in (losses, predicted))
         dim = 1 if a.shape[1] > 1 else 0  # the differences within an element make its derivatives
-        pairs = [(a - a.mean(dim, keepdim=True), b - b.mean(dim, keepdim=True)), *derivatives]
+        weight = torch.ones_like(a[..., :1]) if kept is None else kept[..., None].double()
+        count = weight.sum(dim, keepdim=True).clamp_min(1.0)
+        a, b = ((one - (weight * one).sum(dim, keepdim=True) / count) * weight for one in (a, b))
+        pairs = [(a, b), *derivatives]
         new = [[float((one * other).sum()), float(other.square().sum())] for one, other in pairs]
         if not all(_is_number(one) for moments in new for one in moments):  # the surrogate predicts nonsense
             self._moments = []

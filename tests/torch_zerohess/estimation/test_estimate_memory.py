@@ -255,3 +255,15 @@ def test_a_surrogate_of_another_shape_says_so() -> None:
     memory = Memory(Model(lambda z: z[:, :1]))
     with pytest.raises(ValueError, match=r"the surrogate of the memory must return \[K, 2\] like the black box"):
         estimate(image, X, SMOOTHING, memory=memory)
+
+
+def test_points_that_are_dropped_leave_the_coefficient() -> None:
+    """Half of the plane has no value; the surrogate is exact where there is one."""
+
+    def half(z: Tensor) -> Tensor:
+        return torch.where((z[:, 0] > 0.9)[:, None], math.nan, image(z) + 5.0)
+
+    memory = Memory(Model(lambda z: image(z) + 5.0))
+    for seed in SEEDS[:4]:
+        estimate(half, X, SMOOTHING.replace(samples=64, seed=seed), memory=memory, on_nonfinite="drop")
+    assert memory.coefficient == pytest.approx(1.0, abs=1e-9)

@@ -130,3 +130,10 @@ def test_the_coefficient_is_the_smallest_over_values_and_derivatives() -> None:
     assert memory.coefficient == pytest.approx(0.25)
     memory.observe(truth, truth, [(slope, slope), (-bend, bend)])
     assert memory.coefficient < 0.25
+
+
+def test_values_that_were_left_out_do_not_count() -> None:
+    memory, truth = Memory(), normal(1, 2000) + 5.0
+    kept = torch.rand(1, 2000, generator=torch.Generator().manual_seed(1)) < 0.5
+    memory.observe(torch.where(kept, truth, 0.0), truth, kept=kept)
+    assert memory.coefficient == pytest.approx(1.0)

@@ -3,10 +3,9 @@
 from experiments.methods import (
     analytic,
     bayesian,
-    block_gauss_newton,
     derivative_free,
+    gauss_newton,
     learned,
-    local,
     memory_networks,
     meshes,
     mitsuba,
@@ -20,7 +19,7 @@ from experiments.methods.method import Method
 METHODS: dict[str, Method] = {
     method.name: method
     for family in (
-        *(paper, ours, memory_networks, block_gauss_newton, local, derivative_free, quasi_newton),
+        *(paper, ours, memory_networks, gauss_newton, derivative_free, quasi_newton),
         *(bayesian, turbo, learned, analytic, meshes, mitsuba),
     )
     for method in family.METHODS

@@ -26,7 +26,8 @@ from torch import Tensor
 from torch_zerohess.search.protocol import AskTell, Method, Settings
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated, Progress
-from torch_zerohess.surrogates.quadratic import LocalModel, loss_derivatives
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.quadratic import LocalModel
 
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
@@ -190,7 +191,8 @@ class BlockMethod(Method[BlockProgress]):
         size = _largest(known.jacobian)
         jacobian = known.jacobian / size  # squares of float32 do not overflow
         directions = jacobian.view(-1, *known.shape)
-        _, slope, bend = loss_derivatives(self._of_output, known.output.view(known.shape), directions)
+        loss = loss_curvature(self._of_output, known.output.view(known.shape))
+        slope, bend = loss.slope.flatten(), loss.products(directions)
         steep, bent = _largest(slope), _largest(bend)
         gradient, hessian = jacobian @ (slope / steep).float(), jacobian @ (bend / bent).mT
         return size * steep * gradient.double(), size**2 * bent * hessian.double()

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.surrogates.gaussian_process import GaussianProcess
-from torch_zerohess.surrogates.quadratic import loss_derivatives
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
 
 _ERROR = 0.1
 """Error of the expansion, relative to the predicted change of the loss, up to which it is true."""
@@ -37,7 +37,12 @@ class LossModel:
     ) -> None:
         self.process, self.optimism, m = process, optimism, len(output)
         directions = torch.cat([(process.mean - output)[None], process.weights])
-        self.value, slope, bend = loss_derivatives(loss, output.view(shape), directions.view(-1, *shape))
+        expanded = loss_curvature(loss, output.view(shape))
+        self.value, slope, bend = (
+            expanded.value,
+            expanded.slope.flatten(),
+            expanded.products(directions.view(-1, *shape)),
+        )
         self.slope, self.bend = directions @ slope, directions @ bend.mT
         self.steepness = float(slope.square().sum()), bend @ slope, bend @ bend.mT
         self.elements = m

@@ -17,6 +17,15 @@ class LossCurvature:
     value: float
     slope: Tensor
     product: Callable[[Tensor], Tensor]
+    scale: float | None = None
+    """The second derivative, where it is this multiple of the identity."""
+
+    def products(self, directions: Tensor) -> Tensor:
+        """Return the products with directions [r, *out], [r, m] in their type."""
+        flat = directions.reshape(len(directions), -1)
+        if self.scale is not None:
+            return self.scale * flat
+        return torch.stack([self.product(one.to(self.slope)).flatten() for one in directions]).to(directions)
 
 
 def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurvature:
@@ -37,15 +46,16 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
 
     fixed = _finite(slope.detach())
     if not slope.requires_grad:
-        return LossCurvature(float(value.detach()), fixed, torch.zeros_like)
+        return LossCurvature(float(value.detach()), fixed, torch.zeros_like, 0.0)
     # A generic vector is an eigenvector only of a multiple of the identity.
     probe = torch.cos(torch.arange(1.0, y.numel() + 1.0, dtype=y.dtype, device=y.device)).view_as(y)
     image, square = product(probe), float(probe.square().sum())
     scale = float((image * probe).sum()) / square
     if float((image - scale * probe).norm()) <= _EIGEN * abs(scale) * square**0.5:
-        return LossCurvature(float(value.detach()), fixed, lambda s: scale * s)
+        return LossCurvature(float(value.detach()), fixed, lambda s: scale * s, scale)
     return LossCurvature(float(value.detach()), fixed, product)
 
 
 def _finite(derivatives: Tensor) -> Tensor:
+    """Replace derivatives that are not finite by zero: of a norm at zero, of a logarithm outside of its domain."""
     return torch.nan_to_num(derivatives, nan=0.0, posinf=0.0, neginf=0.0)

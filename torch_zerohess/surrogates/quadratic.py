@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
+
 _NOISE = (1e-7, 1e-4, 1e-2, 1e-1)
 """Variances of the part of the values that is not quadratic, in units of the prior's; the evidence chooses."""
 _CONSTANT = 10.0
@@ -28,8 +30,6 @@ _INTERCEPT = 1e-9
 """Prior precision of the constant term of an output, in evaluations."""
 _JITTER = 1e-13
 """Added to a kernel matrix, in units of its mean diagonal element, so that rounding leaves it definite."""
-_EIGEN = 1e-12
-"""Relative error to which a Hessian times a vector may be a multiple of that vector."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,8 @@ def fit_outputs(
     inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
     slopes = inverse @ (design.mT @ (weights[:, None] * outputs))
     intercept, jacobian = slopes[0], slopes[1:]
-    value, downhill, bend = loss_derivatives(loss, intercept.view(shape), jacobian.view(r, *shape))
+    expanded = loss_curvature(loss, intercept.view(shape))
+    downhill, bend = expanded.slope.flatten(), expanded.products(jacobian.view(r, *shape))
     gradient = jacobian @ downhill
     hessian = jacobian @ bend.mT
     hessian = 0.5 * (hessian + hessian.mT)
@@ -164,7 +165,7 @@ def fit_outputs(
     left = (weights @ (outputs - design @ slopes).square()) / max(spare, 1)  # variance per output, [m]
     own = inverse.diagonal()[1:] if spare > 0 else torch.full_like(gradient, math.inf)
     return LocalModel(
-        value,
+        expanded.value,
         gradient,
         hessian,
         basis,
@@ -221,43 +222,3 @@ def _reduced(u: Tensor) -> tuple[Tensor | None, Tensor]:
         return None, u
     basis, triangle = torch.linalg.qr(u.mT)
     return basis, triangle.mT
-
-
-def loss_derivatives(
-    loss: Callable[[Tensor], Tensor], output: Tensor, directions: Tensor
-) -> tuple[float, Tensor, Tensor]:
-    """Return loss, its gradient [m] and its Hessian times directions [r, *out], [r, m], at an output [*out].
-
-    The products have the type of the directions.
-    """
-    with torch.enable_grad():
-        y = output.detach().requires_grad_(True)
-        value = loss(y)
-        if not value.requires_grad:
-            raise ValueError("loss must be differentiable by torch, got a value that does not depend on its output")
-        (slope,) = torch.autograd.grad(value, y, create_graph=True)
-        if not slope.requires_grad:
-            return (
-                float(value.detach()),
-                _finite(slope.detach().flatten()),
-                torch.zeros_like(directions.reshape(len(directions), -1)),
-            )
-
-        def product(direction: Tensor) -> Tensor:
-            return torch.autograd.grad(slope, y, direction, retain_graph=True, materialize_grads=True)[0]
-
-        # A generic combination of directions is an eigenvector only if all of them are, with the same eigenvalue.
-        generic = torch.cos(torch.arange(1.0, len(directions) + 1.0)).to(directions)
-        probe = torch.tensordot(generic, directions, dims=1).to(y)
-        image, square = product(probe), float(probe.square().sum())
-        scale = float((image * probe).sum()) / square if square > 0.0 else 0.0
-        if float((image - scale * probe).norm()) <= _EIGEN * abs(scale) * math.sqrt(square):
-            products = scale * directions.reshape(len(directions), -1)
-        else:
-            products = torch.stack([product(one.to(y)).flatten() for one in directions]).to(directions)
-    return float(value.detach()), _finite(slope.detach().flatten()), _finite(products)
-
-
-def _finite(derivatives: Tensor) -> Tensor:
-    """Replace derivatives that are not finite by zero: of a norm at zero, of a logarithm outside of its domain."""
-    return torch.nan_to_num(derivatives, nan=0.0, posinf=0.0, neginf=0.0)

@@ -5,8 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-pytest.importorskip("cocoex")
-
 from experiments.methods import METHODS
 from experiments.problems import bbob
 from experiments.studies.optimizers import OURS, Job, Reached, optimizers, reached, read, report

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torch_zerohess.surrogates.quadratic import fit_outputs, fit_values, loss_derivatives
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.quadratic import fit_outputs, fit_values
 from truths import vector
 
 
@@ -251,7 +252,8 @@ def test_second_derivatives_of_a_loss_are_those_of_torch_func(loss, count):
     generator = torch.Generator().manual_seed(0)
     output = torch.randn(2, 3, generator=generator, dtype=torch.float64)
     directions = torch.randn(count, 2, 3, generator=generator, dtype=torch.float64)
-    value, slope, products = loss_derivatives(loss, output, directions)
+    found = loss_curvature(loss, output)
+    value, slope, products = found.value, found.slope.flatten(), found.products(directions)
     hessian = torch.func.hessian(loss)(output).reshape(6, 6)
     assert value == pytest.approx(float(loss(output)))
     assert torch.allclose(slope, torch.func.grad(loss)(output).flatten())

@@ -18,14 +18,14 @@ element of the output as there are parameters: with a thousand parameters it ste
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.jacobian_progress import JacobianProgress
 from torch_zerohess.search.protocol import AskTell, Method, Settings
 from torch_zerohess.search.space import Bounds
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -33,8 +33,6 @@ LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
 _REFUSED = 0.4
 """Factor of the radius where no step lowers the loss."""
-_ENDLESS = 10
-"""Batches in a row with values that are not finite, after which the search ends."""
 _SHIFTS = (1e-8, 1e8)
 """Range of the shift that shortens a step, in units of the largest curvature."""
 _BISECTIONS = 50
@@ -43,23 +41,15 @@ _RIDGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BlockProgress(Progress):
+class BlockProgress(JacobianProgress):
     """An output, the Jacobian there, and what is asked for to go on."""
 
-    phase: Literal["sample", "trial"] = "sample"
-    """What is asked for: samples that renew the Jacobian, after the start itself at first, or steps."""
-    radius: float
-    """Root mean square over the parameters."""
     wanted: int
     """Samples that are still wanted in this iteration."""
     unused: Tensor
     """Directions [k, n] of the latest basis that were not sampled yet, float32."""
-    output: Tensor
-    """At the center [m], float64; empty before the first values."""
     jacobian: Tensor
     """[n, m], float32: errors of sampling are far above its rounding. Empty before the first values."""
-    refused: int = 0
-    """Batches in a row without a finite value."""
 
 
 class BlockMethod(Method[BlockProgress]):
@@ -93,20 +83,13 @@ class BlockMethod(Method[BlockProgress]):
         self, known: BlockProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[BlockProgress, Tensor]:
         """Renew the Jacobian by samples, or take the best step; then ask for what follows."""
-        finite = evaluated.finite
-        known = replace(
-            known,
-            shape=evaluated.shape,
-            evaluations=known.evaluations + len(evaluated),
-            refused=0 if bool(finite.any()) else known.refused + 1,
-        )
-        if known.refused >= _ENDLESS:
-            message = f"{_ENDLESS} batches in a row had no finite value"
-            return replace(known, done=True, message=message), known.center.new_empty(0, self.settings.n)
+        known = known.counted(evaluated)
+        if known.done:
+            return known, known.center.new_empty(0, self.settings.n)
         if known.phase == "sample":
             known = self._renewed(known, evaluated)
             return self._sample(known, generator) if known.wanted > 0 else self._try(known)
-        known = self._taken(known, evaluated.those(finite))
+        known = self._taken(known, evaluated.those(evaluated.finite))
         if known.done:
             return known, known.center.new_empty(0, self.settings.n)
         return self._sample(known, generator)

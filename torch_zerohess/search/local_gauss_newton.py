@@ -12,16 +12,17 @@ radius. Where the output of that step was predicted well, the next steps use the
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.krylov import krylov_steps
 from torch_zerohess.search.draws import normal, reflect
+from torch_zerohess.search.jacobian_progress import JacobianProgress
 from torch_zerohess.search.protocol import AskTell, Method, Settings
 from torch_zerohess.search.space import Bounds
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
@@ -31,8 +32,6 @@ LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
 _REFUSED = 0.4
 """Factor of the radius where no step lowers the loss."""
-_ENDLESS = 10
-"""Batches in a row with values that are not finite, after which the search ends."""
 _TRUSTED = 0.9
 """Share of the held-out change from which on the first radius is that of the samples, 1."""
 _FAITHFUL = 0.1
@@ -76,21 +75,13 @@ class LocalSettings:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LocalProgress(Progress):
+class LocalProgress(JacobianProgress):
     """An output, the sparse Jacobian there, and what is asked for to go on."""
 
-    phase: Literal["sample", "trial"] = "sample"
-    """What is asked for: samples, after the start itself at first, or steps."""
-    radius: float
-    """Root mean square over the parameters."""
-    output: Tensor
-    """At the center [m], float64; empty before the first values."""
     jacobian: SparseJacobian | None = None
     """float32: errors of sampling are far above its rounding."""
     samples: int
     """Of the next batch."""
-    refused: int = 0
-    """Batches in a row without a finite value."""
 
 
 class LocalMethod(Method[LocalProgress]):
@@ -124,20 +115,13 @@ class LocalMethod(Method[LocalProgress]):
         self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LocalProgress, Tensor]:
         """Fit the Jacobian to samples, or take the best step; then ask for what follows."""
-        finite = evaluated.finite
-        known = replace(
-            known,
-            shape=evaluated.shape,
-            evaluations=known.evaluations + len(evaluated),
-            refused=0 if bool(finite.any()) else known.refused + 1,
-        )
-        if known.refused >= _ENDLESS:
-            message = f"{_ENDLESS} batches in a row had no finite value"
-            return replace(known, done=True, message=message), known.center[None][:0]
+        known = known.counted(evaluated)
+        if known.done:
+            return known, known.center[None][:0]
         if known.phase == "sample":
             known = self._fitted(known, evaluated)
         else:
-            known = self._taken(known, evaluated.those(finite))
+            known = self._taken(known, evaluated.those(evaluated.finite))
         if known.done:
             return known, known.center[None][:0]
         return self.step(known) if known.phase == "trial" else (known, self._samples(known, generator))

@@ -46,7 +46,7 @@ class NetworkTrial(Run):
         limit: float = math.inf,
         watch: Callable[[Record], None] | None = None,
     ) -> None:
-        super().__init__(task.name, method, run, task.evaluations, folder, limit, watch)
+        super().__init__(task.name, method, run, task.evaluations, folder, limit, watch, parallel=task.threads != 1)
         self.task = task
         self.images, _ = task.training(run)
         """[N, 3, h, w]."""

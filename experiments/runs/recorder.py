@@ -19,6 +19,9 @@ class Recorder:
     A run that was killed is replayed. The method starts again; evaluations are answered from the journal, and rows are
     taken from the log, with their times. So no black box is called twice, and both clocks go on where they were. Then
     `skip` is told how many calls and points were answered from the journal. Without `files` nothing is written.
+
+    Seconds are of the processor, so that other programs on the machine change them little. On an idle machine they are
+    wall-clock seconds, because a run has one thread. With `parallel` threads seconds are of the clock on the wall.
     """
 
     def __init__(
@@ -29,6 +32,8 @@ class Recorder:
         files: Files | None = None,
         watch: Callable[[Record], None] | None = None,
         skip: Callable[[int, int], None] | None = None,
+        *,
+        parallel: bool = False,
     ) -> None:
         self.task, self.method, self.run = task, method, run
         self.rows: list[Record] = []
@@ -40,11 +45,12 @@ class Recorder:
         self._watch, self._skip = watch, skip
         self._missed = [0, 0]
         """Calls and points that were answered from the journal."""
-        self._clock = Clock()
+        self._now = time.perf_counter if parallel else time.process_time
+        self._clock = Clock(self._now)
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time of the run; measuring errors and writing files are not counted."""
+        """Time of the run; measuring errors and writing files are not counted."""
         return self._clock.seconds
 
     def evaluate(self, fn: Callable[..., Tensor], x: Tensor, *aux: Tensor) -> Tensor:
@@ -55,10 +61,10 @@ class Recorder:
             if self._skip and any(self._missed):
                 self._skip(*self._missed)
                 self._missed = [0, 0]
-            began = time.perf_counter()
+            began = self._now()
             with torch.no_grad():
                 values = fn(x, *aux)
-            self.black_box_seconds += time.perf_counter() - began
+            self.black_box_seconds += self._now() - began
             self._clock.stop()
             if self._journal:
                 self._journal.append(x, values, self.seconds, self.black_box_seconds)
@@ -119,18 +125,19 @@ class Recorder:
 
 
 class Clock:
-    """Seconds that can be stopped and set."""
+    """Seconds of `now` that can be stopped and set."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
         self._before, self._since = 0.0, math.nan
 
     @property
     def seconds(self) -> float:
-        return self._before + (0.0 if math.isnan(self._since) else time.perf_counter() - self._since)
+        return self._before + (0.0 if math.isnan(self._since) else self._now() - self._since)
 
     def start(self) -> None:
         if math.isnan(self._since):
-            self._since = time.perf_counter()
+            self._since = self._now()
 
     def stop(self) -> None:
         self.set(self.seconds)

@@ -19,7 +19,7 @@ class Record:
     run: int
     iteration: int
     seconds: float
-    """Wall-clock time since the start of the run; measuring errors and writing files are not counted."""
+    """Time since the start of the run, see `Recorder`; measuring errors and writing files are not counted."""
     evaluations: int
     """Black-box evaluations since the start of the run."""
     sigma: float | None

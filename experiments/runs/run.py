@@ -45,6 +45,8 @@ class Run:
         limit: float,
         watch: Callable[[Record], None] | None,
         skip: Callable[[int, int], None] | None = None,
+        *,
+        parallel: bool = False,
     ) -> None:
         self.method, self.run, self.limit = method, run, limit
         self.seed = run + SEEDS
@@ -53,7 +55,7 @@ class Run:
         self.diverged: DivergedError | None = None
         self.files = Files(folder / task / method, run) if folder else None
         self._budget = evaluations
-        self._recorder = Recorder(task, method, run, self.files, watch, skip)
+        self._recorder = Recorder(task, method, run, self.files, watch, skip, parallel=parallel)
 
     @property
     def evaluations(self) -> int:

@@ -84,9 +84,11 @@ def test_rows_have_errors_of_the_held_out_images():
     assert trial.evaluations == 0
 
 
-def test_time_limit(monkeypatch):
+@pytest.mark.parametrize(("threads", "clock"), [(None, "perf_counter"), (2, "perf_counter"), (1, "process_time")])
+def test_time_limit(monkeypatch, threads, clock):
     now = 0.0
-    monkeypatch.setattr("experiments.runs.recorder.time.perf_counter", lambda: now)
+    monkeypatch.setattr(f"experiments.runs.recorder.time.{clock}", lambda: now)
+    monkeypatch.setattr(BUMP, "threads", threads)
     trial = NetworkTrial(BUMP, "any", 0, limit=5.0)
     trial.report()
     now = 6.0

@@ -4,6 +4,7 @@ import importlib.util
 import os
 import random
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,7 +59,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 0.0
-        monkeypatch.setattr("experiments.runs.recorder.time.perf_counter", lambda: self.now)
+        monkeypatch.setattr("experiments.runs.recorder.time.process_time", lambda: self.now)
 
     def slow(self, seconds, fn):
         """Return the function, which takes so many seconds."""
@@ -80,6 +81,12 @@ def test_time_for_errors_is_not_counted(monkeypatch):
         trial.report(trial.start)
     assert [row.seconds for row in trial.rows] == [0.0, 0.75, 1.5, 2.25]
     assert (trial.seconds, trial.black_box_seconds) == (2.25, 1.5)
+
+
+def test_waiting_for_other_programs_is_not_counted():
+    trial = Trial(replace(TASK, loss=lambda x: (time.sleep(0.2), TASK.loss(x))[1]), "any", 0)
+    trial.loss(torch.zeros(1, 2))
+    assert trial.black_box_seconds <= trial.seconds < 0.1
 
 
 @pytest.mark.parametrize("points", [torch.zeros(2), torch.zeros(4, 3)])

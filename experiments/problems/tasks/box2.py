@@ -27,7 +27,7 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         title="the place of a soft square, from a plateau",
         parameters="x, y of the centre in units of the image side, 0.1 to 0.9; "
         "starts U(0.43, 0.72)^2, solution (0.3, 0.3)",
-        evaluations=50_000,
+        evaluations=20_000,
         parameter_error=lambda x: float((x - box.loss.target).square().mean()),
     )
 

@@ -108,7 +108,7 @@ def task(preset: Literal["fast", "paper"] = "fast") -> Task:
         loss=loss,
         start=uniform(*(torch.tensor(corner, dtype=torch.float64) for corner in START)),
         sigma=0.2,
-        evaluations=50_000,
+        evaluations=20_000,
         truth=Truth(
             lambda x: float(loss(x[None])[0]), lambda x: float((x - target).square().mean()), analytic=analytic
         ),

@@ -57,7 +57,7 @@ def test_every_task_says_what_it_is(task) -> None:
     assert task.parameters
     assert task.needs
     assert task.sigma > 0
-    assert task.evaluations >= 50_000
+    assert task.evaluations >= 20_000
 
 
 def test_errors_vanish_at_the_solution_and_only_there(task) -> None:

@@ -82,7 +82,7 @@ def misfit(f, solution):
 def run(search, f, evaluations, target=-math.inf):
     """Search until so many evaluations, or the target value."""
     while not search.done and search.evaluations < evaluations and search.value > target:
-        search.tell(f(search.ask(evaluations - search.evaluations)))
+        search.tell(f(search.ask(limit=evaluations - search.evaluations)))
     return search
 
 
@@ -90,6 +90,6 @@ def points_of(search, f, evaluations):
     """The points that a search asks for."""
     asked = []
     while not search.done and search.evaluations < evaluations:
-        asked.append(search.ask(evaluations - search.evaluations))
+        asked.append(search.ask(limit=evaluations - search.evaluations))
         search.tell(f(asked[-1]))
     return torch.cat(asked)

@@ -53,6 +53,7 @@ def minimize(
     bounds: Bounds | None = None,
     max_evaluations: int = 1000,
     engine: Engine = "auto",
+    batch: int = 1,
     vectorized: bool = True,
     evaluator: Evaluator | None = None,
     workers: int | None = None,
@@ -80,10 +81,13 @@ def minimize(
         max_evaluations: points that fn may be called with.
         engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
             and, for an output of 20 parameters or more, by the first evaluations.
+        batch: points that fn gets at once, where the search can use so many: fewer batches, more evaluations. Give the
+            number of `workers`, or how many points fn takes at once. See `TrustRegion.ask`.
         vectorized: False for an fn of one point, [n] -> scalar or [*out].
         evaluator: where evaluations run; in this process if None.
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
-            does not depend on their number. A point that no process survives has the value NaN.
+            does not depend on their number. More than one has work only with a `batch`. A point that no process
+            survives has the value NaN.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.
@@ -123,7 +127,7 @@ def minimize(
             f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(start)} "
             f"parameters, got {max_evaluations}"
         )
-    check_count(max_evaluations=max_evaluations)
+    check_count(max_evaluations=max_evaluations, batch=batch)
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or own or Inline())
     running = _Running(search, None if checkpoint is None else Path(checkpoint), verbose)
@@ -154,7 +158,7 @@ def minimize(
             if reached is not None:
                 end = reached
                 break
-            points = search.ask(max_evaluations - search.evaluations)
+            points = search.ask(batch, limit=max_evaluations - search.evaluations)
             search.tell(call(points.clone(), ()))
             iterate = running.noted(points)
             if callback is not None and _is_true(callback(iterate)) and ended() is None:

@@ -28,7 +28,7 @@ def gauss_newton(trial: Trial, *, sparse: bool, **settings: Any) -> None:
     search = kind(trial.start, loss=task.output.loss, bounds=task.bounds, seed=trial.seed, **given)
     while not search.done:
         steps = search.iterations
-        search.tell(trial.image(search.ask(max(trial.remaining, 1))))
+        search.tell(trial.image(search.ask(limit=max(trial.remaining, 1))))
         if search.iterations > steps:
             trial.report(search.x, sigma=search.sigma * float(search.unit.mean()), loss=search.value)
 

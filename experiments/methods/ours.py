@@ -51,7 +51,7 @@ def search(
         seed=trial.seed,
     )
     while not found.done:
-        found.tell(evaluate(found.ask(max(trial.remaining, 1))))
+        found.tell(evaluate(found.ask(limit=max(trial.remaining, 1))))
         width: Tensor = found.sigma * found.unit
         trial.report(found.x, sigma=float(width.mean()), loss=found.value)
 

@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.jacobian_progress import JacobianProgress
-from torch_zerohess.search.protocol import AskTell, Method, Settings
+from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature

@@ -1,4 +1,4 @@
-"""Where in a box a model is lowest, and where a process knows least: the best of many random candidates."""
+"""Where in a box a model is lowest, or a process knows least, or points are far: the best of many random candidates."""
 
 from collections.abc import Callable
 
@@ -37,6 +37,17 @@ def lowest(
         else:
             width *= _NARROWING
     return x
+
+
+def farthest(points: Tensor, count: int, lower: Tensor, upper: Tensor, generator: torch.Generator) -> Tensor:
+    """Return `count` points of the box [count, n], each far from the others and from points [K, n]."""
+    spots = uniform(generator, lower, upper, 4 * _CANDIDATES * count)
+    distance = torch.cdist(spots, points).amin(1)
+    chosen = []
+    for _ in range(count):
+        chosen.append(spots[int(distance.argmax())])
+        distance = torch.minimum(distance, (spots - chosen[-1]).norm(dim=1))
+    return torch.stack(chosen)
 
 
 def least_known(process: GaussianProcess, lower: Tensor, upper: Tensor, generator: torch.Generator) -> Tensor:

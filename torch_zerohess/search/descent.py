@@ -10,8 +10,8 @@ from torch_zerohess.linalg.subproblem import ball_step, box_step
 from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.draws import normal, reflect, uniform
 from torch_zerohess.search.loss_step import after_loss
+from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.protocol import Method, Settings
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -24,6 +24,8 @@ _ENOUGH = 4
 """Near evaluations, besides the center, that a model needs at least; n if that is less."""
 _SHARPNESS = 0.1
 """Mean squared distance, in units of sigma^2, within which evaluations weigh the same in a faithful model."""
+_BESIDE = 0.3
+"""Spread, over sigma, of samples around the end of a step that are evaluated with it."""
 _REFUSED = 10
 """Batches in a row with values that are not finite, after which a round ends."""
 _HALVING = 0.5
@@ -77,6 +79,8 @@ class LocalQuadratics(Method[DescentProgress]):
         loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
         if known.phase == "trial":
             known = self._judged(replace(known, iterations=known.iterations + 1), evaluated, loss)
+            if known.phase == "sample" and known.need <= evaluated.extra:  # there are enough already
+                known = known.trying()
         else:
             known = replace(known, value=loss if known.phase == "start" else known.value).trying()
         if known.sigma < self.settings.tolerance:
@@ -96,6 +100,12 @@ class LocalQuadratics(Method[DescentProgress]):
             around = self._drawn(known, min(self._n, BATCH), generator, paired=False)
             return torch.cat([known.center[None], around])
         return self._drawn(known, known.need, generator, paired=known.paired)
+
+    def more(self, known: DescentProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Return samples around the end of the step, or where else the search is."""
+        end = replace(known, center=points[0], sigma=_BESIDE * known.sigma)
+        around = end if known.phase == "trial" else known
+        return self._drawn(around, count, generator, paired=False)
 
     def model_at_best(self, known: DescentProgress) -> tuple[LocalModel, float] | None:
         best, sigma = known.best.point, known.best.sigma
@@ -117,7 +127,13 @@ class LocalQuadratics(Method[DescentProgress]):
     def _remembered(self, known: DescentProgress, evaluated: Evaluated) -> DescentProgress:
         finite = evaluated.finite
         new = evaluated.those(finite)
-        pool = known.pool.add(new.points, new.losses, new.outputs, known.center, known.sigma).latest(self.capacity)
+        own, more = new.needed, new.further
+        pool = known.pool.add(own.points, own.losses, own.outputs, known.center, known.sigma)
+        if len(more):
+            trial = known.phase == "trial"
+            drawn = (evaluated.points[0], _BESIDE * known.sigma) if trial else (known.center, known.sigma)
+            pool = pool.add(more.points, more.losses, more.outputs, *drawn)
+        pool = pool.latest(self.capacity)
         best, lowest = known.best, known.lowest
         if len(new):
             k = int(new.losses.argmin())

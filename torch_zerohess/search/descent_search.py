@@ -3,8 +3,9 @@
 from typing import Any
 
 from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_descent import MOST, MetricQuadratics
-from torch_zerohess.search.protocol import AskTell, Method, Settings
+from torch_zerohess.search.protocol import AskTell
 
 
 class Descent(AskTell[Any]):

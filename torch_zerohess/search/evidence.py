@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalProgress, LocalSettings
-from torch_zerohess.search.protocol import Method, Settings
+from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
@@ -107,6 +107,11 @@ class EvidenceMethod(Method[EvidenceProgress]):
         assert known.descent is not None
         descent, points = self.descent.next(known.descent, every, generator)
         return _with(replace(known, descent=descent), descent), points
+
+    def more(self, known: EvidenceProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        if known.chosen != "descent" or known.descent is None:
+            return points[:0]
+        return self.descent.more(known.descent, points, count, generator)
 
     def model_at_best(self, known: EvidenceProgress) -> tuple[LocalModel, float] | None:
         if known.local is not None:

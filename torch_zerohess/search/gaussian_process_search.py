@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.loss_process import LossProcess
+from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.process_method import ProcessMethod
 from torch_zerohess.search.process_progress import ProcessProgress
-from torch_zerohess.search.protocol import AskTell, Method, Settings
+from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.state import Evaluated
 
 

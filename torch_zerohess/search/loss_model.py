@@ -1,5 +1,6 @@
 """Optimistic loss of predicted outputs: where a search by a Gaussian process looks next."""
 
+import copy
 import math
 from collections.abc import Callable
 
@@ -35,7 +36,7 @@ class LossModel:
         shape: torch.Size,
         optimism: float,
     ) -> None:
-        self.process, self.optimism, m = process, optimism, len(output)
+        self.process, self.optimism, self._known, m = process, optimism, len(process.points), len(output)
         directions = torch.cat([(process.mean - output)[None], process.weights])
         expanded = loss_curvature(loss, output.view(shape))
         self.value, slope, bend = (
@@ -52,7 +53,7 @@ class LossModel:
     def __call__(self, x: Tensor) -> Tensor:
         """Optimistic losses [Q] of points [Q, n]."""
         covariance = self.process.covariance(x)
-        c = torch.cat([covariance.new_ones(len(x), 1), covariance], 1)
+        c = torch.cat([covariance.new_ones(len(x), 1), covariance[:, : self._known]], 1)
         variance = self.process.uncertainty(covariance)
         constant, linear, square = self.steepness
         steepness = (constant + 2.0 * c @ linear + ((c @ square) * c).sum(1)).clamp_min(0.0).sqrt()
@@ -62,9 +63,15 @@ class LossModel:
             reach = torch.minimum(reach, steepness * self.elements / self.trace)
         return self._loss(c) - reach * steepness + 0.5 * self.trace / self.elements * reach.square()
 
+    def pending(self, x: Tensor) -> "LossModel":
+        """Return the model where the output at x [n] is taken to be the one that the process predicts."""
+        model = copy.copy(self)
+        model.process = self.process.pending(x)
+        return model
+
     def is_true(self, x: Tensor, loss: float) -> bool:
         """Whether the expansion predicts `loss`, the loss of the predicted output at x [n]."""
-        c = torch.cat([x.new_ones(1, 1), self.process.covariance(x[None])], 1)
+        c = torch.cat([x.new_ones(1, 1), self.process.covariance(x[None])[:, : self._known]], 1)
         return abs(float(self._loss(c)[0]) - loss) <= _ERROR * abs(loss - self.value) + 1e-12 * abs(loss)
 
     def _loss(self, c: Tensor) -> Tensor:

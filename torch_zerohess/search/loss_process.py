@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_descent import MetricQuadratics
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.process_method import APART, ProcessMethod
 from torch_zerohess.search.process_progress import ProcessProgress
-from torch_zerohess.search.protocol import Settings
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -74,6 +74,11 @@ class LossProcess(ProcessMethod[LossProgress]):
             known, points = self._after_process(known, evaluated, generator)
         return (known, points) if known.finishing else self.points(known, generator)
 
+    def more(self, known: LossProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        if known.quadratics is not None and known.finishing:
+            return self._finish.more(known.quadratics, points, count, generator)
+        return super().more(known, points, count, generator)
+
     def model_at_best(self, known: LossProgress) -> tuple[LocalModel, float] | None:
         quadratics = known.quadratics
         if quadratics is not None and torch.equal(quadratics.best.point, known.best.point):
@@ -84,13 +89,13 @@ class LossProcess(ProcessMethod[LossProgress]):
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
         """Let quadratics finish where the process has found a new basin, or finds nothing better for long."""
-        before = known.best.loss
+        before, count = known.best.loss, len(evaluated.needed)
         known = self.take(known, evaluated)
         known = replace(
             known,
             steps=known.steps + 1 if known.moved < _NEAR else 0,
-            waited=0 if known.best.loss < before else known.waited + len(evaluated),
-            searched=known.searched + len(evaluated),
+            waited=0 if known.best.loss < before else known.waited + count,
+            searched=known.searched + count,
         )
         nothing, n = evaluated.points[:0], self.settings.n
         new = float((known.best.point - known.finished).norm()) > APART
@@ -110,7 +115,7 @@ class LossProcess(ProcessMethod[LossProgress]):
         known = self.avoiding(known, evaluated.points[~finite])
         for k in finite.nonzero().flatten().tolist():  # what tells the process something new
             if float((known.pool.points - evaluated.points[k]).norm(dim=1).min()) > APART:
-                known = self.remembered(known, evaluated.those(torch.tensor([k])))
+                known = self.remembered(known, evaluated.those(torch.tensor([k])), max(self.capacity, len(known.pool)))
         best = now.best if now.best.loss <= known.best.loss else known.best
         known = replace(
             known,
@@ -121,7 +126,7 @@ class LossProcess(ProcessMethod[LossProgress]):
             quadratics=now,
             evaluations=known.evaluations + len(evaluated),
             iterations=known.iterations + now.iterations - before.iterations,
-            waited=0 if now.best.loss < before.best.loss else known.waited + len(evaluated),
+            waited=0 if now.best.loss < before.best.loss else known.waited + len(evaluated.needed),
         )
         plateau = now.wide is not None  # the process leaves it sooner
         patient = known.waited < _QUADRATIC_PATIENCE * (self.settings.n + 1)

@@ -18,8 +18,8 @@ from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.draws import normal, reflect, uniform
+from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_progress import MetricProgress
-from torch_zerohess.search.protocol import Method, Settings
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool
@@ -41,6 +41,8 @@ _BAD, _GOOD, _LONG = 0.1, 0.7, 0.8
 """Part of its promise that a refused step achieves; a good step, and its length in units of the region."""
 _GROWTH, _SHRINKING = 2.0, 0.6
 """Factors for sigma after a good long step and after a refused one."""
+_OTHER_LENGTHS = (2.0, 0.5, 4.0, 0.25)
+"""Sizes of the region, over sigma, for further steps that are evaluated at the same time."""
 _STILL, _CLOSING = 1e-3, 0.3
 """Length of a step that is not worth an evaluation, and the factor for sigma after it."""
 _LEAPING, _CONFIRMED = 1e-3, 0.1
@@ -95,6 +97,7 @@ class MetricQuadratics(Method[MetricProgress]):
             return self._widely(known, *self._wide.next(known.wide, evaluated, generator))
         before, missed = known.lowest.loss, float(evaluated.losses[0]) - known.expected
         known = known.remembered(evaluated, self._capacity)
+        evaluated = evaluated.needed
         risen = known.expected + missed - before
         known = replace(known, confirmed=known.phase == "geometry" and abs(missed) <= _CONFIRMED * abs(risen))
         if known.lost >= _LOST:
@@ -135,6 +138,19 @@ class MetricQuadratics(Method[MetricProgress]):
             known = replace(known, sigma=(_LEAPING if known.confirmed else _CLOSING) * known.sigma, confirmed=False)
         reason = f"sigma fell below {self._finest:g} of the first one"
         return self._arrived(known, reason, generator)
+
+    def more(self, known: MetricProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Return ends of shorter and longer steps, then points of the region around the end of the step."""
+        if known.wide is not None:
+            return self._wide.more(known.wide, points, count, generator)
+        trial, x, ends = known.phase == "trial", known.lowest.point, points[:1]
+        for factor in _OTHER_LENGTHS[: (count + 1) // 2] if trial else ():
+            lower, upper = self.settings.lower - x, self.settings.upper - x
+            step = region_step(known.gradient, known.hessian, factor * known.sigma * known.root, lower, upper)
+            if float((ends - x - step).norm(dim=1).min()) > _STILL * known.sigma:
+                ends = torch.cat([ends, (x + step)[None]])
+        steps = normal(generator, x, count + 1 - len(ends), self._n) @ (known.sigma / math.sqrt(self._n) * known.root)
+        return self._inside(torch.cat([ends[1:], (points[0] if trial else x) + steps]))
 
     def model_at_best(self, known: MetricProgress) -> tuple[LocalModel, float] | None:
         if known.wide is not None:
@@ -189,7 +205,8 @@ class MetricQuadratics(Method[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Ask for another point along every axis, twice as far if the first one was better, else on the other side."""
         if not len(known.values):
-            return replace(known, lost=known.lost), self._around(known, generator)
+            start = known.center + known.sigma * normal(generator, known.center, 1, self._n)
+            return known, self._inside(start)
         losses = evaluated.losses
         if len(losses) > 1 and int((losses[1:] == losses[0]).sum()) > len(losses[1:]) // 2:
             return self._on_plateau(known, generator)
@@ -198,10 +215,6 @@ class MetricQuadratics(Method[MetricProgress]):
         if not len(other) or self._n <= _FEW:
             return self.plan(known, generator)
         return replace(known, phase="axes"), self._inside(evaluated.points[0] + other)
-
-    def _around(self, known: MetricProgress, generator: torch.Generator) -> Tensor:
-        """Draw a point [1, n] around the center of a round that has no finite value yet."""
-        return self._inside(known.center + known.sigma * normal(generator, known.center, 1, self._n))
 
     def _arrived(
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False

@@ -17,11 +17,11 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.candidates import least_known, lowest
+from torch_zerohess.search.candidates import farthest, least_known, lowest
 from torch_zerohess.search.draws import normal, reflect
 from torch_zerohess.search.loss_model import LossModel
+from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.process_progress import ProcessProgress
-from torch_zerohess.search.protocol import Method, Settings
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.pool import Pool
@@ -33,6 +33,8 @@ _OPTIMISM = 0.3
 """Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
 _EXPLORING = 2.0
 """The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
+_BESIDE = 0.5
+"""Spread of points around the end of a step that are evaluated with it, over the distance of the nearest evaluation."""
 _SAME = 1e-4
 """Distance below which a point is known already."""
 _SETTLED = 3
@@ -50,8 +52,8 @@ _PROPORTION = 1e3
 _EXPANSIONS = 3
 """Expansions of the loss around predicted minima, until one predicts the loss there. If none does, the process is one
 of the loss itself from then on."""
-_POOL = 60
-"""Evaluations kept."""
+_POOL, _BATCHES = 60, 8
+"""Evaluations kept, and batches of several points kept at least."""
 _NEAR, _WIDENING, _WIDEST = 1e-3, 1.5, 10.0
 """Weight from which an evaluation counts as near the best point; sigma is widened by the factor up to the last one."""
 
@@ -78,11 +80,16 @@ class ProcessMethod(Method[Q]):
             iterations=known.iterations + trial,
             refused=0 if bool(finite.all()) else known.refused + 1,
         )
+        before = known.best.point
         if known.refused >= _REFUSED:
             return replace(known, done=True, message=f"{_REFUSED} batches in a row had values that are not finite")
-        known = self.avoiding(self.remembered(known, evaluated.those(finite)), evaluated.points[~finite])
+        capacity = max(self.capacity, _BATCHES * len(evaluated)) if evaluated.extra else self.capacity
+        known = self.remembered(known, evaluated.those(finite), capacity)
+        known = self.avoiding(known, evaluated.points[~finite])
+        if evaluated.extra:
+            known = replace(known, moved=max(known.moved, self._length(known.best.point - before)))
         known = self._settled(known) if trial else known
-        return replace(known, center=evaluated.points[-1], phase="trial")
+        return replace(known, center=evaluated.needed.points[-1], phase="trial")
 
     def points(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
         """Draw the next points [K, n]. What the process says about noise is known afterwards, too."""
@@ -93,15 +100,33 @@ class ProcessMethod(Method[Q]):
             return known, torch.cat([best[None], self._around(best, generator)])
         if len(known.pool) < 2:
             return known, self._around(best, generator)
-        known, process, x = (self._through_output if known.expands else self._from_losses)(known, generator)
-        best = known.best.point
+        known, model, x = self._modelled(known, generator)
+        process, best = model.process, known.best.point
         # A process of the loss has less to go by: after an arrival it looks where it knows least.
         explores = known.exploring > 0 and not known.expands
-        moved = math.inf if explores else float((x - best).norm()) / math.sqrt(settings.n)
-        same = torch.equal(x, best) or float((process.points - x).norm(dim=1).min()) < _SAME
-        if explores or same:
+        moved = math.inf if explores else self._length(x - best)
+        if explores or torch.equal(x, best) or _is_known(process, x):
             x = least_known(process, settings.lower, settings.upper, generator)
         return replace(known, moved=moved), x[None]
+
+    def more(self, known: Q, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Return points around the first one, and points chosen as if the process was right about those before."""
+        lower, upper = self.settings.lower, self.settings.upper
+        near = count // 2
+        if known.phase == "start" or len(known.pool) < 2:
+            around = self._drawn(known.center, 1.0, near, generator)
+            return torch.cat([around, farthest(torch.cat([points, around]), count - near, lower, upper, generator)])
+        known, model, _ = self._modelled(known, generator)
+        reach = _BESIDE * float((known.pool.points - points[0]).norm(dim=1).min()) / math.sqrt(self.settings.n)
+        near = near if 0.0 < reach < math.inf else 0
+        every = [*points, *self._drawn(points[0], reach, near, generator)]
+        for one in every[:-1]:
+            model = model.pending(one)
+        while len(every) < len(points) + count:
+            model = model.pending(every[-1])
+            x = self._lowest(known, model, generator)
+            every.append(least_known(model.process, lower, upper, generator) if _is_known(model.process, x) else x)
+        return torch.stack(every[len(points) :])
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
         pool, best, sigma = known.pool, known.best.point, known.best.sigma
@@ -131,13 +156,15 @@ class ProcessMethod(Method[Q]):
 
     # What was evaluated.
 
-    def remembered(self, known: Q, new: Evaluated) -> Q:
+    def remembered(self, known: Q, new: Evaluated, capacity: int) -> Q:
         """Add evaluations with finite values to the pool."""
         if not len(new):
             return known
         best = known.best.point
-        pool = known.pool.thin(best) if len(known.pool) >= self.capacity and not known.noisy else known.pool
-        known = replace(known, pool=pool.add(new.points, new.losses, new.outputs, best, 1.0).latest(self.capacity))
+        pool = known.pool
+        while len(pool) + len(new) > capacity > len(new) and not known.noisy:
+            pool = pool.thin(best)
+        known = replace(known, pool=pool.add(new.points, new.losses, new.outputs, best, 1.0).latest(capacity))
         k = int(new.losses.argmin())
         if float(new.losses[k]) >= known.record.loss:
             return known
@@ -177,8 +204,21 @@ class ProcessMethod(Method[Q]):
         directions, _ = torch.linalg.qr(normal(generator, x, n, n))
         return reflect(x + math.sqrt(n) * directions.mT, self.settings.lower, self.settings.upper)
 
+    def _drawn(self, x: Tensor, sigma: float, count: int, generator: torch.Generator) -> Tensor:
+        """Draw points [count, n] from N(x, sigma^2), mirrored into the box."""
+        steps = sigma * normal(generator, x, count, len(x))
+        return reflect(x + steps, self.settings.lower, self.settings.upper)
+
+    def _length(self, step: Tensor) -> float:
+        """Length of a step [n] in units of the first sigma sqrt(n)."""
+        return float(step.norm()) / math.sqrt(self.settings.n)
+
+    def _modelled(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
+        """Return a model of the loss and the point [n] where it is lowest."""
+        return (self._through_output if known.expands else self._from_losses)(known, generator)
+
     @torch.no_grad()
-    def _through_output(self, known: Q, generator: torch.Generator) -> tuple[Q, GaussianProcess, Tensor]:
+    def _through_output(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
         loss, pool, shape = self.settings.loss, known.pool, known.shape
         assert loss is not None
@@ -197,10 +237,10 @@ class ProcessMethod(Method[Q]):
             x = self._lowest(known, model, generator)
             output = process.predict(x[None])[0]
             if model.is_true(x, float(loss(output.view(shape)))):
-                return known, process, x
+                return known, model, x
         return self._from_losses(replace(known, expands=False), generator)
 
-    def _from_losses(self, known: Q, generator: torch.Generator) -> tuple[Q, GaussianProcess, Tensor]:
+    def _from_losses(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
         """Predict the loss, and return the point [n] that is lowest."""
         values = known.pool.values
         least, middle = float(values.min()), float(values.median())
@@ -213,7 +253,7 @@ class ProcessMethod(Method[Q]):
             values = process.predict(known.pool.points)[:, 0]
             known = self._judged(known, values * spread + least)
         model = LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
-        return known, process, self._lowest(known, model, generator)
+        return known, model, self._lowest(known, model, generator)
 
     def _fitted(self, known: Q, outputs: Tensor) -> tuple[Q, GaussianProcess]:
         """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again.
@@ -246,3 +286,8 @@ class ProcessMethod(Method[Q]):
         x = lowest(model, best, self.settings.lower, self.settings.upper, generator)
         solved = torch.equal(known.solved, best) and float((x - best).norm()) < APART
         return best if solved else x
+
+
+def _is_known(process: GaussianProcess, x: Tensor) -> bool:
+    """Whether a point [n] is one of those that the process knows."""
+    return float((process.points - x).norm(dim=1).min()) < _SAME

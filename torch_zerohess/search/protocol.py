@@ -1,9 +1,7 @@
 """Ask and tell, the same for every search: what is checked, what is told, what is saved.
 
-A search is a `Method`: settings that never change, and a pure step from what it knows (`Progress`) and what was
-evaluated (`Evaluated`) to what it knows next and the points to evaluate next. `AskTell` puts the public classes around
-it. `tell` computes the whole next `State` and assigns it at the end, so a search is as it was if anything raises; `ask`
-only reads the state.
+A search is a `Method`, and `AskTell` puts the public classes around it. `tell` computes the whole next `State` and
+assigns it at the end, so a search is as it was if anything raises; `ask` only reads the state.
 
 To add a search: a subclass of `Progress` with its fields, a subclass of `Method` with its step, and a subclass of
 `AskTell` that makes the method.
@@ -12,78 +10,16 @@ To add a search: a subclass of `Progress` with its fields, a subclass of `Method
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Generic
+from typing import Any, Generic
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
+from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
 from torch_zerohess.surrogates.quadratic import LocalModel
-
-
-@dataclass(frozen=True, eq=False)
-class Settings:
-    """What a search is given, in units of its first sigma. See `AskTell` for the meaning."""
-
-    start: Tensor
-    """[n], float64."""
-    lower: Tensor
-    """[n], float64."""
-    upper: Tensor
-    loss: Callable[[Tensor], Tensor] | None
-    restarts: int
-    tolerance: float
-    noise: float
-    pool: int | None
-
-    @property
-    def n(self) -> int:
-        """Number of parameters."""
-        return len(self.start)
-
-    @property
-    def bounded(self) -> bool:
-        """Whether every bound is finite."""
-        return bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())
-
-
-class Method(ABC, Generic[P]):
-    """A search as settings and a pure step.
-
-    Nothing in it changes, and nothing in a `Progress` that it was given. All randomness is drawn from the generator.
-    Both `first` and `next` return points [K, n] within the bounds, at least one unless the search is done.
-    """
-
-    engine: ClassVar[str]
-    """Name for a reader."""
-    progress: type[P]
-    """Class of what it knows."""
-
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-
-    @abstractmethod
-    def first(self, generator: torch.Generator) -> tuple[P, Tensor]:
-        """Return what is known at the beginning, and the first points [K, n], the start before all others."""
-
-    @abstractmethod
-    def next(self, known: P, evaluated: Evaluated, generator: torch.Generator) -> tuple[P, Tensor]:
-        """Return what is known after an evaluation, and the next points [K, n]."""
-
-    @abstractmethod
-    def model_at_best(self, known: P) -> tuple[LocalModel, float] | None:
-        """Return a quadratic model around the best point and its sigma, or None if too little is known there."""
-
-    def promise(self, known: P) -> float:
-        """Return by how much the next step lowers the loss, according to a model that holds there; or infinity."""
-        return math.inf
-
-    def width(self, known: P) -> Tensor:
-        """Return half of the extent of the region along every parameter [n]."""
-        return torch.full_like(known.best.point, known.sigma)
 
 
 class AskTell(ABC, Generic[P]):
@@ -133,8 +69,8 @@ class AskTell(ABC, Generic[P]):
         generator = torch.Generator()
         generator.manual_seed(int(torch.randint(2**63 - 1, ())) if seed is None else seed)
         self._state = self._after(*self._method.first(generator), generator)
-        self._given = 0
-        """How many of the points asked for are out for evaluation: bookkeeping between the two calls, not state."""
+        self._out: Tensor | None = self._state.asked[:0]
+        """Points out for evaluation [K, n], None if `load_state_dict` does not know: bookkeeping, not state."""
         self.told = torch.empty(0, dtype=torch.float64)
         """Losses [K] of the points told last."""
 
@@ -231,18 +167,24 @@ class AskTell(ABC, Generic[P]):
         """
         return self._method.model_at_best(self._state.progress)
 
-    def ask(self, limit: int | None = None) -> Tensor:
-        """Return the next points to evaluate [K, n], at most `limit` of them; the same ones until they are told.
+    def ask(self, batch: int = 1, *, limit: int | None = None) -> Tensor:
+        """Return the next points to evaluate [K, n]; the same ones until they are told.
 
-        ValueError for a limit below 1, RuntimeError if the search is done.
+        Args:
+            batch: how many evaluations run at once. If the search itself has fewer points to ask for, others are
+                added that tell most besides them. They save rounds, not evaluations. `LocalGaussNewton` and
+                `BlockGaussNewton` add none.
+            limit: how many points there may be at most.
+
+        ValueError for a batch or limit below 1, RuntimeError if the search is done.
         """
-        if limit is not None and limit < 1:
-            raise ValueError(f"limit must be at least 1, got {limit}")
+        for name, value in (("batch", batch), ("limit", limit)):
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
         if self.done:
             raise RuntimeError(f"the search is done: {self.message}")
-        points = self._state.asked[:limit]
-        self._given = len(points)
-        return self._space.parameters(points)
+        self._out = self._points(batch)[:limit]
+        return self._space.parameters(self._out)
 
     def tell(self, values: Any) -> None:
         """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
@@ -251,15 +193,17 @@ class AskTell(ABC, Generic[P]):
         no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
         raises. The search is then as before, and the same values can be told again.
         """
-        if not self._given:
+        values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
+        points = self._points(len(values))[: len(values)] if self._out is None and values.ndim else self._out
+        if points is None or not len(points):
             raise RuntimeError("ask for points before telling their values")
-        evaluated = self._evaluated(values, self._state.asked[: self._given])
+        evaluated = self._evaluated(values, points)
         if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
             raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
-        self._given, self.told = 0, evaluated.losses
+        self._out, self.told = points[:0], evaluated.losses
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a search with the same settings needs to go on exactly as this one would.
@@ -282,7 +226,7 @@ class AskTell(ABC, Generic[P]):
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         progress = restored(self._method.progress, state["progress"], device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
-        self._given = len(self._state.asked)  # they may have been evaluated before the search was saved
+        self._out = None  # points may have been evaluated before the search was saved
 
     @property
     def _kind(self) -> str:
@@ -291,17 +235,28 @@ class AskTell(ABC, Generic[P]):
     def _after(self, progress: P, asked: Tensor, generator: torch.Generator) -> State[P]:
         return State(progress, self._space.rounded(asked), generator.get_state())
 
-    def _evaluated(self, values: Any, points: Tensor) -> Evaluated:
+    def _points(self, batch: int) -> Tensor:
+        """Return the points of the search [K, n], and further ones up to a batch. All come from the state."""
+        points = self._state.asked
+        if len(points) >= batch or self.done:
+            return points
+        generator = torch.Generator()
+        generator.set_state(self._state.random)
+        generator.manual_seed(int(torch.randint(2**63 - 1, (), generator=generator)))  # numbers of its own
+        further = self._method.more(self._state.progress, points, batch - len(points), generator)
+        return torch.cat([points, self._space.rounded(further)])
+
+    def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:
         """Return what was told as losses and outputs."""
         loss, shape = self._method.settings.loss, self._state.progress.shape
-        values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
+        extra = max(len(points) - len(self._state.asked), 0)
         if loss is None and values.shape == (len(points), 1):
             values = values[:, 0]
         if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
             wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
             raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
         if loss is None:
-            return Evaluated(points, values)
+            return Evaluated(points, values, extra=extra)
         if shape and values.shape[1:] != shape:
             raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
         with torch.no_grad():
@@ -315,4 +270,5 @@ class AskTell(ABC, Generic[P]):
             torch.stack([one.double().reshape(()) for one in losses]),
             values.reshape(len(values), -1),
             values.shape[1:],
+            extra,
         )

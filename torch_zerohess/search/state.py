@@ -73,6 +73,8 @@ class Evaluated:
     """[K, m], outputs [K, *out] in a row; None where the black box returns the loss."""
     shape: torch.Size = _SCALAR
     """Of an output, [*out]."""
+    extra: int = 0
+    """How many of them, the last ones, are from `Method.more`."""
 
     def __len__(self) -> int:
         return len(self.losses)
@@ -83,10 +85,21 @@ class Evaluated:
         finite = torch.isfinite(self.losses)
         return finite if self.outputs is None else finite & torch.isfinite(self.outputs).all(1)
 
+    @property
+    def needed(self) -> "Evaluated":
+        """Those that the method itself asked for."""
+        return self.those(torch.arange(len(self), device=self.points.device) < len(self) - self.extra)
+
+    @property
+    def further(self) -> "Evaluated":
+        """Those from `Method.more`."""
+        return self.those(torch.arange(len(self), device=self.points.device) >= len(self) - self.extra)
+
     def those(self, which: Tensor) -> "Evaluated":
-        """The ones that `which` [K] selects."""
+        """The ones that `which` selects: bools [K], or indices."""
         outputs = None if self.outputs is None else self.outputs[which]
-        return Evaluated(self.points[which], self.losses[which], outputs, self.shape)
+        extra = int((torch.arange(len(self), device=which.device)[which] >= len(self) - self.extra).sum())
+        return Evaluated(self.points[which], self.losses[which], outputs, self.shape, extra)
 
 
 def plain(value: Any) -> Any:

@@ -9,7 +9,8 @@ from torch_zerohess.search.descent_search import descent_method
 from torch_zerohess.search.evidence import FEWEST, EvidenceMethod, EvidenceProgress
 from torch_zerohess.search.gaussian_process_search import process_method
 from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalSettings
-from torch_zerohess.search.protocol import AskTell, Method, Settings
+from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
 
 _MOST = 4

@@ -10,7 +10,7 @@ One length serves all parameters. For one length per parameter divide the points
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -101,6 +101,19 @@ class GaussianProcess:
         weights = torch.cholesky_solve(change, factor)
         variance = float((change * weights).sum()) / outputs.numel() or 1.0
         return cls(points, kernel, length, mean, weights, variance, noise, factor)
+
+    def pending(self, x: Tensor) -> "GaussianProcess":
+        """Return the process that is also told, at x [n], the output that it expects there.
+
+        It expects the same outputs everywhere and is certain at x. Source: Desautels, Krause and Burdick (2014),
+        section 3.2.
+        """
+        row = torch.linalg.solve_triangular(self.factor, self.covariance(x[None]).mT, upper=False)[:, 0]
+        rest = (1.0 + CONSTANT + self.noise - row.square().sum()).clamp_min(self.noise).sqrt()
+        factor = torch.nn.functional.pad(self.factor, (0, 1, 0, 1))
+        factor[-1, :-1], factor[-1, -1] = row, rest
+        weights = torch.nn.functional.pad(self.weights, (0, 0, 0, 1))
+        return replace(self, points=torch.cat([self.points, x[None]]), weights=weights, factor=factor)
 
     def __call__(self, x: Tensor) -> Tensor:
         """Expected outputs [Q, m] at points x [Q, n], with derivatives of every order in x.

@@ -54,7 +54,7 @@ def test_a_method_asks_its_engine(engine, output, sigma):
     )
     expected = torch.empty(0, 2, dtype=torch.float64)
     while len(expected) < len(found):
-        z = search.ask(BOUNDED.evaluations - len(expected))
+        z = search.ask(limit=BOUNDED.evaluations - len(expected))
         expected = torch.cat([expected, z])
         search.tell(TASK.output.image(z) if output else TASK.loss(z))
     torch.testing.assert_close(found, expected[: len(found)], rtol=0, atol=0)

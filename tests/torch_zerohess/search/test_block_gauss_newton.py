@@ -24,7 +24,7 @@ def solve(search, f, most):
     """Evaluate until the search has used `most` evaluations, and return the losses after each batch."""
     losses = []
     while not search.done and search.evaluations < most:
-        search.tell(f(search.ask(most - search.evaluations)))
+        search.tell(f(search.ask(limit=most - search.evaluations)))
         losses.append(search.value)
     return losses
 
@@ -274,7 +274,7 @@ def test_asking_changes_nothing_and_a_limit_leaves_the_rest_for_later():
     assert torch.equal(search.ask(), search.ask())
     first, asked = search.ask(), []
     for _ in range(7):
-        asked.append(search.ask(3))
+        asked.append(search.ask(limit=3))
         search.tell(f(asked[-1]))
     # The samples that a limit left out come in the next batches: the same 21 points in the end.
     torch.testing.assert_close(torch.cat(asked), first)

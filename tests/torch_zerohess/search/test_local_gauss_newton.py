@@ -23,7 +23,7 @@ def square(target):
 def solve(search, f, most):
     """Evaluate until the search has used `most` evaluations."""
     while not search.done and search.evaluations < most:
-        search.tell(f(search.ask(most - search.evaluations)))
+        search.tell(f(search.ask(limit=most - search.evaluations)))
     return search
 
 
@@ -173,7 +173,7 @@ def test_a_dense_jacobian_costs_no_evaluation_more_than_before(n):
     points = [[], []]
     for one, seen in zip((search, descent), points, strict=True):
         while one.evaluations < n + 20 and not one.done:
-            z = one.ask(n + 20 - one.evaluations)
+            z = one.ask(limit=n + 20 - one.evaluations)
             seen.append(z)
             one.tell(z @ A.mT)
     assert search.engine == "descent"

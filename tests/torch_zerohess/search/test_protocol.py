@@ -80,7 +80,7 @@ def test_asking_changes_nothing(name):
         before = search.state_dict()
         points = search.ask()
         assert torch.equal(search.ask(), points)
-        assert torch.equal(search.ask(1), points[:1])
+        assert torch.equal(search.ask(limit=1), points[:1])
         assert torch.equal(search.ask(), points)
         assert same(search.state_dict(), before)
         search.tell(f(points))
@@ -157,16 +157,16 @@ def test_asking_for_fewer():
     every = search.ask()
     assert len(every) == 6
     torch.testing.assert_close(every[0], zeros(5))
-    assert torch.equal(search.ask(2), every[:2])
+    assert torch.equal(search.ask(limit=2), every[:2])
     with pytest.raises(ValueError, match=r"values must have shape \[2\]"):
         search.tell(bowl(every))
     search.tell(bowl(every[:2]))  # the others are given up
     assert search.evaluations == 2
-    other.ask(2)
+    other.ask(limit=2)
     other.tell(bowl(every[:2]))
     assert same(search.state_dict(), other.state_dict())
     with pytest.raises(ValueError, match="limit must be at least 1, got 0"):
-        search.ask(0)
+        search.ask(limit=0)
     assert run(search, bowl, 37).evaluations == 37
 
 

@@ -1,0 +1,183 @@
+"""Several points at once: what `ask(batch)` adds, that it changes nothing else, and that it saves rounds."""
+
+import io
+import math
+
+import pytest
+import torch
+from searches import bowl, misfit, rays, rays_loss, rosenbrock, spiral, waves, well, zeros
+
+import torch_zerohess as zh
+from torch_zerohess.optim import Descent, GaussianProcessSearch, LocalGaussNewton, TrustRegion
+from truths import vector
+
+SEARCHES = {
+    "process of the output": (GaussianProcessSearch, 2, waves, misfit(waves, vector(0.7, 0.2))),
+    "process of the loss": (GaussianProcessSearch, 2, well, None),
+    "descent of the output": (Descent, 5, rays, rays_loss(5)),
+    "descent of the loss": (Descent, 3, rosenbrock, None),
+    "by evidence": (TrustRegion, 20, lambda z: z @ DENSE.mT, lambda y: y.square().sum()),
+}
+DENSE = torch.randn(60, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+every_search = pytest.mark.parametrize("name", SEARCHES)
+
+
+def make(name, **changes):
+    kind, n, _, loss = SEARCHES[name]
+    return kind(zeros(n) - 0.3, **{"sigma": 1.0, "bounds": (-4.0, 4.0), "seed": 0, "loss": loss, **changes})
+
+
+def rounds(search, f, batch, target, most=200):
+    """Rounds of a batch until a value is at most the target."""
+    count = 0
+    while count < most and search.value > target:
+        points = search.ask(batch)
+        search.tell(f(points))
+        count += math.ceil(len(points) / batch)
+    return count
+
+
+@every_search
+def test_a_batch_has_the_points_of_the_search_and_others(name):
+    search, f = make(name), SEARCHES[name][2]
+    full = 0
+    for _ in range(6):
+        alone, points = search.ask(), search.ask(8)
+        assert torch.equal(points[: len(alone)], alone)
+        assert torch.equal(search.ask(8, limit=3), points[:3])
+        assert len(points) <= max(8, len(alone))
+        full += len(points) == 8
+        assert bool((points.abs() <= 4.0).all())
+        assert len(torch.unique(points, dim=0)) == len(points)
+        search.tell(f(search.ask(8)))
+    assert full >= 4
+
+
+@every_search
+def test_asking_for_a_batch_changes_nothing(name):
+    one, other, f = make(name), make(name), SEARCHES[name][2]
+    for _ in range(5):
+        one.ask(7)
+        points = one.ask()
+        assert torch.equal(points, other.ask())
+        one.tell(f(points))
+        other.tell(f(points))
+
+
+@every_search
+def test_a_batch_survives_a_restart(name):
+    """Also where the points were evaluated before and only their values are told after it."""
+    search, f = make(name), SEARCHES[name][2]
+    for _ in range(4):
+        points = search.ask(6)
+        file = io.BytesIO()
+        torch.save(search.state_dict(), file)
+        file.seek(0)
+        resumed = make(name, seed=5)
+        resumed.load_state_dict(torch.load(file, weights_only=True))
+        resumed.tell(f(points))
+        search.tell(f(points))
+        assert torch.equal(resumed.ask(), search.ask())
+        assert resumed.value == search.value
+
+
+@every_search
+def test_the_best_of_all_points_counts(name):
+    search, f = make(name), SEARCHES[name][2]
+    loss = SEARCHES[name][3]
+    best = math.inf
+    for _ in range(8):
+        values = f(search.ask(6))
+        search.tell(values)
+        best = min(best, *(float(one if loss is None else loss(one)) for one in values))
+        assert search.value == pytest.approx(best, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "part"),
+    [
+        ("process of the output", 1e-6, 0.6),
+        ("process of the loss", 1e-3, 0.6),
+        ("descent of the output", 1e-3, 0.6),
+        ("descent of the loss", 1e-2, 0.6),
+    ],
+)
+def test_a_batch_saves_rounds(name, target, part):
+    f = SEARCHES[name][2]
+    alone = sum(rounds(make(name, seed=seed), f, 1, target) for seed in range(3))
+    eight = sum(rounds(make(name, seed=seed), f, 8, target) for seed in range(3))
+    assert eight <= part * alone
+
+
+@every_search
+def test_values_that_are_not_finite_are_avoided(name):
+    search, (_, _, f, _) = make(name), SEARCHES[name]
+    for _ in range(6):
+        points = search.ask(6)
+        values = f(points)
+        values[1::3] = math.nan
+        search.tell(values)
+        assert math.isfinite(search.value)
+    assert search.evaluations >= 36
+
+
+def test_further_points_of_a_process_are_apart():
+    """All of them at the predicted minimum would say what one says."""
+    search = GaussianProcessSearch(
+        zeros(1), sigma=1.0, bounds=(-6.0, 6.0), loss=misfit(spiral, vector(2.0)), seed=0, restarts=0
+    )
+    for _ in range(3):
+        points = search.ask(8)
+        gaps = (points - points.mT).abs() + 10 * torch.eye(len(points))
+        assert float(gaps.min()) > 1e-4
+        search.tell(spiral(points))
+
+
+def test_engines_that_ask_for_batches_of_their_own_add_none():
+    search = LocalGaussNewton(zeros(20), sigma=1.0, loss=lambda y: y.square().sum(), seed=0)
+    assert torch.equal(search.ask(100), search.ask())
+
+
+def test_bad_batches_are_named():
+    with pytest.raises(ValueError, match="batch must be at least 1, got 0"):
+        make("process of the loss").ask(0)
+    with pytest.raises(ValueError, match="batch must be at least 1, got -2"):
+        zh.minimize(bowl, zeros(2), sigma=1.0, batch=-2)
+    with pytest.raises(TypeError, match=r"batch must be an integer, got 1\.5"):
+        zh.minimize(bowl, zeros(2), sigma=1.0, batch=1.5)
+
+
+def test_minimize_gives_batches_to_the_function():
+    sizes = []
+
+    def f(z):
+        sizes.append(len(z))
+        return waves(z)
+
+    fit = zh.minimize(
+        f,
+        zeros(2),
+        sigma=1.0,
+        bounds=(-4.0, 4.0),
+        loss=misfit(waves, vector(0.7, 0.2)),
+        batch=5,
+        max_evaluations=33,
+        seed=0,
+        restarts=10,
+    )
+    assert sizes == [5] * 6 + [3]
+    assert fit.evaluations == 33
+    assert [len(one.points) for one in fit.history] == sizes
+
+
+def test_results_do_not_depend_on_the_number_of_workers():
+    """Nor on where the batch was evaluated."""
+
+    def fit(**options):
+        return zh.minimize(
+            rosenbrock, zeros(3), sigma=1.0, batch=4, max_evaluations=24, seed=0, bounds=(-3, 3), **options
+        )
+
+    alone, two = fit(), fit(workers=2)
+    assert torch.equal(alone.x, two.x)
+    assert alone.value == two.value

@@ -1,0 +1,86 @@
+"""What a search is behind ask and tell: settings that never change, and a pure step.
+
+The step goes from what the search knows (`Progress`) and what was evaluated (`Evaluated`) to what it knows next and the
+points to evaluate next.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Generic
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.state import Evaluated, P
+from torch_zerohess.surrogates.quadratic import LocalModel
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """What a search is given, in units of its first sigma. See `AskTell` for the meaning."""
+
+    start: Tensor
+    """[n], float64."""
+    lower: Tensor
+    """[n], float64."""
+    upper: Tensor
+    loss: Callable[[Tensor], Tensor] | None
+    restarts: int
+    tolerance: float
+    noise: float
+    pool: int | None
+
+    @property
+    def n(self) -> int:
+        """Number of parameters."""
+        return len(self.start)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether every bound is finite."""
+        return bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())
+
+
+class Method(ABC, Generic[P]):
+    """A search as settings and a pure step.
+
+    Nothing in it changes, and nothing in a `Progress` that it was given. All randomness is drawn from the generator.
+    Both `first` and `next` return points [K, n] within the bounds, at least one unless the search is done.
+    """
+
+    engine: ClassVar[str]
+    """Name for a reader."""
+    progress: type[P]
+    """Class of what it knows."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+
+    @abstractmethod
+    def first(self, generator: torch.Generator) -> tuple[P, Tensor]:
+        """Return what is known at the beginning, and the first points [K, n], the start before all others."""
+
+    @abstractmethod
+    def next(self, known: P, evaluated: Evaluated, generator: torch.Generator) -> tuple[P, Tensor]:
+        """Return what is known after an evaluation, and the next points [K, n]."""
+
+    def more(self, known: P, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Return up to `count` points that are worth evaluating at once with those [K, n] that the search asks for.
+
+        By default there are none. `next` gets their values after the others, see `Evaluated`.
+        """
+        return points[:0]
+
+    @abstractmethod
+    def model_at_best(self, known: P) -> tuple[LocalModel, float] | None:
+        """Return a quadratic model around the best point and its sigma, or None if too little is known there."""
+
+    def promise(self, known: P) -> float:
+        """Return by how much the next step lowers the loss, according to a model that holds there; or infinity."""
+        return math.inf
+
+    def width(self, known: P) -> Tensor:
+        """Return half of the extent of the region along every parameter [n]."""
+        return torch.full_like(known.best.point, known.sigma)

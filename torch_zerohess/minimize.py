@@ -2,10 +2,7 @@
 
 import difflib
 import inspect
-import math
 import os
-import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.optim.second_order import check_count
 from torch_zerohess.search.minimum import Iterate, Minimum, Status
+from torch_zerohess.search.running import Running
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 
@@ -26,8 +24,8 @@ __all__ = ["Iterate", "Minimum", "minimize"]
 
 _AGREED = 3
 """Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
-_PAUSE = 1.0
-"""Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
+_LUCK = 2.0
+"""Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
 _OTHER_NAMES = {
     "maxiter": "max_evaluations",
     "max_iter": "max_evaluations",
@@ -66,6 +64,7 @@ def minimize(
     time_limit: float | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     restarts: int | None = None,
+    noise: float | None = None,
     **settings: Any,
 ) -> Minimum:
     """Minimise fn from x0 with `optim.TrustRegion`.
@@ -99,7 +98,10 @@ def minimize(
             from it: the function and all settings must be the same.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up or three rounds in a row have arrived at the same point.
-        settings: further ones of `TrustRegion`: tolerance, noise, pool, grid.
+        noise: standard deviation of repeated losses at one point. If None it is measured: x0 is evaluated twice, and
+            six times more if the values differ. In noise an eighth of the evaluations is kept for the end. They go to
+            the points that may be best. `value` is the mean of those at x, `value_error` its standard error.
+        settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn
     passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the message says so.
@@ -117,11 +119,20 @@ def minimize(
     if evaluator is not None and workers is not None:
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
     start = working(checked_input(x0)) if isinstance(x0, Tensor) else checked_start(x0)
-    rounds = max_evaluations if restarts is None else restarts
-    search = TrustRegion(
-        start, sigma=sigma, bounds=bounds, loss=loss, engine=engine, seed=seed, restarts=max(rounds, 0), **settings
-    )
-    smallest = len(search.ask()) + 1
+    rounds = max(max_evaluations if restarts is None else restarts, 0)
+    seed = int(torch.randint(2**63 - 1, ())) if seed is None else seed
+
+    def make(noise: float) -> TrustRegion:
+        given: dict[str, Any] = settings | {
+            "loss": loss,
+            "engine": engine,
+            "seed": seed,
+            "restarts": rounds,
+            "noise": noise,
+        }
+        return TrustRegion(start, sigma=sigma, bounds=bounds, **given)
+
+    smallest = len(make(noise or 0.0).ask()) + 1
     if max_evaluations < smallest:
         raise ValueError(
             f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(start)} "
@@ -130,12 +141,14 @@ def minimize(
     check_count(max_evaluations=max_evaluations, batch=batch)
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or own or Inline())
-    running = _Running(search, None if checkpoint is None else Path(checkpoint), verbose)
+    path = None if checkpoint is None else Path(checkpoint)
+    running = Running(make, call, noise, batch, max_evaluations, path, verbose=verbose)
 
     def ended() -> tuple[Status, str] | None:
+        search = running.search
         if search.done:
             return "solved" if search.solved and not running.flat else "stalled", search.message
-        if target is not None and search.value <= target:
+        if target is not None and search.value <= target - _LUCK * (running.noise or 0.0):
             return "target", f"the value is at most the target {target}"
         if xtol is not None and bool((search.width <= xtol).all()):
             return "solved", f"the region is within xtol ({xtol}) of x"
@@ -145,7 +158,7 @@ def minimize(
             return "solved", "the search has arrived at x, within xtol and ftol"
         if restarts is None and search.agreed >= _AGREED:
             return "solved", f"{search.agreed} rounds in a row have arrived at x"
-        if search.evaluations >= max_evaluations:
+        if running.left < 1:
             return "budget", f"max_evaluations ({max_evaluations}) used up"
         if time_limit is not None and running.history and running.seconds > time_limit:
             return "time", f"time_limit ({time_limit} s) used up"
@@ -158,12 +171,11 @@ def minimize(
             if reached is not None:
                 end = reached
                 break
-            points = search.ask(batch, limit=max_evaluations - search.evaluations)
-            search.tell(call(points.clone(), ()))
-            iterate = running.noted(points)
+            iterate = running.step()
             if callback is not None and _is_true(callback(iterate)) and ended() is None:
                 end = "callback", "the callback asked to end"
                 break
+        running.decide()
     except KeyboardInterrupt:
         if not running.history:
             raise
@@ -177,85 +189,6 @@ def minimize(
         if own is not None:
             own.close()
     return running.minimum(*end)
-
-
-class _Running:
-    """A search with all that was evaluated, and the file that it is written to."""
-
-    def __init__(self, search: TrustRegion, path: Path | None, verbose: bool) -> None:
-        self.search, self.history = search, list[Iterate]()
-        self._path, self._verbose = path, verbose
-        self._begun = self._written = self._said = time.monotonic()
-        if path is not None and path.exists():
-            saved = torch.load(path, weights_only=True)
-            search.load_state_dict(saved["search"])
-            self.history = [Iterate(**one) for one in saved["history"]]
-
-    @property
-    def seconds(self) -> float:
-        """Since the search began, or was resumed."""
-        return time.monotonic() - self._begun
-
-    @property
-    def flat(self) -> bool:
-        """Whether all values are equal."""
-        first = self.history[0].values[0] if self.history else math.nan
-        return all(bool((one.values == first).all()) for one in self.history)
-
-    def noted(self, points: Tensor) -> Iterate:
-        """Return what is known after a batch at points [K, n], and write it where it is due."""
-        search = self.search
-        self.history.append(Iterate(search.evaluations, search.value, search.x, points.clone(), search.told.clone()))
-        now = time.monotonic()
-        if self._verbose and now - self._said >= _PAUSE:
-            self._said = now
-            said = f"{search.evaluations} evaluations, value {search.value:.6g}, sigma {search.sigma:.3g}"
-            print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)
-        if now - self._written >= _PAUSE:
-            self.write()
-        return self.history[-1]
-
-    def write(self) -> None:
-        """Write the file; it is never half written."""
-        if self._path is None or not self.history:
-            return
-        self._written = time.monotonic()
-        draft = self._path.with_name(f"{self._path.name}.part")
-        torch.save({"search": self.search.state_dict(), "history": [vars(one) for one in self.history]}, draft)
-        draft.replace(self._path)
-
-    def minimum(self, status: Status, message: str) -> Minimum:
-        """Return the result."""
-        search = self.search
-        x, found = search.x, search.model_at_best()
-        gradient = hessian = errors = None
-        unit = search.unit
-        if found is not None:
-            model, sigma = found
-            unit = unit * sigma
-            gradient = (model.full_gradient() / unit).to(x)
-            hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
-            slope, bend = model.full_errors()
-            errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
-        if self.flat and len(search.unit) < search.evaluations and status != "target":
-            message += f"; all {search.evaluations} values are equal: enlarge sigma"
-        success = status in ("target", "solved") or (search.solved and not self.flat)
-        if success and status in ("budget", "time"):
-            message += "; the search had arrived at x, a minimum at least of its surroundings"
-        return Minimum(
-            x,
-            search.value,
-            gradient,
-            hessian,
-            errors,
-            unit.to(x),
-            search.evaluations,
-            self.history,
-            message,
-            search.engine,
-            success,
-            status,
-        )
 
 
 def _check_names(settings: dict[str, Any]) -> None:

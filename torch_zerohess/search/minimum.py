@@ -52,8 +52,13 @@ class Minimum:
     """target: the value is at most the target. solved: the search has ended at a minimum, possibly a local one.
     stalled: it has ended without one. budget, time: evaluations or seconds are used up. callback, interrupted: the
     caller has ended it. failed: the black box has raised."""
+    value_error: float = 0.0
+    """Standard error of the value, which in noise is a mean of evaluations at x; 0 without noise."""
+    noise: float = 0.0
+    """Standard deviation of repeated losses at one point, as it was given or measured; 0 without noise."""
 
     def __repr__(self) -> str:
-        found = f"x={short(self.x)}, value={self.value:.6g}, evaluations={self.evaluations}"
+        error = f" +- {self.value_error:.2g}" if self.value_error else ""
+        found = f"x={short(self.x)}, value={self.value:.6g}{error}, evaluations={self.evaluations}"
         said = f"engine={self.engine!r}, success={self.success}, message={self.message!r}"
         return f"Minimum({found}, {said})"

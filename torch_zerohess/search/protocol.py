@@ -10,6 +10,7 @@ To add a search: a subclass of `Progress` with its fields, a subclass of `Method
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Generic
 
 import torch
@@ -160,12 +161,16 @@ class AskTell(ABC, Generic[P]):
         name = type(self).__name__
         return f"{name}(engine={self.engine!r}, n={len(self.unit)}, evaluations={self.evaluations}, {told}, {end})"
 
-    def model_at_best(self) -> tuple[LocalModel, float] | None:
+    def model_at_best(self, x: Tensor | None = None) -> tuple[LocalModel, float] | None:
         """A quadratic model around `x` and its sigma: that at which x was found, or wider if few evaluations are near.
 
-        None before the first `tell`, or if no evaluations near x are kept.
+        None before the first `tell`, or if no evaluations near x are kept. In noise it may be wanted around another
+        point x [n] than the best one.
         """
-        return self._method.model_at_best(self._state.progress)
+        progress = self._state.progress
+        if x is not None and not torch.equal(x, self.x):
+            progress = replace(progress, best=replace(progress.best, point=self._space.coordinates(x)))
+        return self._method.model_at_best(progress)
 
     def ask(self, batch: int = 1, *, limit: int | None = None) -> Tensor:
         """Return the next points to evaluate [K, n]; the same ones until they are told.
@@ -204,6 +209,11 @@ class AskTell(ABC, Generic[P]):
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
         self._out, self.told = points[:0], evaluated.losses
+
+    def losses(self, values: Any) -> Tensor:
+        """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""
+        values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
+        return self._evaluated(values, self.unit.expand(len(values) if values.ndim else 0, -1)).losses
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a search with the same settings needs to go on exactly as this one would.

@@ -1,0 +1,69 @@
+"""Noise of a black box: how much repeated values differ, and which of several points has the lowest mean."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+REPEATED = 8
+"""Values at one point that tell the standard deviation of noise."""
+_ROUNDING = 1e-6
+"""Difference of two values, relative to them, that is rounding: renders of one seed differ by 3e-8."""
+_SHARE, _MOST, _LEAST = 8, 48, 4
+"""The part of all evaluations that the decision at the end gets: one in so many, at most and at least so many."""
+
+
+def differs(one: Tensor, other: Tensor) -> bool:
+    """Whether two values [*out] of one point differ by more than rounding."""
+    return float((one - other).abs().max()) > _ROUNDING * float(torch.maximum(one.abs(), other.abs()).max())
+
+
+def deviation(losses: Tensor) -> float:
+    """Standard deviation of losses [K] at one point."""
+    return float(losses.std())
+
+
+def reserved(evaluations: int) -> int:
+    """How many of the evaluations of a search in noise the decision at its end gets."""
+    return min(max(evaluations // _SHARE, _LEAST), _MOST)
+
+
+def distinct(points: Sequence[Tensor]) -> Tensor:
+    """Return the points [C, n] without those that are there already, in order."""
+    chosen: list[Tensor] = []
+    for one in points:
+        if not any(torch.equal(one, other) for other in chosen):
+            chosen.append(one)
+    return torch.stack(chosen)
+
+
+def lowest_mean(
+    evaluate: Callable[[Tensor], Tensor], points: Tensor, evaluations: int, noise: float
+) -> tuple[int, float, float]:
+    """Evaluate points [C, n] again; return which has the lowest mean, and its mean and standard error.
+
+    The first half of the evaluations chooses: all points that are left get the same number, then the better half is
+    left (successive halving: Karnin, Koren and Somekh 2013). The second half are all at the point that is chosen. The
+    mean has only these: those for which a point is chosen are lucky ones.
+
+    Args:
+        evaluate: points [K, n] -> losses [K].
+        points: what to choose from.
+        evaluations: how many there may be.
+        noise: standard deviation of a loss; what is measured counts where it is more.
+    """
+    left, choosing = torch.arange(len(points)), evaluations // 2
+    losses = torch.zeros(len(points), 0, dtype=torch.float64)  # of those that are left
+    rounds = math.ceil(math.log2(len(points)))
+    for k in range(rounds):
+        each = choosing // ((rounds - k) * len(left))
+        if each:
+            told = evaluate(points[left].repeat(each, 1)).reshape(each, -1).mT.cpu()
+            choosing, evaluations = choosing - told.numel(), evaluations - told.numel()
+            losses = torch.cat([losses, torch.where(torch.isfinite(told), told, torch.inf)], 1)
+            better = losses.mean(1).argsort()[: math.ceil(len(left) / 2)]
+            left, losses = left[better], losses[better]
+    told = evaluate(points[left[:1]].repeat(evaluations, 1))
+    spread = max(noise, deviation(told)) if len(told) > 1 else noise
+    return int(left[0]), float(told.mean()), spread / math.sqrt(len(told))

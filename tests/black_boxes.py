@@ -128,3 +128,19 @@ def aborting_at_every_third(z):
     if bool(third(z).any()):
         os.abort()
     return wave_and_growth(z)
+
+
+class Meeting:
+    """Waves, but an evaluation ends only when those of all points 0 to `count` - 1 have begun."""
+
+    def __init__(self, folder: Path, count: int) -> None:
+        self.folder, self.count = folder, count
+
+    def __call__(self, z):
+        (self.folder / str(int(z[0, 0]))).touch()
+        until = time.monotonic() + 60
+        while len(list(self.folder.iterdir())) < self.count:
+            if time.monotonic() > until:
+                raise TimeoutError("nobody came")
+            time.sleep(0.01)
+        return waves(z)

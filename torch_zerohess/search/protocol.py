@@ -21,6 +21,8 @@ from torch import Tensor
 from torch_zerohess.estimation.inputs import short
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
+from torch_zerohess.search.told import evaluated as told
+from torch_zerohess.search.told import joined
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 
@@ -135,6 +137,8 @@ class AskTell(ABC, Generic[P]):
         self._state = self._after(*self._method.first(generator), generator)
         self._given = 0
         """How many of the points asked for are out for evaluation: bookkeeping between the two calls, not state."""
+        self._early: dict[int, Tensor] = {}
+        """Values of some of them, by number, that came before the others."""
         self.told = torch.empty(0, dtype=torch.float64)
         """Losses [K] of the points told last."""
 
@@ -244,8 +248,17 @@ class AskTell(ABC, Generic[P]):
         self._given = len(points)
         return self._space.parameters(points)
 
-    def tell(self, values: Any) -> None:
+    @property
+    def missing(self) -> list[int]:
+        """Numbers of the points, among those that `ask` returned, whose values are not told."""
+        return [k for k in range(self._given) if k not in self._early]
+
+    def tell(self, values: Any, which: Sequence[int] | None = None) -> None:
         """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
+
+        With `which` [k], numbers of points, these are the values of some of them: [k] or [k, *out], in any order. The
+        step is taken when the last one is told, and does not depend on the order. Without `which` they are the values
+        of all points that are `missing`.
 
         Points whose values are not finite are avoided. Raises ValueError for a wrong shape, or if the start itself has
         no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
@@ -253,20 +266,28 @@ class AskTell(ABC, Generic[P]):
         """
         if not self._given:
             raise RuntimeError("ask for points before telling their values")
-        evaluated = self._evaluated(values, self._state.asked[: self._given])
+        if which is not None or self._early:
+            early = joined(self._early, values, self.missing if which is None else which, self._given)
+            if not early.keys() >= set(range(self._given)):
+                self._early = early
+                return
+            values = torch.stack([early[k] for k in range(self._given)])
+        method, progress = self._method, self._state.progress
+        points = self._state.asked[: self._given]
+        evaluated = told(values, points, method.settings.loss, progress.shape, self.unit.device)
         if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
             raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
         generator = torch.Generator()
         generator.set_state(self._state.random)
-        self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
-        self._given, self.told = 0, evaluated.losses
+        self._state = self._after(*method.next(progress, evaluated, generator), generator)
+        self._given, self._early, self.told = 0, {}, evaluated.losses
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a search with the same settings needs to go on exactly as this one would.
 
         Tensors, numbers, strings, lists and dicts: `torch.save`, and `torch.load` with weights_only=True.
         """
-        return {"search": self._kind, "unit": self.unit, **plain(self._state)}
+        return {"search": self._kind, "unit": self.unit, "early": dict(self._early), **plain(self._state)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a `state_dict`; the settings and the loss stay those given here.
@@ -282,6 +303,7 @@ class AskTell(ABC, Generic[P]):
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         progress = restored(self._method.progress, state["progress"], device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
+        self._early = dict(state.get("early", {}))
         self._given = len(self._state.asked)  # they may have been evaluated before the search was saved
 
     @property
@@ -290,29 +312,3 @@ class AskTell(ABC, Generic[P]):
 
     def _after(self, progress: P, asked: Tensor, generator: torch.Generator) -> State[P]:
         return State(progress, self._space.rounded(asked), generator.get_state())
-
-    def _evaluated(self, values: Any, points: Tensor) -> Evaluated:
-        """Return what was told as losses and outputs."""
-        loss, shape = self._method.settings.loss, self._state.progress.shape
-        values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
-        if loss is None and values.shape == (len(points), 1):
-            values = values[:, 0]
-        if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
-            wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
-            raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
-        if loss is None:
-            return Evaluated(points, values)
-        if shape and values.shape[1:] != shape:
-            raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
-        with torch.no_grad():
-            losses = [loss(one) for one in values]
-        if not all(isinstance(one, Tensor) for one in losses):
-            raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")
-        if any(one.numel() != 1 for one in losses):
-            raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
-        return Evaluated(
-            points,
-            torch.stack([one.double().reshape(()) for one in losses]),
-            values.reshape(len(values), -1),
-            values.shape[1:],
-        )

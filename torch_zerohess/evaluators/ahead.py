@@ -47,6 +47,7 @@ class Job:
     error: BaseException | None = None
     """Why the call fails, whatever its points do."""
     _begun: bool = False
+    _cancelled: bool = False
 
     def __post_init__(self) -> None:
         self.future.lost = self.batch.lost
@@ -59,7 +60,8 @@ class Job:
     @property
     def over(self) -> bool:
         """Whether nothing more is to be done."""
-        return self.error is not None or self.future.cancelled() or self.batch.finished
+        gone = self._cancelled if self._begun else self.future.cancelled()
+        return gone or self.error is not None or self.batch.finished
 
     def settle(self) -> None:
         """Give the future its values or its error."""
@@ -79,8 +81,8 @@ class Job:
         """Begin, which who waits for a future that was cancelled hears; whether it was not."""
         if not self._begun:
             self._begun = True
-            self.future.set_running_or_notify_cancel()
-        return not self.future.cancelled()
+            self._cancelled = not self.future.set_running_or_notify_cancel()
+        return not self._cancelled
 
 
 class Ahead(Closing, ABC):

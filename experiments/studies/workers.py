@@ -40,6 +40,8 @@ from torch_zerohess.evaluators import Factory, Inline, ProcessPool
 
 _CALL = 200
 """Points of a call that is disturbed."""
+_EARLY = 5
+"""Kills before they are due."""
 
 
 @dataclass(frozen=True)
@@ -200,17 +202,16 @@ def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, tim
     different = lost = done = 0
     with tempfile.TemporaryDirectory() as folder, ProcessPool(count, timeout=timeout, retries=20) as pool:
         fn = Hanging(folder)
-        begun = time.monotonic()
-        pool(fn, x[:count])
-        pause = max(1.0, 0.5 * (time.monotonic() - begun))  # where workers start slowly, they would all die young
-        with _killer(kills, chance, pause) as killed:
+        due = [0]
+        with _killer(kills, chance, due) as killed:
             for k, part in enumerate(progress(calls, "disturbed calls")):
                 for number in range(hanging.count(k)):
                     (Path(folder) / str(number)).touch()
+                due[0] = kills * (k + 1) // len(calls)
                 values = pool(fn, part)
                 different += int((values != (part**3).sin().sum(1)).sum())
                 lost += len(pool.lost)
-                while len(killed) < kills * (k + 1) // len(calls):  # as many as are due, then go on
+                while len(killed) < due[0]:  # as many as are due, then go on
                     time.sleep(0.01)
                 done += len(values)
     left = [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
@@ -219,13 +220,18 @@ def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, tim
 
 
 @contextmanager
-def _killer(kills: int, chance: random.Random, pause: float) -> Iterator[list[int]]:
-    """Kill workers at random times, on average `pause` seconds after each other, and append the number of each."""
+def _killer(kills: int, chance: random.Random, due: list[int]) -> Iterator[list[int]]:
+    """Kill workers at random times, a few more than are due at most, and append the number of each.
+
+    Where workers start slowly, they would all die before they begin, if kills did not keep step with calls.
+    """
     killed: list[int] = []
     over = threading.Event()
 
     def kill() -> None:
-        while len(killed) < kills and not over.wait(chance.expovariate(1.0 / pause)):
+        while len(killed) < kills and not over.wait(chance.expovariate(1.0)):
+            if len(killed) >= due[0] + _EARLY:
+                continue
             running = [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
             if running and (pid := chance.choice(running).pid) is not None and pid not in killed:
                 os.kill(pid, signal.SIGKILL)

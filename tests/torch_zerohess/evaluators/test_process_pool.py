@@ -332,12 +332,14 @@ def test_arguments_are_checked():
 
 
 def test_a_pool_is_closed_for_good_and_copied_by_its_settings():
-    with ProcessPool(3, timeout=2.0, retries=4) as pool:
+    with ProcessPool(3, timeout=20.0, retries=4) as pool:
+        assert torch.equal(pool(black_boxes.waves, points(1)), black_boxes.waves(points(1)))
+        assert len(pool._staffed) == 1  # more workers than points
         copy = pickle.loads(pickle.dumps(pool))
         assert (
             repr(copy)
             == repr(pool)
-            == "ProcessPool(workers=3, timeout=2.0, retries=4, recycle=None, memory_limit=None)"
+            == "ProcessPool(workers=3, timeout=20.0, retries=4, recycle=None, memory_limit=None)"
         )
     with pytest.raises(RuntimeError, match="the ProcessPool is closed"):
         pool(black_boxes.waves, points(1))

@@ -33,6 +33,7 @@ def run(
     evaluations: int | None = None,
     variant: str = "auto",
     threads: int | None = None,
+    workers: int | None = None,
 ) -> None:
     """Run methods on tasks, or go on with runs that were interrupted: the same command does both.
 
@@ -48,11 +49,13 @@ def run(
         evaluations: that a run may use; those of the task if not given.
         variant: of Mitsuba; auto takes a just-in-time one only where it is known to work.
         threads: render threads of networks; all cores if not given. Other tasks have one per process.
+        workers: processes for the black box of each run, one thread each but for `threads`; besides that of the run,
+            which then waits. The results do not depend on them, the seconds do.
     """
     names = chosen("TASK", tasks, list(TASKS))
     wanted = None if methods.strip() == "all" else chosen("methods", methods.split(","), list(METHODS))
     fitting, networks = (range(seed, seed + (number if runs is None else runs)) for number in (RUNS, NETWORK_RUNS))
-    ensemble = Ensemble(out, fitting, preset, jobs, limit, variant, networks, threads, evaluations)
+    ensemble = Ensemble(out, fitting, preset, jobs, limit, variant, networks, threads, evaluations, workers)
     try:
         outcomes = _run(ensemble, names, wanted)
         _report(ensemble, names, outcomes)

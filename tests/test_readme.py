@@ -59,6 +59,11 @@ def test_code_runs(name, tmp_path, monkeypatch):
         assert names["search"].value < 0.05
         assert names["found"].value <= 1e-6
         assert names["found"].evaluations < 100
+        assert names["state"]["progress"]["evaluations"] == names["search"].evaluations >= 20
+        assert names["calibrated"].value < 0.5 * names["missed"]([0.3, 0.8])
+        assert names["wrong"] < 0.5  # a guess has log 2
+        assert names["writer"][0].weight.grad.abs().sum() > 0
+        assert (names["fitted"].x - torch.tensor([0.6, 0.3])).abs().max() < 0.01
 
 
 CALLS = {name: [match[1] for line in commands(text) if (match := COMMAND.match(line))] for name, text in TEXTS.items()}

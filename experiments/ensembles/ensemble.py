@@ -42,6 +42,8 @@ class Ensemble:
     """That render the images of a network task; all cores if None. A fitting task has one per process."""
     evaluations: int | None = None
     """That a run may use; those of the task if None."""
+    workers: int | None = None
+    """Processes for the black box of each run, besides its own; none if None."""
 
     def __post_init__(self) -> None:
         for runs in (self.runs, self.network_runs or self.runs):
@@ -49,7 +51,8 @@ class Ensemble:
                 raise SystemExit(f"runs must be at least 1, got {len(runs)}")
             if runs.start < 0:
                 raise SystemExit(f"seed must be at least 0, got {runs.start}")
-        for name, value in (("jobs", self.jobs), ("threads", self.threads), ("evaluations", self.evaluations)):
+        least = {"jobs": self.jobs, "threads": self.threads, "evaluations": self.evaluations, "workers": self.workers}
+        for name, value in least.items():
             if value is not None and value < 1:
                 raise SystemExit(f"{name} must be at least 1, got {value}")
         if self.limit is not None and not self.limit > 0:
@@ -78,6 +81,8 @@ class Ensemble:
         loaded = catalogue.budgeted(loaded, self.evaluations)
         network = isinstance(loaded, NetworkTask)
         shared = {"preset": preset, "variant": variant} | ({"threads": threads} if network else {"level": LEVELS[-1]})
+        if self.workers is not None:
+            shared["workers"] = self.workers  # seconds depend on them
         limit = LIMIT if self.limit is None and not network else self.limit
         jobs = []
         for name in METHODS if methods is None else methods:
@@ -91,7 +96,7 @@ class Ensemble:
             budget = {"limit": limit, "evaluations": loaded.evaluations, "sigma": loaded.sigma}
             settings = shared | budget | {"method": own}
             runs = self.network_runs or self.runs if network else self.runs
-            fixed = self.folder, preset, variant, limit, settings, own, loaded.evaluations, threads
+            fixed = self.folder, preset, variant, limit, settings, own, loaded.evaluations, threads, self.workers
             jobs += [Job(task, name, run, *fixed) for run in runs]
         return jobs
 

@@ -18,7 +18,7 @@ _CODE = ("experiments", "torch_zerohess", "csrc", "setup.py", "pyproject.toml", 
 """What results depend on. Tables stored under `experiments/results` are made from results."""
 _PACKAGES = ("torch", "torch_zerohess", "numpy", "scipy", "cma", "DFO-LS", "mitsuba")
 NAME = "command.json"
-SHARED = ("preset", "variant", "threads")
+SHARED = ("preset", "variant", "threads", "workers")
 """Settings that all methods of a task must have in common."""
 
 

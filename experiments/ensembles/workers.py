@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from experiments.ensembles.spread import spread
 from experiments.methods import METHODS, Method
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
@@ -20,6 +21,7 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
+from torch_zerohess.evaluators import ProcessPool
 from torch_zerohess.evaluators.lifetime import end_with_parent, one_thread
 
 _PROGRESS = 0.2
@@ -47,6 +49,8 @@ class Job:
     """Evaluations of the task."""
     threads: int | None = None
     """That render the images of a network task; all cores if None."""
+    workers: int | None = None
+    """Further processes, in which the black box is evaluated; it is in that of the job if None."""
 
     @property
     def task_name(self) -> str:
@@ -75,11 +79,12 @@ def run_jobs(jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Message]]:
     """Run jobs in `count` processes; yield their progress, and for each job an outcome or trouble at its end."""
     waiting = deque(jobs)
     workers: list[_Worker] = []
+    alone = all(job.workers is None for job in jobs)
     try:
         while waiting or any(worker.job for worker in workers):
             workers = [worker for worker in workers if worker.process.is_alive() or worker.job]
             while waiting and len(workers) < count:
-                workers.append(_Worker())
+                workers.append(_Worker(daemon=alone))
             for worker in workers:
                 if worker.job is None and waiting:
                     worker.give(waiting.popleft())
@@ -95,10 +100,10 @@ def run_jobs(jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Message]]:
 class _Worker:
     """A process, the pipe to it and its job."""
 
-    def __init__(self) -> None:
+    def __init__(self, daemon: bool) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs,), daemon=True)
+        self.process = context.Process(target=_work, args=(theirs,), daemon=daemon)  # which has no children
         with one_thread():
             self.process.start()
         theirs.close()
@@ -169,6 +174,9 @@ def _execute(job: Job, connection: Connection) -> Message:
     try:
         task = _load(job.task, job.preset, job.variant, job.threads) if isinstance(job.task, str) else job.task
         task = catalogue.budgeted(task, job.budget)
+        if job.workers is not None:
+            source = job.task, job.preset, job.variant, job.threads
+            task = spread(task, _pool(job.task_name, job.workers), *source)
         method = METHODS[job.method] if isinstance(job.method, str) else job.method
         method.load()
         return attempt(
@@ -189,3 +197,15 @@ def _execute(job: Job, connection: Connection) -> Message:
 @lru_cache(maxsize=1)  # a scene that stays loaded slows down the next
 def _load(name: str, preset: Preset, variant: str, threads: int | None) -> Task | NetworkTask:
     return catalogue.load(name, preset, variant, threads)
+
+
+@lru_cache(maxsize=1)
+def _pool(task: str, workers: int) -> ProcessPool:
+    """Return the processes for the black box of a task; those of another task end."""
+    for pool in _pools:
+        pool.close()
+    _pools[:] = [ProcessPool(workers)]
+    return _pools[0]
+
+
+_pools: list[ProcessPool] = []

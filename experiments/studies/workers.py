@@ -9,6 +9,8 @@
 
 The faults are kills of workers at random times, and evaluations that hang. All values must be those of an undisturbed
 call, bit by bit, and nothing may be left: no process, and no file open that was not open before.
+
+`scaling` has a module of its own.
 """
 
 import json
@@ -33,10 +35,13 @@ from experiments.problems import catalogue
 from experiments.reports.progress import progress
 from experiments.reports.tables import table
 from experiments.studies.bench_ratios import in_turn
+from experiments.studies.scaling import scaling as scaling_of
 from torch_zerohess.evaluators import Factory, Inline, ProcessPool
 
 _CALL = 200
 """Points of a call that is disturbed."""
+_EARLY = 5
+"""Kills before they are due."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,7 @@ def workers(
     kills: int = 200,
     hangs: int = 50,
     seed: int = 0,
+    scaling: Path | None = None,
     out: Path | None = None,
 ) -> tuple[list[Cost], Faults | None]:
     """Measure the cost of worker processes, and disturb them.
@@ -105,6 +111,7 @@ def workers(
         kills: of workers, at random times.
         hangs: evaluations that hang.
         seed: of the times.
+        scaling: CSV file to write: batches in up to `count` workers, measured, and in up to 10 000, simulated.
         out: JSON file to write.
 
     Raises:
@@ -125,6 +132,8 @@ def workers(
         out.parent.mkdir(parents=True, exist_ok=True)
         written = {"costs": [asdict(one) for one in costs], "faults": None if faults is None else asdict(faults)}
         out.write_text(json.dumps(written, indent=1))
+    if scaling is not None:
+        scaling_of(count, scaling)
     if faults and not faults.right:
         raise SystemExit(1)
     return costs, faults
@@ -193,14 +202,16 @@ def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, tim
     different = lost = done = 0
     with tempfile.TemporaryDirectory() as folder, ProcessPool(count, timeout=timeout, retries=20) as pool:
         fn = Hanging(folder)
-        with _killer(kills, chance) as killed:
+        due = [0]
+        with _killer(kills, chance, due) as killed:
             for k, part in enumerate(progress(calls, "disturbed calls")):
                 for number in range(hanging.count(k)):
                     (Path(folder) / str(number)).touch()
+                due[0] = kills * (k + 1) // len(calls)
                 values = pool(fn, part)
                 different += int((values != (part**3).sin().sum(1)).sum())
                 lost += len(pool.lost)
-                while len(killed) < kills * (k + 1) // len(calls):  # as many as are due, then go on
+                while len(killed) < due[0]:  # as many as are due, then go on
                     time.sleep(0.01)
                 done += len(values)
     left = [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
@@ -209,13 +220,18 @@ def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, tim
 
 
 @contextmanager
-def _killer(kills: int, chance: random.Random) -> Iterator[list[int]]:
-    """Kill workers at random times, and append the number of each."""
+def _killer(kills: int, chance: random.Random, due: list[int]) -> Iterator[list[int]]:
+    """Kill workers at random times, a few more than are due at most, and append the number of each.
+
+    Where workers start slowly, they would all die before they begin, if kills did not keep step with calls.
+    """
     killed: list[int] = []
     over = threading.Event()
 
     def kill() -> None:
         while len(killed) < kills and not over.wait(chance.expovariate(1.0)):
+            if len(killed) >= due[0] + _EARLY:
+                continue
             running = [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
             if running and (pid := chance.choice(running).pid) is not None and pid not in killed:
                 os.kill(pid, signal.SIGKILL)

@@ -3,22 +3,26 @@
 import concurrent.futures
 import threading
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
-from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.ahead import wait_all
+from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
-from torch_zerohess.evaluators.inline import Closing
+from torch_zerohess.evaluators.inline import Closing, Evaluation
 from torch_zerohess.evaluators.values import checked_values
 
 _HELD = 4
 """Black boxes that a process keeps."""
 _held: dict[str, Callable[..., Any]] = {}
 _lock = threading.Lock()
+
+Tasks = list[tuple[Chunk, "concurrent.futures.Future[bytes]"]]
+"""Chunks, and their values as bytes."""
 
 
 class Executor(Closing):
@@ -59,28 +63,53 @@ class Executor(Closing):
         """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
         if self._closed:
             raise RuntimeError("the Executor is closed: make another one")
-        if not same(self._fn, fn):
-            self._fn, self._name = fn, uuid.uuid4().hex
         if len(points) == 0:
             return checked_values(fn(points, *aux), points)
-        batch = Batch(points, 0)
-        futures = []
+        batch, tasks = self._tasks(fn, points, aux)
+        try:
+            return _joined(batch, tasks).to(points.device)
+        finally:
+            for _, task in tasks:
+                task.cancel()
+
+    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
+        """Return a future of what a call with these arguments returns; several may be under way."""
+        if self._closed:
+            raise RuntimeError("the Executor is closed: make another one")
+        if len(points) == 0:
+            return Evaluation.of(lambda: checked_values(fn(points, *aux), points))
+        batch, tasks = self._tasks(fn, points, aux)
+        future, device = Evaluation(), points.device
+        future.set_running_or_notify_cancel()  # what was given to the executor is its own
+        wait_all([task for _, task in tasks], lambda: future.settle(lambda: _joined(batch, tasks).to(device)))
+        return future
+
+    def _tasks(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> tuple[Batch, Tasks]:
+        """Submit the chunks of points."""
+        if not same(self._fn, fn):
+            self._fn, self._name = fn, uuid.uuid4().hex
+        batch, tasks = Batch(points, 0), Tasks()
         try:
             while batch.waiting:
                 chunk = batch.take()
                 data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
-                futures.append((chunk, self.executor.submit(evaluated, self._name, fn, data)))
-            for chunk, future in futures:  # in order, so that the first error is that of the first point
-                batch.came(chunk, transfer.unpacked(future.result())[0])
-        finally:
-            for _, future in futures:
-                future.cancel()
-        return batch.result().to(points.device)
+                tasks.append((chunk, self.executor.submit(evaluated, self._name, fn, data)))
+        except BaseException:
+            for _, task in tasks:
+                task.cancel()
+            raise
+        return batch, tasks
 
     def close(self) -> None:
         """Take no further points; the executor stays as it is."""
         self._closed = True
         self._fn = None
+
+
+def _joined(batch: Batch, tasks: Tasks) -> Tensor:
+    for chunk, task in tasks:  # in order, so that the first error is that of the first point
+        batch.came(chunk, transfer.unpacked(task.result())[0])
+    return batch.result()
 
 
 def evaluated(name: str, fn: Callable[..., Any], data: bytes) -> bytes:

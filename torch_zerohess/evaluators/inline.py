@@ -1,11 +1,14 @@
 """Evaluation in this process, and what every evaluator is."""
 
+import concurrent.futures
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
+
+from torch_zerohess.evaluators.values import checked_values
 
 E = TypeVar("E", bound="Closing")
 
@@ -14,11 +17,34 @@ class Evaluator(Protocol):
     """Calls a black box on a batch of points, in any process and order; results are in the order of the points.
 
     An evaluator that gives up points, whose values are then NaN, says so in an attribute `lost`: the numbers of these
-    points in the last call, and why.
+    points in the last call, and why. One that can begin further calls before the first has ended has
+    `submit(fn, points, *aux)`, which returns a `concurrent.futures.Future` of the values.
     """
 
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Any:
         """Return fn(points [K, n], *aux [K, ...]), values of K points."""
+
+
+class Evaluation(concurrent.futures.Future[Tensor]):
+    """The values [K, *out] of a call that was submitted."""
+
+    lost: dict[int, str] = {}  # noqa: RUF012
+    """Points without a value, by number, and why; complete when the future is done."""
+
+    @classmethod
+    def of(cls, call: Callable[[], Tensor]) -> "Evaluation":
+        """Return a future that is done, with what `call` returns or raises."""
+        future = cls()
+        future.set_running_or_notify_cancel()
+        future.settle(call)
+        return future
+
+    def settle(self, call: Callable[[], Tensor]) -> None:
+        """Take what `call` returns or raises."""
+        try:
+            self.set_result(call())
+        except Exception as error:
+            self.set_exception(error)
 
 
 class Closing:
@@ -48,3 +74,7 @@ class Inline(Closing):
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Any:
         with torch.no_grad():
             return fn(points, *aux)
+
+    def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
+        """Call at once, and return a future that is done: see `ProcessPool.submit`, for which this stands in."""
+        return Evaluation.of(lambda: checked_values(self(fn, points, *aux), points))

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer, worker
+from torch_zerohess.evaluators.ahead import Job
 from torch_zerohess.evaluators.batch import Chunk
 from torch_zerohess.evaluators.lifetime import end_group, one_thread
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
@@ -36,6 +37,8 @@ class Process:
         """Number of the black box that it has."""
         self.chunk: Chunk | None = None
         """What it evaluates."""
+        self.job: Job | None = None
+        """The call that the chunk is of."""
         self.deadline: float | None = None
         self.evaluations = 0
 
@@ -54,9 +57,10 @@ class Process:
         data = torch.frombuffer(bytearray(payload), dtype=torch.uint8)
         self.messages.send(FUNCTION, None, (data,), shared=self._room((data,)))
 
-    def give(self, chunk: Chunk, tensors: tuple[Tensor, ...], timeout: float | None) -> None:
+    def give(self, job: Job, chunk: Chunk, timeout: float | None) -> None:
         """Send the points of a chunk."""
-        self.ready, self.chunk = False, chunk
+        self.ready, self.job, self.chunk = False, job, chunk
+        tensors = tuple(one[chunk.start : chunk.stop] for one in job.tensors)
         self.messages.send(EVALUATE, None, tensors, shared=self._room(tensors))
         self.deadline = None if timeout is None else time.monotonic() + timeout * len(chunk)
 
@@ -67,7 +71,7 @@ class Process:
             self._enlarge(header)
         elif kind != READY and self.chunk is not None:
             self.evaluations += len(self.chunk)
-            self.chunk = self.deadline = None
+            self.chunk = self.job = self.deadline = None
         self.ready = kind != ROOM
         return kind, header, tensors
 

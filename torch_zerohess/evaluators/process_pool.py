@@ -7,25 +7,22 @@ end concerns its own chunk alone.
 """
 
 import atexit
-import multiprocessing.util  # noqa: F401 its own end of processes is registered first, hence runs after ours
+import multiprocessing
+import multiprocessing.util  # its own end of processes is registered first, hence runs after ours
 import os
 import sys
-import threading
 import time
 import weakref
-from collections.abc import Callable
-from multiprocessing.connection import wait
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
-from torch_zerohess.evaluators.factory import same
-from torch_zerohess.evaluators.inline import Closing
 from torch_zerohess.evaluators.payload import dumped, loaded_error
 from torch_zerohess.evaluators.process import Process
-from torch_zerohess.evaluators.values import checked_values
 from torch_zerohess.evaluators.worker import ERROR, VALUES
 
 _STARTS = 25
@@ -40,7 +37,7 @@ _GRACE = 2.0
 """Seconds that a worker has to end by itself."""
 
 
-class ProcessPool(Closing):
+class ProcessPool(Ahead):
     """Calls the black box in worker processes, a few points at a time.
 
     Workers are new Python processes (spawn) with one thread each, so that a black box with its own threads does not
@@ -101,15 +98,8 @@ class ProcessPool(Closing):
             raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
         self.workers = workers or cores()
         self.timeout, self.retries, self.recycle, self.memory_limit = timeout, retries, recycle, memory_limit
-        self.lost: dict[int, str] = {}
-        """Points of the last call that have no value, by number, and why."""
-        self._lock = threading.Lock()
+        super().__init__()
         self._forget()
-        self._fn: Callable[..., Any] | None = None
-        self._payload = b""
-        self._number = 0
-        self._known: tuple[torch.dtype, torch.Size] | None = None
-        self._closed = False
         _pools.add(self)
 
     def __repr__(self) -> str:
@@ -121,42 +111,20 @@ class ProcessPool(Closing):
         settings |= {"recycle": self.recycle, "memory_limit": self.memory_limit}
         return _again, (self.workers, settings)
 
-    def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Tensor:
-        """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
-        with self._lock:
-            if self._closed:
-                raise RuntimeError("the ProcessPool is closed: make another one")
-            if self._process != os.getpid():
-                self._forget()  # after a fork, workers and pipes belong to the other process
-            if len(points) == 0:
-                return checked_values(fn(points, *aux), points)
-            self._take(fn)
-            tensors = tuple(one.detach().cpu() for one in (points, *aux))
-            batch = Batch(tensors[0], self.retries)
-            self.lost = batch.lost
-            try:
-                while not batch.finished:
-                    self._staff(batch)
-                    self._assign(batch, tensors)
-                    self._listen(batch)
-                values = batch.result(self._known)
-            finally:  # after an error, or Ctrl-C, nobody waits for what they do
-                for one in [one for one in self._staffed if one.chunk is not None]:
-                    self._remove(one)
-            self._known = values.dtype, values.shape[1:]
-            return values.to(points.device)
-
     def close(self) -> None:
         """End all workers. A worker that does not end by itself is killed."""
-        self._closed = True
         if self._process != os.getpid():
+            self._closed = True
             return
+        self._stop()
         every = self._staffed + [one for one, _ in self._leaving]
         for one in self._staffed:
             one.leave()
         until = time.monotonic() + _GRACE
         for one in every:
             one.end(0.0 if one.chunk is not None or one.number is None else max(0.0, until - time.monotonic()))
+        for end in self._bell or ():
+            end.close()
         self._forget()
 
     def _forget(self) -> None:
@@ -164,15 +132,40 @@ class ProcessPool(Closing):
         self._staffed: list[Process] = []
         self._leaving: list[tuple[Process, float]] = []
         self._failed_starts = 0
+        self._bell: tuple[Connection[Any, Any], Connection[Any, Any]] | None = None
+        """A pipe whose messages end a wait, if a thread serves."""
+        self._rung = False
 
-    def _take(self, fn: Callable[..., Any]) -> None:
-        """Remember the black box, and what to send to workers."""
-        if not same(self._fn, fn):
-            self._payload = dumped(fn)
-            self._fn, self._known = fn, None
-            self._number += 1
+    def _check_open(self) -> None:
+        super()._check_open()
+        if self._process != os.getpid():  # after a fork, workers, pipes and threads belong to the other process
+            self._alone()
+            self._forget()
 
-    def _staff(self, batch: Batch) -> None:
+    def _sent(self, fn: Callable[..., Any]) -> bytes:
+        return dumped(fn)
+
+    def _batch(self, points: Tensor) -> Batch:
+        return Batch(points, self.retries)
+
+    def _round(self, jobs: Sequence[Job]) -> None:
+        self._staff(jobs)
+        self._assign(jobs)
+        self._listen(jobs)
+
+    def _give_up(self, jobs: Sequence[Job]) -> None:
+        for one in [one for one in self._staffed if one.job in jobs]:
+            self._remove(one)
+
+    def _prepare(self) -> None:
+        self._bell = multiprocessing.Pipe(duplex=False)
+
+    def _wake(self) -> None:
+        if self._bell and not self._rung:
+            self._rung = True
+            self._bell[1].send_bytes(b"")
+
+    def _staff(self, jobs: Sequence[Job]) -> None:
         """Have a worker for every chunk, as far as they may be, and none that is due to be replaced."""
         for one in [one for one in self._staffed if one.ready and self.recycle and one.evaluations >= self.recycle]:
             self._staffed.remove(one)
@@ -181,64 +174,71 @@ class ProcessPool(Closing):
         for pair in [pair for pair in self._leaving if not pair[0].process.is_alive() or time.monotonic() > pair[1]]:
             self._leaving.remove(pair)
             pair[0].end()
-        wanted = min(self.workers, len(batch.waiting) + len(batch.busy))
+        chunks = sum(len(job.batch.waiting) + len(job.batch.busy) for job in jobs if not job.over)
+        wanted = min(self.workers, chunks)
         while len(self._staffed) < wanted:
             self._staffed.append(Process())
 
-    def _assign(self, batch: Batch, tensors: tuple[Tensor, ...]) -> None:
+    def _assign(self, jobs: Sequence[Job]) -> None:
         for one in self._staffed:
-            if not one.ready or not batch.waiting:
+            job = next((job for job in jobs if job.waiting), None) if one.ready else None
+            if job is None:
                 continue
             try:
-                if one.number != self._number:
-                    one.give_function(self._number, self._payload)
+                if one.number != job.function.number:
+                    one.give_function(job.function.number, job.function.sent)
                 else:
-                    chunk = batch.take()
-                    one.give(chunk, tuple(part[chunk.start : chunk.stop] for part in tensors), self.timeout)
+                    one.give(job, job.batch.take(), self.timeout)
             except (BrokenPipeError, ConnectionResetError):
                 pass  # its end is seen by who listens
 
-    def _listen(self, batch: Batch) -> None:
+    def _listen(self, jobs: Sequence[Job]) -> None:
         """Wait until something happens, and treat it."""
         seconds = _ALIVE if self.memory_limit is None else _LOOK
         for one in self._staffed:
             if one.deadline is not None:
                 seconds = min(seconds, max(0.0, one.deadline - time.monotonic()))
-        ready = set(wait([handle for one in self._staffed for handle in one.handles], seconds))
+        handles = [handle for one in self._staffed for handle in one.handles]
+        ready = set(wait(handles + ([self._bell[0]] if self._bell else []), seconds))
+        if self._bell and self._bell[0] in ready:
+            self._bell[0].recv_bytes()
+            self._rung = False
         for one in list(self._staffed):
             if one.connection in ready:
-                self._hear(one, batch)
+                self._hear(one, jobs)
             elif one.process.sentinel in ready or (not ready and not one.process.is_alive()):
-                self._lose(one, batch, None)
+                self._lose(one, jobs, None)
             elif one.deadline is not None and time.monotonic() > one.deadline:
-                self._lose(one, batch, f"the black box took longer than timeout={self.timeout:g} s per point")
+                self._lose(one, jobs, f"the black box took longer than timeout={self.timeout:g} s per point")
             elif too_large := self._too_large(one):
-                self._lose(one, batch, too_large)
+                self._lose(one, jobs, too_large)
 
-    def _hear(self, one: Process, batch: Batch) -> None:
-        chunk = one.chunk
+    def _hear(self, one: Process, jobs: Sequence[Job]) -> None:
+        job, chunk = one.job, one.chunk
         try:
             kind, header, tensors = one.receive()
         except (EOFError, OSError):
-            self._lose(one, batch, None)
+            self._lose(one, jobs, None)
             return
         if too_large := self._too_large(one):
-            one.chunk = chunk
-            self._lose(one, batch, too_large)
+            one.job, one.chunk = job, chunk
+            self._lose(one, jobs, too_large)
         elif kind == ERROR:
             making, data = header
             error = loaded_error(data)
-            if making:
+            if making:  # calls with other black boxes go on
                 number, one.number = one.number, None
-                if number == self._number:  # not that of an earlier call, which has raised it already
-                    raise _unmade(error)
+                for each in [each for each in jobs if each.function.number == number]:
+                    each.error = _unmade(error)
                 return
+            assert job is not None
             assert chunk is not None
-            batch.raised(chunk, error)
+            job.batch.raised(chunk, error)
         elif kind == VALUES:
+            assert job is not None
             assert chunk is not None
             self._failed_starts = 0
-            batch.came(chunk, tensors[0])
+            job.batch.came(chunk, tensors[0])
 
     def _too_large(self, one: Process) -> str:
         """Return that a worker takes too much memory, or nothing."""
@@ -246,24 +246,27 @@ class ProcessPool(Closing):
             return ""
         return f"the process of the black box took {used:.4g} bytes, more than memory_limit={self.memory_limit:.4g}"
 
-    def _lose(self, one: Process, batch: Batch, reason: str | None) -> None:
+    def _lose(self, one: Process, jobs: Sequence[Job], reason: str | None) -> None:
         """Remove a worker that ended, or that must; its chunk has failed."""
-        chunk, number = one.chunk, one.number
+        job, chunk, number = one.job, one.chunk, one.number
         how = self._remove(one, _GRACE if reason is None else 0.0)  # it ends, so let it say how
-        if chunk is not None:
-            batch.failed(chunk, reason or f"the black box ended its process ({how})")
+        if job is not None and chunk is not None:
+            job.batch.failed(chunk, reason or f"the black box ended its process ({how})")
             return
         self._failed_starts += 1
+        error = None
         if number is None and how.startswith("exit code"):
-            raise RuntimeError(
+            error = RuntimeError(
                 f"a worker process ended with {how} at its start, see its messages above. If they name "
                 '`__main__`: put the main part of the script under `if __name__ == "__main__":`'
             )
-        if self._failed_starts > (_STARTS if number is None else _MAKES) or reason is not None:
+        elif self._failed_starts > (_STARTS if number is None else _MAKES) or reason is not None:
             when = "at its start" if number is None else "while it made the black box"
-            raise RuntimeError(
+            error = RuntimeError(
                 f"a worker process ended {when}: {reason or how}, {self._failed_starts} times in a row without a value"
             )
+        for each in jobs if error else ():
+            each.error = error
 
     def _remove(self, one: Process, grace: float = 0.0) -> str:
         self._staffed.remove(one)

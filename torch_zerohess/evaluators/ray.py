@@ -2,21 +2,22 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
+from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.executor import values_of
-from torch_zerohess.evaluators.factory import same
-from torch_zerohess.evaluators.inline import Closing
-from torch_zerohess.evaluators.values import checked_values
+
+_LOOK = 0.05
+"""Seconds after which a wait looks for calls that were submitted meanwhile."""
 
 
-class Ray(Closing):
+class Ray(Ahead):
     """Calls the black box in actors of Ray, on one machine or many, one chunk per actor and call.
 
     An actor holds the black box from call to call. An actor that ends, with its process or its machine, is restarted by
@@ -52,66 +53,62 @@ class Ray(Closing):
         self._ray: Any = ray
         self.count, self.retries = actors, retries
         self.options = {"num_cpus": 1, "max_restarts": -1, "max_task_retries": 0} | options
-        self.lost: dict[int, str] = {}
-        """Points of the last call that have no value, by number, and why."""
         self.actors: list[Any] = []
         """Handles of the actors."""
         self._starting: dict[Any, Any] = {}
         """Actors that have ended and start again, by what says that they have."""
-        self._fn: Callable[..., Any] | None = None
-        self._held: Any = None
-        """Where the cluster has the black box."""
-        self._known: tuple[torch.dtype, torch.Size] | None = None
-        self._own = self._closed = False
+        self._idle: list[Any] = []
+        self._busy: dict[Any, tuple[Any, Chunk, Job]] = {}
+        """What actors evaluate, by the reference to its values."""
+        self._own = False
+        super().__init__()
 
     def __repr__(self) -> str:
         return f"Ray(actors={self.count}, retries={self.retries}, options={self.options})"
 
-    def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Tensor:
-        """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
-        if self._closed:
-            raise RuntimeError("the Ray evaluator is closed: make another one")
-        if len(points) == 0:
-            return checked_values(fn(points, *aux), points)
-        self._connect()
-        self._staff()
-        if self._held is None or not same(self._fn, fn):
-            self._fn, self._known, self._held = fn, None, self._ray.put(fn)
-        batch = Batch(points, self.retries, len(self.actors))
-        self.lost = batch.lost
-        busy: dict[Any, tuple[Any, Chunk]] = {}
-        idle = [actor for actor in self.actors if actor not in self._starting.values()]
-        try:
-            while not batch.finished:
-                while idle and batch.waiting:
-                    chunk, actor = batch.take(), idle.pop(0)
-                    data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
-                    busy[actor.evaluate.remote([self._held], data)] = actor, chunk
-                done, _ = self._ray.wait([*busy, *self._starting], num_returns=1)
-                for one in done:
-                    if one in busy:
-                        actor, chunk = busy.pop(one)
-                        alive = self._answered(one, chunk, batch)
-                    else:
-                        actor, alive = self._started(one)
-                    if alive:
-                        idle.append(actor)
-                    else:  # until it has restarted, it would refuse points
-                        self._starting[actor.ready.options(max_task_retries=-1).remote()] = actor
-        finally:
-            for one in busy:
-                self._ray.cancel(one)
-        values = batch.result(self._known)
-        self._known = values.dtype, values.shape[1:]
-        return values.to(points.device)
-
     def close(self) -> None:
         """End the actors, and a Ray that was started for them alone."""
-        self._closed = True
+        self._stop()
         self._end_actors()
         if self._own:
             self._own = False
             self._ray.shutdown()
+
+    def _sent(self, fn: Callable[..., Any]) -> Any:
+        self._connect()
+        self._staff()
+        return self._ray.put(fn)
+
+    def _batch(self, points: Tensor) -> Batch:
+        return Batch(points, self.retries, len(self.actors))
+
+    def _round(self, jobs: Sequence[Job]) -> None:
+        for actor in list(self._idle):
+            job = next((job for job in jobs if job.waiting), None)
+            if job is None:
+                break
+            self._idle.remove(actor)
+            chunk = job.batch.take()
+            data = transfer.packed([one[chunk.start : chunk.stop] for one in job.tensors])
+            self._busy[actor.evaluate.remote([job.function.sent], data)] = actor, chunk, job
+        done, _ = self._ray.wait([*self._busy, *self._starting], num_returns=1, timeout=_LOOK)
+        for one in done:
+            if one in self._busy:
+                actor, chunk, job = self._busy.pop(one)
+                alive = self._answered(one, chunk, job.batch)
+            else:
+                actor, alive = self._started(one)
+            if alive:
+                self._idle.append(actor)
+            else:  # until it has restarted, it would refuse points
+                self._starting[actor.ready.options(max_task_retries=-1).remote()] = actor
+
+    def _give_up(self, jobs: Sequence[Job]) -> None:
+        for one, (actor, _, job) in list(self._busy.items()):
+            if job in jobs:
+                self._ray.cancel(one)
+                del self._busy[one]
+                self._idle.append(actor)
 
     def _connect(self) -> None:
         if self._ray.is_initialized():
@@ -128,11 +125,12 @@ class Ray(Closing):
         if not self.actors:
             count = self.count or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
             self.actors = [self._new() for _ in range(count)]
+            self._idle = list(self.actors)
 
     def _end_actors(self) -> None:
         for actor in self.actors if self._ray.is_initialized() else ():
             self._ray.kill(actor)
-        self.actors, self._starting, self._fn, self._held = [], {}, None, None
+        self.actors, self._idle, self._busy, self._starting, self._function = [], [], {}, {}, None
 
     def _answered(self, one: Any, chunk: Chunk, batch: Batch) -> bool:
         """Treat what became of a chunk; False if its actor has ended."""

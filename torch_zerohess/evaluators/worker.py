@@ -83,7 +83,8 @@ def main(connection: "Connection[Any, Any]") -> None:
     torch.set_num_threads(1)
     messages = Messages(connection)
     fn: Any = None
-    messages.send(READY)
+    with contextlib.suppress(OSError):  # the pool was closed meanwhile: there will be no message
+        messages.send(READY)
     while True:
         try:
             kind, header, tensors = messages.receive()

@@ -20,6 +20,8 @@ from torch_zerohess.estimation.inputs import short
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
+from torch_zerohess.search.told import evaluated as told
+from torch_zerohess.search.told import joined
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 
@@ -72,6 +74,8 @@ class AskTell(ABC, Generic[P]):
         self._state = self._after(*self._method.first(generator), generator)
         self._out: Tensor | None = self._state.asked[:0]
         """Points out for evaluation [K, n], None if `load_state_dict` does not know: bookkeeping, not state."""
+        self._early: dict[int, Tensor] = {}
+        """Values of some of them, by number, that came before the others."""
         self.told = torch.empty(0, dtype=torch.float64)
         """Losses [K] of the points told last."""
 
@@ -191,28 +195,49 @@ class AskTell(ABC, Generic[P]):
         self._out = self._points(batch)[:limit]
         return self._space.parameters(self._out)
 
-    def tell(self, values: Any) -> None:
+    @property
+    def missing(self) -> list[int]:
+        """Numbers of the points, among those that `ask` returned, whose values are not told."""
+        points = self._state.asked if self._out is None else self._out
+        return [k for k in range(len(points)) if k not in self._early]
+
+    def tell(self, values: Any, which: Sequence[int] | None = None) -> None:
         """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
+
+        With `which` [k], numbers of points, these are the values of some of them: [k] or [k, *out], in any order. The
+        step is taken when the last one is told, and does not depend on the order. Without `which` they are the values
+        of all points that are `missing`. After `load_state_dict` ask for a batch again before telling parts of it.
 
         Points whose values are not finite are avoided. Raises ValueError for a wrong shape, or if the start itself has
         no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
         raises. The search is then as before, and the same values can be told again.
         """
         values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
-        points = self._points(len(values))[: len(values)] if self._out is None and values.ndim else self._out
-        if points is None or not len(points):
+        points = self._out
+        if points is None and which is not None:
+            points = self._state.asked
+        elif points is None:
+            count = len(values) if values.ndim else 1
+            points = self._points(count)[:count]
+        if not len(points):
             raise RuntimeError("ask for points before telling their values")
+        if which is not None or self._early:
+            early = joined(self._early, values, self.missing if which is None else which, len(points))
+            if not early.keys() >= set(range(len(points))):
+                self._out, self._early = points, early
+                return
+            values = torch.stack([early[k] for k in range(len(points))])
         evaluated = self._evaluated(values, points)
         if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
             raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
-        self._out, self.told = points[:0], evaluated.losses
+        self._out, self._early, self.told = points[:0], {}, evaluated.losses
 
     def losses(self, values: Any) -> Tensor:
         """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""
-        values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
+        values = torch.as_tensor(values, dtype=torch.float64)
         return self._evaluated(values, self.unit.expand(len(values) if values.ndim else 0, -1)).losses
 
     def state_dict(self) -> dict[str, Any]:
@@ -220,7 +245,9 @@ class AskTell(ABC, Generic[P]):
 
         Tensors, numbers, strings, lists and dicts: `torch.save`, and `torch.load` with weights_only=True.
         """
-        return {"search": self._kind, "unit": self.unit, **plain(self._state)}
+        given = 0 if self._out is None or not self._early else len(self._out)
+        early = {"early": dict(self._early), "given": given}
+        return {"search": self._kind, "unit": self.unit, **early, **plain(self._state)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a `state_dict`; the settings and the loss stay those given here.
@@ -236,7 +263,9 @@ class AskTell(ABC, Generic[P]):
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         progress = restored(self._method.progress, state["progress"], device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
-        self._out = None  # points may have been evaluated before the search was saved
+        self._early = dict(state.get("early", {}))
+        # Without early values it is not known how many points were evaluated before the search was saved.
+        self._out = self._points(state["given"])[: state["given"]] if self._early else None
 
     @property
     def _kind(self) -> str:
@@ -256,29 +285,8 @@ class AskTell(ABC, Generic[P]):
         further = self._method.more(self._state.progress, points, batch - len(points), generator)
         return torch.cat([points, self._space.rounded(further)])
 
-    def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:
-        """Return what was told as losses and outputs."""
-        loss, shape = self._method.settings.loss, self._state.progress.shape
-        extra = max(len(points) - len(self._state.asked), 0)
-        if loss is None and values.shape == (len(points), 1):
-            values = values[:, 0]
-        if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
-            wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
-            raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
-        if loss is None:
-            return Evaluated(points, values, extra=extra)
-        if shape and values.shape[1:] != shape:
-            raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
-        with torch.no_grad():
-            losses = [loss(one) for one in values]
-        if not all(isinstance(one, Tensor) for one in losses):
-            raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")
-        if any(one.numel() != 1 for one in losses):
-            raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
-        return Evaluated(
-            points,
-            torch.stack([one.double().reshape(()) for one in losses]),
-            values.reshape(len(values), -1),
-            values.shape[1:],
-            extra,
-        )
+    def _evaluated(self, values: Any, points: Tensor) -> Evaluated:
+        """Return what was told about points [K, n], of which those beyond the search's own are from `Method.more`."""
+        shape = self._state.progress.shape
+        found = told(values, points, self._method.settings.loss, shape, self.unit.device)
+        return replace(found, extra=max(len(points) - len(self._state.asked), 0))

@@ -84,9 +84,9 @@ class Running:
     def step(self) -> Iterate:
         """Evaluate what the search asks for next; in the first batch the start twice, if noise is to be measured."""
         search = self.search
+        if self.noise is None and self.left > max(len(search.ask()), self._batch) + 1:
+            return self._first(search.ask(max(self._batch - 1, 1)))
         points = search.ask(self._batch, limit=self.left)
-        if self.noise is None and self.left > len(points) + 1:
-            return self._first(points)
         self.noise = self.noise or 0.0
         search.tell(self._call(points.clone(), ()))
         return self._noted(points, search.told)
@@ -166,7 +166,7 @@ class Running:
         at_start = torch.cat([losses[:1], losses[len(points) :]])
         self.noise = deviation(at_start[torch.isfinite(at_start)])
         self.search = self._make(self.noise)
-        if torch.equal(self.search.ask(self._batch, limit=len(points)), points):
+        if torch.equal(self.search.ask(max(self._batch - 1, 1)), points):
             self.search.tell(values[: len(points)])
         return self._noted(torch.cat([points, start.repeat(1 + count, 1)]), losses)
 

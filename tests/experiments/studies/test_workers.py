@@ -43,3 +43,11 @@ def test_a_wrong_value_is_noticed(monkeypatch) -> None:
 def test_wrong_arguments_are_named() -> None:
     with pytest.raises(SystemExit, match="kills must be at least 0, got -1"):
         study.workers(kills=-1)
+
+
+def test_scaling_is_asked_for(monkeypatch, tmp_path) -> None:
+    called = []
+    monkeypatch.setattr(study, "scaling_of", lambda *given: called.append(given))
+    study.workers(repeats=0, evaluations=0)
+    study.workers(count=3, repeats=0, evaluations=0, scaling=tmp_path)
+    assert called == [(3, tmp_path)]

@@ -62,6 +62,22 @@ def test_gradient_and_hessian_are_those_of_the_module():
     torch.testing.assert_close(one.hessian(), other.hessian(), rtol=1e-3, atol=1e-4)
 
 
+def test_derivatives_behind_a_quantised_pre_processing():
+    """Gain and offset of what is rounded to 8 bits: the same samples through onnxruntime and through torch."""
+    f = OnnxFunction(model(), constants={"c": C[0]}, output="y")
+    photo = vector(0.2, 0.9)
+
+    def pixels(z):
+        return (255 * (z[:, :1] * photo + z[:, 1:]).clamp(0, 1)).round() / 255
+
+    x, smoothing = vector(0.5, 0.2), zh.Smoothing(sigma=0.2, samples=32, seed=0)
+    one = zh.estimate(lambda z: f(pixels(z)).square().sum(1), x, smoothing)
+    other = zh.estimate(lambda z: truth(pixels(z), C[0]).square().sum(1), x, smoothing)
+    assert other.gradient.abs().min() > 0.1
+    torch.testing.assert_close(one.gradient, other.gradient, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(one.hessian(), other.hessian(), rtol=1e-3, atol=1e-3)
+
+
 def test_the_inputs_of_a_deployed_model_are_found():
     f = OnnxFunction(model(), constants={"c": C[0]}, output="y")
     y = truth(Z[:1], C[0])[0].double()

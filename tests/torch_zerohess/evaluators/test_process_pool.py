@@ -22,7 +22,7 @@ import torch_zerohess as zh
 from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
 from torch_zerohess.evaluators.batch import MOST, Batch, cut
 from torch_zerohess.evaluators.process_pool import cores
-from truths import vector
+from truths import Exponential, PlaneWave, deviation, vector
 
 S = zh.Smoothing(sigma=0.3, samples=8, seed=0)
 
@@ -195,22 +195,62 @@ def test_the_first_error_is_raised_whichever_comes_first():
 
 
 class Losing:
-    """An evaluator that has no value of the second point."""
+    """An evaluator of this process that has no value where `which`, points [K, n] -> [K], is true."""
 
-    lost: dict[int, str] = {1: "it crashed"}  # noqa: RUF012
+    def __init__(self, which):
+        self.which = which
+        self.lost: dict[int, str] = {}
 
     def __call__(self, fn, points, *aux):
-        values = fn(points, *aux)
-        values[1] = torch.nan
+        values, gone = fn(points, *aux), self.which(points)
+        values[gone] = torch.nan
+        self.lost = dict.fromkeys(gone.nonzero()[:, 0].tolist(), "it crashed")
         return values
 
 
 def test_a_head_cannot_hide_a_lost_point():
     smoothing = S.replace(samples=4, baseline="mean")
-    settings = {"head": lambda out: out.nan_to_num(3.0), "evaluator": Losing(), "value": "smoothed"}
+    second = Losing(lambda z: torch.arange(len(z)) == 1)
+    settings = {"head": lambda out: out.nan_to_num(3.0), "evaluator": second, "value": "smoothed"}
     assert zh.estimate(black_boxes.waves, vector(0.1, 0.2), smoothing, on_nonfinite="drop", **settings).dropped == 2
     with pytest.raises(LostEvaluationError, match=r"it crashed, at the point \[.*\], number 1 of 8; 1 without a value"):
         zh.estimate(black_boxes.waves, vector(0.1, 0.2), smoothing, **settings)
+
+
+DROPPING = {"value": "smoothed", "on_nonfinite": "drop"}
+
+
+def test_every_third_point_ends_its_process_and_the_others_make_the_estimate(pool):
+    """Which points these are is a hash of their bits, not of their values."""
+    x, smoothing = vector(0.2, -0.3), zh.Smoothing(sigma=0.7, samples=4, seed=9, baseline="mean")
+    here, there = (
+        zh.estimate(fn, x, smoothing, evaluator=one, **DROPPING)
+        for fn, one in (
+            (black_boxes.wave_and_growth, Losing(black_boxes.third)),
+            (black_boxes.aborting_at_every_third, pool),
+        )
+    )
+    gone = black_boxes.third(there.points).nonzero()[:, 0].tolist()
+    assert len(gone) == 2
+    assert pool.lost == dict.fromkeys(gone, "the black box ended its process (SIGABRT)")
+    assert there.dropped == here.dropped == 2 * len({k % 4 for k in gone})  # with the other ones of their pairs
+    for one, other in ((there.value, here.value), (there.gradient, here.gradient), (there.hessian(), here.hessian())):
+        assert torch.equal(one, other)
+
+
+def test_an_estimate_without_every_third_point_is_unbiased():
+    """3 numbers within 5 standard errors: a false alarm in 2e-6 of the seeds."""
+    x, smoothing = vector(0.2, -0.3), zh.Smoothing(sigma=0.7, samples=48, baseline="mean")
+    parts = PlaneWave(vector(*black_boxes.WAVE)), Exponential(vector(*black_boxes.GROWTH))
+    sigma, losing = torch.tensor(0.7), Losing(black_boxes.third)
+    truth = torch.cat([sum(one.value(x, sigma) for one in parts)[None], sum(one.gradient(x, sigma) for one in parts)])
+    calls = [
+        zh.estimate(black_boxes.wave_and_growth, x, smoothing.replace(seed=seed), evaluator=losing, **DROPPING)
+        for seed in range(100)
+    ]
+    assert deviation(torch.stack([torch.cat([call.value[None], call.gradient]) for call in calls]), truth) < 5
+    kept = 1 - sum(call.dropped for call in calls) / (100 * 96)
+    assert abs(kept - (2 / 3) ** 2) < 0.04  # a pair stays if both of its points do; 5 standard errors
 
 
 def test_kills_and_hangs_change_no_bit(tmp_path):
@@ -292,12 +332,14 @@ def test_arguments_are_checked():
 
 
 def test_a_pool_is_closed_for_good_and_copied_by_its_settings():
-    with ProcessPool(3, timeout=2.0, retries=4) as pool:
+    with ProcessPool(3, timeout=20.0, retries=4) as pool:
+        assert torch.equal(pool(black_boxes.waves, points(1)), black_boxes.waves(points(1)))
+        assert len(pool._staffed) == 1  # more workers than points
         copy = pickle.loads(pickle.dumps(pool))
         assert (
             repr(copy)
             == repr(pool)
-            == "ProcessPool(workers=3, timeout=2.0, retries=4, recycle=None, memory_limit=None)"
+            == "ProcessPool(workers=3, timeout=20.0, retries=4, recycle=None, memory_limit=None)"
         )
     with pytest.raises(RuntimeError, match="the ProcessPool is closed"):
         pool(black_boxes.waves, points(1))

@@ -38,6 +38,17 @@ def test_actors_hold_the_black_box(actors, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
+def test_calls_that_do_not_wait_share_the_actors(actors, tmp_path):
+    fn = black_boxes.Meeting(tmp_path, 2)
+    futures = [actors.submit(fn, torch.full((1, 1), float(k))) for k in range(2)]
+    futures += [actors.submit(black_boxes.failing, Z), actors.submit(black_boxes.waves, Z)]
+    assert torch.equal(futures[3].result(), black_boxes.waves(Z))
+    assert isinstance(futures[2].exception(), ArithmeticError)
+    for k in range(2):
+        assert torch.equal(futures[k].result(), black_boxes.waves(torch.full((1, 1), float(k))))
+
+
+@pytest.mark.filterwarnings("ignore")
 def test_errors(actors):
     with pytest.raises(ArithmeticError, match="no value above one half"):
         actors(black_boxes.failing, Z)

@@ -2,6 +2,7 @@
 
 import io
 import math
+import random
 
 import numpy as np
 import pytest
@@ -286,6 +287,48 @@ def test_points_may_be_evaluated_before_the_search_is_loaded():
     copy.tell(rosenbrock(points))
     search.tell(rosenbrock(points))
     assert same(copy.state_dict(), search.state_dict())
+
+
+@every_search
+def test_values_told_late_and_out_of_order_change_nothing(name):
+    """One point at a time, in any order, saved and loaded in between: the states of one that is told all at once."""
+    search, late, f = make(name, seed=3), make(name, seed=3), black_box(name)
+    chance = random.Random(0)
+    for _ in range(12):
+        points = search.ask()
+        values = f(points)
+        assert torch.equal(late.ask(), points)
+        before = late.state_dict()
+        for k in chance.sample(range(len(points)), len(points)):
+            assert late.missing == [one for one in range(len(points)) if one not in late.state_dict()["early"]]
+            late.tell(values[[k]], which=[k])
+            if k % 3 == 0:
+                state = saved(late.state_dict())
+                late = make(name, seed=99)
+                late.load_state_dict(state)
+        assert len(points) == 1 or not same(late.state_dict(), before)
+        search.tell(values)
+        assert same(late.state_dict(), search.state_dict())
+
+
+def test_values_of_some_points_are_checked():
+    search = Descent(zeros(5), sigma=1.0, seed=0)
+    values = bowl(search.ask())
+    search.tell(values[[4, 1]], which=[4, 1])
+    assert search.missing == [0, 2, 3, 5]
+    for which, one, message in [
+        ([1], values[[1]], r"which must be some of the points whose values are missing, \[0, 2, 3, 5\], got \[1\]"),
+        ([6], values[[0]], r"are missing, \[0, 2, 3, 5\], got \[6\]"),
+        ([0, 0], values[[0, 0]], r"are missing, \[0, 2, 3, 5\], got \[0, 0\]"),
+        ([0, 2], values[[0]], r"values must have one per point in which, \[2, \*out\], got \[1\]"),
+        ([0], values[None, :2], r"values must have outputs \[\] as before, got \[2\]"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            search.tell(one, which=which)
+    assert search.missing == [0, 2, 3, 5]
+    search.ask(limit=3)  # the others are given up
+    search.tell(values[[0, 2]])  # all that are missing
+    assert (search.evaluations, search.missing) == (3, [])
 
 
 def test_a_state_is_not_changed_by_the_search_it_came_from():

@@ -1,0 +1,62 @@
+"""What a caller tells about the points of a search: checked, and kept until all of them are known."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.state import Evaluated
+
+
+def evaluated(
+    values: Any, points: Tensor, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size, device: torch.device
+) -> Evaluated:
+    """Return what was told about points [K, n] as losses and outputs.
+
+    values: [K], or [K, *out] if there is a loss.
+    shape: of earlier outputs [*out]; empty if there are none.
+
+    Raises ValueError or TypeError for values, or losses of them, that cannot be that.
+    """
+    values = torch.as_tensor(values, dtype=torch.float64).detach().to(device)
+    if loss is None and values.shape == (len(points), 1):
+        values = values[:, 0]
+    if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
+        wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
+        raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
+    if loss is None:
+        return Evaluated(points, values)
+    if shape and values.shape[1:] != shape:
+        raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
+    with torch.no_grad():
+        losses = [loss(one) for one in values]
+    if not all(isinstance(one, Tensor) for one in losses):
+        raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")
+    if any(one.numel() != 1 for one in losses):
+        raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
+    return Evaluated(
+        points,
+        torch.stack([one.double().reshape(()) for one in losses]),
+        values.reshape(len(values), -1),
+        values.shape[1:],
+    )
+
+
+def joined(early: dict[int, Tensor], values: Any, which: Sequence[int], count: int) -> dict[int, Tensor]:
+    """Return the values of points by number, those known early and further ones [k, *out] of the points `which` [k].
+
+    Raises ValueError for a number that is not one of `count` points or is known, or for values of another shape.
+    """
+    values = torch.as_tensor(values, dtype=torch.float64).detach().cpu()
+    numbers = [int(one) for one in which]
+    for k, one in enumerate(numbers):
+        if not 0 <= one < count or one in early or one in numbers[:k]:
+            missing = [other for other in range(count) if other not in early]
+            raise ValueError(f"which must be some of the points whose values are missing, {missing}, got {numbers}")
+    if values.ndim < 1 or len(values) != len(numbers):
+        raise ValueError(f"values must have one per point in which, [{len(numbers)}, *out], got {list(values.shape)}")
+    for other in early.values():
+        if other.shape != values.shape[1:]:
+            raise ValueError(f"values must have outputs {list(other.shape)} as before, got {list(values.shape[1:])}")
+    return early | {one: value.clone() for one, value in zip(numbers, values, strict=True)}

@@ -28,14 +28,14 @@ import torch_zerohess as zh
 from experiments.methods import paper_networks
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method, everywhere
-from experiments.methods.paper_networks import has_curvature, is_single
+from experiments.methods.paper_networks import has_curvature
 from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
 DIFFERENCE = 1 / 3
 """Half the distance of the two gradients of our_hvp, in units of sigma."""
-FEWEST_MOVES = 20
+FEWEST_MOVES = 15
 """our_h does not apply where the evaluations of a task are not enough for this many moves, with one pair each."""
 
 
@@ -177,7 +177,7 @@ METHODS = (
         "our_hvp",
         "conjugate gradients, Hessian-vector products by finite differences",
         2,
-        trains=is_single,
+        trains=has_curvature,
         derivatives="differences",
     ),
     _method(

@@ -268,7 +268,10 @@ def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit:
     if outcome.status == "failed":
         raise RuntimeError(outcome.traceback)
     there = {metric: Run(outcome, rows).reached(metric, LEVEL) for metric in METRICS}
-    return [Reached(metric, row and row.evaluations, row and row.seconds) for metric, row in there.items()]
+    return [
+        Reached(metric, row.evaluations, row.seconds) if row else Reached(metric, None, None)
+        for metric, row in there.items()
+    ]
 
 
 def _write(report: LossReport, out: Path) -> None:

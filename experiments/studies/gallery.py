@@ -40,7 +40,7 @@ from experiments.runs.trial import LIMIT, Trial
 METHOD = "gaussian_process"
 OWN = {
     **dict.fromkeys(("quad", "box10", "brdf", "texture"), "descent"),
-    **dict.fromkeys(("meshfit", "meshfit_color"), "handles_newton"),
+    **dict.fromkeys(("meshfit", "meshfit_color", "suzanne", "banana"), "handles_newton"),
     "caustic": "block_gauss_newton",
 }
 """Tasks for which another method is recommended."""

@@ -82,6 +82,9 @@ class Fit:
     """image: mean squared error of the picture, whatever the loss; parameter: that of x."""
     evaluations: float | None
     """Median over the runs that get there, if they are at least half of all."""
+    evaluations_low: float | None
+    evaluations_high: float | None
+    """Quartiles over the same."""
     share: float
     seconds: float | None
     runs: int
@@ -155,7 +158,7 @@ def _curves(kept: KeptParts, swept: Sequence[Pictures], sweep: int, seed: int) -
     printer = Printer(
         "smoothed objectives along the line from the solution (0) through the start (1); end: smallest there",
         ["task", "sigma", "loss", "minimum: inside", "image", "fall at the start: inside", "image"],
-        [6, 5, 8, 0, 6, 0, 5],
+        [6, 5, 14, 0, 6, 0, 5],
     )
     for one, scale in progress([(one, scale) for one in swept for scale in SCALES], "curves", leave=False):
         sigma = scale * one.task.sigma
@@ -174,7 +177,7 @@ def _errors(
     printer = Printer(
         "\nrelative RMSE of the gradient of either objective, from the same evaluations",
         ["task", "loss", "where", "evaluations", "inside", "image", "truth: inside", "image"],
-        [6, 8, 8, 0, 7, 7, 0, 7],
+        [6, 14, 8, 0, 7, 7, 0, 7],
     )
     settings = {"samples": list(samples), "runs": runs, "truth": truth, "seed": seed}
     for one, where in progress([(one, where) for one in swept for where in WHERE], "gradients", leave=False):
@@ -191,8 +194,8 @@ def _fits(kept: KeptParts, shown: Sequence[Pictures], runs: int, evaluations: in
     """Yield the fits, and print them."""
     printer = Printer(
         f"\nTrustRegion: median evaluations until an error is reduced by {100 * LEVEL:g} %, share of the runs",
-        ["task", "loss", "error", "inside", "share", "image", "share"],
-        [6, 8, 9, 6, 5, 6, 5],
+        ["task", "loss", "error", "inside", "quartiles", "share", "image", "quartiles", "share"],
+        [6, 14, 9, 6, 12, 5, 6, 12, 5],
     )
     settings = {"evaluations": evaluations, "limit": limit}
     for one, name in ((task, name) for task in shown for name in task.losses):
@@ -204,8 +207,14 @@ def _fits(kept: KeptParts, shown: Sequence[Pictures], runs: int, evaluations: in
             ended += [(form, row) for row in reached]
         found = list(_medians(one.task.name, name, ended))
         for a, b in _pairs(found):
-            printer([a.task, a.loss, a.metric, a.evaluations, f"{a.share:.0%}", b.evaluations, f"{b.share:.0%}"])
+            sides = [cell for fit in (a, b) for cell in (fit.evaluations, _spread(fit), f"{fit.share:.0%}")]
+            printer([a.task, a.loss, a.metric, *sides])
         yield from found
+
+
+def _spread(fit: Fit) -> str:
+    """Return the quartiles in words."""
+    return "" if fit.evaluations_low is None else f"{fit.evaluations_low:g} to {fit.evaluations_high:g}"
 
 
 def _pairs(rows: Sequence[_Row]) -> Iterator[tuple[_Row, _Row]]:
@@ -247,7 +256,8 @@ def _medians(task: str, loss: str, ended: Sequence[tuple[str, Reached]]) -> Iter
     for metric in METRICS:
         for form in FORMS:
             (cell,) = objects(there[(there["metric"] == metric) & (there["form"] == form)])
-            yield Fit(*(task, loss, form, metric), *(cell["evaluations"], cell["share"], cell["seconds"], cell["runs"]))
+            spread = [cell[f"evaluations{end}"] for end in ("", "_low", "_high")]
+            yield Fit(*(task, loss, form, metric), *spread, *(cell[one] for one in ("share", "seconds", "runs")))
 
 
 def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> list[Reached]:

@@ -24,7 +24,7 @@ from experiments.problems.catalogue import FITTING, Preset, chosen
 from experiments.problems.variations import Change
 from experiments.problems.variations import load as load_varied
 from experiments.reports import robustness_curves
-from experiments.reports.medians import medians, objects, reached
+from experiments.reports.medians import MEASURES, medians, objects, reached
 from experiments.reports.results import Results, Run, load
 from experiments.reports.tables import table
 from experiments.runs.trial import LEVELS, LIMIT
@@ -95,7 +95,12 @@ class Row:
     """Of the runs that reduced the image error by 90 %."""
     share_99: float
     evaluations_99: float | None
+    evaluations_99_low: float | None
+    evaluations_99_high: float | None
+    """Quartiles."""
     seconds_99: float | None
+    seconds_99_low: float | None
+    seconds_99_high: float | None
     image_error: float | None
     """At the end, over that at the start."""
     parameter_error: float | None
@@ -266,8 +271,7 @@ def row(cell: Cell, runs: Sequence[Run]) -> Row:
         len(runs),
         first["share"],
         second["share"],
-        second["evaluations"],
-        second["seconds"],
+        *(second[f"{name}{end}"] for name in MEASURES for end in ("", "_low", "_high")),
         None if math.isnan(image) else float(image),
         None if math.isnan(parameter) else float(parameter),
     )

@@ -80,7 +80,7 @@ class Ensemble:
         shared = {"preset": preset, "variant": variant} | ({"threads": threads} if network else {"level": LEVELS[-1]})
         limit = LIMIT if self.limit is None and not network else self.limit
         jobs = []
-        for name in METHODS if methods is None else methods:
+        for name in [one for one, it in METHODS.items() if not it.extra] if methods is None else methods:
             method = METHODS[name] if isinstance(name, str) else name
             reason = method.unusable(loaded)
             if reason:

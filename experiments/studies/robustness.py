@@ -263,15 +263,10 @@ def row(cell: Cell, runs: Sequence[Run]) -> Row:
     ends = [(run.error("image")[-1], run.records[-1].parameter_error) for run in runs if run.records]
     errors = pd.DataFrame(ends, columns=["image", "parameter"], dtype=float)
     image, parameter = errors["image"].median(), errors["parameter"].pow(0.5).median()
+    evaluations, seconds = ([second[f"{name}{end}"] for end in ("", "_low", "_high")] for name in MEASURES)
     return Row(
-        cell.task,
-        cell.sweep,
-        cell.value,
-        cell.method,
-        len(runs),
-        first["share"],
-        second["share"],
-        *(second[f"{name}{end}"] for name in MEASURES for end in ("", "_low", "_high")),
+        *(cell.task, cell.sweep, cell.value, cell.method, len(runs), first["share"], second["share"]),
+        *(evaluations[0], evaluations[1], evaluations[2], seconds[0], seconds[1], seconds[2]),
         None if math.isnan(image) else float(image),
         None if math.isnan(parameter) else float(parameter),
     )

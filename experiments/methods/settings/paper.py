@@ -204,9 +204,10 @@ RETUNED: dict[str, dict[str, Settings]] = {
 """What replaces Table 3, or stands for it; `tune` is `python -m experiments tune`."""
 
 TUNED: dict[str, dict[str, Settings]] = {
-    # On BOX2 our_h, our_hvp and our_hvpa were searched above, twelve settings each; these are twelve for Adam, of which
-    # the largest learning rate is the best: tune box2 --method our_g --runs 4 --trials 12 --evaluations 6000 --over \
-    #     learning_rate=0.002,0.005,0.01,0.02 steps=100,300,1000; the same for fr22
+    # On BOX2 our_h, our_hvp and our_hvpa were searched above, twelve settings each. These are twelve of our_g, of which
+    # the largest learning rate is the best; fr22 takes them over without a search of its own.
+    # tune box2 --method our_g --runs 4 --trials 12 --evaluations 6000 --over learning_rate=0.002,0.005,0.01,0.02 \
+    #     steps=100,300,1000
     "box2": {
         "fr22": {"learning_rate": 0.02, "steps": 100},
         "our_g": {"learning_rate": 0.02, "steps": 100},

@@ -1,7 +1,11 @@
 """What this installation can do."""
 
+import ctypes.util
 import importlib.metadata
 import platform
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import torch
@@ -10,6 +14,11 @@ from torch_zerohess.adapters import mitsuba_variants
 from torch_zerohess.sampling import extension
 
 _OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "numpy")
+_NAME = "torch_zerohess"
+_DEVELOPERS = "test"
+"""The extra that only those need who change this package."""
+_TRY = 30.0
+"""Seconds that one variant of Mitsuba may take."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,7 @@ class Report:
     versions: dict[str, str]
     """Installed packages; those that are missing are left out."""
     advice: list[str] = field(default_factory=list)
+    """What to install, with the command."""
 
     def __str__(self) -> str:
         lines = ["torch_zerohess " + self.versions.get("torch_zerohess", "(not installed)")]
@@ -44,11 +54,57 @@ def doctor() -> Report:
         'cpu'
     """
     versions = {"python": platform.python_version()}
-    versions |= {name: version for name in ("torch_zerohess", "torch", *_OPTIONAL) if (version := _version(name))}
+    versions |= {name: version for name in (_NAME, "torch", *_OPTIONAL) if (version := _version(name))}
     devices = ["cpu"] + [f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in range(torch.cuda.device_count())]
-    variants = {name: "works" if probe.works else probe.reason for name, probe in mitsuba_variants.variants().items()}
+    variants = _variants()
     advice = [] if extension.available else [f"for the C++ extension, {extension.HINT}"]
+    if "mitsuba" in versions and variants.get("llvm_ad_rgb") != "works":
+        advice.append(f"for fast renders with derivatives, {_LLVM}")
+    advice += [f"for {', '.join(names)}: pip install '{_NAME}[{extra}]'" for extra, names in _missing()]
     return Report(extension.available, extension.status, devices, variants, versions, advice)
+
+
+_LLVM = f"LLVM {mitsuba_variants.MINIMUM_LLVM} or newer (Debian: apt-get install libllvm19, macOS: brew install llvm)"
+
+
+def _variants() -> dict[str, str]:
+    """Variants of Mitsuba and "works" or the reason why not; all are tried at the same time."""
+
+    def tried(name: str) -> str:
+        if name.startswith("cuda") and not ctypes.util.find_library("cuda"):
+            return "no NVIDIA driver was found"
+        llvm = mitsuba_variants.find_llvm() if name.startswith("llvm") else None
+        found = mitsuba_variants.probe(name, llvm, _TRY)
+        return "works" if found.works else found.reason
+
+    names = mitsuba_variants.CANDIDATES
+    with ThreadPoolExecutor(len(names)) as pool:
+        return dict(zip(names, pool.map(tried, names), strict=True))
+
+
+def _missing() -> Iterator[tuple[str, list[str]]]:
+    """Yield the extras that name a package that is not installed, with these packages: each under its first extra."""
+    seen: set[str] = set()
+    for extra, packages in _extras().items():
+        names = [one for one in packages if one not in seen and not _version(one)]
+        seen.update(packages)
+        if names:
+            yield extra, names
+
+
+def _extras() -> dict[str, list[str]]:
+    """Packages of every extra of this one, without those that another extra brings."""
+    try:
+        required = importlib.metadata.requires(_NAME) or []
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    found: dict[str, list[str]] = {}
+    for one in required:
+        name = re.match(r"[\w.-]+", one)
+        extra = re.search(r"""extra == ["']([\w-]+)["']""", one)
+        if name and extra and extra[1] != _DEVELOPERS and name[0].replace("-", "_") != _NAME:
+            found.setdefault(extra[1], []).append(name[0])
+    return found
 
 
 def _version(package: str) -> str | None:

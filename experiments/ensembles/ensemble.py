@@ -85,7 +85,7 @@ class Ensemble:
             shared["workers"] = self.workers  # seconds depend on them
         limit = LIMIT if self.limit is None and not network else self.limit
         jobs = []
-        for name in METHODS if methods is None else methods:
+        for name in [one for one, it in METHODS.items() if not it.extra] if methods is None else methods:
             method = METHODS[name] if isinstance(name, str) else name
             reason = method.unusable(loaded)
             if reason:

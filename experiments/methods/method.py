@@ -38,6 +38,8 @@ class Method:
     """Train `trial.encoder`, in the same way; see `experiments.runs.network_trial`. None if the method fits only."""
     trains: Callable[[NetworkTask], str | None] = everywhere
     """None, or why `train` does not apply to a task."""
+    extra: bool = False
+    """Whether it is run only where it is named: not among all methods."""
     uses: str = "loss"
     """What it gets besides the start: the loss, the image, derivatives, or more; tables show it."""
 

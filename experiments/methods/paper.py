@@ -14,11 +14,15 @@ the trust region is in units of the parameters for our_h, and in units of sigma 
 source. Settings: `experiments.methods.settings`. The same derivatives on network tasks:
 `experiments.methods.paper_networks`.
 
+Each has two variants with other settings, NAME_source and NAME_tuned. They are run where they are named.
+
 What differs from the source: our_h and our_hvpa subtract f(x) from every value. That takes one evaluation more; without
 it the Hessian drowns in the noise of a constant. `zh.optim.NonlinearCG` says what else differs.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -28,14 +32,15 @@ import torch_zerohess as zh
 from experiments.methods import paper_networks
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method, everywhere
-from experiments.methods.paper_networks import has_curvature, is_single
+from experiments.methods.paper_networks import has_curvature
+from experiments.methods.settings import no_variant
 from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
 DIFFERENCE = 1 / 3
 """Half the distance of the two gradients of our_hvp, in units of sigma."""
-FEWEST_MOVES = 20
+FEWEST_MOVES = 15
 """our_h does not apply where the evaluations of a task are not enough for this many moves, with one pair each."""
 
 
@@ -162,7 +167,29 @@ def _method(
     return Method(name, title, solve, applies, train=train, trains=trains)
 
 
-METHODS = (
+_VARIANTS = {"source": "settings of the source's Table 3", "tuned": "settings searched for all alike"}
+
+
+def _with_variants(method: Method) -> tuple[Method, ...]:
+    """Return a method and its two variants, which differ in their settings alone and only fit."""
+
+    def applies(task: Task, variant: str) -> str | None:
+        return no_variant(variant, task.name) or method.applies(task)
+
+    return method, *(
+        replace(
+            method,
+            name=f"{method.name}_{variant}",
+            title=f"{method.title}: {title}",
+            applies=partial(applies, variant=variant),
+            train=None,
+            extra=True,
+        )
+        for variant, title in _VARIANTS.items()
+    )
+
+
+_METHODS = (
     _method("fr22", "Adam on the gradient of Fischer and Ritschel (2023)", 1, proposal="fr22"),
     _method("our_g", "Adam on the smoothed gradient", 1, proposal="aggregate"),
     _method(
@@ -177,7 +204,7 @@ METHODS = (
         "our_hvp",
         "conjugate gradients, Hessian-vector products by finite differences",
         2,
-        trains=is_single,
+        trains=has_curvature,
         derivatives="differences",
     ),
     _method(
@@ -188,3 +215,4 @@ METHODS = (
         derivatives="aggregate",
     ),
 )
+METHODS = tuple(variant for method in _METHODS for variant in _with_variants(method))

@@ -5,7 +5,7 @@
 | fr22 | gradient of Fischer and Ritschel (2023) | Adam |
 | our_g | gradient, aggregate sampling | Adam |
 | our_h | Hessian, one sample set per element | Newton-CG with J^T abs(H) J |
-| our_hvp | Hessian by differences of independent gradients | Newton-CG with J^T abs(H) J |
+| our_hvp | Hessian by differences of independent gradients, along every parameter | Newton-CG with J^T abs(H) J |
 | our_hvpa | Hessian from shared aggregate samples | Newton-CG with J^T abs(H) J |
 
 The names are those of the source; its second-order steps are a nonlinear conjugate gradient on the weights. J is the
@@ -97,7 +97,8 @@ def second_order(
     def step(images: Tensor) -> float:
         return float(optimizer.step(partial(_model, layer, trial.encoder, images, differences=differences)))
 
-    renders = smoothing.evaluations(trial.task.n) + (4 if differences else 0)  # differences take two more pairs
+    n = trial.task.n
+    renders = smoothing.evaluations(n) + (4 * n if differences else 0)  # a difference takes two pairs more
     _train(trial, layer, optimizer, ("radius", radius), batch, renders, step)
 
 
@@ -142,17 +143,24 @@ def _model(layer: zh.BlackBox, encoder: nn.Module, images: Tensor, *, difference
     """
     y, fn, smoothing = encoder(images), layer.fn, layer.smoothing
     local = zh.estimate(fn, y, smoothing, images)
-    if differences:
-        # With one parameter, one product is the whole Hessian; a pair cancels every baseline of a gradient.
-        pairs = smoothing.replace(baseline="none")
-        hessian = zh.finite_difference_hvp(fn, y, torch.ones(1), pairs, images, common=False)[..., None]
-    else:
-        hessian = local.hessian()
+    hessian = hessian_by_differences(fn, y, smoothing, images) if differences else local.hessian()
     values, vectors = torch.linalg.eigh(hessian)
     d = y - y.detach()
     along = (vectors.mT @ d[..., None])[..., 0]
     model = local.value + (local.gradient * d).sum(1) + 0.5 * (values.abs() * along**2).sum(1)
     return model.mean(), y
+
+
+def hessian_by_differences(fn: Callable[..., Tensor], y: Tensor, smoothing: zh.Smoothing, images: Tensor) -> Tensor:
+    """Return Hessians [B, n, n] of fn at y [B, n]: a product with every unit vector, made symmetric.
+
+    A pair of opposite signs cancels every baseline of a gradient.
+    """
+    pairs = smoothing.replace(baseline="none")
+    units = torch.eye(y.shape[1], dtype=y.dtype)
+    products = [zh.finite_difference_hvp(fn, y, unit, pairs, images, common=False) for unit in units]
+    columns = torch.stack(products, -1)
+    return 0.5 * (columns + columns.mT)
 
 
 def _batches(images: Tensor, size: int) -> Iterator[Tensor]:
@@ -168,10 +176,3 @@ def has_curvature(task: NetworkTask) -> str | None:
     if task.n <= MOST:
         return None
     return f"samples the Hessian of every image with one pair: up to {MOST} parameters, the task has {task.n}"
-
-
-def is_single(task: NetworkTask) -> str | None:
-    """Say so where one Hessian-vector product is not the whole Hessian."""
-    if task.n == 1:
-        return None
-    return f"takes one Hessian-vector product per image for the Hessian, but there are {task.n} parameters"

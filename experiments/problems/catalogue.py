@@ -17,7 +17,10 @@ Preset = Literal["fast", "paper"]
 
 FITTING = {
     name: f"experiments.problems.tasks.{name}"
-    for name in ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "throw", "caustic", "meshfit", "meshfit_color")
+    for name in (
+        *("quad", "box2", "box10", "texture", "brdf", "nonpsd", "throw", "caustic"),
+        *("meshfit", "meshfit_color", "suzanne", "banana"),
+    )
 }
 """Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
 RENDERED = {name: f"experiments.problems.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror")}

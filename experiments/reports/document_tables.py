@@ -6,11 +6,12 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.reports import stored
+from experiments.reports import source_table, stored
 from experiments.reports.speed_ups import HEADERS, speed_ups, with_ratios
 
 SPEED_UP = "speed_up"
-"""The name of the table that is computed from others."""
+TABLE_2 = "table_2"
+"""Names of the tables that are computed from others."""
 
 
 @dataclass
@@ -53,6 +54,8 @@ def table_of(name: str, query: Query) -> str:
     """Return a stored table as Markdown, with a line below it: runs, commit, machine and command."""
     if name == SPEED_UP:
         return _speed_up(query)
+    if name == TABLE_2:
+        return _table_2(query)
     table = stored.read(name)
     if {"metric", "level"} <= set(table):
         return _fitted(table, query)
@@ -129,9 +132,10 @@ def _fitted(table: pd.DataFrame, query: Query) -> str:
     level = query.take("level", "99", ("90", "99", "99.9"))
     show = query.take("show", "both", ("both", "evaluations", "seconds"))
     interval = query.take("share", "plain", ("plain", "interval")) == "interval"
+    quartiles = query.take("quartiles", "hide", ("hide", "show")) == "show"
     query.end()
     table = table[(table["metric"] == metric) & (table["level"] == float(level))]
-    cells = {(row["task"], row["method"]): _cell(row, show, interval) for row in table.to_dict("records")}
+    cells = {(row["task"], row["method"]): _cell(row, show, interval, quartiles) for row in table.to_dict("records")}
     about = table.drop_duplicates("method").set_index("method")
     sizes = table.drop_duplicates("task").set_index("task")["n"]
     headers = ["method", "what it does", "uses", *(_heading(task, sizes[task]) for task in tasks)]
@@ -143,6 +147,7 @@ def _fitted(table: pd.DataFrame, query: Query) -> str:
     note = f"Median {what} until the {metric} error is reduced by {level} %"
     note += ", of the starts that get there; in brackets the share of starts that get there, if not all do"
     note += " (95 % interval)." if interval else "."
+    note += " Behind a median its quartiles." if quartiles else ""
     if any(str(one).startswith("image") for one in about["uses"]):
         note += " Where a task has no image, a method that uses the image uses the loss."
     return markdown(headers, rows) + _origin(table, note)
@@ -152,7 +157,7 @@ def _heading(task: str, n: float) -> str:
     return task.upper() if n != n else f"{task.upper()}, n = {n:.0f}"
 
 
-def _cell(row: dict[Any, Any], show: str, interval: bool) -> str:
+def _cell(row: dict[Any, Any], show: str, interval: bool, quartiles: bool) -> str:
     """A dash where fewer than half of the starts get there."""
     share = ""
     if row["reached"] < row["runs"]:
@@ -162,8 +167,15 @@ def _cell(row: dict[Any, Any], show: str, interval: bool) -> str:
         share = f" ({share})"
     if row["evaluations"] != row["evaluations"]:
         return "-" + share
-    shown = {"evaluations": number(row["evaluations"]), "seconds": f"{number(row['seconds'])} s"}
-    return ", ".join(shown[one] for one in shown if show in ("both", one)) + share
+    shown = {"evaluations": "", "seconds": " s"}
+    return (
+        ", ".join(_median(row, one, quartiles) + unit for one, unit in shown.items() if show in ("both", one)) + share
+    )
+
+
+def _median(row: dict[Any, Any], measure: str, quartiles: bool) -> str:
+    median = number(row[measure])
+    return f"{median} [{number(row[f'{measure}_low'])} to {number(row[f'{measure}_high'])}]" if quartiles else median
 
 
 _TRAINED = {
@@ -193,12 +205,31 @@ def _trained(table: pd.DataFrame, query: Query) -> str:
     return markdown(headers, rows) + _origin(table, note + "error by 100.")
 
 
-def _ratios(query: Query) -> pd.DataFrame:
-    """Return a row per method with its mean ratios to the reference, under `speed_up`'s own column names."""
+def _fits(kind: str, query: Query) -> pd.DataFrame:
+    """Return the rows of the stored tables of fits that a table of this kind is computed from."""
     names = query.take("of", "")
     if not names:
-        raise SystemExit(f"{SPEED_UP} must have of=NAME,NAME: tables of fits")
-    table = pd.concat([stored.read(name) for name in names.split(",")], ignore_index=True)
+        raise SystemExit(f"{kind} must have of=NAME,NAME: tables of fits")
+    return pd.concat([stored.read(name) for name in names.split(",")], ignore_index=True)
+
+
+def _table_2(query: Query) -> str:
+    """Rows are tasks and methods, columns the source's ratios and ours at each level."""
+    table = _fits(TABLE_2, query)
+    found = source_table.side_by_side(table)
+    tasks = query.names("tasks", list(found["task"].unique()))
+    metric = query.take("metric", "image", ("image", "parameter"))
+    query.end()
+    rows = source_table.rows(found[found["task"].isin(tasks)], metric)
+    note = f"Seconds and evaluations until the {metric} error is reduced, divided by those of `our_hvpa`: as the "
+    note += "source prints them in its Table 2 (seconds), and ours. A dash: not printed, not measured, or fewer than "
+    note += "half of the starts of the method or of `our_hvpa` get there."
+    return markdown(source_table.HEADERS, rows) + _origin(table[table["task"].isin(tasks)], note)
+
+
+def _ratios(query: Query) -> pd.DataFrame:
+    """Return a row per method with its mean ratios to the reference, under `speed_up`'s own column names."""
+    table = _fits(SPEED_UP, query)
     reference = query.names("reference", list(table["method"].unique()))[0]
     if "methods" in query.options:
         query.options["methods"] += f",{reference}"

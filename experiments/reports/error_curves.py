@@ -23,7 +23,7 @@ _LINES = ("-", "--", ":")
 _COLORS = 10
 _FLOOR = 1e-8
 """Relative errors below are drawn here."""
-_AXES = {"seconds": "run time [s]", "evaluations": "evaluations"}
+AXES = {"seconds": "run time [s]", "evaluations": "evaluations"}
 Array = npt.NDArray[np.float64]
 Style = Mapping[str, Any]
 
@@ -65,7 +65,7 @@ def curves(
     chosen = styles(methods) if chosen is None else chosen
     figure, axes = plt.subplots(2, 2, figsize=(11, 7), layout="constrained", sharex="col", sharey=True)
     for row, metric in zip(axes, METRICS, strict=True):
-        for axis, against in zip(row, _AXES, strict=True):
+        for axis, against in zip(row, AXES, strict=True):
             axis.set(xscale="log", yscale="log")
             for name, runs in methods.items():
                 band(axis, runs, metric, against, f"{name} ({len(runs)})", chosen[name])
@@ -73,7 +73,7 @@ def curves(
                 axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
             axis.grid(which="major", alpha=0.3)
         row[0].set_ylabel(f"{metric} error / error at the start")
-    for axis, label in zip(axes[1], _AXES.values(), strict=True):
+    for axis, label in zip(axes[1], AXES.values(), strict=True):
         axis.set_xlabel(label)
         plain_ticks(axis)
     handles, labels = axes[0][1].get_legend_handles_labels()

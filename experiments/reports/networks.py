@@ -77,7 +77,10 @@ def held_out(task: str, results: Sequence[Result]) -> pd.DataFrame:
 
 
 def per_method(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a row per task and method of `held_out`: medians, errors divided by (also at worst), and successes."""
+    """Return a row per task and method of `held_out`: medians, errors divided by (also at worst), and successes.
+
+    Quartiles are `seconds_low` and so on.
+    """
     for metric in METRICS:
         rows = rows.assign(**{f"{metric}_divided": rows[f"{metric}_before"] / rows[f"{metric}_after"]})
     groups = rows.assign(reached=rows["parameter_divided"] >= REDUCTION).groupby(["task", "method"], sort=False)
@@ -85,6 +88,9 @@ def per_method(rows: pd.DataFrame) -> pd.DataFrame:
     for metric in reversed(METRICS):
         found[f"{metric}_divided"] = groups[f"{metric}_divided"].median()
         found[f"{metric}_divided_worst"] = groups[f"{metric}_divided"].min()
+    for name in ("seconds", *(f"{metric}_divided" for metric in reversed(METRICS))):
+        for end, share in (("low", 0.25), ("high", 0.75)):
+            found[f"{name}_{end}"] = groups[name].quantile(share)
     return found.assign(reached=groups["reached"].sum(), runs=groups.size()).reset_index()
 
 

@@ -14,10 +14,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import pandas as pd
 import tyro
 
 from experiments.problems.catalogue import chosen
-from experiments.reports.medians import medians, objects, reached
+from experiments.reports import source_table
+from experiments.reports.medians import MEASURES, medians, objects, reached
 from experiments.reports.results import METRICS, Results, Run, load
 from experiments.reports.speed_ups import HEADERS, SpeedUp, speed_ups, with_ratios
 from experiments.reports.tables import table as text_table
@@ -134,6 +136,20 @@ def as_csv(summary: Summary) -> str:
     return out.getvalue().rstrip("\n")
 
 
+def as_table_2(summary: Summary) -> str:
+    """Ratios of the source's Table 2 beside ours, for the tasks that both have."""
+    rows = pd.DataFrame([asdict(row) for row in summary.rows]).astype(dict.fromkeys(MEASURES, float))
+    rows["level"] = (100 * rows["level"]).round(6)
+    found = source_table.side_by_side(rows, list(rows["task"].unique()))
+    if found.empty:
+        raise SystemExit(f"Table 2 of the source has {', '.join(source_table.printed()['task'].unique())}")
+    parts = [
+        f"{metric} error: ratios to our_hvpa\n" + text_table(source_table.HEADERS, source_table.rows(found, metric))
+        for metric in METRICS
+    ]
+    return "\n\n".join(parts)
+
+
 def as_text(summary: Summary) -> str:
     """One table per task, then the mean ratios and why runs ended early."""
     parts = []
@@ -186,7 +202,7 @@ def _speed_up_text(summary: Summary) -> str:
 def table(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
     /,
-    format: Literal["text", "csv", "json"] = "text",
+    format: Literal["text", "csv", "json", "table_2"] = "text",
     reference: str | None = None,
     methods: str | None = None,
 ) -> None:
@@ -194,7 +210,8 @@ def table(
 
     Args:
         folder: written by `run`.
-        format: text prints a table per task; csv and json a row per task, method, error and level.
+        format: text prints a table per task; csv and json a row per task, method, error and level; table_2 the ratios
+            to our_hvpa beside those that the source prints.
         reference: method that ratios are to; the recommended one, or the best of the source's, if not given.
         methods: names separated by commas, or all.
     """
@@ -204,4 +221,7 @@ def table(
     if reference is not None:
         (reference,) = chosen("reference", [reference], wanted)
     summary = summarize(results, reference, wanted)
+    if format == "table_2":
+        print(as_table_2(summary))
+        return
     print({"text": as_text, "csv": as_csv, "json": as_json}[format](summary))

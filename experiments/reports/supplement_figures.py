@@ -1,8 +1,12 @@
-"""The picture figures of the source's supplement: all tasks (9), the caustic (12) and the two mirrors (13)."""
+"""Figures of the source's supplement that show runs.
+
+Known derivatives (7, 8), all tasks (9), the caustic (12) and the two mirrors (13).
+"""
 
 import io
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +15,8 @@ import torch
 from torch import Tensor
 
 from experiments.reports.animation import Look, Trace, pixels
-from experiments.reports.error_curves import plain_ticks
+from experiments.reports.error_curves import AXES, band, plain_ticks
+from experiments.reports.results import Run
 from experiments.runs.trial import LEVELS
 
 mpl.use("Agg")
@@ -26,32 +31,90 @@ _WAY = ((1.5, 0.0, 2.2), (1.5, 0.0, -0.6), (-1.2, 0.0, -0.6), (-1.2, 0.0, -2.4))
 """From the eye to the bunny of MIRROR."""
 
 
-def overview(shown: Sequence[tuple[Trace, Look]], path: Path) -> None:
+@dataclass(frozen=True)
+class Column:
+    """A task in the overview: pictures [h, w] or [h, w, 3] in [0, 1] at the start, at the end, and of the target."""
+
+    task: str
+    method: str
+    start: Tensor
+    end: Tensor
+    target: Tensor
+    caption: str
+    """Of the end."""
+
+    @classmethod
+    def of(cls, found: Trace, seen: Look) -> "Column":
+        """Return the column of a run on a fitting task."""
+        start, end = (seen.picture(found.points[k]) for k in (0, -1))
+        return cls(found.task.name, found.method, start, end, seen.target, found.caption(-1))
+
+
+def overview(shown: Sequence[Column], path: Path) -> None:
     """Draw figure 9: a column per task, with its start, where the run ended, and what is sought."""
     bands = -(-len(shown) // _ACROSS)
     across = -(-len(shown) // bands)
     figure = plt.figure(figsize=(1.35 * across + 0.4, 4.3 * bands), layout="constrained")
-    methods = {found.method for found, _ in shown}
+    methods = {one.method for one in shown}
     method = methods.pop() if len(methods) == 1 else None
-    for k, band in enumerate(figure.subfigures(bands, 1, squeeze=False)[:, 0]):
-        _band(band, shown[k * across : (k + 1) * across], across, method)
+    for k, part in enumerate(figure.subfigures(bands, 1, squeeze=False)[:, 0]):
+        _band(part, shown[k * across : (k + 1) * across], across, method)
     save_small(figure, path)
 
 
-def _band(figure: Any, shown: Sequence[tuple[Trace, Look]], across: int, method: str | None) -> None:
+def _band(figure: Any, shown: Sequence[Column], across: int, method: str | None) -> None:
     """Draw `across` columns; `method` is that of all runs, None if there are several."""
     axes = figure.subplots(3, across, squeeze=False)
     for axis in axes[:, len(shown) :].flat:
         axis.axis("off")
-    for column, (found, seen) in zip(axes.T, shown, strict=False):
-        pictures = (seen.picture(found.points[0]), seen.picture(found.points[-1]), seen.target)
-        for axis, picture in zip(column, pictures, strict=True):
+    for column, one in zip(axes.T, shown, strict=False):
+        for axis, picture in zip(column, (one.start, one.end, one.target), strict=True):
             _picture(axis, picture)
-        column[0].set_title(found.task.name.upper(), fontsize=9)
-        text = found.caption(-1) if method else f"{found.method}, {found.caption(-1)}"
+        column[0].set_title(one.task.upper(), fontsize=9)
+        text = one.caption if method else f"{one.method}, {one.caption}"
         column[1].set_xlabel(text.replace(", ", "\n"), fontsize=6.5)
     for axis, name in zip(axes[:, 0], ("start", method or "end", "target"), strict=True):
         axis.set_ylabel(name, fontsize=10)
+
+
+def descents(groups: Mapping[str, Sequence[Trace]], path: Path) -> None:
+    """Draw figures 7 and 8: errors of an ensemble, and where a task has two parameters the ways of its runs from above.
+
+    groups: runs on one task, by what they have in common; dashed where the name begins with "first".
+    """
+    task = next(iter(groups.values()))[0].task
+    ways = list(groups) if task.n == 2 else []
+    figure = plt.figure(figsize=(3.1 * len(ways) + 9, 3.6), layout="constrained")
+    axes: Any = figure.subplots(1, len(ways) + 2, width_ratios=[1.0] * len(ways) + [1.4, 1.4], squeeze=False)[0]
+    colors = {name: f"C{k}" for k, name in enumerate(groups)}
+    for axis, name in zip(axes, ways, strict=False):
+        _ways(axis, groups[name], colors[name])
+        axis.set_title(name, fontsize=9)
+    for axis, (against, label) in zip(axes[len(ways) :], AXES.items(), strict=True):
+        axis.set(xscale="log", yscale="log", xlabel=label, ylabel="error / at the start: median, quartiles")
+        for name, found in groups.items():
+            style = {"color": colors[name], "linestyle": "--" if name.startswith("first") else "-"}
+            band(axis, [Run(one.outcome, one.records) for one in found], "image", against, name, style)
+        axis.grid(which="major", alpha=0.3)
+        plain_ticks(axis)
+    axes[-1].legend(fontsize=8, frameon=False)
+    figure.suptitle(f"{task.name.upper()}: {len(next(iter(groups.values())))} starts", fontsize=11)
+    save_small(figure, path)
+
+
+def _ways(axis: Any, found: Sequence[Trace], color: str) -> None:
+    """Draw the ways of runs over the bands of the loss."""
+    task = found[0].task
+    places = torch.cat([torch.stack(one.points) for one in found])
+    low, high = task.bounds or (places.amin(0), places.amax(0))
+    grid = [torch.linspace(float(a), float(b), 81, dtype=torch.float64) for a, b in zip(low, high, strict=True)]
+    values = task.loss(torch.cartesian_prod(*grid)).reshape(81, 81).mT.numpy()
+    axis.contourf(grid[0].numpy(), grid[1].numpy(), values, levels=12, cmap="Greys", alpha=0.6)
+    for one in found:
+        points = torch.stack(one.points).numpy()
+        axis.plot(points[:, 0], points[:, 1], "-", color=color, linewidth=0.8, alpha=0.8)
+        axis.plot(points[0, 0], points[0, 1], ".", color=color, markersize=4)
+    axis.set(xlim=(float(low[0]), float(high[0])), ylim=(float(low[1]), float(high[1])), aspect="equal")
 
 
 def caustic(found: Trace, seen: Look, other: Trace | None, path: Path) -> None:

@@ -1,6 +1,9 @@
-"""Plain text tables."""
+"""Plain text tables, whole or row by row."""
 
+import sys
 from collections.abc import Sequence
+
+from tqdm import tqdm
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -24,6 +27,30 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
         ).rstrip()
         for line in lines
     )
+
+
+class Printer:
+    """A table that is printed row by row, as the rows come: above the progress bars, where there are any.
+
+    Args:
+        title: a line above the table.
+        headers: of the columns.
+        widths: of the columns at least, as the rows to come need it; a column is never narrower than its header.
+    """
+
+    def __init__(self, title: str, headers: Sequence[str], widths: Sequence[int]) -> None:
+        self._widths = [max(len(header), width) for header, width in zip(headers, widths, strict=True)]
+        self._lines = [title, "", self._line(headers), self._line(["-" * width for width in self._widths])]
+
+    def __call__(self, row: Sequence[object]) -> None:
+        """Print a row; the first one comes with title and headers."""
+        for line in (*self._lines, self._line([_text(value) for value in row])):
+            tqdm.write(line)
+        sys.stdout.flush()
+        self._lines = []
+
+    def _line(self, cells: Sequence[str]) -> str:
+        return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True)).rstrip()
 
 
 def _text(value: object) -> str:

@@ -1,5 +1,6 @@
 """Error of the estimators against evaluations, samples or seconds, as log-log curves with fitted slopes."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -110,3 +111,65 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
     figure.subplots_adjust(0.03, 0.32 / height, 0.99, 1 - 0.13 / height, wspace=0.14, hspace=0.55)
     figure.savefig(path, dpi=100)
     plt.close(figure)
+
+
+OPERATORS = {"gradient": "gradient", "hessian": "Hessian", "hvp": "Hessian-vector product"}
+_KINDS = {"uniform": "uniform", "aggregate": "aggregate", "per-element": "optimal"}
+_COLORS = {"uniform": "#e08a1e", "aggregate": "#c1272d", "per-element": "#2b2b2b"}
+
+
+def draw_operators(measurements: Sequence[Measurement], problem: str, path: Path) -> None:
+    """Draw figure 11: variance of uniform, aggregate and optimal sampling for one problem.
+
+    Above against samples per element, as in the source; below against evaluations. Solid lines subtract f(x) from the
+    values, dotted ones nothing.
+    """
+    figure, axes = plt.subplots(2, len(OPERATORS), figsize=(12, 7), layout="constrained", sharey="col", squeeze=False)
+    for row, against in zip(axes, ("samples", "evaluations"), strict=True):
+        for axis, (quantity, title) in zip(row, OPERATORS.items(), strict=True):
+            for method in dict.fromkeys(one.method for one in measurements):
+                kind, _, baseline = method.partition(" + ")
+                x, y = curve(measurements, problem, method, quantity, against)
+                line = "-" if baseline == "center" else ":"
+                label = f"{_KINDS[kind]}{'' if baseline == 'center' else ', nothing subtracted'}"
+                axis.plot(x, [one**2 for one in y], line, color=_COLORS[kind], marker="o", markersize=3, label=label)
+            axis.set(xscale="log", yscale="log", xlabel=AXES[against], title=f"{problem}: {title}")
+            axis.xaxis.set_minor_formatter(NullFormatter())
+            axis.grid(which="major", color="0.9")
+    axes[0, 0].set_ylabel("relative variance")
+    axes[1, 0].set_ylabel("relative variance")
+    axes[0, 0].legend(fontsize=7, frameon=False)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def orders(measurements: Sequence[Measurement], problem: str) -> list[list[object]]:
+    """Return a row per operator, baseline and axis: the kinds of sampling, the one with the least variance first.
+
+    Variances are compared at the largest place of the axis that all kinds reach, on lines between the logarithms.
+    """
+    rows: list[list[object]] = []
+    methods = list(dict.fromkeys(one.method for one in measurements))
+    for quantity, title in OPERATORS.items():
+        for baseline in dict.fromkeys(method.partition(" + ")[2] for method in methods):
+            for against in ("samples", "evaluations"):
+                lines = {
+                    method.partition(" + ")[0]: curve(measurements, problem, method, quantity, against)
+                    for method in methods
+                    if method.endswith(f" + {baseline}")
+                }
+                place = min(max(x) for x, _ in lines.values())
+                there = {kind: _at(place, x, y) ** 2 for kind, (x, y) in lines.items()}
+                order = " < ".join(f"{_KINDS[kind]} {there[kind]:.2g}" for kind in sorted(there, key=there.__getitem__))
+                subtracted = "f(x) subtracted" if baseline == "center" else "nothing subtracted"
+                rows.append([f"{title}, {subtracted}", f"{place:g} {AXES[against]}", order])
+    return rows
+
+
+def _at(place: float, x: Sequence[float], y: Sequence[float]) -> float:
+    """Return y at a place between the x, on a straight line between the logarithms of its neighbours."""
+    for (a, low), (b, high) in itertools.pairwise(zip(x, y, strict=True)):
+        if a <= place <= b:
+            share = math.log(place / a) / math.log(b / a)
+            return math.exp((1 - share) * math.log(low) + share * math.log(high))
+    return y[0] if place <= x[0] else y[-1]

@@ -28,8 +28,10 @@ from experiments.problems.task import Task
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
 from experiments.reports.html_page import html_page, html_table, html_text
+from experiments.reports.overview_networks import network_column
 from experiments.reports.progress import REFRESH, progress
 from experiments.reports.similarity import described, measures
+from experiments.reports.supplement_figures import Column
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
@@ -38,7 +40,7 @@ from experiments.runs.trial import LIMIT, Trial
 METHOD = "gaussian_process"
 OWN = {
     **dict.fromkeys(("quad", "box10", "brdf", "texture"), "descent"),
-    **dict.fromkeys(("meshfit", "meshfit_color"), "handles_newton"),
+    **dict.fromkeys(("meshfit", "meshfit_color", "suzanne", "banana"), "handles_newton"),
     "caustic": "block_gauss_newton",
 }
 """Tasks for which another method is recommended."""
@@ -65,7 +67,7 @@ def gallery(
     """Run every task once and make pictures of it: figure 9, 12 and 13 of the source, animations, and a page of all.
 
     Args:
-        folder: of results; predictions of networks that `run` trained there are on the page too.
+        folder: of results; networks that `run` trained there are in figure 9 and on the page too.
         tasks: names of fitting tasks; those without pictures are left out.
         method: one of those in `list`; the recommended one of each task if not given.
         run: number of the start.
@@ -84,13 +86,18 @@ def gallery(
     out = out or folder / "gallery"
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
-    shown = _traces(chosen("tasks", tasks, list(FITTING)), method, run, limit, preset, variant)
+    shown = traces(chosen("tasks", tasks, list(FITTING)), method, run, limit, preset, variant)
     if not shown:
         raise SystemExit("no task of this command can be shown")
     for one in shown:
         if one[0].outcome.status == "failed":
             print(f"{one[0].task.name} failed: {one[0].outcome.reason}")
-    files = [*_figures(shown, out, limit, variant), *_animations(shown, out, count), *_predictions(folder, out)]
+    trained = [column for name in NETWORKS if (column := network_column(folder, name, variant))]
+    files = [
+        *_figures(shown, trained, out, limit, variant),
+        *_animations(shown, out, count),
+        *_predictions(folder, out),
+    ]
     page = out / "index.html"
     page.write_text(_page(shown, files), encoding="utf-8")
     print("\n" + table(*_table(shown)))
@@ -98,7 +105,7 @@ def gallery(
     return [found for found, _ in shown]
 
 
-def _traces(
+def traces(
     names: Sequence[str], method: str | None, run: int, limit: float, preset: Preset, variant: str
 ) -> list[Shown]:
     shown = []
@@ -153,11 +160,11 @@ def _watch(bar: tqdm) -> Callable[[Record], None]:
     return watch
 
 
-def _figures(shown: Sequence[Shown], out: Path, limit: float, variant: str) -> list[Path]:
+def _figures(shown: Sequence[Shown], trained: Sequence[Column], out: Path, limit: float, variant: str) -> list[Path]:
     """Write figure 9, and 12 and 13 if their tasks are there."""
     files = [out / "figure9.png"]
     stills = [(found, finer(found.task, seen)) for found, seen in progress(shown, "stills")]
-    supplement_figures.overview(stills, files[0])
+    supplement_figures.overview([*(Column.of(*one) for one in stills), *trained], files[0])
     for found, seen in stills:
         if found.task.name == "caustic":
             other = METHODS[OTHER]

@@ -12,8 +12,10 @@ and a sampled one, which is that of the smoothed loss, is not the true one and m
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -21,11 +23,12 @@ import tyro
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.ensembles.kept_parts import KeptParts
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import RenderedTask
 from experiments.reports.progress import progress
-from experiments.reports.tables import table
+from experiments.reports.tables import Printer
 
 POINTS = {"start": 1.0, "middle": 0.5, "near": 0.1}
 """Distance from the solution, over that of the start."""
@@ -66,8 +69,11 @@ def gradients(
     sigma: float = 0.2,
     preset: Preset = "fast",
     variant: str = "auto",
+    out: Path = Path("results/gradients"),
 ) -> list[GradientError]:
     """Compare derivatives of rendered tasks at the start of run 0, half-way and near the solution.
+
+    Rows are printed and kept point by point; the same command goes on where it was stopped.
 
     Args:
         tasks: those that Mitsuba renders.
@@ -78,73 +84,83 @@ def gradients(
         sigma: of the sampled gradients, in the same units.
         preset: fast or paper.
         variant: of Mitsuba; without derivatives only sampled gradients are measured.
+        out: folder of the rows, parts.jsonl.
     """
     if repeats < 1 or spp < 1 or min(pairs, default=0) < 1:
         raise SystemExit(f"repeats, spp and pairs must be at least 1, got {repeats}, {spp} and {pairs}")
     if not (step > 0 and sigma > 0):
         raise SystemExit(f"step and sigma must be above 0, got {step} and {sigma}")
     torch.set_num_threads(1)
-    found: list[GradientError] = []
-    for name in progress(catalogue.chosen("tasks", tasks, list(catalogue.RENDERED)), "tasks"):
-        task = catalogue.load(name, preset, variant)
+    names = catalogue.chosen("tasks", tasks, list(catalogue.RENDERED))
+    loaded = [catalogue.load(name, preset, variant) for name in names]
+    kept, printer, found = KeptParts(out), Printer("derivatives against the truth", _HEADERS, _WIDTHS), []
+    settings = {"repeats": repeats, "spp": spp, "pairs": list(pairs), "step": step, "sigma": sigma}
+    for task in loaded:
         assert isinstance(task, RenderedTask)
         reason = task.renderer.no_adjoint()
         if reason:
-            print(f"{name}: {reason}")
-        found += measure(task, repeats, spp, pairs, step, sigma)
-    headers = ["task", "point", "gradient", "evaluations", "true length", "noise", "cosine", "error", "way", "ms"]
-    rows = [
-        [
-            one.task,
-            one.point,
-            one.method,
-            one.evaluations,
-            f"{one.truth:.2g}",
-            f"{one.noise:.0%}",
-            f"{one.cosine:.2f}",
-            f"{one.error:.2f}",
-            f"{one.way:.2f}",
-            f"{one.milliseconds:.0f}",
-        ]
-        for one in found
+            print(f"{task.name}: {reason}")
+        rulers = _Rulers(task, repeats, spp, pairs, step, sigma)
+        for point in progress(POINTS, task.name, leave=False):
+            part = {"task": task.name, "point": point, "preset": preset, "variant": variant, **settings}
+            rows = kept.rows(part, GradientError, partial(rulers.measure, point))
+            for row in rows:
+                printer(_cells(row))
+            found += rows
+    print(f"\nkept in {out}")
+    return found
+
+
+_HEADERS = ["task", "point", "gradient", "evaluations", "true length", "noise", "cosine", "error", "way", "ms"]
+_WIDTHS = [6, 6, 16, 0, 0, 0, 0, 5, 5, 5]
+
+
+def _cells(one: GradientError) -> list[object]:
+    return [
+        *(one.task, one.point, one.method, one.evaluations, f"{one.truth:.2g}", f"{one.noise:.0%}"),
+        *(f"{one.cosine:.2f}", f"{one.error:.2f}", f"{one.way:.2f}", f"{one.milliseconds:.0f}"),
     ]
-    print(table(headers, rows))
-    return found
 
 
-def measure(
-    task: RenderedTask, repeats: int, spp: int, pairs: tuple[int, ...], step: float, sigma: float
-) -> list[GradientError]:
-    """Return the errors of every kind of gradient at every point."""
-    kinds = _kinds(task, pairs, sigma * task.sigma)
-    for _, one, _ in kinds:
-        one(task.start(0), 0)  # compiles
-    precise = _precise_loss(task, spp)
-    found = []
-    for point, distance in POINTS.items():
-        x = task.solution + distance * (task.start(0) - task.solution)
-        truth, noise = differences(precise, x, step * task.sigma)
+@dataclass(frozen=True)
+class _Rulers:
+    """What the gradients of a task are measured with; loaded for the first point that is measured."""
+
+    task: RenderedTask
+    repeats: int
+    spp: int
+    pairs: tuple[int, ...]
+    step: float
+    sigma: float
+
+    @cached_property
+    def kinds(self) -> "list[tuple[str, Gradient, int]]":
+        kinds = _kinds(self.task, self.pairs, self.sigma * self.task.sigma)
+        for _, one, _ in kinds:
+            one(self.task.start(0), 0)  # compiles
+        return kinds
+
+    @cached_property
+    def precise(self) -> Callable[[Tensor], Tensor]:
+        return _precise_loss(self.task, self.spp)
+
+    def measure(self, point: str) -> Iterator[GradientError]:
+        """Yield the errors of every kind of gradient at a point."""
+        task = self.task
+        kinds, precise = self.kinds, self.precise
+        x = task.solution + POINTS[point] * (task.start(0) - task.solution)
+        truth, noise = differences(precise, x, self.step * task.sigma)
         size, noise_size, way = float(truth.norm()), float(noise.norm() / truth.norm()), x - task.solution
-        found.append(
-            GradientError(task.name, point, "truth", 0, size, noise_size, 1.0, 0.0, _cosine(truth, way), math.nan)
-        )
+        yield GradientError(task.name, point, "truth", 0, size, noise_size, 1.0, 0.0, _cosine(truth, way), math.nan)
         for name, one, evaluations in kinds:
-            estimates, times = zip(*(_timed(one, x, seed) for seed in range(repeats)), strict=True)
-            found.append(
-                GradientError(
-                    task.name,
-                    point,
-                    name,
-                    evaluations,
-                    size,
-                    noise_size,
-                    statistics.median(_cosine(g, truth) for g in estimates),
-                    statistics.median(float((g - truth).norm()) / size for g in estimates),
-                    statistics.median(_cosine(g, way) for g in estimates),
-                    1e3 * statistics.median(times),
-                )
+            estimates, times = zip(*(_timed(one, x, seed) for seed in range(self.repeats)), strict=True)
+            yield GradientError(
+                *(task.name, point, name, evaluations, size, noise_size),
+                statistics.median(_cosine(g, truth) for g in estimates),
+                statistics.median(float((g - truth).norm()) / size for g in estimates),
+                statistics.median(_cosine(g, way) for g in estimates),
+                1e3 * statistics.median(times),
             )
-    return found
 
 
 Gradient = Callable[[Tensor, int], Tensor]

@@ -16,20 +16,23 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+import pandas as pd
 import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.ensembles.kept_parts import KeptParts
 from experiments.methods.ours import search
 from experiments.methods.settings import settings
 from experiments.problems.catalogue import FITTING, chosen, fitting
-from experiments.reports.medians import medians, objects, reached
+from experiments.reports.medians import MEASURES, medians, objects
 from experiments.reports.progress import progress
 from experiments.reports.results import METRICS, Run
-from experiments.reports.tables import table
+from experiments.reports.tables import Printer
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
 from experiments.runs.run import Finished
@@ -79,9 +82,21 @@ class Fit:
     """image: mean squared error of the picture, whatever the loss; parameter: that of x."""
     evaluations: float | None
     """Median over the runs that get there, if they are at least half of all."""
+    evaluations_low: float | None
+    evaluations_high: float | None
+    """Quartiles over the same."""
     share: float
     seconds: float | None
     runs: int
+
+
+@dataclass(frozen=True)
+class Reached:
+    """When a run of the trust region has reduced an error by 99 %; None if it never has."""
+
+    metric: str
+    evaluations: int | None
+    seconds: float | None
 
 
 @dataclass(frozen=True)
@@ -103,9 +118,11 @@ def losses(
     evaluations: int = 2000,
     limit: float = 60.0,
     seed: int = 0,
-    out: Path | None = None,
+    out: Path = Path("results/losses"),
 ) -> LossReport:
     """Measure a loss inside the black box against the same loss after an image-valued one.
+
+    Rows are printed and kept as they come; the same command goes on where it was stopped.
 
     Args:
         tasks: fitting tasks whose image is a picture; box2 and brdf are swept too, others only fitted.
@@ -116,7 +133,7 @@ def losses(
         evaluations: that a fit may use.
         limit: seconds that a fit may take.
         seed: of the perturbations.
-        out: folder for losses.json, sweep.csv and sweep.png; nothing is written if not given.
+        out: folder of parts.jsonl, which grows, and of losses.json, sweep.csv and sweep.png at the end.
     """
     least = 4 * _SCRAMBLES
     if runs < 2 or min(samples, default=0) < 1 or min(truth, sweep) < least:
@@ -125,46 +142,79 @@ def losses(
             f"got {runs}, {samples}, {truth} and {sweep}"
         )
     shown = {name: pictures_of(fitting(name)) for name in chosen("tasks", tasks, list(FITTING))}
-    swept = [one for name, one in shown.items() if name in SOLUTIONS]
-    curves = progress([(one, scale * one.task.sigma) for one in swept for scale in SCALES], "curves")
+    swept, kept = [one for name, one in shown.items() if name in SOLUTIONS], KeptParts(out)
     report = LossReport(
-        [bias for one, sigma in curves for bias in curves_along(one, sigma, sweep, seed)],
-        [error for one in progress(swept, "gradients") for error in _gradient_errors(one, samples, runs, truth, seed)],
-        [fit for one in shown.values() for fit in _fits(one, runs, evaluations, limit)],
+        list(_curves(kept, swept, sweep, seed)),
+        list(_errors(kept, swept, samples, runs, truth, seed)),
+        list(_fits(kept, list(shown.values()), runs, evaluations, limit)),
     )
-    print(text(report))
-    if out is not None:
-        _write(report, out)
-        print(f"\nwritten to {out}")
+    _write(report, out)
+    print(f"\nwritten to {out}")
     return report
 
 
-def text(report: LossReport) -> str:
-    """Return the three tables, the loss inside next to the loss of the image."""
-    parts: list[str] = []
-    rows: list[list[object]] = []
-    if report.biases:
-        for a, b in _pairs(report.biases):
+def _curves(kept: KeptParts, swept: Sequence[Pictures], sweep: int, seed: int) -> Iterator[Bias]:
+    """Yield the objectives along the lines, and print them."""
+    printer = Printer(
+        "smoothed objectives along the line from the solution (0) through the start (1); end: smallest there",
+        ["task", "sigma", "loss", "minimum: inside", "image", "fall at the start: inside", "image"],
+        [6, 5, 14, 0, 6, 0, 5],
+    )
+    for one, scale in progress([(one, scale) for one in swept for scale in SCALES], "curves", leave=False):
+        sigma = scale * one.task.sigma
+        part = {"what": "curve", "task": one.task.name, "sigma": sigma, "sweep": sweep, "seed": seed}
+        found = kept.rows(part, Bias, partial(curves_along, one, sigma, sweep, seed))
+        for a, b in _pairs(found):
             minima, falls = [position_text(one.minimum) for one in (a, b)], [f"{one.fall:.2f}" for one in (a, b)]
-            rows.append([a.task, f"{a.sigma:g}", a.loss, *minima, *falls])
-        headers = ["task", "sigma", "loss", "minimum: inside", "image", "fall at the start: inside", "image"]
-        title = "smoothed objectives along the line from the solution (0) through the start (1)"
-        parts += [f"{title}; end: smallest there", table(headers, rows)]
-    if report.errors:
-        rows = [
-            [a.task, a.loss, a.where, a.evaluations, a.rmse, b.rmse, a.truth_error, b.truth_error]
-            for a, b in _pairs(report.errors)
-        ]
-        headers = ["task", "loss", "where", "evaluations", "inside", "image", "truth: inside", "image"]
-        title = "relative RMSE of the gradient of either objective, from the same evaluations"
-        parts += [f"\n{title}", table(headers, rows)]
-    rows = [
-        [a.task, a.loss, a.metric, a.evaluations, f"{a.share:.0%}", b.evaluations, f"{b.share:.0%}"]
-        for a, b in _pairs(report.fits)
-    ]
-    headers = ["task", "loss", "error", "inside", "share", "image", "share"]
-    title = f"TrustRegion: median evaluations until an error is reduced by {100 * LEVEL:g} %, share of the runs"
-    return "\n".join([*parts, f"\n{title}", table(headers, rows)]).lstrip()
+            printer([a.task, f"{a.sigma:g}", a.loss, *minima, *falls])
+        yield from found
+
+
+def _errors(
+    kept: KeptParts, swept: Sequence[Pictures], samples: Sequence[int], runs: int, truth: int, seed: int
+) -> Iterator[GradientError]:
+    """Yield the errors of the gradients, and print them."""
+    printer = Printer(
+        "\nrelative RMSE of the gradient of either objective, from the same evaluations",
+        ["task", "loss", "where", "evaluations", "inside", "image", "truth: inside", "image"],
+        [6, 14, 8, 0, 7, 7, 0, 7],
+    )
+    settings = {"samples": list(samples), "runs": runs, "truth": truth, "seed": seed}
+    for one, where in progress([(one, where) for one in swept for where in WHERE], "gradients", leave=False):
+        part = {"what": "gradient", "task": one.task.name, "where": where, **settings}
+        found = kept.rows(
+            part, GradientError, partial(_gradient_errors, one, where, samples, runs=runs, truth=truth, seed=seed)
+        )
+        for a, b in _pairs(found):
+            printer([a.task, a.loss, a.where, a.evaluations, a.rmse, b.rmse, a.truth_error, b.truth_error])
+        yield from found
+
+
+def _fits(kept: KeptParts, shown: Sequence[Pictures], runs: int, evaluations: int, limit: float) -> Iterator[Fit]:
+    """Yield the fits, and print them."""
+    printer = Printer(
+        f"\nTrustRegion: median evaluations until an error is reduced by {100 * LEVEL:g} %, share of the runs",
+        ["task", "loss", "error", "inside", "quartiles", "share", "image", "quartiles", "share"],
+        [6, 14, 9, 6, 12, 5, 6, 12, 5],
+    )
+    settings = {"evaluations": evaluations, "limit": limit}
+    for one, name in ((task, name) for task in shown for name in task.losses):
+        ended: list[tuple[str, Reached]] = []
+        jobs = [(form, run) for form in FORMS for run in range(runs)]
+        for form, run in progress(jobs, f"fits of {one.task.name}, {name}", leave=False):
+            part = {"what": "fit", "task": one.task.name, "loss": name, "form": form, "run": run, **settings}
+            reached = kept.rows(part, Reached, partial(_fit, one, name, form, run, evaluations, limit))
+            ended += [(form, row) for row in reached]
+        found = list(_medians(one.task.name, name, ended))
+        for a, b in _pairs(found):
+            sides = [cell for fit in (a, b) for cell in (fit.evaluations, _spread(fit), f"{fit.share:.0%}")]
+            printer([a.task, a.loss, a.metric, *sides])
+        yield from found
+
+
+def _spread(fit: Fit) -> str:
+    """Return the quartiles in words."""
+    return "" if fit.evaluations_low is None else f"{fit.evaluations_low:g} to {fit.evaluations_high:g}"
 
 
 def _pairs(rows: Sequence[_Row]) -> Iterator[tuple[_Row, _Row]]:
@@ -173,26 +223,23 @@ def _pairs(rows: Sequence[_Row]) -> Iterator[tuple[_Row, _Row]]:
 
 
 def _gradient_errors(
-    one: Pictures, samples: Sequence[int], runs: int, truth: int, seed: int
+    one: Pictures, where: str, samples: Sequence[int], *, runs: int, truth: int, seed: int
 ) -> Iterator[GradientError]:
     solution, way = line(one)
     n, sigma = one.task.n, one.task.sigma
-    for where, position in WHERE.items():
-        x = solution + position * way
-        parts = [
-            one.moments(x, sigma, normal(truth // (2 * _SCRAMBLES), n, (seed << 32) + i)) for i in range(_SCRAMBLES)
-        ]
-        true, spread = Moments.mean(parts), math.sqrt(_SCRAMBLES - 1)
-        for pairs in samples:
-            smoothing = zh.Smoothing(sigma=sigma, samples=pairs)
-            found = [one.estimate(x, smoothing.replace(seed=(seed << 32) + run)) for run in range(runs)]
-            exact = {form: one.objective(true, form)[1] for form in FORMS}
-            rmse = {form: _relative(one, found, form, exact[form]) for form in FORMS}
-            own = {form: _relative(one, parts, form, exact[form]) / spread for form in FORMS}
-            for i, name in enumerate(one.losses):
-                for form in FORMS:
-                    numbers = float(rmse[form][i]), float(own[form][i])
-                    yield GradientError(one.task.name, name, form, where, smoothing.evaluations(n), *numbers)
+    x = solution + WHERE[where] * way
+    parts = [one.moments(x, sigma, normal(truth // (2 * _SCRAMBLES), n, (seed << 32) + i)) for i in range(_SCRAMBLES)]
+    true, spread = Moments.mean(parts), math.sqrt(_SCRAMBLES - 1)
+    for pairs in samples:
+        smoothing = zh.Smoothing(sigma=sigma, samples=pairs)
+        found = [one.estimate(x, smoothing.replace(seed=(seed << 32) + run)) for run in range(runs)]
+        exact = {form: one.objective(true, form)[1] for form in FORMS}
+        rmse = {form: _relative(one, found, form, exact[form]) for form in FORMS}
+        own = {form: _relative(one, parts, form, exact[form]) / spread for form in FORMS}
+        for i, name in enumerate(one.losses):
+            for form in FORMS:
+                numbers = float(rmse[form][i]), float(own[form][i])
+                yield GradientError(one.task.name, name, form, where, smoothing.evaluations(n), *numbers)
 
 
 def _relative(one: Pictures, estimates: Sequence[Moments], form: str, truth: Tensor) -> Tensor:
@@ -201,24 +248,19 @@ def _relative(one: Pictures, estimates: Sequence[Moments], form: str, truth: Ten
     return (gradients - truth).square().sum(2).mean(0).sqrt() / torch.linalg.vector_norm(truth, dim=1)
 
 
-def _fits(one: Pictures, runs: int, evaluations: int, limit: float) -> Iterator[Fit]:
-    for name in one.losses:
-        ended: dict[str, list[Run]] = {form: [] for form in FORMS}
-        jobs = [(form, run) for form in FORMS for run in range(runs)]
-        for form, run in progress(jobs, f"fits of {one.task.name}, {name}"):
-            ended[form].append(_fit(one, name, form, run, evaluations, limit))
-        there = medians(reached([((form,), ended[form]) for form in FORMS], ("form",)), ("form", "metric", "level"))
-        there = there[there["level"] == LEVEL]
-        for metric in METRICS:
-            for form in FORMS:
-                (cell,) = objects(there[(there["metric"] == metric) & (there["form"] == form)])
-                yield Fit(
-                    *(one.task.name, name, form, metric),
-                    *(cell["evaluations"], cell["share"], cell["seconds"], cell["runs"]),
-                )
+def _medians(task: str, loss: str, ended: Sequence[tuple[str, Reached]]) -> Iterator[Fit]:
+    """Yield the fits of a loss: an error after the other, inside before image."""
+    rows = [{"form": form, **asdict(row)} for form, row in ended]
+    table = pd.DataFrame(rows).astype(dict.fromkeys(MEASURES, float))
+    there = medians(table, ("form", "metric"))
+    for metric in METRICS:
+        for form in FORMS:
+            (cell,) = objects(there[(there["metric"] == metric) & (there["form"] == form)])
+            spread = [cell[f"evaluations{end}"] for end in ("", "_low", "_high")]
+            yield Fit(*(task, loss, form, metric), *spread, *(cell[one] for one in ("share", "seconds", "runs")))
 
 
-def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> Run:
+def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> list[Reached]:
     sigma = settings("descent", one.task.name).get("sigma")
     rows: list[Record] = []
 
@@ -235,7 +277,11 @@ def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit:
     outcome = attempt(task, f"{loss}, {form}", run, solve, limit=limit, watch=watch)
     if outcome.status == "failed":
         raise RuntimeError(outcome.traceback)
-    return Run(outcome, rows)
+    there = {metric: Run(outcome, rows).reached(metric, LEVEL) for metric in METRICS}
+    return [
+        Reached(metric, row.evaluations, row.seconds) if row else Reached(metric, None, None)
+        for metric, row in there.items()
+    ]
 
 
 def _write(report: LossReport, out: Path) -> None:

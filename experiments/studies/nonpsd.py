@@ -14,6 +14,7 @@ error, absolute over the mean size of the true elements, does not depend on that
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -85,7 +86,18 @@ def nonpsd_error(
     headers = ["s1", "s2", "sampling", "evaluations", "signed", "squared", "absolute", "relative", f"within {CLAIM:g}"]
     print(f"mean error of the Hessian of -N(0, s1) * N(0, s2) over {grid}x{grid} points of (-3, 3)^2\n")
     print(table(headers, rows))
+    print(f"\n{verdict(errors)}")
     return errors
+
+
+def verdict(errors: Sequence[HessianError]) -> str:
+    """Say in which norm the claim of the source holds, and how large the relative error is."""
+    counts = [f"{name} in {sum(getattr(one, name) <= CLAIM for one in errors)}" for name in READINGS]
+    low, high = (pick(one.relative for one in errors) for pick in (min, max))
+    return (
+        f"Mean error within {CLAIM:g} of {len(errors)} rows: {', '.join(counts)}. "
+        f"Relative error {100 * low:.0f} to {100 * high:.0f} %."
+    )
 
 
 def _measure(

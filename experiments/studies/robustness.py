@@ -24,7 +24,7 @@ from experiments.problems.catalogue import FITTING, Preset, chosen
 from experiments.problems.variations import Change
 from experiments.problems.variations import load as load_varied
 from experiments.reports import robustness_curves
-from experiments.reports.medians import medians, objects, reached
+from experiments.reports.medians import MEASURES, medians, objects, reached
 from experiments.reports.results import Results, Run, load
 from experiments.reports.tables import table
 from experiments.runs.trial import LEVELS, LIMIT
@@ -95,7 +95,12 @@ class Row:
     """Of the runs that reduced the image error by 90 %."""
     share_99: float
     evaluations_99: float | None
+    evaluations_99_low: float | None
+    evaluations_99_high: float | None
+    """Quartiles."""
     seconds_99: float | None
+    seconds_99_low: float | None
+    seconds_99_high: float | None
     image_error: float | None
     """At the end, over that at the start."""
     parameter_error: float | None
@@ -258,16 +263,10 @@ def row(cell: Cell, runs: Sequence[Run]) -> Row:
     ends = [(run.error("image")[-1], run.records[-1].parameter_error) for run in runs if run.records]
     errors = pd.DataFrame(ends, columns=["image", "parameter"], dtype=float)
     image, parameter = errors["image"].median(), errors["parameter"].pow(0.5).median()
+    evaluations, seconds = ([second[f"{name}{end}"] for end in ("", "_low", "_high")] for name in MEASURES)
     return Row(
-        cell.task,
-        cell.sweep,
-        cell.value,
-        cell.method,
-        len(runs),
-        first["share"],
-        second["share"],
-        second["evaluations"],
-        second["seconds"],
+        *(cell.task, cell.sweep, cell.value, cell.method, len(runs), first["share"], second["share"]),
+        *(evaluations[0], evaluations[1], evaluations[2], seconds[0], seconds[1], seconds[2]),
         None if math.isnan(image) else float(image),
         None if math.isnan(parameter) else float(parameter),
     )

@@ -116,7 +116,8 @@ def variance(
     for against in AXES:
         draw(measurements, made, against, out / f"variance_{against}.png")
     headers, rows = _table(report)
-    print(f"Relative RMSE of {report.runs} runs\n\n{table(headers, rows)}\n")
+    shown = len(headers) - len(_ERRORS)
+    print(f"Relative RMSE of {report.runs} runs\n\n{table(headers[:shown], [row[:shown] for row in rows])}\n")
     _print_checks(report)
     print(f"written to {out}")
     if store is not None:
@@ -172,8 +173,12 @@ def _ratios(measurements: list[Measurement]) -> list[Ratio]:
     return ratios
 
 
+_ERRORS = [f"{quantity}_error" for quantity in QUANTITIES]
+"""Columns of the standard errors of the RMSE, in the file alone."""
+
+
 def _table(report: VarianceReport) -> tuple[list[str], list[list[object]]]:
-    """Return headers and rows: a row per problem, method and budget."""
+    """Return headers and rows: a row per problem, method and budget, standard errors last."""
     rows: dict[tuple[str, str, int], dict[str, Measurement]] = {}
     for m in report.measurements:
         rows.setdefault((m.problem, m.method, m.budget), {})[m.quantity] = m
@@ -185,10 +190,11 @@ def _table(report: VarianceReport) -> tuple[list[str], list[list[object]]]:
             (one := next(iter(found.values()))).evaluations,
             1e3 * one.seconds,
             *(found[q].rmse if q in found else None for q in QUANTITIES),
+            *(found[q].rmse_error if q in found else None for q in QUANTITIES),
         ]
         for (problem, method, budget), found in rows.items()
     ]
-    return ["problem", "method", "budget", "evaluations", "ms", *QUANTITIES], body
+    return ["problem", "method", "budget", "evaluations", "ms", *QUANTITIES, *_ERRORS], body
 
 
 def _print_checks(report: VarianceReport) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import setuptools
 
 import torch_zerohess as zh
+from torch_zerohess.adapters import mitsuba_variants
 
 ROOT = Path(__file__).parents[2]
 VALUES = """
@@ -51,6 +52,18 @@ def test_extension_is_built_and_doctor_says_so():
     assert report.devices[0] == "cpu"
     assert "scalar_rgb" in report.mitsuba
     assert "C++ extension  used" in str(report)
+
+
+def test_doctor_says_what_to_install_for_what_is_missing(monkeypatch):
+    required = ["torch>=2.10", 'numpy; extra == "onnx"', 'nonesuch>=1; extra == "onnx"', 'absent; extra == "test"']
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: required)
+    monkeypatch.setattr(
+        "torch_zerohess.adapters.mitsuba_variants.probe", lambda *_: mitsuba_variants.Probe(False, "no")
+    )
+    report = zh.doctor()
+    assert report.mitsuba["scalar_rgb"] == "no"
+    assert [one for one in report.advice if "pip" in one] == ["for nonesuch: pip install 'torch_zerohess[onnx]'"]
+    assert any("apt-get install libllvm19" in one for one in report.advice)
 
 
 def test_pure_torch_gives_the_same_numbers():

@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from experiments.problems.scenes.icosphere import icosphere, vertex_normals
+from experiments.problems.scenes.blobs import Ellipsoid, blend
+from experiments.problems.scenes.icosphere import vertex_normals
 
 Array = npt.NDArray[np.float64]
 Faces = npt.NDArray[np.uint32]
@@ -26,7 +27,7 @@ def bunny_surface() -> tuple[Surface, Source]:
     """Vertices [m, 3], unit normals [m, 3] and triangles [k, 3], wound counterclockwise, and where they are from."""
     path = _scan()
     if path is None:
-        vertices, faces = _procedural()
+        vertices, faces = blend(_ELLIPSOIDS, (-0.10, -0.06, 0.0))
         source: Source = "procedural"
     else:
         points, triangles = read_ply(path)
@@ -87,7 +88,7 @@ def cluster(vertices: Array, faces: npt.NDArray[np.integer], cell: float) -> tup
     return means[used], renamed.reshape(-1, 3)
 
 
-_ELLIPSOIDS = (  # centre, half axes, radius of the ball as a length
+_ELLIPSOIDS: tuple[Ellipsoid, ...] = (
     ((0.00, -0.22, 0.00), (0.30, 0.26, 0.25)),  # body
     ((0.20, -0.28, 0.02), (0.20, 0.20, 0.24)),  # haunches
     ((-0.24, 0.06, 0.02), (0.20, 0.17, 0.16)),  # head
@@ -97,20 +98,3 @@ _ELLIPSOIDS = (  # centre, half axes, radius of the ball as a length
     ((-0.22, -0.40, 0.10), (0.12, 0.07, 0.07)),  # paws
     ((-0.22, -0.40, -0.10), (0.12, 0.07, 0.07)),
 )
-
-
-def _procedural() -> tuple[Array, npt.NDArray[np.int64]]:
-    """A closed surface: how far the blended ellipsoids reach from a point inside, in the directions of an icosphere."""
-    directions, faces = icosphere(5)
-    origin = np.array([-0.10, -0.06, 0.0])
-    reach = np.linspace(0.0, 1.0, 201)[1:]
-    field = np.zeros((len(directions), len(reach)))
-    for centre, axes in _ELLIPSOIDS:
-        ray, offset = directions / axes, (origin - centre) / axes
-        square = (ray**2).sum(1)[:, None] * reach**2 + 2 * (ray @ offset)[:, None] * reach + offset @ offset
-        field += np.exp(4.0 * (1.0 - square))  # 1 on the ellipsoid
-    last = len(reach) - 1 - np.argmax(field[:, ::-1] >= 1.0, axis=1)
-    rows = np.arange(len(directions))
-    inside, outside = np.log(field[rows, last]), np.log(field[rows, np.minimum(last + 1, len(reach) - 1)])
-    exact = reach[last] + (reach[1] - reach[0]) * inside / (inside - outside)
-    return origin + exact[:, None] * directions, faces

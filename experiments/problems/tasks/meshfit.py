@@ -1,13 +1,16 @@
-"""MESHFIT: an icosphere of 2562 vertices becomes the Stanford bunny, from eight views of it.
+"""MESHFIT, MESHFIT_COLOR, SUZANNE and BANANA: an icosphere of 2562 vertices becomes a mesh, from eight views of it.
 
-Parameters: x, y, z of every vertex, in heights of the bunny; n = 7686. With colours (MESHFIT_COLOR) red, green and blue
-of every vertex follow its position; n = 15372. Starts: a sphere of radius U(0.40, 0.50) around a point within 0.05 of
-the origin in each coordinate, grey (0.5). Loss: mean squared difference of eight images of 64x64 pixels from azimuths
-45 degrees apart and elevations 30 and -10 degrees in turn, on black. Sigma: 0.01, a fifth of the distance of
-neighbouring vertices.
+MESHFIT's target is the Stanford bunny. SUZANNE and BANANA are tasks of the source, whose meshes are not given: see
+`experiments.problems.scenes.mesh_targets`.
+
+Parameters: x, y, z of every vertex, in units of the longest side of the target, of the bunny its height; n = 7686. With
+colours (MESHFIT_COLOR, BANANA) red, green and blue of every vertex follow its position; n = 15372. Starts: a sphere of
+radius U(0.40, 0.50) around a point within 0.05 of the origin in each coordinate, grey (0.5). Loss: mean squared
+difference of eight images of 64x64 pixels from azimuths 45 degrees apart and elevations 30 and -10 degrees in turn, on
+black. Sigma: 0.01, a fifth of the distance of neighbouring vertices.
 
 The black box is a z-buffer of flat-shaded triangles with a lamp beside every camera (`scenes.raster`): no
-shadows, no antialiasing, one sample per pixel; one channel is enough where the mesh is grey. The target is the scan in
+shadows, no antialiasing, one sample per pixel; one channel is enough where the mesh is grey. The bunny is the scan in
 the package pymeshfix with its vertices merged to about 5 000, or without this package a bunny of ellipsoids
 (`experiments.problems.scenes.stanford`). The `paper` preset has images of 256x256 pixels.
 
@@ -27,8 +30,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from experiments.problems.scenes.fitted_mesh import FittedMesh
+from experiments.problems.scenes.mesh_targets import TARGETS, Target
 from experiments.problems.scenes.raster import Cameras, render
-from experiments.problems.scenes.stanford import bunny_surface
 from experiments.problems.task import Picture, Task, Truth, least_squares
 
 VIEWS = 8
@@ -48,19 +51,18 @@ class MeshFit:
 
     Args:
         side: of the images in pixels.
-        colors: whether vertices have colours.
+        target: the mesh that is sought; vertices of the fitted one have colours if those of the target have.
     """
 
-    def __init__(self, side: int, *, colors: bool = False) -> None:
+    def __init__(self, side: int, target: Target) -> None:
         cameras = Cameras.around(VIEWS, ELEVATIONS, DISTANCE, side, EXTENT)
-        self.mesh = FittedMesh(cameras, LEVEL, 6 if colors else 3)
-        (vertices, _, faces), self.source = bunny_surface()
-        corners, triangles = torch.from_numpy(vertices), torch.from_numpy(faces.astype(np.int64))
-        painted = coat(corners)[None] if colors else None
+        self.mesh = FittedMesh(cameras, LEVEL, 3 if target.colors is None else 6)
+        corners, triangles = torch.from_numpy(target.vertices), torch.from_numpy(target.faces)
+        painted = None if target.colors is None else torch.from_numpy(target.colors)[None]
         self.target = render(cameras, corners[None], triangles, painted)[0]
         """[v, side, side] or [v, side, side, 3]."""
         self._covered = render(cameras, corners[None], triangles)[0] > 0  # the shading is nowhere 0
-        self._points = _spread(vertices, triangles.numpy())
+        self._points = _spread(target.vertices, target.faces)
         self._tree = cKDTree(self._points)
 
     def start(self, run: int) -> Tensor:
@@ -124,31 +126,24 @@ class MeshFit:
         )
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
-    return MeshFit(_SIDES[preset]).task(
-        "meshfit",
-        "an icosphere fitted to eight views of the Stanford bunny",
-        "x, y, z of 2562 vertices in heights of the bunny; starts: spheres of radius .4 to .5",
-    )
-
-
 _SIDES = {"fast": 64, "paper": 256}
 
 
-def color_task(preset: Literal["fast", "paper"] = "fast") -> Task:
-    """MESHFIT_COLOR."""
-    return MeshFit(_SIDES[preset], colors=True).task(
-        "meshfit_color",
-        "an icosphere and its colours fitted to eight views of a painted Stanford bunny",
-        "x, y, z in heights of the bunny, red, green, blue in 0 to 1 of 2562 vertices; starts: grey spheres of radius "
-        ".4 to .5",
+def fitted_to(name: str, preset: Literal["fast", "paper"]) -> Task:
+    """Return the task of fitting an icosphere to one of `TARGETS`."""
+    target = TARGETS[name]()
+    colored = target.colors is not None
+    unit = "heights of the bunny" if "bunny" in target.name else "units of the longest side of the target"
+    return MeshFit(_SIDES[preset], target).task(
+        name,
+        f"an icosphere{' and its colours' if colored else ''} fitted to eight views of {target.name}",
+        f"x, y, z in {unit}{', red, green, blue in 0 to 1' if colored else ''} of 2562 vertices; "
+        f"starts: {'grey ' if colored else ''}spheres of radius .4 to .5",
     )
 
 
-def coat(places: Tensor) -> Tensor:
-    """Colours [m, 3] in 0.15 to 0.95 that vary smoothly with the place [m, 3]."""
-    waves = torch.tensor([[2.0, 4.0, 0.0], [0.0, 3.0, 5.0], [5.0, 0.0, 3.0]], dtype=torch.float64)
-    return 0.55 + 0.4 * (places.double() @ waves.T + torch.tensor([0.5, 2.0, 4.0])).sin()
+def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+    return fitted_to("meshfit", preset)
 
 
 def contact_sheet(images: Tensor) -> Tensor:

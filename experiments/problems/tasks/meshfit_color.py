@@ -1,5 +1,10 @@
 """MESHFIT_COLOR: MESHFIT with the colours of the vertices as further parameters, see `tasks.meshfit`."""
 
-from experiments.problems.tasks.meshfit import color_task as task
+from typing import Literal
 
-__all__ = ["task"]
+from experiments.problems.task import Task
+from experiments.problems.tasks.meshfit import fitted_to
+
+
+def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+    return fitted_to("meshfit_color", preset)

@@ -8,6 +8,7 @@ import re
 import pytest
 import torch
 
+from experiments.ensembles.ensemble import Ensemble
 from experiments.methods import METHODS
 from experiments.methods.settings import SPACES, settings, space
 from experiments.methods.settings.table_3 import table_3
@@ -98,6 +99,8 @@ def test_a_run_can_be_repeated():
 
 def test_full_hessians_do_not_apply_to_many_parameters():
     assert METHODS["our_h"].applies(bowl(10)) is None
+    as_bunny = dataclasses.replace(bowl(3), evaluations=400)
+    assert METHODS["our_h"].applies(as_bunny) is None
     reason = METHODS["our_h"].applies(bowl(1024))
     assert reason is not None
     assert reason.startswith("one Hessian of 1024 parameters takes 1051651 evaluations")
@@ -184,6 +187,36 @@ def test_settings_replace_table_3_only_where_they_say_so(method, task, expected)
     assert {name: found[name] for name in expected} == expected
     assert settings("no_such_method", task) == {}
     assert settings(method, "no_such_task") == {}
+
+
+def test_variants_have_the_settings_of_the_source_or_those_of_an_equal_search():
+    assert settings("our_g", "box2")["sigma"] == settings("our_g_tuned", "box2")["sigma"] == (0.2, 2e-5)
+    source = settings("our_g_source", "box2")
+    assert source == table_3("our_g", "box2")
+    assert source["sigma"] == pytest.approx((1.5 / 500, 0.01 / 500))
+    assert settings("our_g_source", "quad") == settings("our_g", "quad")  # with what Table 3 leaves open
+    rates = [settings(name, "box2")["learning_rate"] for name in ("our_g", "our_g_source", "our_g_tuned")]
+    assert rates == pytest.approx([0.0006, 0.0006, 0.02])
+    for name in ("our_h", "our_hvp", "our_hvpa"):
+        assert settings(f"{name}_tuned", "box2") == settings(name, "box2")
+    assert settings("cma_es_source", "quad") == {}
+
+
+def test_variants_are_methods_that_run_where_they_are_named(tmp_path, monkeypatch):
+    names = [name for name, method in METHODS.items() if method.extra]
+    assert names == [f"{name}_{variant}" for name in PAPER for variant in ("source", "tuned")]
+    assert list(METHODS).index("our_g_source") == list(METHODS).index("our_g") + 1  # side by side in tables
+    task = catalogue.load("brdf")
+    assert "Table 3 of the source does not have this task" in METHODS["our_g_source"].unusable(task)
+    assert "not searched" in METHODS["our_g_tuned"].unusable(task)
+    task = catalogue.load("box2")
+    assert METHODS["our_g_source"].unusable(task) is METHODS["our_g_tuned"].unusable(task) is None
+    assert METHODS["our_h_source"].unusable(catalogue.load("texture")).startswith("one Hessian of 1024")
+    planned = Ensemble(tmp_path, range(1)).plan(["box2"])
+    assert {"our_g", "cobyqa"} <= {job.method_name for job in planned}
+    assert not {job.method_name for job in planned} & set(names)
+    (job,) = Ensemble(tmp_path / "named", range(1)).plan(["box2"], ["our_g_tuned"])
+    assert job.settings["method"] == settings("our_g_tuned", "box2")
 
 
 @pytest.mark.parametrize("name", PAPER)

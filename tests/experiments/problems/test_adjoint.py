@@ -1,7 +1,7 @@
 """Derivatives by the renderer: closed forms where they are right, and how the harness counts and replays them."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 
 import pytest
@@ -14,7 +14,7 @@ from experiments.problems.scenes import adjoint
 from experiments.problems.scenes.adjoint import ADJOINTS, unavailable, value_and_gradient
 from experiments.problems.task import Renderer
 from experiments.runs.trial import Trial
-from experiments.studies.gradients import differences, gradients
+from experiments.studies.gradients import GradientError, differences, gradients
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Transform, Value
 
 
@@ -196,8 +196,11 @@ def test_differences_of_a_quadratic_are_its_gradient() -> None:
     assert float(error.max()) < 1e-12
 
 
-def test_command_measures_sampled_gradients_where_there_are_no_others(capsys) -> None:
-    found = gradients(("shad",), repeats=1, spp=4, pairs=(4,), variant="scalar_rgb")
+def test_command_measures_sampled_gradients_where_there_are_no_others(capsys, monkeypatch, tmp_path) -> None:
+    def measured() -> list[GradientError]:
+        return gradients(("shad",), repeats=1, spp=4, pairs=(4,), variant="scalar_rgb", out=tmp_path)
+
+    found = measured()
     assert "shad: mitsuba needs llvm_ad_rgb" in capsys.readouterr().out
     assert [(one.point, one.method, one.evaluations) for one in found] == [
         (point, *kind) for point in ("start", "middle", "near") for kind in (("truth", 0), ("sampled, 4 pairs", 8))
@@ -205,5 +208,8 @@ def test_command_measures_sampled_gradients_where_there_are_no_others(capsys) ->
     assert all(-1 <= one.cosine <= 1 and math.isfinite(one.error) and one.truth > 0 for one in found)
     near = found[-1]
     assert near.way > 0.5  # a step against it leads to the solution
+    monkeypatch.setattr("experiments.studies.gradients.differences", None)  # nothing is measured twice
+    again = measured()
+    assert [asdict(one) for one in again] == pytest.approx([asdict(one) for one in found], nan_ok=True)
     with pytest.raises(SystemExit, match="at least 1"):
         gradients(("shad",), repeats=0)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from experiments.methods import METHODS
 from experiments.methods.meshes import DAMPING, _losses, _newton
 from experiments.problems import catalogue
-from experiments.problems.scenes import stanford
+from experiments.problems.scenes import mesh_targets, stanford
 from experiments.problems.scenes.fitted_mesh import FittedMesh
 from experiments.problems.scenes.icosphere import icosphere, split, vertex_normals
 from experiments.problems.scenes.raster import AMBIENT, LAMP, Cameras, render
@@ -277,7 +277,52 @@ def test_a_scan_that_is_not_installed_is_not_found(monkeypatch) -> None:
     assert stanford._scan() is None
 
 
-@pytest.mark.parametrize(("name", "n"), [("meshfit", 3 * 2562), ("meshfit_color", 6 * 2562)])
+def edges_of(faces) -> list[tuple[int, int]]:
+    return [tuple(edge) for face in faces.tolist() for edge in zip(face, face[1:] + face[:1], strict=True)]
+
+
+@pytest.mark.parametrize("make", [mesh_targets.suzanne, mesh_targets.banana])
+def test_targets_of_the_source_are_closed_and_wound_outward(make, monkeypatch) -> None:
+    monkeypatch.setattr(mesh_targets, "_blender", lambda: None)
+    found = make()
+    assert found.source == "procedural"
+    assert set(found.faces.ravel()) == set(range(len(found.vertices)))
+    edges = edges_of(found.faces)
+    assert len(set(edges)) == len(edges)  # each once in each direction
+    assert {(b, a) for a, b in edges} == set(edges)
+    np.testing.assert_allclose(found.vertices.min(0) + found.vertices.max(0), 0.0, atol=1e-12)
+    assert np.ptp(found.vertices, axis=0).max() == pytest.approx(1.0)
+    assert volume(found.vertices, found.faces) > 0.01
+    # Euler: a sphere, no holes and no handles.
+    assert len(found.vertices) - len(edges) // 2 + len(found.faces) == 2
+
+
+def test_a_banana_is_bent_thin_and_has_three_colours() -> None:
+    found = mesh_targets.banana()
+    assert found.colors.shape == found.vertices.shape
+    assert 0 < found.colors.min() < found.colors.max() < 1
+    x, y, z = found.vertices.T
+    assert np.ptp(z) < 0.35 * np.ptp(x)
+    middle, ends = np.abs(x) < 0.05, np.abs(x) > 0.45
+    assert y[middle].mean() + 0.1 < min(y[ends & (x < 0)].mean(), y[ends & (x > 0)].mean())
+    brown = found.colors[:, 0] < 0.4
+    assert np.abs(x[brown]).min() > 0.35
+    green = found.colors[:, 1] > found.colors[:, 0]
+    assert 0.02 < green.mean() < 0.3
+
+
+def test_suzanne_is_that_of_blender_where_it_is_installed(monkeypatch) -> None:
+    square = np.array(quad(0.0, 3.0, 0.0, 1.0, 0.0))
+    monkeypatch.setattr(mesh_targets, "_blender", lambda: (square, TWO.numpy()))
+    found = mesh_targets.suzanne()
+    assert (found.name, found.source) == ("Suzanne", "bpy")
+    assert np.ptp(found.vertices, axis=0) == pytest.approx([1.0, 1 / 3, 0.0])
+
+
+COLORED = ("meshfit_color", "banana")
+
+
+@pytest.mark.parametrize(("name", "n"), [(name, (6 if name in COLORED else 3) * 2562) for name in mesh_targets.TARGETS])
 def test_task(name, n) -> None:
     task = catalogue.load(name)
     x = torch.stack([task.start(run) for run in range(2)])
@@ -306,7 +351,7 @@ def test_task(name, n) -> None:
 
 
 def test_silhouette_iou_is_that_of_spheres() -> None:
-    fit = meshfit.MeshFit(128)
+    fit = meshfit.MeshFit(128, mesh_targets.bunny())
     x = fit.start(0)
     centred = 0.3 * fit.mesh.sphere.flatten()
     fit._covered = fit.mesh.render(centred[None])[0] > 0
@@ -321,7 +366,7 @@ def test_silhouette_iou_is_that_of_spheres() -> None:
 
 
 def test_chamfer_is_the_squared_distance_of_parallel_surfaces() -> None:
-    fit = meshfit.MeshFit(8)
+    fit = meshfit.MeshFit(8, mesh_targets.bunny())
     sphere, faces = fit.mesh.sphere.numpy(), fit.mesh.faces.numpy()
     fit._points = meshfit._spread(sphere, faces)
     fit._tree = meshfit.cKDTree(fit._points)

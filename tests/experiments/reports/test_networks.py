@@ -10,8 +10,9 @@ from small import BUMP, FAIL_TO_TRAIN, SHIFT, SIZE
 from experiments.ensembles.ensemble import Ensemble
 from experiments.problems.network_task import Size
 from experiments.problems.tasks import cnn
-from experiments.reports import onnx_export
-from experiments.reports.networks import conclude, summary
+from experiments.reports import onnx_export, overview_networks
+from experiments.reports.networks import HELD_OUT, conclude, summary
+from experiments.reports.overview_networks import network_column
 from experiments.reports.trained_network import Result
 from experiments.run import run
 
@@ -50,6 +51,21 @@ def test_networks_end_in_logs_figures_encoder_and_table(tmp_path, capsys):
     logs = {path: path.read_bytes() for path in folder.glob("*/*.jsonl")}
     assert summary(BUMP, conclude(BUMP, ended(tmp_path, methods), tmp_path)) == summary(BUMP, results)
     assert {path: path.read_bytes() for path in folder.glob("*/*.jsonl")} == logs  # nothing is trained twice
+
+
+def test_a_trained_network_has_a_column_in_the_overview(tmp_path, monkeypatch):
+    assert network_column(tmp_path, "bump") is None
+    ended(tmp_path, ["our_g", SHIFT], runs=1)
+    (tmp_path / "bump" / HELD_OUT).touch()  # what `conclude` writes
+    monkeypatch.setattr(overview_networks.catalogue, "load", lambda *_: BUMP)
+    for preferred in ("our_g", "shift"):
+        monkeypatch.setattr(overview_networks, "PREFERRED", preferred)
+        found = network_column(tmp_path, "bump")
+        assert (found.task, found.method) == ("bump", preferred)
+        assert found.start.shape == found.end.shape == found.target.shape
+        assert not torch.equal(found.start, found.target)
+        outcome = json.loads((tmp_path / "bump" / preferred / "0.json").read_text())
+        assert found.caption.startswith(f"{outcome['evaluations']} evaluations, error ")
 
 
 def test_runs_that_fail_are_named_and_left_out(tmp_path, capsys):

@@ -97,6 +97,7 @@ def test_networks_have_a_row_per_method(tmp_path, results):
     assert [float(row[one]) for one in ("renders", "seconds")] == [20.0, 1.0]
     assert float(row["parameter_divided"]) == (400 + 64) / 2  # of the two runs that did not fail
     assert float(row["parameter_divided_worst"]) == 64
+    assert [float(row[f"parameter_divided_{end}"]) for end in ("low", "high")] == [148, 316]
     assert float(row["image_divided"]) == (20 + 8) / 2
     assert float(row["image_divided_worst"]) == 8
     assert (row["reached"], row["runs"], row["n"]) == ("1", "3", "")
@@ -189,6 +190,9 @@ def test_a_table_of_fits(folder):
     assert "- (33 %)" in others
     assert "descent" not in others
     assert "- (33 %, 6 to 79 %)" in table_of("bowls", Query.of(["share=interval"]))
+    spread = table_of("bowls", Query.of(["quartiles=show"]))
+    assert "7.5 [6.75 to 8.25], 1.25 [1.12 to 1.38] s" in spread
+    assert "Behind a median its quartiles." in spread
 
 
 def test_means_of_ratios():

@@ -200,7 +200,7 @@ def test_overviews_go_on_in_another_row(tmp_path):
     seen = Look(small.picture, small.picture(small.TARGET))
     sizes = []
     for count in (5, 9):
-        supplement_figures.overview([(found, seen)] * count, tmp_path / "figure9.png")
+        supplement_figures.overview([supplement_figures.Column.of(found, seen)] * count, tmp_path / "figure9.png")
         with Image.open(tmp_path / "figure9.png") as image:
             sizes.append(image.size)
     assert sizes[1] == (sizes[0][0], 2 * sizes[0][1])  # 5 across, and 5 + 4

@@ -1,7 +1,9 @@
 """The study of losses: both smoothed objectives against moments that are known, and the command run small."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from experiments.problems import catalogue
 from experiments.problems.soft_squares import box2
 from experiments.problems.task import Picture, Task, least_squares
 from experiments.problems.tasks.box2 import fitting
+from experiments.runs.attempt import attempt
 from experiments.studies.loss_objectives import pictures_of
 from experiments.studies.losses import LossReport, losses
 
@@ -93,17 +96,42 @@ def test_wrong_arguments_of_the_command_are_named(wrong) -> None:
         losses(**wrong)
 
 
+SMALL = {"tasks": ("box2",), "runs": 4, "samples": (1, 16), "truth": 128, "sweep": 16, "evaluations": 60}
+
+
 @pytest.fixture(scope="module")
-def report(tmp_path_factory) -> LossReport:
+def measured(tmp_path_factory) -> Iterator[tuple[LossReport, Path]]:
     out = tmp_path_factory.mktemp("losses")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("experiments.studies.losses.fitting", lambda name: small_box2())
-        found = losses(tasks=("box2",), runs=4, samples=(1, 16), truth=128, sweep=16, evaluations=60, out=out)
-    written = json.loads((out / "losses.json").read_text())
-    assert len(written["biases"]) == len(found.biases) == 2 * 3 * 2
-    assert len((out / "sweep.csv").read_text().splitlines()) == 1 + 12 * len(written["positions"])
-    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
-    return found
+        found = losses(**SMALL, out=out)
+        written = json.loads((out / "losses.json").read_text())
+        assert len(written["biases"]) == len(found.biases) == 2 * 3 * 2
+        assert len((out / "sweep.csv").read_text().splitlines()) == 1 + 12 * len(written["positions"])
+        assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+        yield found, out
+
+
+@pytest.fixture(scope="module")
+def report(measured) -> LossReport:
+    return measured[0]
+
+
+def test_a_second_call_measures_nothing_again(monkeypatch, measured) -> None:
+    first, out = measured
+    lines = (out / "parts.jsonl").read_bytes().splitlines(keepends=True)
+    assert len(lines) == 2 + 3 + 3 * 2 * 4  # curves; places of gradients; fits: losses, forms, runs
+    (out / "parts.jsonl").write_bytes(b"".join(lines[:-1]) + lines[-1][:9])  # killed in the last line
+    again = []
+    monkeypatch.setattr(
+        "experiments.studies.losses.attempt", lambda *rest, **more: again.append(rest[2]) or attempt(*rest, **more)
+    )
+    for name in ("curves_along", "_gradient_errors", "draw"):
+        monkeypatch.setattr(f"experiments.studies.losses.{name}", lambda *_, **__: None)
+    second = losses(**SMALL, out=out)
+    assert again == [3]
+    assert (second.biases, second.errors) == (first.biases, first.errors)
+    assert [fit.evaluations for fit in second.fits] == [fit.evaluations for fit in first.fits]
 
 
 def test_the_loss_of_a_mean_picture_is_at_most_the_mean_loss(report) -> None:

@@ -233,6 +233,8 @@ def test_rows_count_runs_that_got_there():
     found = row(Cell("t", "spp", "1x", "m", "t"), runs)
     assert (found.runs, found.share_90, found.share_99) == (3, 1.0, pytest.approx(2 / 3))
     assert (found.evaluations_99, found.seconds_99) == (25, 1.25)  # between 20 and 30 evaluations
+    assert (found.evaluations_99_low, found.evaluations_99_high) == (22.5, 27.5)
+    assert (found.seconds_99_low, found.seconds_99_high) == (1.125, 1.375)
     assert found.image_error == 0.01  # of 0.005, 0.05 and 0.01
     assert found.parameter_error == pytest.approx(0.2)  # roots of 0.02, 0.4 and 0.04
     assert row(Cell("t", "spp", "1x", "m", "t"), runs[1:2]).evaluations_99 is None

@@ -1,0 +1,54 @@
+"""The column of a trained network in the overview of all tasks (figure 9)."""
+
+from pathlib import Path
+
+import torch
+
+from experiments.problems import catalogue
+from experiments.problems.network_task import NetworkTask
+from experiments.reports.networks import HELD_OUT
+from experiments.reports.results import load
+from experiments.reports.supplement_figures import Column
+from experiments.runs.records import Files
+
+PREFERRED = "memory_newton"
+"""The method that is shown where several have trained a network."""
+_SEED = 2**30
+"""Of the input that is shown, which no network was trained on."""
+
+
+def network_column(folder: Path, name: str, variant: str = "auto") -> Column | None:
+    """Return what a network predicts for an input that it was not trained on: its render before and after training.
+
+    Args:
+        folder: written by `run`.
+        name: of a network task.
+        variant: of Mitsuba.
+
+    Returns: None if `run` has trained no such network there.
+    """
+    if not (folder / name / HELD_OUT).is_file():
+        return None
+    runs = [run.outcome for mine in load(folder, {name}).runs[name].values() for run in mine]
+    there = [
+        one for one in runs if one.status != "failed" and Files(folder / name / one.method, one.run).weights.exists()
+    ]
+    if not there:
+        return None
+    shown = min(there, key=lambda one: one.method != PREFERRED)  # the first of the preferred method, or of all
+    task = catalogue.load(name, shown.settings.get("preset", "fast"), variant)
+    assert isinstance(task, NetworkTask)
+    encoder, start = task.encoders(shown.run)
+    weights = Files(folder / name / shown.method, shown.run).weights
+    encoder.load_state_dict(torch.load(weights, weights_only=True))
+    x = task.parameters(1, torch.Generator().manual_seed(_SEED), held_out=True)
+    target = task.image(x)
+    with torch.no_grad():
+        before, after = start(target), encoder(target)
+    images = [(task.image(one), one) for one in (before, after)]
+    errors = [float((image - target).square().mean()) for image, _ in images]
+    first, last, sought = (
+        torch.from_numpy(task.pictures(image, at)[0]).double() / 255 for image, at in (*images, (target, x))
+    )
+    caption = f"{shown.evaluations} evaluations, error {100 * errors[1] / errors[0]:.2g} %"
+    return Column(name, shown.method, first, last, sought, caption)

@@ -1,0 +1,202 @@
+"""`python -m experiments figures`: the figures of the source's supplement, each by its number.
+
+| figure | what |
+|---|---|
+| 6 | densities and inverse CDFs of all lobes, with histograms of draws |
+| 7 | BRDF: first and second order, with exact and with sampled derivatives |
+| 8 | NONPSD: the same, and the ways of the runs |
+| 9 | all tasks: start, end, target; networks are trained with few renders |
+| 10 | robustness on MUG: pairs, samples per pixel, JPEG quality |
+| 11 | variance of uniform, aggregate and optimal sampling against samples per element, and against evaluations |
+| 12 | CAUSTIC |
+| 13 | MIRROR |
+
+Figures 9, 12 and 13 are those of `gallery`, figure 10 is that of `robustness`. Runs of 7 and 8 have 20 starts.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+from experiments.ensembles.ensemble import Ensemble
+from experiments.methods import METHODS
+from experiments.problems import catalogue
+from experiments.problems.catalogue import FITTING, Preset, chosen
+from experiments.problems.network_task import NetworkTask
+from experiments.reports import supplement_figures
+from experiments.reports.animation import Trace
+from experiments.reports.networks import conclude
+from experiments.reports.progress import progress
+from experiments.reports.tables import table
+from experiments.studies import lobes
+from experiments.studies.estimator_curves import draw_operators, orders
+from experiments.studies.gallery import gallery, trace
+from experiments.studies.robustness import robustness
+from experiments.studies.variance import variance
+
+GROUPS: Mapping[str, str] = {
+    "first order, exact": "analytic_1",
+    "first order, sampled": "our_g",
+    "second order, exact": "analytic_2",
+    "second order, sampled": "our_hvpa",
+}
+"""Methods of figures 7 and 8."""
+TRAINED: Mapping[str, int] = {"cnn": 400, "cnn5": 1200, "cnn_texture": 200}
+"""Networks of figure 9, and the renders that they are trained with."""
+DRAWS = 20_000
+"""Of every lobe in figure 6."""
+OPERATORS = tuple(
+    f"{kind} + {baseline}" for kind in ("uniform", "aggregate", "per-element") for baseline in ("none", "center")
+)
+"""Ways to estimate in figure 11."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all figures have in common."""
+
+    out: Path
+    runs: int
+    seed: int
+    preset: Preset
+    limit: float
+    variant: str
+
+
+def figures(
+    names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[NUMBER...]")] = (),
+    /,
+    out: Path = Path("results/figures"),
+    runs: int = 20,
+    seed: int = 0,
+    preset: Preset = "fast",
+    limit: float = 60.0,
+    variant: str = "auto",
+) -> None:
+    """Draw figures of the source's supplement, and print the numbers that belong to them.
+
+    Args:
+        names: numbers of figures, 6 to 13; all if not given.
+        out: folder of the figures.
+        runs: starts of figures 7, 8 and 10, and independent estimates of figure 11.
+        seed: number of the first start, and seed of the draws.
+        preset: fast or paper.
+        limit: seconds that a run may take.
+        variant: of Mitsuba.
+    """
+    if runs < 2 or seed < 0 or not limit > 0:
+        raise SystemExit(f"runs must be at least 2, seed at least 0, limit positive, got {runs}, {seed} and {limit:g}")
+    wanted = chosen("NUMBER", names or tuple(FIGURES), list(FIGURES))
+    out.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)
+    setting = Setting(out, runs, seed, preset, limit, variant)
+    for name in wanted:
+        print(f"figure {name}", flush=True)
+        FIGURES[name](setting)
+
+
+def _lobes(setting: Setting) -> None:
+    path = setting.out / "figure6.png"
+    found = lobes.draw(path, DRAWS, setting.seed)
+    headers = ["lobe", f"largest difference of {DRAWS} draws to the CDF, or to the shares of bins where n = 2"]
+    print(f"{table(headers, [[name, value] for name, value in found.items()])}\n{path}")
+
+
+def _descents(name: str, number: int) -> Callable[[Setting], None]:
+    """Return what draws the figure of a task whose convolution is known."""
+
+    def draw(setting: Setting) -> None:
+        task = catalogue.fitting(name, setting.preset, setting.variant)
+        jobs = [(group, run) for group in GROUPS for run in range(setting.seed, setting.seed + setting.runs)]
+        found: dict[str, list[Trace]] = {group: [] for group in GROUPS}
+        for group, run in progress(jobs, name, leave=False):
+            found[group].append(trace(task, METHODS[GROUPS[group]], run, setting.limit))
+        rows: list[list[object]] = []
+        for group, traces in found.items():
+            ends = torch.tensor([[one.error[-1] or 0.0, one.records[-1].evaluations] for one in traces]).double()
+            there = sum(one.outcome.status == "finished" for one in traces)
+            rows.append([group, GROUPS[group], f"{there} of {len(traces)}", *ends.median(0).values.tolist()])
+        path = setting.out / f"figure{number}.png"
+        supplement_figures.descents(found, path)
+        headers = ["", "method", "runs that arrive", "error at the end / at the start", "evaluations"]
+        print(f"{table(headers, rows)}\n{path}")
+
+    return draw
+
+
+def _tasks(setting: Setting) -> None:
+    folder = setting.out / "networks"
+    for name, evaluations in TRAINED.items():
+        try:
+            runs = range(setting.seed, setting.seed + 1)
+            ensemble = Ensemble(
+                folder, runs, setting.preset, variant=setting.variant, threads=1, evaluations=evaluations
+            )
+            outcomes = ensemble.run(ensemble.plan([name], ["memory_newton"]))
+        except ImportError as error:
+            print(error)
+            continue
+        task = catalogue.load(name, setting.preset, setting.variant, 1)
+        assert isinstance(task, NetworkTask)
+        conclude(task, outcomes, folder)
+    _gallery(setting, folder=folder)
+
+
+def _gallery_of(name: str) -> Callable[[Setting], None]:
+    return lambda setting: _gallery(setting, (name,))
+
+
+def _gallery(setting: Setting, tasks: tuple[str, ...] = tuple(FITTING), folder: Path | None = None) -> None:
+    folder = folder or setting.out
+    gallery(
+        folder,
+        tasks=tasks,
+        run=setting.seed,
+        limit=setting.limit,
+        preset=setting.preset,
+        out=setting.out,
+        variant=setting.variant,
+    )
+
+
+def _robustness(setting: Setting) -> None:
+    robustness(
+        ("mug",),
+        over=("pairs", "spp", "jpeg"),
+        runs=setting.runs,
+        preset=setting.preset,
+        out=setting.out / "robustness",
+        seed=setting.seed,
+        limit=setting.limit,
+        variant=setting.variant,
+    )
+
+
+def _variance(setting: Setting) -> None:
+    folder = setting.out / "variance"
+    report = variance(runs=setting.runs, seed=setting.seed, out=folder, problems=("BOX2",), methods=OPERATORS)
+    path = setting.out / "figure11.png"
+    draw_operators(report.measurements, "BOX2", path)
+    print(
+        table(
+            ["operator", "axis", "relative variance at the same place, least first"],
+            orders(report.measurements, "BOX2"),
+        )
+    )
+    print(path)
+
+
+FIGURES: Mapping[str, Callable[[Setting], None]] = {
+    "6": _lobes,
+    "7": _descents("brdf", 7),
+    "8": _descents("nonpsd", 8),
+    "9": _tasks,
+    "10": _robustness,
+    "11": _variance,
+    "12": _gallery_of("caustic"),
+    "13": _gallery_of("mirror"),
+}

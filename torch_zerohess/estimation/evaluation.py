@@ -142,6 +142,7 @@ def evaluate(
         keep: see `perturb`.
         control: what is subtracted from the values before they become coefficients.
     """
+    smoothing = smoothing.resolved(x.shape[1])
     seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
     perturbations = perturb(x, smoothing, seed, keep)
     points, stein = perturbations.points, perturbations.stein

@@ -48,9 +48,9 @@ class LikelihoodRatio(Stein):
 
     @classmethod
     def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:
-        S = K // (1 + smoothing.antithetic)
-        first = Layout((B, K, n)) if _kept(smoothing, keep) else Layout((B, S, 5), torch.int64)
-        return [first, Layout((B, K))]
+        if _kept(smoothing, keep):
+            return [Layout((B, K, n)), Layout((B, K))]
+        return [Layout((B, K // (1 + smoothing.resolved(n).antithetic), 5), torch.int64), Layout((B, K))]
 
     def tensors(self) -> list[Tensor]:
         """Perturbations, or the rows of their recipe [B, S, 5]; weights."""

@@ -25,6 +25,12 @@ _FAR_ABOVE = 4096  # sigmas of more roundings of x need no look at the points
 _ROWS = 64  # compared with x at a time; the first few nearly always settle it
 
 
+def family(smoothing: Smoothing) -> type[Stein]:
+    """Return the family of weights of a proposal."""
+    # Every proposal that "auto" may become has the same one.
+    return FAMILIES["aggregate" if smoothing.proposal == "auto" else smoothing.proposal]
+
+
 @dataclass(frozen=True)
 class Perturbations:
     """Points z = x + sigma u, and how values at them become estimates."""
@@ -54,7 +60,7 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
         farthest = x.abs() + length * sigma
         if not bool((farthest < limits.max).all()):
             raise _out_of_range(x, sigma, farthest)
-    points, stein = FAMILIES[smoothing.proposal].draw(x, sigma, smoothing, seed, keep)
+    points, stein = family(smoothing).draw(x, sigma, smoothing, seed, keep)
     if least < _FAR_ABOVE * limits.eps * largest:
         _check_moved(points, x, sigma)
     return Perturbations(points, stein, sigma)
@@ -89,7 +95,7 @@ def _check_moved(points: Tensor, x: Tensor, sigma: Tensor) -> None:
 
 def stored(smoothing: Smoothing, B: int, n: int) -> bool:
     """Whether the perturbations of a batch are kept, and not drawn again from their seed."""
-    return smoothing.sampler != "random" or B * n * smoothing.evaluations(n, center=False) <= STORED
+    return smoothing.resolved(n).sampler != "random" or B * n * smoothing.evaluations(n, center=False) <= STORED
 
 
 def draws(smoothing: Smoothing, n: int) -> list[Tensor]:

@@ -50,10 +50,11 @@ class Estimate:
         reason: str = "one batch: no tolerance was given",
         value: ValueMode = "center",
         term: SurrogateTerm | None = None,
+        chosen: str = "",
     ) -> None:
         self._batches = [Batch(evaluations, smoothing), *more]
         self._batch, self._x, self._smoothing, self.reason = batch, x, smoothing, reason
-        self._value_mode, self._term = value, term
+        self._value_mode, self._term, self._chosen = value, term, chosen
         self._sigma = evaluations.expansion.sigma
         self._out = evaluations.expansion.base.shape[1:]
 
@@ -173,6 +174,7 @@ class Estimate:
     def __repr__(self) -> str:
         shape = f"x {list(self._x.shape)}, output {[*self._batch, *self._out]}"
         parts = [shape, f"value={short(self.value)}", f"gradient={short(self.gradient)}"]
+        parts += [f"auto: {self._chosen}"] * bool(self._chosen)
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
 

@@ -22,10 +22,13 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
     samples = smoothing.samples
     if smoothing.sampler == "random":
         return 1
+    if smoothing.scrambles is not None:
+        return samples // smoothing.scrambles
     if smoothing.sampler == "sobol":
         # Enough independent scrambles for a standard error, each long enough for its points to be even.
         return samples // next(r for r in (8, 4, 2, 1) if samples % r == 0 and (r <= 2 or samples >= 8 * r))
-    return min(n, (samples + 1) // 2)
+    # Two blocks have a standard error; with a mean of the others it takes three.
+    return min(n, max(1, samples // 3) if smoothing.baseline == "mean" else (samples + 1) // 2)
 
 
 def sobol(

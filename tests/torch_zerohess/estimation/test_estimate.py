@@ -86,6 +86,14 @@ def test_unbiased_with_the_fewest_samples(baseline: str, antithetic: bool) -> No
         check(Exponential(vector(0.9)), vector(0.2), smoothing, 20_000)
 
 
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("samples", [1, 2, 3, 4, 8, 9, 24])
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_unbiased_whatever_is_chosen(n: int, samples: int, order: int) -> None:
+    smoothing = Smoothing.auto(sigma=spread(n, 0.4, 0.7), samples=samples, order=order, seed=41)
+    check(truths(n)["exponential"], spread(n, -0.3, 0.4), smoothing, 16_000 // (samples * n))
+
+
 def lobe_average(a: float) -> float:
     """E exp(a u) under the density |u| exp(-u^2/2) / 2."""
     return integrate.quad(lambda u: 0.5 * abs(u) * math.exp(a * u - 0.5 * u * u), -30, 30, points=[0.0])[0]

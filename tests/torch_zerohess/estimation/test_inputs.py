@@ -45,9 +45,9 @@ SETTINGS = [
     ({"samples": None}, TypeError, "samples must be an integer, got None"),
     ({"samples": 1, "baseline": "mean"}, ValueError, "samples must be at least 2, got 1"),
     ({"proposal": "cauchy"}, ValueError, "proposal must be one of 'aggregate', 'gaussian', .*got 'cauchy'"),
-    ({"baseline": "median"}, ValueError, "baseline must be one of 'center', 'mean', 'none', got 'median'"),
-    ({"sampler": "halton"}, ValueError, "sampler must be one of 'random', 'sobol', 'orthogonal', got 'halton'"),
-    ({"antithetic": "yes"}, ValueError, "antithetic must be one of True, False, got 'yes'"),
+    ({"baseline": "median"}, ValueError, "baseline must be one of 'center', 'mean', 'none', 'auto', got 'median'"),
+    ({"sampler": "halton"}, ValueError, "sampler must be one of 'random', 'sobol', 'orthogonal', 'auto', got 'halton'"),
+    ({"antithetic": "yes"}, ValueError, "antithetic must be one of True, False, 'auto', got 'yes'"),
     ({"seed": -1}, ValueError, "seed must be at least 0, got -1"),
     ({"seed": 2**63}, ValueError, r"seed must be below 2\*\*63, got 9223372036854775808"),
     ({"seed": 1.5}, TypeError, r"seed must be an integer, got 1\.5"),
@@ -57,6 +57,10 @@ SETTINGS = [
     ({"sampler": "orthogonal", "proposal": "uniform"}, ValueError, "proposal must be .*got 'uniform'"),
     ({"sampler": "orthogonal", "proposal": "fr22"}, ValueError, "proposal must be .*got 'fr22'"),
     ({"sampler": "sobol", "proposal": "optimal"}, ValueError, "sampler must be 'random', got 'sobol'"),
+    ({"sampler": "sobol", "scrambles": 3}, ValueError, "scrambles must divide samples, got 3 of 8"),
+    ({"sampler": "sobol", "scrambles": 0}, ValueError, "scrambles must divide samples, got 0 of 8"),
+    ({"sampler": "sobol", "scrambles": True}, ValueError, "scrambles must divide samples, got True of 8"),
+    ({"scrambles": 2}, ValueError, "scrambles are those of sampler 'sobol', got 2 with 'random'"),
     ({"width": 1.0}, TypeError, "width"),
 ]
 

@@ -48,5 +48,5 @@ class Expansion:
     @staticmethod
     def layout(smoothing: Smoothing, B: int, K: int, n: int, out: Sequence[int], keep: bool) -> list[Layout]:
         """Return what `tensors` of a batch will look like, for outputs of shape `out`."""
-        family = family(smoothing).layout(smoothing, B, K, n, keep)
-        return [Layout((B, *out)), Layout((B, K, *out)), Layout((n,), batched=False), *family]
+        own = family(smoothing).layout(smoothing, B, K, n, keep)
+        return [Layout((B, *out)), Layout((B, K, *out)), Layout((n,), batched=False), *own]

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.sampling import kernels
-from torch_zerohess.sampling.philox import EXTRA, uniforms
-from torch_zerohess.sampling.proposals import NORMAL, mixture_rows, shape, with_lobes
+from torch_zerohess.sampling.kernels import shape, uniforms, with_lobes
+from torch_zerohess.sampling.philox import EXTRA
+from torch_zerohess.sampling.proposals import NORMAL, mixture_rows
 from torch_zerohess.smoothing import Smoothing
 
 _SOBOL_BITS = 30

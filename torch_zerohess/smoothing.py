@@ -136,11 +136,15 @@ class Smoothing:
 
     def resolved(self, n: int) -> "Smoothing":
         """Return the settings for x of n parameters, without "auto" in them; itself if there is none."""
-        if all(getattr(self, name) != "auto" for name in _CHOSEN):
+        if not self._automatic:
             return self
         if n not in self._resolved:
             self._resolved[n] = replace(self, **self._choice(n))
         return self._resolved[n]
+
+    @cached_property
+    def _automatic(self) -> bool:
+        return any(getattr(self, name) == "auto" for name in _CHOSEN)
 
     @cached_property
     def _resolved(self) -> dict[int, "Smoothing"]:
@@ -169,7 +173,7 @@ class Smoothing:
 
     def __repr__(self) -> str:
         settings = ", ".join(f"{field.name}={getattr(self, field.name)!r}" for field in fields(self))
-        if all(getattr(self, name) != "auto" for name in _CHOSEN):
+        if not self._automatic:
             return f"Smoothing({settings})"
         return f"Smoothing({settings}; auto: {'; '.join(self._chosen_ranges())})"
 

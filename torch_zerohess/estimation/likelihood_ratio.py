@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, total
+from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, completed, total
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.sampling.kernels import Redrawn, Samples
 from torch_zerohess.smoothing import Smoothing
@@ -24,14 +24,14 @@ class LikelihoodRatio(Stein):
 
     @classmethod
     def draw(
-        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False
     ) -> tuple[Tensor, "LikelihoodRatio"]:
         """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as weights of "uniform" can."""
         B, n = x.shape
         density, single = _density(smoothing), x.dtype == torch.float32
         if smoothing.sampler == "random":  # of the K rows only the points exist at once unless they are kept
             rows, points, u, weight = kernels.sample(
-                seed, smoothing.samples, x, sigma, smoothing.antithetic, density, False, keep
+                seed, smoothing.samples, x, sigma, smoothing.antithetic, density, center, keep
             )
             made = cls(u if keep else Redrawn(rows, x, sigma, smoothing.antithetic, single), weight)
         else:
@@ -39,7 +39,7 @@ class LikelihoodRatio(Stein):
             points, u, weight = kernels.place(
                 drawn, x.double().contiguous(), sigma, smoothing.antithetic, single, density
             )
-            made = cls(u, weight)
+            points, made = completed(points, x, center), cls(u, weight)
         if density == proposals.UNIFORM and bool((weight == 0).all(1).any()):
             raise ValueError(
                 f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"

@@ -41,6 +41,13 @@ class Redrawn(NamedTuple):
         """Return the recipe as the operators want it: contiguous, which a fold of a batch by vmap need not be."""
         return self.rows.contiguous(), self.x.contiguous(), self.sigma.contiguous(), self.antithetic, self.single
 
+    def points(self) -> Tensor:
+        """Return the points x + sigma u, [B, K, n], in the precision of x."""
+        result = self.x.new_empty(len(self.x), self.K, self.x.shape[1])
+        for part, _, _, columns in self.chunks():
+            result[:, columns] = part
+        return result
+
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
         rows, x, sigma, antithetic, single = self.arguments()

@@ -176,6 +176,49 @@ def test_redrawn_perturbations_give_the_same_estimates(
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+def test_points_that_are_not_kept_are_the_ones_that_were_evaluated(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """fn gets the only copy and writes into it."""
+    x, smoothing = spread(8, -1.0, 1.0).view(2, 4), Smoothing(sigma=0.3, samples=5, seed=8)
+    kept = estimate(lambda z: z.sum(1), x, smoothing, value=value)
+    monkeypatch.setattr(perturbations, "STORED", 0)
+    monkeypatch.setattr(kernels, "_CHUNK", 24)
+    seen: list[Tensor] = []
+
+    def writing(z: Tensor) -> Tensor:
+        seen.append(z.clone())
+        values = z.sum(1)
+        z.zero_()
+        return values
+
+    drawn = estimate(writing, x, smoothing, value=value)
+    assert torch.equal(drawn.points, kept.points)
+    assert torch.equal(drawn.points.flatten(0, 1), seen[0])
+    assert drawn.evaluations == kept.evaluations == 22
+    with pytest.raises(ValueError, match=f"at the point .{float(kept.points[0, 0, 0]):.6g}, "):
+        estimate(lambda z: writing(z) * math.nan, x, smoothing, value=value)
+
+
+def test_a_million_parameters_take_no_second_copy_of_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perturbations, "STORED", 0)
+    copies: list[bool] = []
+    original = kernels.sample
+
+    def sample(*arguments):
+        drawn = original(*arguments)
+        copies.append(drawn[1])
+        return drawn
+
+    monkeypatch.setattr(kernels, "sample", sample)
+
+    def fn(z: Tensor) -> Tensor:
+        copies.append(z)
+        return z.sum(1)
+
+    estimate(fn, spread(4, -1.0, 1.0), Smoothing(sigma=0.3, samples=5, seed=8))
+    assert copies[0].data_ptr() == copies[1].data_ptr()
+
+
 CALIBRATED = [
     ("aggregate", "random", "center", True),
     ("aggregate", "random", "mean", True),

@@ -108,7 +108,7 @@ class Smoothing:
             raise ValueError(
                 "proposal 'optimal' draws one small set per element: sampler must be 'random', got 'sobol'"
             )
-        if self.baseline == "mean" and self.samples * (self.antithetic or 1) < 2 and self.proposal != "optimal":
+        if self.baseline == "mean" and self.samples < 2 and self.proposal != "optimal":
             raise ValueError("baseline 'mean' needs the mean of other draws: samples must be at least 2, got 1")
 
     @classmethod
@@ -176,6 +176,11 @@ class Smoothing:
         if not self._automatic:
             return f"Smoothing({settings})"
         return f"Smoothing({settings}; auto: {'; '.join(self._chosen_ranges())})"
+
+    @property
+    def paired(self) -> bool:
+        """Whether perturbations are used with both signs, in settings without "auto"."""
+        return bool(self.antithetic)
 
     @property
     def sampling(self) -> str:

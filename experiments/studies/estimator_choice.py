@@ -66,8 +66,7 @@ class _Case:
     name: str
     fn: Function
     gradient: Tensor
-    hessian: Tensor | None
-    """[n, n], or None where products are not judged."""
+    hessian: Tensor
 
 
 def compare(

@@ -135,9 +135,9 @@ def variance(
     if store is not None:
         print(keep(headers, rows, store))
     if rivals:
-        compared = compare(sizes=sizes, runs=rivals, seed=seed)
-        print(f"\nErrors of auto settings and of other packages, geometric means\n\n{table(*summary(compared))}")
-        (out / "rivals.json").write_text(json.dumps([asdict(row) for row in compared], indent=1))
+        beside = compare(sizes=sizes, runs=rivals, seed=seed)
+        print(f"\nErrors of auto settings and of other packages, geometric means\n\n{table(*summary(beside))}")
+        (out / "rivals.json").write_text(json.dumps([asdict(row) for row in beside], indent=1))
     return report
 
 

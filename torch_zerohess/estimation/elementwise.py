@@ -47,11 +47,11 @@ class Elementwise(Stein):
             kernels.draw(rows, n),
             x.double().contiguous(),
             sigma,
-            smoothing.antithetic,
+            smoothing.paired,
             x.dtype == torch.float32,
             proposals.GAUSSIAN,
         )
-        elements = elements.repeat(1 + smoothing.antithetic, 1)
+        elements = elements.repeat(1 + smoothing.paired, 1)
         weight = proposals.element_weights(u, elements) * smoothing.groups(n)
         return completed(points, x, center), cls(weight, elements, n, smoothing.order)
 

@@ -31,14 +31,12 @@ class LikelihoodRatio(Stein):
         density, single = _density(smoothing), x.dtype == torch.float32
         if smoothing.sampler == "random":  # of the K rows only the points exist at once unless they are kept
             rows, points, u, weight = kernels.sample(
-                seed, smoothing.samples, x, sigma, smoothing.antithetic, density, center, keep
+                seed, smoothing.samples, x, sigma, smoothing.paired, density, center, keep
             )
-            made = cls(u if keep else Redrawn(rows, x, sigma, smoothing.antithetic, single), weight)
+            made = cls(u if keep else Redrawn(rows, x, sigma, smoothing.paired, single), weight)
         else:
             _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
-            points, u, weight = kernels.place(
-                drawn, x.double().contiguous(), sigma, smoothing.antithetic, single, density
-            )
+            points, u, weight = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.paired, single, density)
             points, made = completed(points, x, center), cls(u, weight)
         if density == proposals.UNIFORM and bool((weight == 0).all(1).any()):
             raise ValueError(
@@ -50,7 +48,7 @@ class LikelihoodRatio(Stein):
     def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:
         if _kept(smoothing, keep):
             return [Layout((B, K, n)), Layout((B, K))]
-        return [Layout((B, K // (1 + smoothing.resolved(n).antithetic), 5), torch.int64), Layout((B, K))]
+        return [Layout((B, K // (1 + smoothing.resolved(n).paired), 5), torch.int64), Layout((B, K))]
 
     def tensors(self) -> list[Tensor]:
         """Perturbations, or the rows of their recipe [B, S, 5]; weights."""
@@ -65,7 +63,7 @@ class LikelihoodRatio(Stein):
         if _kept(smoothing, keep):
             return cls(first, weight)
         single = x.dtype == torch.float32
-        return cls(Redrawn(first.flatten(0, 1), x.detach(), sigma, smoothing.antithetic, single), weight)
+        return cls(Redrawn(first.flatten(0, 1), x.detach(), sigma, smoothing.paired, single), weight)
 
     def value(self, a: Tensor) -> Tensor:
         return total((a * self.weight[:, None]).mT)[:, 0]

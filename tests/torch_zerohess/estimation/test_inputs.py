@@ -44,6 +44,7 @@ SETTINGS = [
     ({"samples": True}, TypeError, "samples must be an integer, got True"),
     ({"samples": None}, TypeError, "samples must be an integer, got None"),
     ({"samples": 1, "baseline": "mean"}, ValueError, "samples must be at least 2, got 1"),
+    ({"samples": 1, "baseline": "mean", "antithetic": "auto"}, ValueError, "samples must be at least 2, got 1"),
     ({"proposal": "cauchy"}, ValueError, "proposal must be one of 'aggregate', 'gaussian', .*got 'cauchy'"),
     ({"baseline": "median"}, ValueError, "baseline must be one of 'center', 'mean', 'none', 'auto', got 'median'"),
     ({"sampler": "halton"}, ValueError, "sampler must be one of 'random', 'sobol', 'orthogonal', 'auto', got 'halton'"),

@@ -73,6 +73,62 @@ Tensor draw(const Tensor& rows, int64_t n, bool single) {
   return single ? draw_as<float>(rows, n, ScalarType::Float) : draw_as<double>(rows, n, ScalarType::Double);
 }
 
+// Uniforms [R, count] of columns first .. first + count of rows with the given seeds and indices; first is even.
+Tensor uniforms_of(const Tensor& seed, const Tensor& row, int64_t first, int64_t count, int64_t stream) {
+  check(seed, "seed", 1, ScalarType::Long);
+  check(row, "row", 1, ScalarType::Long);
+  check_size(count, "count", 0);
+  check_size(first, "first", 0);
+  STD_TORCH_CHECK(seed.size(0) == row.size(0) && first % 2 == 0, "seed and row do not fit, or first is odd");
+  const int64_t R = row.size(0);
+  Tensor result = torch::stable::empty({R, count}, ScalarType::Double);
+  const int64_t *seeds = seed.const_data_ptr<int64_t>(), *rows = row.const_data_ptr<int64_t>();
+  double* out = result.mutable_data_ptr<double>();
+  torch::stable::parallel_for(0, R, grain(2 * count), [&](int64_t begin, int64_t end) {
+    double buffer[kBlock];
+    for (int64_t r = begin; r < end; ++r) {
+      for (int64_t at = 0; at < count; at += kBlock) {
+        const int64_t some = std::min(kBlock, count - at);
+        uniforms(uint64_t(seeds[r]), uint64_t(rows[r]), Stream(stream), first + at, (some + 1) / 2, buffer);
+        std::copy_n(buffer, some, out + r * count + at);
+      }
+    }
+  });
+  return result;
+}
+
+// Turns uniforms p [R, n] into perturbations of the kinds that the rows ask for.
+Tensor shape(const Tensor& rows, const Tensor& p) {
+  const Row* row = row_data(rows);
+  check(p, "p", 2);
+  STD_TORCH_CHECK(rows.size(0) == p.size(0), "rows and p do not fit");
+  const int64_t n = p.size(1);
+  Tensor u = torch::stable::empty({p.size(0), n}, ScalarType::Double);
+  const double* source = p.const_data_ptr<double>();
+  double* out = u.mutable_data_ptr<double>();
+  torch::stable::parallel_for(0, p.size(0), grain(8 * n), [&](int64_t begin, int64_t end) {
+    for (int64_t r = begin; r < end; ++r) shape_row(row[r], source + r * n, n, out + r * n);
+  });
+  return u;
+}
+
+// Copies u [R, n], with the lobes of the rows in dimensions i and j, from uniforms p_i and p_j [R].
+Tensor with_lobes(const Tensor& rows, const Tensor& u, const Tensor& p_i, const Tensor& p_j) {
+  const Row* row = row_data(rows);
+  check(u, "u", 2);
+  check(p_i, "p_i", 1);
+  check(p_j, "p_j", 1);
+  const int64_t R = u.size(0), n = u.size(1);
+  STD_TORCH_CHECK(rows.size(0) == R && p_i.size(0) == R && p_j.size(0) == R, "rows, u, p_i and p_j do not fit");
+  Tensor result = torch::stable::empty({R, n}, ScalarType::Double);
+  const double *first = p_i.const_data_ptr<double>(), *second = p_j.const_data_ptr<double>();
+  double* out = result.mutable_data_ptr<double>();
+  std::copy_n(u.const_data_ptr<double>(), R * n, out);
+  for (int64_t r = 0; r < R; ++r)
+    set_lobes(row[r], 0, n, out + r * n, [&](int64_t d) { return d == row[r].i ? first[r] : second[r]; });
+  return result;
+}
+
 // Places the rows of a batch; u is kept, empty or absent.
 template <class U, class X, class T, class Columns>
 std::tuple<Tensor, Tensor, Tensor> placed(
@@ -257,6 +313,9 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def(
       "place(Tensor u, Tensor x, Tensor sigma, bool antithetic, bool single, int proposal) "
       "-> (Tensor, Tensor, Tensor)");
+  m.def("uniforms(Tensor seed, Tensor row, int first, int count, int stream) -> Tensor");
+  m.def("shape(Tensor rows, Tensor p) -> Tensor");
+  m.def("with_lobes(Tensor rows, Tensor u, Tensor p_i, Tensor p_j) -> Tensor");
   m.def("project(Tensor u, Tensor t) -> Tensor");
   m.def("accumulate(Tensor u, Tensor a, bool squares) -> Tensor");
   m.def("hessian(Tensor u, Tensor a) -> Tensor");
@@ -277,6 +336,9 @@ STABLE_TORCH_LIBRARY_IMPL(torch_zerohess, CPU, m) {
   m.impl("draw", TORCH_BOX(&draw));
   m.impl("sample", TORCH_BOX(&sample));
   m.impl("place", TORCH_BOX(&place_all));
+  m.impl("uniforms", TORCH_BOX(&uniforms_of));
+  m.impl("shape", TORCH_BOX(&shape));
+  m.impl("with_lobes", TORCH_BOX(&with_lobes));
   m.impl("project", TORCH_BOX(&project));
   m.impl("accumulate", TORCH_BOX(&accumulate));
   m.impl("hessian", TORCH_BOX(&hessian));

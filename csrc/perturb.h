@@ -63,6 +63,19 @@ inline void draw_columns(const Row& row, int64_t first, int64_t count, double* o
   }
 }
 
+// All n perturbations of a row from given uniforms p.
+inline void shape_row(const Row& row, const double* p, int64_t n, double* out) {
+  if (row.kind == kBox) {
+    for (int64_t d = 0; d < n; ++d) out[d] = kBoxHalfWidth * (2.0 * p[d] - 1.0);
+  } else if (row.kind == kEveryGradientLobe) {
+    gradient_lobe_quantiles(p, n, out);
+  } else {
+    for (int64_t first = 0; first < n; first += kBlock)
+      normal_quantiles(p + first, n - first < kBlock ? n - first : kBlock, out + first);
+    set_lobes(row, 0, n, out, [&](int64_t d) { return p[d]; });
+  }
+}
+
 // The same in single precision, from noise of its own: 32 bits for each number.
 inline void draw_columns(const Row& row, int64_t first, int64_t count, float* out) {
   uint32_t words[kBlock];

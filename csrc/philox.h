@@ -13,7 +13,7 @@ namespace zerohess {
 
 constexpr int64_t kBlock = 256;  // columns worked on at a time; a multiple of 16
 
-enum Stream : uint32_t { kDimensions = 0, kPicks = 1 };
+enum Stream : uint32_t { kDimensions = 0, kPicks = 1, kExtra = 2 };
 
 ZH_INLINE double from_bits(uint64_t bits) {
   double x;

@@ -12,7 +12,18 @@ ROOT = Path(__file__).parents[1]
 # A folder, or a module at the top of its tree, imports only from those before it. Imports inside functions count too.
 LAYERS = {
     "torch_zerohess": [
-        *("smoothing", "losses", "heads", "surrogates", "sampling", "evaluators", "estimation", "autograd", "linalg"),
+        *(
+            "choice",
+            "smoothing",
+            "losses",
+            "heads",
+            "surrogates",
+            "sampling",
+            "evaluators",
+            "estimation",
+            "autograd",
+            "linalg",
+        ),
         *("search", "optim", "minimize", "adapters", "doctor"),
     ],
     "experiments": [

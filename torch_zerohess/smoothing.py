@@ -2,24 +2,35 @@
 
 import operator
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
-Proposal = Literal["aggregate", "gaussian", "optimal", "uniform", "fr22"]
-Baseline = Literal["center", "mean", "none"]
-Sampler = Literal["random", "sobol", "orthogonal"]
+from torch_zerohess.choice import chosen_baseline, chosen_sampler, chosen_scrambles, chosen_signs
+
+Proposal = Literal["aggregate", "gaussian", "optimal", "uniform", "fr22", "auto"]
+Baseline = Literal["center", "mean", "none", "auto"]
+Sampler = Literal["random", "sobol", "orthogonal", "auto"]
+Signs = bool | Literal["auto"]
+_CHOSEN = ("proposal", "sampler", "baseline", "antithetic")  # what may be "auto"
+_SHOWN = 2048  # parameters up to which a repr says what was chosen; beyond the choice stays as it is
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Smoothing:
     """How a function is convolved with a Gaussian, F(x) = E f(x + sigma u), u ~ N(0, I), and sampled.
 
+    `Smoothing.auto(sigma=...)` is what we recommend: proposal, sampler, baseline and antithetic are then "auto". They
+    are chosen for the least error by the number of parameters, the number of evaluations and the order, see `choice`.
+    The repr says what is chosen for how many parameters, and `resolved(n)` returns it.
+
     Args:
         sigma: standard deviation of the Gaussian, in units of x: a positive number, or a tensor [n] of them, one per
             parameter. Features narrower than sigma are blurred away; plateaus up to a few sigma wide get a slope.
         samples: number of perturbations. With `antithetic` each is used with both signs: 2 * samples evaluations.
+            With antithetic="auto" there are 2 * samples evaluations too, in pairs or all different.
         proposal: density the perturbations are drawn from.
             "aggregate" mixes the lobes of the kernel's first and second derivative over all dimensions with a Gaussian
             share and divides by the density of that mixture; "gaussian" is the plain normal; "uniform" a box of +-5
@@ -35,6 +46,8 @@ class Smoothing:
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
             perturbations: every call uses the same ones, whatever the number of threads.
+        scrambles: independent scrambles of sampler "sobol", a divisor of samples. Fewer ones have a smaller error, and
+            a standard error with fewer degrees of freedom. None takes 8 of at least 8 points, else 4, 2 or 1.
         order: highest derivative that is wanted; 1 leaves out the lobes made for the second. Second derivatives stay
             available from "aggregate", with more variance, and not from "optimal".
 
@@ -44,16 +57,20 @@ class Smoothing:
     Example:
         >>> Smoothing(sigma=0.1, samples=4).evaluations(n=3)
         9
+        >>> smoothing = Smoothing.auto(sigma=0.1, samples=16, order=1)
+        >>> smoothing.resolved(n=10).sampler, smoothing.evaluations(n=10)
+        ('orthogonal', 33)
     """
 
     sigma: float | Tensor
     samples: int = 8
     proposal: Proposal = "aggregate"
-    antithetic: bool = True
+    antithetic: Signs = True
     baseline: Baseline = "center"
     sampler: Sampler = "random"
     seed: int | None = None
     order: int = 2
+    scrambles: int | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
@@ -72,11 +89,17 @@ class Smoothing:
             ("proposal", self.proposal, get_args(Proposal)),
             ("baseline", self.baseline, get_args(Baseline)),
             ("sampler", self.sampler, get_args(Sampler)),
-            ("antithetic", self.antithetic, (True, False)),
+            ("antithetic", self.antithetic, (True, False, "auto")),
         ):
             if value not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
-        if self.sampler == "orthogonal" and self.proposal not in ("aggregate", "gaussian"):
+        if self.scrambles is not None and (
+            isinstance(self.scrambles, bool) or self.scrambles < 1 or self.samples % self.scrambles
+        ):
+            raise ValueError(f"scrambles must divide samples, got {self.scrambles} of {self.samples}")
+        if self.scrambles is not None and self.sampler != "sobol":
+            raise ValueError(f"scrambles are those of sampler 'sobol', got {self.scrambles} with {self.sampler!r}")
+        if self.sampler == "orthogonal" and self.proposal not in ("aggregate", "gaussian", "auto"):
             raise ValueError(
                 f"sampler 'orthogonal' makes normal directions: proposal must be 'aggregate' or 'gaussian', "
                 f"got {self.proposal!r}"
@@ -85,8 +108,13 @@ class Smoothing:
             raise ValueError(
                 "proposal 'optimal' draws one small set per element: sampler must be 'random', got 'sobol'"
             )
-        if self.baseline == "mean" and self.samples * (self.antithetic or 1) < 2 and self.proposal != "optimal":
+        if self.baseline == "mean" and self.samples < 2 and self.proposal != "optimal":
             raise ValueError("baseline 'mean' needs the mean of other draws: samples must be at least 2, got 1")
+
+    @classmethod
+    def auto(cls, *, sigma: float | Tensor, **settings: Any) -> "Smoothing":
+        """Return settings that are "auto" where nothing else is given."""
+        return cls(sigma=sigma, **{**dict.fromkeys(_CHOSEN, "auto"), **settings})
 
     def replace(self, **changes: Any) -> "Smoothing":
         """Return a copy with some settings changed, validated again."""
@@ -106,6 +134,71 @@ class Smoothing:
             return 1
         return 1 + n + (n * (n + 1) // 2 if self.order == 2 else 0)
 
+    def resolved(self, n: int) -> "Smoothing":
+        """Return the settings for x of n parameters, without "auto" in them; itself if there is none."""
+        if not self._automatic:
+            return self
+        if n not in self._resolved:
+            self._resolved[n] = replace(self, **self._choice(n))
+        return self._resolved[n]
+
+    @cached_property
+    def _automatic(self) -> bool:
+        return any(getattr(self, name) == "auto" for name in _CHOSEN)
+
+    @cached_property
+    def _resolved(self) -> dict[int, "Smoothing"]:
+        return {}
+
+    def _choice(self, n: int) -> dict[str, Any]:
+        """Return what differs for x of n parameters."""
+        proposal, sampler, signs, baseline = self.proposal, self.sampler, self.antithetic, self.baseline
+        evaluations = self.samples * (2 if self.antithetic else 1)
+        mixed = proposal in ("aggregate", "gaussian", "auto")
+        if sampler == "auto":
+            sampler = chosen_sampler(n, evaluations, self.order) if mixed else "random"
+        if signs == "auto":
+            signs = chosen_signs(n, evaluations, self.order, sampler) if mixed else True
+        samples = self.samples if signs or self.antithetic is False else evaluations
+        if sampler == "sobol" and self.sampler == "auto" and samples % 2:  # one scramble has no standard error
+            sampler = "orthogonal"
+        scrambles = chosen_scrambles(samples) if sampler == "sobol" and self.scrambles is None else self.scrambles
+        if proposal == "auto":
+            proposal = "gaussian" if self.order == 1 and sampler == "orthogonal" else "aggregate"
+        if baseline == "auto":
+            draws = scrambles if sampler == "sobol" and scrambles else samples
+            baseline = chosen_baseline(signs, draws) if mixed else "center"
+        chosen = {"proposal": proposal, "sampler": sampler, "antithetic": signs, "baseline": baseline}
+        return {**chosen, "samples": samples, "scrambles": scrambles}
+
+    def __repr__(self) -> str:
+        settings = ", ".join(f"{field.name}={getattr(self, field.name)!r}" for field in fields(self))
+        if not self._automatic:
+            return f"Smoothing({settings})"
+        return f"Smoothing({settings}; auto: {'; '.join(self._chosen_ranges())})"
+
+    @property
+    def paired(self) -> bool:
+        """Whether perturbations are used with both signs, in settings without "auto"."""
+        return bool(self.antithetic)
+
+    @property
+    def sampling(self) -> str:
+        """How points are sampled, as text."""
+        return _sampling(self.proposal, self.sampler, self.antithetic, self.baseline)
+
+    def _chosen_ranges(self) -> list[str]:
+        """Return what is chosen for which numbers of parameters, as text."""
+        ranges: list[tuple[int, str]] = []
+        for n in range(1, _SHOWN + 1):
+            text = _sampling(**self._choice(n))
+            if ranges and ranges[-1][1] == text:
+                ranges.pop()
+            ranges.append((n, text))
+        return [f"{text} up to n = {last}" for last, text in ranges[:-1]] + [
+            ranges[-1][1] + (" beyond" if ranges[1:] else "")
+        ]
+
     def sigma_vector(self, n: int, device: torch.device) -> Tensor:
         """Return sigma as float64 [n]; ValueError if its length is neither one nor n."""
         if isinstance(self.sigma, float):
@@ -113,6 +206,10 @@ class Smoothing:
         if len(self.sigma) != n:
             raise ValueError(f"sigma has {len(self.sigma)} elements, but x has {n} parameters: give one number or {n}")
         return self.sigma.to(device=device, dtype=torch.float64)
+
+
+def _sampling(proposal: str, sampler: str, antithetic: Signs, baseline: str, **_: Any) -> str:
+    return f"{proposal}, {sampler}, {'pairs' if antithetic else 'single'}, {baseline}"
 
 
 # Numbers of Python are float64, whatever the default of torch.

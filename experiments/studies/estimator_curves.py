@@ -58,9 +58,15 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
 
 def _style(method: Method) -> dict[str, Any]:
     """Colour says where points come from, the line what is subtracted, the marker how points depend on each other."""
-    colors = {"aggregate": "#c1272d", "gaussian": "#1f6fb4", "optimal": "#2b2b2b", "uniform": "#e08a1e"}
-    lines = {"center": "-", "mean": "--", "none": ":"}
-    markers = {"random": "o", "sobol": "s", "orthogonal": "^"}
+    colors = {
+        "auto": "#7a9a01",
+        "aggregate": "#c1272d",
+        "gaussian": "#1f6fb4",
+        "optimal": "#2b2b2b",
+        "uniform": "#e08a1e",
+    }
+    lines = {"auto": "-", "center": "-", "mean": "--", "none": ":"}
+    markers = {"auto": "*", "random": "o", "sobol": "s", "orthogonal": "^"}
     style: dict[str, Any] = {
         "color": colors[method.proposal],
         "linestyle": lines[method.baseline],

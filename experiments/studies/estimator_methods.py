@@ -20,10 +20,10 @@ class Method:
     """One way to estimate; `difference` takes the HVP by finite differences of gradients instead."""
 
     name: str
-    proposal: Literal["aggregate", "gaussian", "optimal", "uniform"]
-    baseline: Literal["center", "mean", "none"]
-    sampler: Literal["random", "sobol", "orthogonal"] = "random"
-    antithetic: bool = True
+    proposal: Literal["aggregate", "gaussian", "optimal", "uniform", "auto"]
+    baseline: Literal["center", "mean", "none", "auto"]
+    sampler: Literal["random", "sobol", "orthogonal", "auto"] = "random"
+    antithetic: bool | Literal["auto"] = True
     difference: Literal["independent", "common"] | None = None
     memory: Literal["process", "untrained"] | None = None
     """Surrogate of the control variate: a Gaussian process of earlier evaluations, or an untrained random network."""
@@ -47,7 +47,10 @@ class Method:
         if self.difference:
             budget //= 2
         each = settings.evaluations(n, center=False) // 2
-        return settings.replace(samples=max(1, (budget - (self.baseline == "center")) // each))
+        chosen = settings.replace(samples=max(1, budget // each))
+        if chosen.resolved(n).baseline != "center":
+            return chosen
+        return settings.replace(samples=max(1, (budget - 1) // each))
 
     def estimate(self, problem: Problem, counted: Callable[[Function], Function], budget: int, seed: int) -> Quantities:
         """Return every quantity this method estimates, from one budget of evaluations.
@@ -122,6 +125,7 @@ class _Untrained(torch.nn.Module):
 
 METHODS = (
     Method(OURS, "aggregate", "center"),
+    Method("auto", "auto", "auto", sampler="auto", antithetic="auto"),
     Method("aggregate + center, sobol", "aggregate", "center", sampler="sobol"),
     Method("aggregate + center, orthogonal", "aggregate", "center", sampler="orthogonal"),
     Method("aggregate + center, memory", "aggregate", "center", memory="process"),

@@ -1,6 +1,7 @@
 """Accuracy against closed forms where arithmetic is hard: extreme scales, offsets, rounding, conditioning, sizes.
 
-A second table has the shares of confidence intervals that contain the truth: see `coverage`.
+A second table has the shares of confidence intervals that contain the truth: see `coverage`. A third one has searches
+on hard functions: see `stability_optimizers`.
 
 Errors are dimensionless (gradients times sigma, Hessians times sigma squared) and in units of the standard error that
 the estimate itself reports. What exceeds five of them plus the rounding allowance is wrong; for more than a hundred
@@ -24,6 +25,7 @@ from experiments.reports.progress import progress
 from experiments.reports.tables import table
 from experiments.studies.coverage import coverage
 from experiments.studies.stability_cases import Case, cases
+from experiments.studies.stability_optimizers import searches
 
 _MOST_STANDARD_ERRORS = 5.0
 _MOST_RMS_STANDARD_ERRORS = 2.0
@@ -48,7 +50,7 @@ class Accuracy:
 
 
 def stability(
-    *, seed: int = 0, largest: int = 1_000_000, repeats: int = 2000, out: Path | None = None
+    *, seed: int = 0, largest: int = 1_000_000, repeats: int = 2000, runs: int = 5, out: Path | None = None
 ) -> list[Accuracy]:
     """Check value, gradient, Hessian diagonal, HVP and Hessian against closed forms on stiff and extreme cases.
 
@@ -56,6 +58,7 @@ def stability(
         seed: of the perturbations.
         largest: parameters of the largest case.
         repeats: of every setting whose intervals are counted.
+        runs: of every search on every hard case; 0 leaves them out.
         out: JSON file to write.
 
     Raises:
@@ -72,8 +75,12 @@ def stability(
     print(f"\n{len(rows) - len(wrong)} of {len(rows)} right\n")
     headers = [f"{repeats} intervals of", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
     print(table(headers, [one.cells() for one in shares]))
+    found = searches(runs=runs, seed=seed) if runs else []
+    headers = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
+    print(f"\nSearches, {runs} runs each\n\n{table(headers, [list(asdict(one).values()) for one in found])}")
     outside = [one for one in shares if one.verdict.startswith("WRONG")]
-    if wrong or outside:
+    false = [one for one in found if one.verdict.startswith("WRONG")]
+    if wrong or outside or false:
         raise SystemExit(1)
     return rows
 

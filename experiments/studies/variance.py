@@ -13,6 +13,8 @@ tasks these are images, not losses.
 
 Methods take turns within every run, so that whatever else the machine does falls on all of them alike.
 
+A second table compares "auto" settings with estimators of other packages, see `estimator_choice`.
+
 At n = 10 uniform sampling does not settle: the few samples near x carry all the weight, up to (10/sqrt(2 pi))^10, and
 most runs have none of them.
 """
@@ -31,6 +33,7 @@ from experiments.problems.catalogue import chosen
 from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
+from experiments.studies.estimator_choice import SIZES, compare, summary
 from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
 from experiments.studies.estimator_methods import METHODS, NAMES, OURS, Method
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
@@ -79,6 +82,8 @@ def variance(
     problems: tuple[str, ...] = tuple(PROBLEMS),
     methods: tuple[str, ...] = NAMES,
     side: int = 64,
+    sizes: tuple[int, ...] = SIZES,
+    rivals: int = 100,
     store: str | None = None,
 ) -> VarianceReport:
     """Measure the relative RMSE of the estimators against evaluations and seconds, and plot it.
@@ -91,10 +96,18 @@ def variance(
         problems: any of box2, box10, mug, wave2 and wave10.
         methods: names of the ways to estimate.
         side: pixels along the image side of the BOX tasks.
+        sizes: numbers of parameters of the comparison with other packages.
+        rivals: its runs; 0 leaves it out.
         store: name of a table to keep under experiments/results, for the documents.
     """
     smallest = min(budgets, default=0)
-    for argument, value, least in (("runs", runs, 2), ("budgets", smallest, 16), ("side", side, 1), ("seed", seed, 0)):
+    for argument, value, least in (
+        ("runs", runs, 2),
+        ("budgets", smallest, 16),
+        ("side", side, 1),
+        ("seed", seed, 0),
+        ("rivals", rivals, 0),
+    ):
         if value < least:
             raise SystemExit(f"{argument} must be at least {least}, got {value}")
     if store is not None:
@@ -122,6 +135,10 @@ def variance(
     print(f"written to {out}")
     if store is not None:
         print(keep(headers, rows, store))
+    if rivals:
+        beside = compare(sizes=sizes, runs=rivals, seed=seed)
+        print(f"\nErrors of auto settings and of other packages, geometric means\n\n{table(*summary(beside))}")
+        (out / "rivals.json").write_text(json.dumps([asdict(row) for row in beside], indent=1))
     return report
 
 

@@ -189,7 +189,7 @@ class BlackBox(nn.Module):
         keep = torch.compiler.is_compiling() or stored(self.smoothing, B * transforms.mapped_size([x, *aux]), n)
         K = self.smoothing.evaluations(n, center=False)
         tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, x, aux)
-        return Expansion.rebuild(tensors, x, self.smoothing, keep)
+        return Expansion.rebuild(tensors, x, self.smoothing if keep else self.smoothing.resolved(n), keep)
 
     def _center(self, x: Tensor, aux: list[Tensor]) -> Tensor:
         if transforms.watched(x):

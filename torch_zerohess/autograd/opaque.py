@@ -94,7 +94,8 @@ def _evaluate_center(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
 
 def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Layout]:
     owner = _owner(handle)
-    return Expansion.layout(owner.smoothing, x.shape[0], K, x.shape[1], _output_shape(owner, x, aux), keep)
+    smoothing = owner.smoothing if keep else owner.smoothing.resolved(int(x.shape[1]))
+    return Expansion.layout(smoothing, x.shape[0], K, x.shape[1], _output_shape(owner, x, aux), keep)
 
 
 @_evaluate.register_fake

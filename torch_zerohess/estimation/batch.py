@@ -36,7 +36,7 @@ class Batch:
         t: vector of the hvp [B, P, n], in units of sigma. The squares of values from 1e-300 to 1e300 exist only
         relative to the largest of them, a power of two so that nothing is rounded.
         """
-        index = draws(self.smoothing, self.evaluations.points.shape[2])
+        index = draws(self.smoothing, len(self.evaluations.expansion.sigma))
         unit = _power_of_two(self.a.abs().amax(2, keepdim=True))
         pooled = self._pooled / unit if self._coupled(quantity) else None
         length = torch.ones_like(unit) if t is None else _power_of_two(t.abs().amax(2, keepdim=True))
@@ -65,13 +65,13 @@ def combined(batches: Sequence[Batch], of: Callable[[Batch], Tensor]) -> Tensor:
     """Return the mean of a sum over independent batches, each weighted by its number of rows."""
     if len(batches) == 1:
         return of(batches[0])
-    rows = [one.evaluations.points.shape[1] for one in batches]
+    rows = [one.evaluations.share.shape[1] for one in batches]
     return torch.stack([of(one) * (count / sum(rows)) for one, count in zip(batches, rows, strict=True)]).sum(0)
 
 
 def combined_spread(batches: Sequence[Batch], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the standard error of the mean over independent batches, and its degrees of freedom (Satterthwaite)."""
-    rows = [one.evaluations.points.shape[1] for one in batches]
+    rows = [one.evaluations.share.shape[1] for one in batches]
     error, inverse = torch.zeros(()), torch.zeros(())
     for one, count in zip(batches, rows, strict=True):
         share = count / sum(rows)

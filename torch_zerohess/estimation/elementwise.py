@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Spread, Stein
+from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Spread, Stein, completed
 from torch_zerohess.sampling import kernels, proposals
 from torch_zerohess.sampling.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
 from torch_zerohess.smoothing import Smoothing
@@ -30,7 +30,7 @@ class Elementwise(Stein):
 
     @classmethod
     def draw(
-        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False
     ) -> tuple[Tensor, "Elementwise"]:
         """See `Stein.draw`; ValueError if more than a million evaluations would be needed."""
         B, n = x.shape
@@ -47,13 +47,13 @@ class Elementwise(Stein):
             kernels.draw(rows, n),
             x.double().contiguous(),
             sigma,
-            smoothing.antithetic,
+            smoothing.paired,
             x.dtype == torch.float32,
             proposals.GAUSSIAN,
         )
-        elements = elements.repeat(1 + smoothing.antithetic, 1)
+        elements = elements.repeat(1 + smoothing.paired, 1)
         weight = proposals.element_weights(u, elements) * smoothing.groups(n)
-        return points, cls(weight, elements, n, smoothing.order)
+        return completed(points, x, center), cls(weight, elements, n, smoothing.order)
 
     @classmethod
     def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:

@@ -81,6 +81,8 @@ def estimate(
     x = checked_input(x).detach().clone()
     batch, flat, aux_rows = x.shape[:-1], working(x).reshape(-1, x.shape[-1]), folded_aux(aux, x.shape[:-1])
     B, n = flat.shape
+    given, smoothing = smoothing, smoothing.resolved(n)
+    chosen = "" if given is smoothing else smoothing.sampling
 
     control = None if memory is None else Control.of(memory, head, learning=True)
     term = None
@@ -93,7 +95,14 @@ def estimate(
 
     def made(batches: list[Batch], reason: str) -> Estimate:
         first, *more = batches
-        return Estimate(first.evaluations, batch, x, first.smoothing, more=more, reason=reason, value=value, term=term)
+        return Estimate(
+            *(first.evaluations, batch, x, first.smoothing),
+            more=more,
+            reason=reason,
+            value=value,
+            term=term,
+            chosen=chosen,
+        )
 
     if tolerance is None:
         return made([draw(smoothing)], "one batch: no tolerance was given")

@@ -14,14 +14,16 @@ from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
+from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.perturbations import draws, perturb
-from torch_zerohess.estimation.stein import Stein, total
+from torch_zerohess.estimation.stein import Stein, completed, total
 from torch_zerohess.evaluators.batch import loss_error
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.evaluators.values import checked_values
 from torch_zerohess.heads import LocalEntropy
+from torch_zerohess.sampling.kernels import Redrawn
 from torch_zerohess.smoothing import Smoothing
 
 ValueMode = Literal["center", "smoothed"]
@@ -61,13 +63,15 @@ class BlackBoxCall:
         values = checked_values(self.evaluator(fn, points, *aux), points, self.vectorized)
         return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
 
-    def values(self, points: Tensor, aux: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    def values(self, points: Tensor, aux: Sequence[Tensor], *, spare: bool = False) -> tuple[Tensor, Tensor]:
         """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
 
         Without a head they are the same.
+
+        spare: nobody needs the points again; else the black box gets a copy, because it may write to its input.
         """
         B, E = points.shape[:2]
-        flat = points.flatten(0, 1).clone()  # the black box may write to its input
+        flat = points.flatten(0, 1) if spare else points.flatten(0, 1).clone()
         if self.head is None:
             values = self(flat, [one.repeat_interleave(E, 0) for one in aux]).unflatten(0, (B, E))
             self._lost(flat)
@@ -94,8 +98,8 @@ class Evaluations:
     Shapes: B batch, K perturbations, n parameters.
     """
 
-    points: Tensor
-    """Perturbed points [B, K, n], in the dtype of x."""
+    kept: Tensor | None
+    """Perturbed points [B, K, n], in the dtype of x, if they are kept."""
     values: Tensor
     """Values there, [B, K, *out], as the black box returned them; zero where they were dropped."""
     center: Tensor | None
@@ -107,6 +111,16 @@ class Evaluations:
     baseline: Tensor
     """What was subtracted from `rest`, its mean over the rows, [B, P]."""
     expansion: Expansion
+
+    @property
+    def points(self) -> Tensor:
+        """Perturbed points [B, K, n], in the dtype of x: made again where they are not kept."""
+        if self.kept is not None:
+            return self.kept
+        stein = self.expansion.stein
+        assert isinstance(stein, LikelihoodRatio)
+        assert isinstance(stein.u, Redrawn)
+        return stein.u.points()
 
     @property
     def smoothed(self) -> Tensor:
@@ -142,13 +156,18 @@ def evaluate(
         keep: see `perturb`.
         control: what is subtracted from the values before they become coefficients.
     """
+    smoothing = smoothing.resolved(x.shape[1])
     seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
-    perturbations = perturb(x, smoothing, seed, keep)
-    points, stein = perturbations.points, perturbations.stein
-    B, K, n = points.shape
     with_center = call.value == "center" or smoothing.baseline == "center"
-    everywhere = torch.cat([points, x[:, None]], 1) if with_center else points
-    values, outputs = call.values(everywhere, control.references(aux) if control else aux)
+    perturbations = perturb(x, smoothing, seed, keep, with_center)
+    everywhere, stein = perturbations.points, perturbations.stein
+    B, K, n = len(x), everywhere.shape[1] - with_center, x.shape[1]
+    # Where perturbations are too many to be kept, so are two copies of the points.
+    redrawn = stein.u if isinstance(stein, LikelihoodRatio) and isinstance(stein.u, Redrawn) else None
+    spare = redrawn is not None and control is None
+    values, outputs = call.values(everywhere, control.references(aux) if control else aux, spare=spare)
+    if spare and redrawn is not None and not math.isfinite(float(values.sum())):
+        everywhere = completed(redrawn.points(), x, with_center)  # as they were before fn
     values, kept = finite_values(values, everywhere, call.on_nonfinite, K, smoothing, stein)
     center = values[:, K] if with_center else None
     share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
@@ -182,7 +201,7 @@ def evaluate(
         if isinstance(call.head, LocalEntropy):
             base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
     expansion = Expansion(base, coefficients, perturbations.sigma, stein)
-    return Evaluations(points, values, center, share, rest, baseline, expansion)
+    return Evaluations(None if spare else everywhere[:, :K], values, center, share, rest, baseline, expansion)
 
 
 def _remaining(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torch_zerohess.estimation.perturbations import FAMILIES
+from torch_zerohess.estimation.perturbations import family
 from torch_zerohess.estimation.stein import Layout, Stein
 from torch_zerohess.smoothing import Smoothing
 
@@ -43,10 +43,10 @@ class Expansion:
     def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, smoothing: Smoothing, keep: bool) -> "Expansion":
         """Return the expansion around x [B, n] that `tensors` were taken from; keep: see `perturb`."""
         base, coefficients, sigma, *rest = tensors
-        return cls(base, coefficients, sigma, FAMILIES[smoothing.proposal].rebuild(rest, x, sigma, smoothing, keep))
+        return cls(base, coefficients, sigma, family(smoothing).rebuild(rest, x, sigma, smoothing, keep))
 
     @staticmethod
     def layout(smoothing: Smoothing, B: int, K: int, n: int, out: Sequence[int], keep: bool) -> list[Layout]:
         """Return what `tensors` of a batch will look like, for outputs of shape `out`."""
-        family = FAMILIES[smoothing.proposal].layout(smoothing, B, K, n, keep)
-        return [Layout((B, *out)), Layout((B, K, *out)), Layout((n,), batched=False), *family]
+        own = family(smoothing).layout(smoothing, B, K, n, keep)
+        return [Layout((B, *out)), Layout((B, K, *out)), Layout((n,), batched=False), *own]

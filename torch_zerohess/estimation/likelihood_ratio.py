@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, total
+from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, completed, total
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.sampling.kernels import Redrawn, Samples
 from torch_zerohess.smoothing import Smoothing
@@ -24,22 +24,20 @@ class LikelihoodRatio(Stein):
 
     @classmethod
     def draw(
-        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False
     ) -> tuple[Tensor, "LikelihoodRatio"]:
         """See `Stein.draw`; ValueError if all weights of a point underflow to zero, as weights of "uniform" can."""
         B, n = x.shape
         density, single = _density(smoothing), x.dtype == torch.float32
         if smoothing.sampler == "random":  # of the K rows only the points exist at once unless they are kept
             rows, points, u, weight = kernels.sample(
-                seed, smoothing.samples, x, sigma, smoothing.antithetic, density, False, keep
+                seed, smoothing.samples, x, sigma, smoothing.paired, density, center, keep
             )
-            made = cls(u if keep else Redrawn(rows, x, sigma, smoothing.antithetic, single), weight)
+            made = cls(u if keep else Redrawn(rows, x, sigma, smoothing.paired, single), weight)
         else:
             _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
-            points, u, weight = kernels.place(
-                drawn, x.double().contiguous(), sigma, smoothing.antithetic, single, density
-            )
-            made = cls(u, weight)
+            points, u, weight = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.paired, single, density)
+            points, made = completed(points, x, center), cls(u, weight)
         if density == proposals.UNIFORM and bool((weight == 0).all(1).any()):
             raise ValueError(
                 f"proposal {smoothing.proposal!r} has no weight left at {n} parameters: use proposal 'aggregate'"
@@ -48,9 +46,9 @@ class LikelihoodRatio(Stein):
 
     @classmethod
     def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:
-        S = K // (1 + smoothing.antithetic)
-        first = Layout((B, K, n)) if _kept(smoothing, keep) else Layout((B, S, 5), torch.int64)
-        return [first, Layout((B, K))]
+        if _kept(smoothing, keep):
+            return [Layout((B, K, n)), Layout((B, K))]
+        return [Layout((B, K // (1 + smoothing.resolved(n).paired), 5), torch.int64), Layout((B, K))]
 
     def tensors(self) -> list[Tensor]:
         """Perturbations, or the rows of their recipe [B, S, 5]; weights."""
@@ -65,7 +63,7 @@ class LikelihoodRatio(Stein):
         if _kept(smoothing, keep):
             return cls(first, weight)
         single = x.dtype == torch.float32
-        return cls(Redrawn(first.flatten(0, 1), x.detach(), sigma, smoothing.antithetic, single), weight)
+        return cls(Redrawn(first.flatten(0, 1), x.detach(), sigma, smoothing.paired, single), weight)
 
     def value(self, a: Tensor) -> Tensor:
         return total((a * self.weight[:, None]).mT)[:, 0]

@@ -25,21 +25,28 @@ _FAR_ABOVE = 4096  # sigmas of more roundings of x need no look at the points
 _ROWS = 64  # compared with x at a time; the first few nearly always settle it
 
 
+def family(smoothing: Smoothing) -> type[Stein]:
+    """Return the family of weights of a proposal."""
+    # Every proposal that "auto" may become has the same one.
+    return FAMILIES["aggregate" if smoothing.proposal == "auto" else smoothing.proposal]
+
+
 @dataclass(frozen=True)
 class Perturbations:
     """Points z = x + sigma u, and how values at them become estimates."""
 
     points: Tensor
-    """[B, K, n], in the dtype of x"""
+    """[B, K, n], in the dtype of x; with x itself as one more where that was asked for"""
     stein: Stein
     sigma: Tensor
     """float64 [n]"""
 
 
-def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbations:
+def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False) -> Perturbations:
     """Draw the perturbations of a batch of points x [B, n], float32 or float64.
 
     keep: store them, instead of drawing them again whenever they are needed (see `stored`).
+    center: add x as the last point.
 
     Raises ValueError if x is not finite, if sigma has the wrong length, is below the rounding of x or leads out of the
     range of its dtype, and where the family of the proposal cannot serve this many parameters.
@@ -54,7 +61,7 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> Perturbat
         farthest = x.abs() + length * sigma
         if not bool((farthest < limits.max).all()):
             raise _out_of_range(x, sigma, farthest)
-    points, stein = FAMILIES[smoothing.proposal].draw(x, sigma, smoothing, seed, keep)
+    points, stein = family(smoothing).draw(x, sigma, smoothing, seed, keep, center)
     if least < _FAR_ABOVE * limits.eps * largest:
         _check_moved(points, x, sigma)
     return Perturbations(points, stein, sigma)
@@ -89,7 +96,7 @@ def _check_moved(points: Tensor, x: Tensor, sigma: Tensor) -> None:
 
 def stored(smoothing: Smoothing, B: int, n: int) -> bool:
     """Whether the perturbations of a batch are kept, and not drawn again from their seed."""
-    return smoothing.sampler != "random" or B * n * smoothing.evaluations(n, center=False) <= STORED
+    return smoothing.resolved(n).sampler != "random" or B * n * smoothing.evaluations(n, center=False) <= STORED
 
 
 def draws(smoothing: Smoothing, n: int) -> list[Tensor]:

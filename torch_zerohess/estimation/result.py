@@ -50,10 +50,11 @@ class Estimate:
         reason: str = "one batch: no tolerance was given",
         value: ValueMode = "center",
         term: SurrogateTerm | None = None,
+        chosen: str = "",
     ) -> None:
         self._batches = [Batch(evaluations, smoothing), *more]
         self._batch, self._x, self._smoothing, self.reason = batch, x, smoothing, reason
-        self._value_mode, self._term = value, term
+        self._value_mode, self._term, self._chosen = value, term, chosen
         self._sigma = evaluations.expansion.sigma
         self._out = evaluations.expansion.base.shape[1:]
 
@@ -85,8 +86,12 @@ class Estimate:
 
     def hessian(self) -> Tensor:
         """d2F/dx_i dx_j: [*batch, *out, n, n], symmetric; formed at every call."""
-        sums = combined(self._batches, lambda one: one.stein.hessian(one.a))
-        return self._shaped(self._completed(self._in_units(sums, "hessian"), "hessian"), "hessian")
+        one = float(self._sigma[0])
+        if bool((self._sigma == one).all()):  # divide the coefficients: they are few, and a Hessian is large
+            sums = combined(self._batches, lambda batch: batch.stein.hessian(batch.a / one / one))
+        else:
+            sums = self._in_units(combined(self._batches, lambda batch: batch.stein.hessian(batch.a)), "hessian")
+        return self._shaped(self._completed(sums, "hessian"), "hessian")
 
     def standard_error(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
         """Standard error of an estimate, in the shape of the estimate, from the spread of its independent draws.
@@ -147,7 +152,8 @@ class Estimate:
     @property
     def evaluations(self) -> int:
         """How often the black box was evaluated, f(x) included."""
-        return self.points.shape[:-1].numel()
+        found = [one.evaluations for one in self._batches]
+        return sum(one.share.numel() + len(one.share) * (one.center is not None) for one in found)
 
     @cached_property
     def points(self) -> Tensor:
@@ -173,6 +179,7 @@ class Estimate:
     def __repr__(self) -> str:
         shape = f"x {list(self._x.shape)}, output {[*self._batch, *self._out]}"
         parts = [shape, f"value={short(self.value)}", f"gradient={short(self.gradient)}"]
+        parts += [f"auto: {self._chosen}"] * bool(self._chosen)
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein
+from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, completed
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.smoothing import Smoothing
 
@@ -26,13 +26,13 @@ class SignedLobes(Stein):
 
     @classmethod
     def draw(
-        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False
     ) -> tuple[Tensor, "SignedLobes"]:
         B, n = x.shape
         density, single = proposals.SIGNED_LOBES, x.dtype == torch.float32
         _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
-        points, u, _ = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.antithetic, single, density)
-        return points, cls(u.sign() * math.sqrt(2 / math.pi))
+        points, u, _ = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.paired, single, density)
+        return completed(points, x, center), cls(u.sign() * math.sqrt(2 / math.pi))
 
     @classmethod
     def layout(cls, smoothing: Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:

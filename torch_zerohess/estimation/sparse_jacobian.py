@@ -76,6 +76,7 @@ def sparse_jacobian(
     x = checked_input(x).detach()
     if x.ndim != 1:
         raise ValueError(f"x must be one point [n], got {list(x.shape)}")
+    smoothing = smoothing.resolved(len(x))
     if smoothing.proposal in ("optimal", "fr22"):
         raise ValueError(
             f"proposal must be 'aggregate', 'gaussian' or 'uniform', which perturb all parameters by what a weight "

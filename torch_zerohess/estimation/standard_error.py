@@ -63,7 +63,7 @@ def variance_of_draws(
             "a standard error needs at least two independent draws: use more samples (an even number for 'sobol')"
             if pooled is None
             else "a standard error with baseline 'mean' needs at least three independent draws: use more samples (a "
-            "multiple of 4 from 32 on for 'sobol', more than twice n for 'orthogonal'), or baseline 'center'"
+            "multiple of 4 from 32 on for 'sobol'), or baseline 'center'"
         )
     whole = stein.sums(quantity, a, v)
     divided = _Divided(stein, quantity, share, draws, v, whole[0].numel())

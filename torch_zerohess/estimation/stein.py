@@ -74,10 +74,13 @@ class Stein(ABC):
 
     @classmethod
     @abstractmethod
-    def draw(cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool) -> tuple[Tensor, "Stein"]:
+    def draw(
+        cls, x: Tensor, sigma: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool = False
+    ) -> tuple[Tensor, "Stein"]:
         """Draw samples around x [B, n] and return their points [B, K, n], in the dtype of x, and the family.
 
-        sigma: float64 [n]; keep: store the perturbations instead of drawing them again whenever they are needed.
+        sigma: float64 [n]; keep: store the perturbations instead of drawing them again whenever they are needed;
+        center: add x as the last point.
         """
 
     @classmethod
@@ -158,6 +161,11 @@ class Stein(ABC):
             "hessian": self.hessian,
         }
         return sums[quantity](a)
+
+
+def completed(points: Tensor, x: Tensor, center: bool) -> Tensor:
+    """Return points [B, K, n], with x [B, n] as the last one where `center`."""
+    return torch.cat([points, x[:, None]], 1) if center else points
 
 
 def total(a: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_zerohess.sampling import extension, proposals
+from torch_zerohess.sampling import extension, philox, proposals
 
 _MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
 _WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
@@ -40,6 +40,13 @@ class Redrawn(NamedTuple):
     def arguments(self) -> tuple[Tensor, Tensor, Tensor, bool, bool]:
         """Return the recipe as the operators want it: contiguous, which a fold of a batch by vmap need not be."""
         return self.rows.contiguous(), self.x.contiguous(), self.sigma.contiguous(), self.antithetic, self.single
+
+    def points(self) -> Tensor:
+        """Return the points x + sigma u, [B, K, n], in the precision of x."""
+        result = self.x.new_empty(len(self.x), self.K, self.x.shape[1])
+        for part, _, _, columns in self.chunks():
+            result[:, columns] = part
+        return result
 
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
@@ -75,6 +82,29 @@ def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
     if _compiled(rows):
         return torch.ops.torch_zerohess.draw(rows.contiguous(), n, single)
     return proposals.draw(rows, n, single)
+
+
+def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> Tensor:
+    """See `philox.uniforms`; first is even."""
+    if _compiled(row):
+        return torch.ops.torch_zerohess.uniforms(seed.contiguous(), row.contiguous(), first, count, stream)
+    return philox.uniforms(seed, row, first, count, stream)
+
+
+def shape(rows: Tensor, p: Tensor) -> Tensor:
+    """See `proposals.shape`."""
+    if _compiled(rows):
+        return torch.ops.torch_zerohess.shape(rows.contiguous(), p.contiguous())
+    return proposals.shape(rows, p)
+
+
+def with_lobes(rows: Tensor, u: Tensor, p_i: Tensor, p_j: Tensor) -> Tensor:
+    """See `proposals.with_lobes`."""
+    if _compiled(rows):
+        return torch.ops.torch_zerohess.with_lobes(
+            rows.contiguous(), u.contiguous(), p_i.contiguous(), p_j.contiguous()
+        )
+    return proposals.with_lobes(rows, u, p_i, p_j)
 
 
 def place(

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.sampling import kernels
-from torch_zerohess.sampling.philox import EXTRA, uniforms
-from torch_zerohess.sampling.proposals import NORMAL, mixture_rows, shape, with_lobes
+from torch_zerohess.sampling.kernels import shape, uniforms, with_lobes
+from torch_zerohess.sampling.philox import EXTRA
+from torch_zerohess.sampling.proposals import NORMAL, mixture_rows
 from torch_zerohess.smoothing import Smoothing
 
 _SOBOL_BITS = 30
@@ -22,10 +23,13 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
     samples = smoothing.samples
     if smoothing.sampler == "random":
         return 1
+    if smoothing.scrambles is not None:
+        return samples // smoothing.scrambles
     if smoothing.sampler == "sobol":
         # Enough independent scrambles for a standard error, each long enough for its points to be even.
         return samples // next(r for r in (8, 4, 2, 1) if samples % r == 0 and (r <= 2 or samples >= 8 * r))
-    return min(n, (samples + 1) // 2)
+    # Two blocks have a standard error; with a mean of the others it takes three.
+    return min(n, max(1, samples // 3) if smoothing.baseline == "mean" else (samples + 1) // 2)
 
 
 def sobol(

@@ -15,6 +15,18 @@ def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
     return rows.new_empty(rows.shape[0], n, dtype=torch.float32 if single else torch.float64)
 
 
+def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> Tensor:
+    return row.new_empty(row.shape[0], count, dtype=torch.float64)
+
+
+def shape(rows: Tensor, p: Tensor) -> Tensor:
+    return torch.empty_like(p)
+
+
+def with_lobes(rows: Tensor, u: Tensor, p_i: Tensor, p_j: Tensor) -> Tensor:
+    return torch.empty_like(u)
+
+
 def sample(
     seed: int, S: int, x: Tensor, sigma: Tensor, antithetic: bool, proposal: int, center: bool, keep: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -60,7 +72,10 @@ def mirror(matrices: Tensor) -> None:
     return None
 
 
-OPERATORS = (pick_rows, draw, sample, place, project, accumulate, hessian, mirror, project_drawn, accumulate_drawn)
+OPERATORS = (
+    *(pick_rows, draw, uniforms, shape, with_lobes, sample, place),
+    *(project, accumulate, hessian, mirror, project_drawn, accumulate_drawn),
+)
 
 
 def register() -> None:

@@ -10,11 +10,12 @@ from experiments.studies.coverage import Coverage
 from experiments.studies.coverage import _rows as _coverage_rows
 from experiments.studies.stability import _rows, stability
 from experiments.studies.stability_cases import Case, cases
+from experiments.studies.stability_optimizers import ENDLESS, _row, hard_cases, searches
 
 
 def test_every_case_of_stability_is_right(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [])
-    rows = stability(largest=1000, out=tmp_path / "stability.json")  # a wrong row would raise SystemExit
+    rows = stability(largest=1000, runs=0, out=tmp_path / "stability.json")  # a wrong row would raise SystemExit
     assert {row.verdict for row in rows} == {"right", "right: refused"}
     # Far from zero twice, sigma 1e308, and a Hessian of order 1e320 and its diagonal.
     assert sum(row.verdict == "right: refused" for row in rows) == 5
@@ -42,7 +43,7 @@ def test_stability_notices_wrong_derivatives(monkeypatch, capsys) -> None:
     monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [case, wrong])
     monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [])
     with pytest.raises(SystemExit) as stopped:
-        stability()
+        stability(runs=0)
     assert stopped.value.code == 1
     assert "WRONG: more than 5 standard errors" in capsys.readouterr().out
 
@@ -58,7 +59,7 @@ def test_shares_of_intervals_are_told_and_judged(monkeypatch, capsys) -> None:
     monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: rows)
     monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [])
     with pytest.raises(SystemExit):
-        stability()
+        stability(runs=0)
     assert "0.900 to 0.910" in capsys.readouterr().out
 
 
@@ -67,3 +68,30 @@ def test_standard_errors_of_half_the_size_are_noticed(monkeypatch) -> None:
     assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["right", "right"]
     monkeypatch.setattr("torch_zerohess.estimation.result.student_factor", lambda level, degrees: 0.5 * degrees**0)
     assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["WRONG", "WRONG"]
+
+
+@pytest.mark.parametrize(
+    "name", ["stiff, condition 1e12, n = 2", "start on a saddle", "NaN between start and minimum", ENDLESS]
+)
+def test_searches_on_hard_functions(name: str) -> None:
+    case = next(case for case in hard_cases() if case.name == name)
+    assert float(case.fn(case.start[None])) == pytest.approx(1.0)
+    row = _row(case, "descent", runs=1, max_evaluations=80 if name == ENDLESS else 150, seed=0)
+    assert row.verdict == "right"
+    assert row.successes == (0.0 if name == ENDLESS else 1.0)
+    assert ("all 80 values are equal" in row.message) == (name == ENDLESS)
+
+
+def test_every_hard_case_starts_at_one_and_false_claims_are_wrong(monkeypatch, capsys) -> None:
+    for case in hard_cases():
+        assert float(case.fn(case.start[None])) == pytest.approx(1.0)
+    easy = next(case for case in hard_cases() if case.name.startswith("stiff, condition 1e0,"))
+    monkeypatch.setattr("experiments.studies.stability_optimizers.hard_cases", lambda: [replace(easy, aim=-1.0)])
+    monkeypatch.setattr("experiments.studies.stability_optimizers.ENGINES", ("descent",))
+    (row,) = searches(runs=1, max_evaluations=100)
+    assert (row.successes, row.claims, row.verdict) == (0.0, 1, "WRONG: claims")
+    monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [])
+    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [])
+    with pytest.raises(SystemExit):
+        stability(runs=1)
+    assert "WRONG: claims" in capsys.readouterr().out

@@ -30,6 +30,7 @@ SETTINGS = {
     "uniform": AGGREGATE.replace(proposal="uniform", samples=40),
     "sobol": AGGREGATE.replace(sampler="sobol"),
     "orthogonal": AGGREGATE.replace(sampler="orthogonal"),
+    "auto": Smoothing.auto(sigma=AGGREGATE.sigma, samples=24, seed=12),  # 48 Sobol points
 }
 EVERY = pytest.mark.parametrize("smoothing", SETTINGS.values(), ids=SETTINGS.keys())
 
@@ -432,6 +433,8 @@ COMPILED = {
     "optimal": SETTINGS["optimal"],
     "sobol": SETTINGS["sobol"],
     "fr22": AGGREGATE.replace(proposal="fr22"),
+    "auto": SETTINGS["auto"],
+    "auto, random": Smoothing.auto(sigma=AGGREGATE.sigma, samples=3, seed=12),
 }
 
 

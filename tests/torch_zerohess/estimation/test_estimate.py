@@ -86,6 +86,14 @@ def test_unbiased_with_the_fewest_samples(baseline: str, antithetic: bool) -> No
         check(Exponential(vector(0.9)), vector(0.2), smoothing, 20_000)
 
 
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("samples", [1, 2, 3, 4, 8, 9, 24])
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_unbiased_whatever_is_chosen(n: int, samples: int, order: int) -> None:
+    smoothing = Smoothing.auto(sigma=spread(n, 0.4, 0.7), samples=samples, order=order, seed=41)
+    check(truths(n)["exponential"], spread(n, -0.3, 0.4), smoothing, 16_000 // (samples * n))
+
+
 def lobe_average(a: float) -> float:
     """E exp(a u) under the density |u| exp(-u^2/2) / 2."""
     return integrate.quad(lambda u: 0.5 * abs(u) * math.exp(a * u - 0.5 * u * u), -30, 30, points=[0.0])[0]
@@ -166,6 +174,49 @@ def test_redrawn_perturbations_give_the_same_estimates(
     pairs += [(drawn.standard_error("hvp", V), kept.standard_error("hvp", V))]
     for one, other in pairs:
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+def test_points_that_are_not_kept_are_the_ones_that_were_evaluated(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """fn gets the only copy and writes into it."""
+    x, smoothing = spread(8, -1.0, 1.0).view(2, 4), Smoothing(sigma=0.3, samples=5, seed=8)
+    kept = estimate(lambda z: z.sum(1), x, smoothing, value=value)
+    monkeypatch.setattr(perturbations, "STORED", 0)
+    monkeypatch.setattr(kernels, "_CHUNK", 24)
+    seen: list[Tensor] = []
+
+    def writing(z: Tensor) -> Tensor:
+        seen.append(z.clone())
+        values = z.sum(1)
+        z.zero_()
+        return values
+
+    drawn = estimate(writing, x, smoothing, value=value)
+    assert torch.equal(drawn.points, kept.points)
+    assert torch.equal(drawn.points.flatten(0, 1), seen[0])
+    assert drawn.evaluations == kept.evaluations == 22
+    with pytest.raises(ValueError, match=f"at the point .{float(kept.points[0, 0, 0]):.6g}, "):
+        estimate(lambda z: writing(z) * math.nan, x, smoothing, value=value)
+
+
+def test_a_million_parameters_take_no_second_copy_of_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perturbations, "STORED", 0)
+    copies: list[bool] = []
+    original = kernels.sample
+
+    def sample(*arguments):
+        drawn = original(*arguments)
+        copies.append(drawn[1])
+        return drawn
+
+    monkeypatch.setattr(kernels, "sample", sample)
+
+    def fn(z: Tensor) -> Tensor:
+        copies.append(z)
+        return z.sum(1)
+
+    estimate(fn, spread(4, -1.0, 1.0), Smoothing(sigma=0.3, samples=5, seed=8))
+    assert copies[0].data_ptr() == copies[1].data_ptr()
 
 
 CALIBRATED = [

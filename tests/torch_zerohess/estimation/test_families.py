@@ -15,7 +15,16 @@ import torch_zerohess as zh
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.estimation.perturbations import FAMILIES, draws, perturb, stored
 from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Spread, Stein, total
+from torch_zerohess.estimation.stein import (
+    FIRST_ORDER_ERROR,
+    Layout,
+    Projection,
+    Quantity,
+    Spread,
+    Stein,
+    completed,
+    total,
+)
 from torch_zerohess.sampling import kernels, proposals
 from truths import Exponential, deviation, spread, vector
 
@@ -181,12 +190,12 @@ class PlainGaussian(Stein):
 
     @classmethod
     def draw(
-        cls, x: Tensor, sigma: Tensor, smoothing: zh.Smoothing, seed: int, keep: bool
+        cls, x: Tensor, sigma: Tensor, smoothing: zh.Smoothing, seed: int, keep: bool, center: bool = False
     ) -> tuple[Tensor, "PlainGaussian"]:
         generator = torch.Generator().manual_seed(seed)
         u = torch.randn(len(x), smoothing.samples, x.shape[1], dtype=torch.float64, generator=generator)
         u = torch.cat([u, -u], 1) if smoothing.antithetic else u
-        return (x[:, None] + sigma * u).to(x.dtype), cls(u)
+        return completed((x[:, None] + sigma * u).to(x.dtype), x, center), cls(u)
 
     @classmethod
     def layout(cls, smoothing: zh.Smoothing, B: int, K: int, n: int, keep: bool) -> list[Layout]:

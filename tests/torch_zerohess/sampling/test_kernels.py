@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_zerohess.sampling import extension, kernels, proposals
+from torch_zerohess.sampling import extension, kernels, philox, proposals
 from torch_zerohess.sampling.kernels import Redrawn
 from truths import spread
 
@@ -58,6 +58,22 @@ def test_draw_same_bits(n: int) -> None:
         got = ops.draw(rows, n, single)
         assert got.dtype == (torch.float32 if single else torch.float64)
         assert torch.equal(got, proposals.draw(rows, n, single))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_parts_of_draws_same_bits(n: int) -> None:
+    """Uniforms of any columns, perturbations from uniforms, and lobes in place of perturbations."""
+    rows = every_kind(n)
+    seed, index = rows[:, 0].contiguous(), rows[:, 1].contiguous()
+    for first, stream in ((0, philox.DIMENSIONS), (2, philox.PICKS), (300, philox.EXTRA)):
+        p = ops.uniforms(seed, index, first, n, stream)
+        assert torch.equal(p, philox.uniforms(seed, index, first, n, stream))
+    assert torch.equal(ops.shape(rows, p), proposals.shape(rows, p))
+    arguments = rows, p - 0.5, p[:, 0].contiguous(), p[:, -1].contiguous()
+    normal = rows[:, 2] < proposals.EVERY_GRADIENT_LOBE
+    equal_places = rows[:, 3] == rows[:, 4]
+    meant = normal & ((rows[:, 2] != proposals.OFF_DIAGONAL_LOBE) | ~equal_places)
+    assert torch.equal(ops.with_lobes(*arguments)[meant], proposals.with_lobes(*arguments)[meant])
 
 
 def test_draw_same_bits_of_very_many_numbers() -> None:
@@ -297,6 +313,7 @@ def recipe(rows: int = 4, B: int = 2, n: int = 3, sigma: int = 3, columns: int =
     return torch.zeros(rows, columns, dtype=torch.int64), doubles(B, n), doubles(sigma), True, False
 
 
+COUNTS = torch.arange(4)
 WRONG = {
     "pick_rows: negative count": lambda: ops.pick_rows(0, 0, -1, 3, 0),
     "pick_rows: no parameters": lambda: ops.pick_rows(0, 0, 4, 0, 0),
@@ -311,6 +328,14 @@ WRONG = {
     "place: rows not a multiple": lambda: ops.place(doubles(5, 3), doubles(2, 3), doubles(3), True, False, 0),
     "place: empty": lambda: ops.place(doubles(0, 3), doubles(0, 3), doubles(3), True, False, 0),
     "place: float32": lambda: ops.place(doubles(4, 3).float(), doubles(2, 3), doubles(3), True, False, 0),
+    "uniforms: odd column": lambda: ops.uniforms(COUNTS, COUNTS, 1, 3, 0),
+    "uniforms: negative count": lambda: ops.uniforms(COUNTS, COUNTS, 0, -1, 0),
+    "uniforms: rows": lambda: ops.uniforms(COUNTS, COUNTS[:2], 0, 3, 0),
+    "uniforms: type": lambda: ops.uniforms(doubles(4), COUNTS, 0, 3, 0),
+    "shape: rows": lambda: ops.shape(recipe()[0], doubles(3, 3)),
+    "shape: dimensions": lambda: ops.shape(recipe()[0], doubles(4)),
+    "with_lobes: rows": lambda: ops.with_lobes(recipe()[0], doubles(3, 3), doubles(3), doubles(3)),
+    "with_lobes: uniforms": lambda: ops.with_lobes(recipe()[0], doubles(4, 3), doubles(4), doubles(3)),
     "project: n": lambda: ops.project(doubles(1, 4, 3), doubles(1, 2, 4)),
     "project: batch": lambda: ops.project(doubles(2, 4, 3), doubles(1, 2, 3)),
     "project: dimensions of u": lambda: ops.project(doubles(4, 3), doubles(1, 2, 3)),

@@ -42,6 +42,15 @@ def test_draw_size(sampler: str, samples: int, n: int, size: int) -> None:
     assert samplers.draw_size(Smoothing(sigma=1.0, samples=samples, sampler=sampler), n) == size
 
 
+def test_draw_size_of_other_settings() -> None:
+    """Scrambles as many as were asked for; three blocks for a mean of the others."""
+    sobol = Smoothing(sigma=1.0, samples=64, sampler="sobol", scrambles=2)
+    assert samplers.draw_size(sobol, 3) == 32
+    for samples, n, size in ((12, 3, 3), (12, 10, 4), (7, 10, 2), (2, 10, 1)):
+        mean = Smoothing(sigma=1.0, samples=samples, sampler="orthogonal", baseline="mean")
+        assert samplers.draw_size(mean, n) == size
+
+
 def test_orthogonal_blocks_are_independent_of_each_other() -> None:
     u = drawn("orthogonal", 20_000, 2, 3)  # a block of two and one of one
     cosines = torch.nn.functional.cosine_similarity(u[:, :1], u[:, 1:], dim=2)

@@ -72,7 +72,7 @@ class ProcessPool(Ahead):
         RuntimeError: workers end before they evaluate anything.
 
     Example:
-        >>> import operator
+        >>> import operator, torch
         >>> with ProcessPool(workers=1) as pool:
         ...     pool(operator.methodcaller("sum", 1), torch.ones(2, 3))
         tensor([3., 3.])

@@ -35,9 +35,9 @@ class GaussianProcessSearch(AskTell[Any]):
       the process knows least, if that point is known already.
     - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds.
 
-    One evaluation follows another. The search has arrived when three steps in a row are shorter than `tolerance`, or
-    when quadratics have ended; these go on to a thousandth of the tolerance. After each of up to `restarts` arrivals it
-    is more optimistic for some steps; of the loss alone it looks where it knows least.
+    One evaluation follows another, unless `ask` gets a batch. The search has arrived when three steps in a row are
+    shorter than `tolerance`, or when quadratics have ended; these go on to a thousandth of the tolerance. After each of
+    up to `restarts` arrivals it is more optimistic for some steps; of the loss alone it looks where it knows least.
 
     In noise `x` is the point whose predicted output has the lowest loss, or with the loss alone the lowest predicted
     loss, and `value` is that prediction. Noise in outputs is detected after some 10 (n + 1) of them; noise in a plain

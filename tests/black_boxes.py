@@ -19,6 +19,10 @@ def picture(z):
     return (z.sum(1)[:, None, None, None] * torch.arange(48 * 64 * 3).reshape(48, 64, 3)).cos()
 
 
+def points(count: int, n: int = 3) -> torch.Tensor:
+    return torch.rand(count, n, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
+
+
 def of_one(point):
     """[n] -> a number of Python."""
     return float(point[0]) ** 2 - 0.5

@@ -42,8 +42,10 @@ def register(folder: Path, settings: dict[str, dict[str, Any]]) -> None:
         for method in sorted({**made, **methods}, key=lambda name: name not in methods):
             old, new = made.get(method, {}), methods.get(method)
             if new is None:  # another method of the task
-                new = {name: value for name, value in next(iter(methods.values())).items() if name in SHARED}
-                old = {name: value for name, value in old.items() if name in new}
+                new, old = (
+                    {name: value for name, value in one.items() if name in SHARED}
+                    for one in (next(iter(methods.values())), old)
+                )
             if old and old != new and any((folder / task / method).glob("*.json*")):
                 raise SystemExit(
                     f"{folder / task / method} was made with {_differences(old, new)}; "

@@ -189,6 +189,7 @@ def _execute(job: Job, connection: Connection) -> Message:
             settings=job.settings,
             watch=watch,
             preparing=watch,
+            parallel=job.workers is not None,
         )
     except Exception as error:
         return Trouble(f"{type(error).__name__}: {error}")

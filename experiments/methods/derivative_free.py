@@ -16,6 +16,7 @@ from scipy.optimize import Bounds, minimize
 
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
+from experiments.methods.restarts import starts
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
@@ -74,23 +75,26 @@ def cma_es(trial: Trial, *, scale: float = 1.0, bounded: bool = False) -> None:
 
 
 def cobyqa(trial: Trial, *, scale: float = 1.0) -> None:
-    """COBYQA of SciPy: a trust region with quadratic models of least change (Ragonneau and Zhang 2022)."""
-    minimize(
-        _one_by_one(trial),
-        trial.start.numpy(),
-        method="COBYQA",
-        bounds=_bounds(trial.task),
-        options={
-            "maxfev": trial.task.evaluations,
-            "maxiter": trial.task.evaluations,
-            "initial_tr_radius": scale * trial.task.sigma,
-            "final_tr_radius": 1e-8 * scale * trial.task.sigma,
-        },
-    )
+    """COBYQA of SciPy: a trust region with quadratic models of least change (Ragonneau and Zhang 2022).
+
+    Where its region has shrunk to nothing it starts again from a random point.
+    """
+    evaluate = _one_by_one(trial)
+    options = {
+        "maxfev": trial.task.evaluations,
+        "maxiter": trial.task.evaluations,
+        "initial_tr_radius": scale * trial.task.sigma,
+        "final_tr_radius": 1e-8 * scale * trial.task.sigma,
+    }
+    for start in starts(trial):
+        minimize(evaluate, start.numpy(), method="COBYQA", bounds=_bounds(trial.task), options=options)
 
 
 def dfo_ls(trial: Trial, *, scale: float = 1.0) -> None:
-    """DFO-LS: Gauss-Newton on interpolated residuals (Cartis, Fiala, Marteau and Roberts 2019)."""
+    """DFO-LS: Gauss-Newton on interpolated residuals (Cartis, Fiala, Marteau and Roberts 2019).
+
+    Where its region has shrunk to nothing it starts again from a random point.
+    """
     import dfols
 
     assert trial.task.output is not None
@@ -103,14 +107,15 @@ def dfo_ls(trial: Trial, *, scale: float = 1.0) -> None:
         return values
 
     bounds = trial.task.bounds
-    dfols.solve(
-        evaluate,
-        trial.start.numpy(),
-        bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
-        rhobeg=scale * trial.task.sigma,
-        maxfun=trial.task.evaluations,
-        do_logging=False,
-    )
+    for start in starts(trial):
+        dfols.solve(
+            evaluate,
+            start.numpy(),
+            bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
+            rhobeg=scale * trial.task.sigma,
+            maxfun=trial.task.evaluations,
+            do_logging=False,
+        )
 
 
 def py_bobyqa(trial: Trial, *, scale: float = 1.0, seek_global_minimum: bool = True) -> None:
@@ -174,7 +179,7 @@ METHODS = (
         is_bounded,
         ("cma",),
     ),
-    Method("cobyqa", "COBYQA (SciPy), quadratic models", with_settings(cobyqa), _is_small, ("scipy",)),
+    Method("cobyqa", "COBYQA (SciPy), quadratic models, with restarts", with_settings(cobyqa), _is_small, ("scipy",)),
     Method(
         "py_bobyqa",
         "Py-BOBYQA, quadratic models with restarts",
@@ -183,6 +188,11 @@ METHODS = (
         ("Py-BOBYQA",),
     ),
     Method(
-        "dfo_ls", "DFO-LS, Gauss-Newton on residuals", with_settings(dfo_ls), _has_residuals, ("DFO-LS",), uses="image"
+        "dfo_ls",
+        "DFO-LS, Gauss-Newton on residuals, with restarts",
+        with_settings(dfo_ls),
+        _has_residuals,
+        ("DFO-LS",),
+        uses="image",
     ),
 )

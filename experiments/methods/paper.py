@@ -14,7 +14,7 @@ the trust region is in units of the parameters for our_h, and in units of sigma 
 source. Settings: `experiments.methods.settings`. The same derivatives on network tasks:
 `experiments.methods.paper_networks`.
 
-Each has two variants with other settings, NAME_source and NAME_tuned. They are run where they are named.
+Each has a variant NAME_source with the settings of the source's Table 3. It is run where it is named.
 
 What differs from the source: our_h and our_hvpa subtract f(x) from every value. That takes one evaluation more; without
 it the Hessian drowns in the noise of a constant. `zh.optim.NonlinearCG` says what else differs.
@@ -22,7 +22,6 @@ it the Hessian drowns in the noise of a constant. `zh.optim.NonlinearCG` says wh
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Literal
 
 import torch
@@ -33,7 +32,7 @@ from experiments.methods import paper_networks
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method, everywhere
 from experiments.methods.paper_networks import has_curvature
-from experiments.methods.settings import no_variant
+from experiments.methods.settings import not_in_table_3
 from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
@@ -167,26 +166,14 @@ def _method(
     return Method(name, title, solve, applies, train=train, trains=trains)
 
 
-_VARIANTS = {"source": "settings of the source's Table 3", "tuned": "settings searched for all alike"}
+def _with_source(method: Method) -> tuple[Method, Method]:
+    """Return a method and its variant with the settings of the source, which only fits."""
 
+    def applies(task: Task) -> str | None:
+        return not_in_table_3(task.name) or method.applies(task)
 
-def _with_variants(method: Method) -> tuple[Method, ...]:
-    """Return a method and its two variants, which differ in their settings alone and only fit."""
-
-    def applies(task: Task, variant: str) -> str | None:
-        return no_variant(variant, task.name) or method.applies(task)
-
-    return method, *(
-        replace(
-            method,
-            name=f"{method.name}_{variant}",
-            title=f"{method.title}: {title}",
-            applies=partial(applies, variant=variant),
-            train=None,
-            extra=True,
-        )
-        for variant, title in _VARIANTS.items()
-    )
+    title = f"{method.title}: settings of the source's Table 3"
+    return method, replace(method, name=f"{method.name}_source", title=title, applies=applies, train=None, extra=True)
 
 
 _METHODS = (
@@ -215,4 +202,4 @@ _METHODS = (
         derivatives="aggregate",
     ),
 )
-METHODS = tuple(variant for method in _METHODS for variant in _with_variants(method))
+METHODS = tuple(one for method in _METHODS for one in _with_source(method))

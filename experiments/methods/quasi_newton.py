@@ -21,6 +21,7 @@ from torch import Tensor
 from experiments.methods.adaptive_differences import bfgs_adaptive_fd
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
+from experiments.methods.restarts import starts
 from experiments.methods.sampled import Annealing, SampledGradient
 from experiments.runs.trial import Trial
 
@@ -169,14 +170,9 @@ def _scipy(trial: Trial, method: str, options: dict[str, Any]) -> None:
         trial.report(torch.tensor(intermediate_result.x), loss=float(intermediate_result.fun))
 
     bounds = trial.task.bounds if method == "L-BFGS-B" else None
-    minimize(
-        loss,
-        trial.start.numpy(),
-        method=method,
-        bounds=None if bounds is None else Bounds(*(one.numpy() for one in bounds)),
-        callback=callback,
-        options=options,
-    )
+    within = None if bounds is None else Bounds(*(one.numpy() for one in bounds))
+    for start in starts(trial):
+        minimize(loss, start.numpy(), method=method, bounds=within, callback=callback, options=options)
 
 
 def _method(name: str, title: str, solve: Callable[..., None], **fixed: bool) -> Method:
@@ -194,6 +190,6 @@ METHODS = (
     _method("lbfgs_frozen", "lbfgs with the same samples", lbfgs, frozen=True),
     _method("bfgs_damped_frozen", "bfgs_damped with the same samples", bfgs, damped=True, frozen=True),
     _method("bfgs_adaptive_fd_frozen", "bfgs_adaptive_fd with the same samples", bfgs_adaptive_fd, frozen=True),
-    _method("bfgs_fd", "BFGS of SciPy on finite differences of the black box", bfgs_fd),
-    _method("lbfgs_fd", "L-BFGS-B of SciPy on finite differences of the black box", lbfgs_fd),
+    _method("bfgs_fd", "BFGS of SciPy on finite differences of the black box, with restarts", bfgs_fd),
+    _method("lbfgs_fd", "L-BFGS-B of SciPy on finite differences of the black box, with restarts", lbfgs_fd),
 )

@@ -52,6 +52,13 @@ class Query:
 
 def table_of(name: str, query: Query) -> str:
     """Return a stored table as Markdown, with a line below it: runs, commit, machine and command."""
+    whole = query.take("origin", "full", ("full", "commit")) == "full"
+    table, rows, note = _made(name, query)
+    return f"{table}\n\n{_origin(rows, note, whole)}"
+
+
+def _made(name: str, query: Query) -> tuple[str, pd.DataFrame, str]:
+    """Return a table as Markdown, the stored rows that it shows, and what to say below it."""
     if name == SPEED_UP:
         return _speed_up(query)
     if name == TABLE_2:
@@ -63,7 +70,7 @@ def table_of(name: str, query: Query) -> str:
         return _trained(table, query)
     columns = query.names("columns", [one for one in table if one not in stored.ORIGIN])
     rows = _where(table, query)
-    return markdown(columns, rows[columns].to_numpy().tolist()) + _origin(rows)
+    return markdown(columns, rows[columns].to_numpy().tolist()), rows, ""
 
 
 def rows_of(name: str, query: Query) -> pd.DataFrame:
@@ -125,7 +132,7 @@ def _selected(table: pd.DataFrame, query: Query) -> tuple[pd.DataFrame, list[str
     return table.sort_values(["task", "method"], key=lambda one: one.map(order[str(one.name)].index)), tasks, methods
 
 
-def _fitted(table: pd.DataFrame, query: Query) -> str:
+def _fitted(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     """Rows are methods, columns tasks: evaluations and seconds until an error is reduced, and the share of starts."""
     table, tasks, methods = _selected(table, query)
     metric = query.take("metric", "image", ("image", "parameter"))
@@ -133,14 +140,16 @@ def _fitted(table: pd.DataFrame, query: Query) -> str:
     show = query.take("show", "both", ("both", "evaluations", "seconds"))
     interval = query.take("share", "plain", ("plain", "interval")) == "interval"
     quartiles = query.take("quartiles", "hide", ("hide", "show")) == "show"
+    titles = query.take("titles", "show", ("show", "hide")) == "show"
     query.end()
     table = table[(table["metric"] == metric) & (table["level"] == float(level))]
     cells = {(row["task"], row["method"]): _cell(row, show, interval, quartiles) for row in table.to_dict("records")}
     about = table.drop_duplicates("method").set_index("method")
     sizes = table.drop_duplicates("task").set_index("task")["n"]
-    headers = ["method", "what it does", "uses", *(_heading(task, sizes[task]) for task in tasks)]
+    known = ["title", "uses"] if titles else ["uses"]
+    headers = ["method", *(_HEADER[one] for one in known), *(_heading(task, sizes[task]) for task in tasks)]
     rows = [
-        [f"`{one}`", about["title"][one], about["uses"][one], *(cells.get((task, one), "") for task in tasks)]
+        [f"`{one}`", *(about[name][one] for name in known), *(cells.get((task, one), "") for task in tasks)]
         for one in methods
     ]
     what = {"both": "evaluations and seconds", "evaluations": "evaluations", "seconds": "seconds"}[show]
@@ -150,7 +159,7 @@ def _fitted(table: pd.DataFrame, query: Query) -> str:
     note += " Behind a median its quartiles." if quartiles else ""
     if any(str(one).startswith("image") for one in about["uses"]):
         note += " Where a task has no image, a method that uses the image uses the loss."
-    return markdown(headers, rows) + _origin(table, note)
+    return markdown(headers, rows), table, note
 
 
 def _heading(task: str, n: float) -> str:
@@ -178,7 +187,7 @@ def _median(row: dict[Any, Any], measure: str, quartiles: bool) -> str:
     return f"{median} [{number(row[f'{measure}_low'])} to {number(row[f'{measure}_high'])}]" if quartiles else median
 
 
-_TRAINED = {
+_HEADER = {
     "task": "task",
     "method": "method",
     "title": "what it does",
@@ -192,17 +201,19 @@ _TRAINED = {
 }
 
 
-def _trained(table: pd.DataFrame, query: Query) -> str:
+def _trained(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     table, *_ = _selected(table, query)
+    hidden = () if query.take("titles", "show", ("show", "hide")) == "show" else ("title",)
     query.end()
+    columns = [name for name in _HEADER if name not in hidden]
     rows = []
     for row in table.to_dict("records"):
         start = [row["task"].upper(), f"`{row['method']}`"]
-        rest = [row[name] for name in list(_TRAINED)[2:]]
+        rest = [row[name] for name in columns[2:]]
         rows.append([*start, *rest, f"{row['reached']} of {row['runs']} ({percent(row['share'])})"])
-    headers = [*_TRAINED.values(), "runs that succeed"]
+    headers = [*(_HEADER[name] for name in columns), "runs that succeed"]
     note = "Medians over runs. Errors are mean squares of held-out images. A run succeeds if it divides the parameter "
-    return markdown(headers, rows) + _origin(table, note + "error by 100.")
+    return markdown(headers, rows), table, note + "error by 100."
 
 
 def _fits(kind: str, query: Query) -> pd.DataFrame:
@@ -213,7 +224,7 @@ def _fits(kind: str, query: Query) -> pd.DataFrame:
     return pd.concat([stored.read(name) for name in names.split(",")], ignore_index=True)
 
 
-def _table_2(query: Query) -> str:
+def _table_2(query: Query) -> tuple[str, pd.DataFrame, str]:
     """Rows are tasks and methods, columns the source's ratios and ours at each level."""
     table = _fits(TABLE_2, query)
     found = source_table.side_by_side(table)
@@ -224,7 +235,7 @@ def _table_2(query: Query) -> str:
     note = f"Seconds and evaluations until the {metric} error is reduced, divided by those of `our_hvpa`: as the "
     note += "source prints them in its Table 2 (seconds), and ours. A dash: not printed, not measured, or fewer than "
     note += "half of the starts of the method or of `our_hvpa` get there."
-    return markdown(source_table.HEADERS, rows) + _origin(table[table["task"].isin(tasks)], note)
+    return markdown(source_table.HEADERS, rows), table[table["task"].isin(tasks)], note
 
 
 def _ratios(query: Query) -> pd.DataFrame:
@@ -244,25 +255,31 @@ def _only(table: pd.DataFrame, column: str) -> str:
     return "; ".join(dict.fromkeys(number(one) for one in table[column]))
 
 
-def _speed_up(query: Query) -> str:
+def _speed_up(query: Query) -> tuple[str, pd.DataFrame, str]:
     table = _ratios(query)
     reference = table["reference"].iloc[0]
     rows = table[["method", "seconds", "seconds_geometric", "evaluations", "evaluations_geometric", "cases"]]
     note = f"Median seconds and evaluations of a method divided by those of `{reference}`: means over all tasks, "
     note += "errors and levels that both reach."
-    return markdown(HEADERS, rows.to_numpy().tolist()) + _origin(table, note)
+    return markdown(HEADERS, rows.to_numpy().tolist()), table, note
 
 
-def _origin(table: pd.DataFrame, note: str = "") -> str:
-    """Return the line below a table."""
+def _origin(table: pd.DataFrame, note: str, whole: bool) -> str:
+    """Return the line below a table; whole: with machine and command."""
     parts = [note] if note else []
     if "runs" in table:
         counts = sorted({int(one) for one in table["runs"]})
         starts = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         limit = _only(table, "limit")
         end = f", {limit} s at most." if limit else "."
+        if "clock" in table:
+            end += (
+                f" Seconds are of the {'processor' if _only(table, 'clock') == 'processor' else 'clock on the wall'}."
+            )
         parts.append(f"{starts} starts, from number {_only(table, 'first_run')} on{end}")
     commits = ", ".join(f"`{one[:9]}`" for one in dict.fromkeys(table["commit"]))
+    if not whole:
+        return " ".join([*parts, f"Commit {commits}."])
     parts.append(f"Commit {commits}, {_only(table, 'date')}, {_only(table, 'machine')}.")
     parts += [f"`{one}`" for one in dict.fromkeys("; ".join(dict.fromkeys(table["command"])).split("; "))]
-    return "\n\n" + " ".join(parts)
+    return " ".join(parts)

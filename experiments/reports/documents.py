@@ -6,12 +6,13 @@
 What is between the marks is written by the command. Marks in code are left alone. Options of a table:
 
 - medians of fits: `tasks=`, `methods=` (names with commas between them), `metric=image|parameter`, `level=90|99|99.9`,
-  `show=both|evaluations|seconds`, `share=plain|interval`, `quartiles=hide|show`;
-- networks: `tasks=`, `methods=`;
+  `show=both|evaluations|seconds`, `share=plain|interval`, `quartiles=hide|show`, `titles=show|hide`;
+- networks: `tasks=`, `methods=`, `titles=show|hide`;
 - `speed_up` in place of a name: mean ratios of methods to `reference=` over the tables in `of=`, and `methods=`;
 - `table_2` in place of a name: the ratios of the source's Table 2 beside those of the tables in `of=`; `tasks=`,
   `metric=`;
-- a study: `columns=`, and `column=value` for the rows to show.
+- a study: `columns=`, and `column=value` for the rows to show;
+- any: `origin=full|commit`, where `commit` leaves out machine and command.
 """
 
 import re

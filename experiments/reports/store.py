@@ -58,14 +58,25 @@ def _ordered(results: Results) -> Results:
 
 
 def _protocol(settings: dict[str, dict[str, Any]], tasks: Sequence[str]) -> dict[str, Any]:
-    """Return the preset and the limit of seconds that all runs have in common."""
-    found = {}
-    for name in ("preset", "limit"):
-        values = {str(one.get(name)): one.get(name) for task in tasks for one in settings.get(task, {}).values()}
+    """Return the preset, the limit of seconds and the clock that all runs have in common."""
+    runs = [one for task in tasks for one in settings.get(task, {}).values()]
+    found: dict[str, Any] = {}
+    for name, of in (
+        ("preset", lambda one: one.get("preset")),
+        ("limit", lambda one: one.get("limit")),
+        ("clock", _clock),
+    ):
+        values = {str(of(one)): of(one) for one in runs}
         if len(values) > 1:
             raise SystemExit(f"runs of one table must have one {name}, got {', '.join(sorted(values))}")
         found[name] = next(iter(values.values()), None)
     return found
+
+
+def _clock(settings: dict[str, Any]) -> str:
+    """Return which clock the seconds of a run are of."""
+    alone = settings.get("threads", 1) == 1 and settings.get("workers") is None
+    return "processor" if alone else "wall"
 
 
 def fitted(results: Results) -> pd.DataFrame:

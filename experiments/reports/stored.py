@@ -14,8 +14,8 @@ import pandas as pd
 from experiments.ensembles import provenance
 
 RESULTS = Path(__file__).parents[1] / "results"
-ORIGIN = ("preset", "limit", "first_run", "commit", "date", "machine", "command")
-"""Columns that say where a row comes from; a study has no runs, and leaves the first three out."""
+ORIGIN = ("preset", "limit", "clock", "first_run", "commit", "date", "machine", "command")
+"""Columns that say where a row comes from; a study has no runs, and leaves the first four out."""
 _DIGITS = 6
 
 

@@ -29,6 +29,7 @@ def attempt(
     settings: dict[str, Any] | None = None,
     watch: Callable[[Record], None] | None = None,
     preparing: Callable[[Preparation], None] | None = None,
+    parallel: bool = False,
 ) -> Outcome:
     """Run a method on a task to its end and return the outcome, written to `folder` if there is one.
 
@@ -45,19 +46,19 @@ def attempt(
         settings: written to the outcome.
         watch: gets every row.
         preparing: gets the progress before the run, outside of its clock.
+        parallel: whether the black box runs in other processes; then seconds are of the clock on the wall.
     """
     _prepare(task, method, run, preparing)
     _seed(run + SEEDS)
-    trial = _trial(task, method, run, folder, limit, watch)
+    trial = _trial(task, method, run, folder, limit, watch, parallel)
     try:
         end = ending(lambda: solve(trial))
     finally:
         trial.close(ended=trial.diverged is not None)
     if trial.files and trial.diverged:
         trial.files.log.unlink()
-        return attempt(
-            task, method, run, solve, folder, limit=limit, settings=settings, watch=watch, preparing=preparing
-        )
+        again: dict[str, Any] = {"settings": settings, "watch": watch, "preparing": preparing, "parallel": parallel}
+        return attempt(task, method, run, solve, folder, limit=limit, **again)
     if trial.ended:
         end = Ending(trial.ended.status, str(trial.ended))
     outcome = Outcome(
@@ -103,10 +104,12 @@ def _trial(
     folder: Path | None,
     limit: float | None,
     watch: Callable[[Record], None] | None,
+    parallel: bool,
 ) -> Trial | NetworkTrial:
     if isinstance(task, NetworkTask):
-        return NetworkTrial(task, method, run, folder, limit=math.inf if limit is None else limit, watch=watch)
-    return Trial(task, method, run, folder, limit=LIMIT if limit is None else limit, watch=watch)
+        most = math.inf if limit is None else limit
+        return NetworkTrial(task, method, run, folder, limit=most, watch=watch, parallel=parallel)
+    return Trial(task, method, run, folder, limit=LIMIT if limit is None else limit, watch=watch, parallel=parallel)
 
 
 def _seed(seed: int) -> None:

@@ -45,8 +45,10 @@ class NetworkTrial(Run):
         *,
         limit: float = math.inf,
         watch: Callable[[Record], None] | None = None,
+        parallel: bool = False,
     ) -> None:
-        super().__init__(task.name, method, run, task.evaluations, folder, limit, watch, parallel=task.threads != 1)
+        parallel = parallel or task.threads != 1
+        super().__init__(task.name, method, run, task.evaluations, folder, limit, watch, parallel=parallel)
         self.task = task
         self.images, _ = task.training(run)
         """[N, 3, h, w]."""

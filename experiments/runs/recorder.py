@@ -21,7 +21,8 @@ class Recorder:
     `skip` is told how many calls and points were answered from the journal. Without `files` nothing is written.
 
     Seconds are of the processor, so that other programs on the machine change them little. On an idle machine they are
-    wall-clock seconds, because a run has one thread. With `parallel` threads seconds are of the clock on the wall.
+    wall-clock seconds, because a run has one thread. With `parallel` threads or processes seconds are of the clock on
+    the wall.
     """
 
     def __init__(

@@ -42,9 +42,10 @@ class Trial(Run):
         *,
         limit: float = LIMIT,
         watch: Callable[[Record], None] | None = None,
+        parallel: bool = False,
     ) -> None:
         skip = task.renderer.skip if task.renderer else None
-        super().__init__(task.name, method, run, task.evaluations, folder, limit, watch, skip)
+        super().__init__(task.name, method, run, task.evaluations, folder, limit, watch, skip, parallel=parallel)
         self.task = task
         self.start = task.start(run).double()
         """Start of this run [n], the same for every method."""

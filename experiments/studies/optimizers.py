@@ -23,6 +23,7 @@ from experiments.methods import METHODS
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.ours import search
+from experiments.methods.restarts import starts
 from experiments.problems import bbob
 from experiments.problems.catalogue import chosen
 from experiments.problems.task import Task
@@ -132,12 +133,9 @@ def reached(task: Task, method: Method, run: int, limit: float = 600.0) -> Reach
 
 def _again(trial: Trial, method: Method) -> None:
     """Start a method again where it ends by itself, from a random point of the box."""
-    for again in itertools.count(1):
-        before = trial.evaluations
+    for start in starts(trial):
+        trial.start = start
         method(trial, None)
-        if trial.evaluations == before:
-            return  # it evaluates nothing
-        trial.start = trial.task.start(1_000_000 * again + trial.run).double()
 
 
 def read(path: Path) -> dict[Job, Reached]:

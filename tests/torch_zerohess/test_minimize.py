@@ -344,6 +344,27 @@ def test_a_minimum_says_what_was_found() -> None:
     assert repr(fit).endswith(told)
 
 
+@pytest.mark.parametrize("deviation", [0.0, 0.1])
+def test_a_plot_shows_every_evaluation_and_the_lowest_so_far(deviation):
+    draws, seen = torch.Generator().manual_seed(0), []
+
+    def fn(z):
+        values = bowl(z) + deviation * torch.randn(len(z), generator=draws, dtype=z.dtype)
+        seen.extend(zip(z.clone(), values, strict=True))
+        return values
+
+    fit = zh.minimize(fn, zeros(), sigma=2.0, seed=0, max_evaluations=60)
+    assert len(fit.points) == len(fit.values) == fit.evaluations == len(seen)
+    assert all(bool((z == point).all()) for (z, _), point in zip(seen, fit.points, strict=True))
+    assert fit.values.tolist() == [float(value) for _, value in seen]
+    axes = fit.plot()
+    every, lowest = (line.get_ydata() for line in axes.lines[:2])
+    assert list(every) == fit.values.tolist()
+    assert list(lowest) == fit.values.cummin(0).values.tolist()
+    assert len(axes.containers) == int(deviation > 0)  # the value with its standard error
+    assert fit.plot(axes) is axes
+
+
 # How it ends.
 
 

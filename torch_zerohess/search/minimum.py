@@ -1,11 +1,15 @@
 """What a minimisation tells while it goes on and at its end."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Status = Literal["target", "solved", "stalled", "budget", "time", "callback", "interrupted", "failed"]
 
@@ -56,6 +60,42 @@ class Minimum:
     """Standard error of the value, which in noise is a mean of evaluations at x; 0 without noise."""
     noise: float = 0.0
     """Standard deviation of repeated losses at one point, as it was given or measured; 0 without noise."""
+
+    @property
+    def points(self) -> Tensor:
+        """All points that were evaluated, in order [evaluations, n]."""
+        return torch.cat([one.points for one in self.history])
+
+    @property
+    def values(self) -> Tensor:
+        """The losses at `points` [evaluations]."""
+        return torch.cat([one.values for one in self.history])
+
+    def plot(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the loss of every evaluation, and the lowest so far as a line, and return the axes.
+
+        Args:
+            axes: of matplotlib, which must be installed; new ones if None.
+
+        The scale is logarithmic where all losses are above zero. In noise the value with its standard error stands at
+        the end: the lowest loss lies below it by luck.
+        """
+        if axes is None:
+            from matplotlib import pyplot
+
+            axes = pyplot.subplots()[1]
+        values = self.values.detach().double().cpu()
+        known = values.nan_to_num(nan=float("inf"))
+        counts = torch.arange(1, len(values) + 1)
+        axes.plot(counts, values, ".", color="0.7", label="evaluations")
+        axes.step(counts, known.cummin(0).values, where="post", label="lowest so far")
+        if self.value_error:
+            axes.errorbar([len(values)], [self.value], [self.value_error], fmt="o", capsize=3, label="value at x")
+        axes.set(xlabel="evaluations", ylabel="loss", title=self.message)
+        if bool((values > 0).all()):
+            axes.set_yscale("log")
+        axes.legend()
+        return axes
 
     def __repr__(self) -> str:
         error = f" +- {self.value_error:.2g}" if self.value_error else ""

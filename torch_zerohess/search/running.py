@@ -13,11 +13,17 @@ from torch import Tensor
 from torch_zerohess.search.minimum import Iterate, Minimum, Status
 from torch_zerohess.search.noise import REPEATED, deviation, differs, distinct, lowest_mean, reserved
 from torch_zerohess.search.trust_region import TrustRegion
+from torch_zerohess.surrogates.local_fit import quadratic_around
+from torch_zerohess.surrogates.quadratic import LocalModel
 
 _PAUSE = 1.0
 """Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
 _OTHERS = 2
 """Points with low values, besides the best one and where the search is, that may be best in noise."""
+_FITTED = 40
+"""Parameters up to which a quadratic is fitted to all evaluations at the end."""
+_EXACT = 1e-3
+"""Relative standard error of its Hessian, below which it takes the place of the model that the search has."""
 
 
 class Running:
@@ -118,7 +124,7 @@ class Running:
         """Return the result."""
         search = self.search
         x, value, value_error = self._decided or (search.x, search.value, self.noise or 0.0)
-        found = search.model_at_best(x)
+        found = self._model(x)
         gradient = hessian = errors = None
         unit = search.unit
         if found is not None:
@@ -150,6 +156,17 @@ class Running:
             value_error,
             self.noise or 0.0,
         )
+
+    def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
+        """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better."""
+        found = self.search.model_at_best(x)
+        if self.noise or not self.history or len(x) > _FITTED:
+            return found
+        unit = self.search.unit
+        points = torch.cat([one.points for one in self.history]).to(unit) / unit
+        losses = torch.cat([one.values for one in self.history]).to(unit)
+        around = quadratic_around(x.to(unit) / unit, points, losses)
+        return found if around is None or (found is not None and around[2] > _EXACT) else around[:2]
 
     def _first(self, points: Tensor) -> Iterate:
         """Evaluate the first points [K, n], and the start again; where its values differ, as often as noise needs."""

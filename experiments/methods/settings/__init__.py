@@ -22,28 +22,23 @@ CHANGES: tuple[Mapping[str, Mapping[str, Mapping[str, Any]]], ...] = (
 )
 """By task and method, in the order in which they replace Table 3."""
 
-__all__ = ["SPACES", "no_variant", "settings", "space"]
+__all__ = ["SPACES", "not_in_table_3", "settings", "space"]
 
 
 def settings(method: str, task: str) -> dict[str, Any]:
     """Return the keyword arguments of a method on a task; empty where its defaults are meant.
 
-    A method of the source has two variants. NAME_source has the settings of Table 3 with what it leaves open;
-    NAME_tuned has those that a search of the same size found for every one of these methods.
+    NAME_source is a method of the source with the settings of Table 3, and with what that leaves open.
     """
     base, _, variant = method.rpartition("_")
     if variant == "source" and base in SOURCE:
         return table_3(base, task) | paper.CHOSEN.get(task, {}).get(base, {})
-    if variant == "tuned" and base in SOURCE:
-        return settings(base, task) | paper.TUNED.get(task, {}).get(base, {})
     found = table_3(method, task)
     for changes in CHANGES:
         found |= changes.get(task, {}).get(method, {})
     return found
 
 
-def no_variant(variant: str, task: str) -> str | None:
-    """Return why a task has no settings of a variant, None if it has."""
-    if variant == "source":
-        return None if task in TABLE_3 else "Table 3 of the source does not have this task"
-    return None if task in paper.TUNED else "its settings were not searched for all of these methods alike"
+def not_in_table_3(task: str) -> str | None:
+    """Return why a task has no settings of the source, None if it has."""
+    return None if task in TABLE_3 else "Table 3 of the source does not have this task"

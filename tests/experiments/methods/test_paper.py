@@ -189,28 +189,25 @@ def test_settings_replace_table_3_only_where_they_say_so(method, task, expected)
     assert settings(method, "no_such_task") == {}
 
 
-def test_variants_have_the_settings_of_the_source_or_those_of_an_equal_search():
-    assert settings("our_g", "box2")["sigma"] == settings("our_g_tuned", "box2")["sigma"] == (0.2, 2e-5)
+def test_variants_have_the_settings_of_the_source():
+    assert settings("our_g", "box2")["sigma"] == (0.2, 2e-5)
     source = settings("our_g_source", "box2")
     assert source == table_3("our_g", "box2")
     assert source["sigma"] == pytest.approx((1.5 / 500, 0.01 / 500))
     assert settings("our_g_source", "quad") == settings("our_g", "quad")  # with what Table 3 leaves open
-    rates = [settings(name, "box2")["learning_rate"] for name in ("our_g", "our_g_source", "our_g_tuned")]
-    assert rates == pytest.approx([0.0006, 0.0006, 0.02])
-    for name in ("our_h", "our_hvp", "our_hvpa"):
-        assert settings(f"{name}_tuned", "box2") == settings(name, "box2")
+    rates = [settings(name, "box2")["learning_rate"] for name in ("our_g", "our_g_source")]
+    assert rates == pytest.approx([0.02, 0.0006])
     assert settings("cma_es_source", "quad") == {}
 
 
 def test_variants_are_methods_that_run_where_they_are_named(tmp_path, monkeypatch):
     names = [name for name, method in METHODS.items() if method.extra]
-    assert names == [f"{name}_{variant}" for name in PAPER for variant in ("source", "tuned")]
+    assert names == [f"{name}_source" for name in PAPER]
     assert list(METHODS).index("our_g_source") == list(METHODS).index("our_g") + 1  # side by side in tables
     task = catalogue.load("brdf")
     assert "Table 3 of the source does not have this task" in METHODS["our_g_source"].unusable(task)
-    assert "not searched" in METHODS["our_g_tuned"].unusable(task)
     task = catalogue.load("box2")
-    assert METHODS["our_g_source"].unusable(task) is METHODS["our_g_tuned"].unusable(task) is None
+    assert METHODS["our_g_source"].unusable(task) is None
     assert METHODS["our_h_source"].unusable(catalogue.load("texture")).startswith("one Hessian of 1024")
     planned = Ensemble(tmp_path, range(1)).plan(["box2"])
     assert {"our_g", "cobyqa"} <= {job.method_name for job in planned}

@@ -17,6 +17,7 @@ from pathlib import Path
 import black_boxes
 import pytest
 import torch
+from black_boxes import points
 
 import torch_zerohess as zh
 from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
@@ -25,16 +26,6 @@ from torch_zerohess.evaluators.process_pool import cores
 from truths import Exponential, PlaneWave, deviation, vector
 
 S = zh.Smoothing(sigma=0.3, samples=8, seed=0)
-
-
-def points(count: int, n: int = 3) -> torch.Tensor:
-    return torch.rand(count, n, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def pool():
-    with ProcessPool(2, retries=0) as one:
-        yield one
 
 
 def pids(pool: ProcessPool) -> set[int]:

@@ -6,20 +6,11 @@ import threading
 import black_boxes
 import pytest
 import torch
+from black_boxes import points
 
 import torch_zerohess as zh
 from torch_zerohess.evaluators import Executor, Inline, ProcessPool
 from truths import vector
-
-
-def points(count: int, n: int = 3) -> torch.Tensor:
-    return torch.rand(count, n, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def pool():
-    with ProcessPool(2, retries=0) as one:
-        yield one
 
 
 @pytest.fixture(scope="module")

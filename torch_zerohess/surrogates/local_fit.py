@@ -1,0 +1,83 @@
+"""The quadratic through the evaluations around a point, as wide as they tell its curvature best."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.surrogates.quadratic import LocalModel
+
+_SPARE = 3
+"""Evaluations beyond the coefficients of a quadratic, at least: the residuals give the standard errors."""
+_WIDER = 1.3
+"""Factor between the numbers of evaluations that are tried."""
+_MOST = 3
+"""Evaluations that are tried at most, over the coefficients."""
+_REACH = 2.0
+"""Distance of the farthest evaluation, in units of the width."""
+_RANK = 1e-9
+"""Smallest pivot of the design, relative to the largest, with which the evaluations tell all coefficients."""
+
+
+def quadratic_around(x: Tensor, points: Tensor, values: Tensor) -> tuple[LocalModel, float, float] | None:
+    """Return the least-squares quadratic around x [n], its width, and the relative standard error of its Hessian.
+
+    Args:
+        x: its centre.
+        points: evaluations [P, n], float64.
+        values: their losses [P], without noise; points whose loss is not finite are left out.
+
+    Of the nearest evaluations, as many are taken as make that error smallest. A quadratic is found exactly. None if
+    the evaluations do not tell one.
+    """
+    finite = torch.isfinite(values)
+    points, values = points[finite], values[finite]
+    n = len(x)
+    coefficients = (n + 1) * (n + 2) // 2
+    distance, order = (points - x).norm(dim=1).sort()
+    best, least = None, math.inf
+    count = coefficients + max(_SPARE, n)
+    while count <= min(len(order), _MOST * coefficients + _SPARE + n):
+        sigma = float(distance[count - 1]) / _REACH
+        near = order[:count]
+        fitted = _least_squares((points[near] - x) / sigma, values[near]) if sigma > 0.0 else None
+        if fitted is not None and fitted[1] < least:
+            best, least = (fitted[0], sigma, fitted[1]), fitted[1]
+        count = math.ceil(_WIDER * count)
+    return best
+
+
+def _least_squares(u: Tensor, values: Tensor) -> tuple[LocalModel, float] | None:
+    """Return a quadratic fitted to values [P] at u [P, n], and the relative standard error of its Hessian."""
+    P, n = u.shape
+    base = values.min()
+    size = float((values - base).max())
+    if size == 0.0:
+        return None
+    row, column = torch.triu_indices(n, n).to(u.device)
+    half = torch.where(row == column, 0.5, 1.0).to(u)
+    design = torch.cat([u.new_ones(P, 1), u, half * u[:, row] * u[:, column]], 1)
+    q, r = torch.linalg.qr(design)
+    pivots = r.diagonal().abs()
+    if float(pivots.min()) < _RANK * float(pivots.max()):
+        return None
+    inverse = torch.linalg.solve_triangular(r, torch.eye(len(r)).to(r), upper=True)
+    target = (values - base) / size
+    solution = inverse @ (q.mT @ target)
+    variance = float((target - design @ solution).square().sum()) / (P - design.shape[1])
+    error = math.sqrt(variance) * inverse.norm(dim=1)
+    gradient, bend = solution[1 : n + 1], solution[n + 1 :]
+    hessian = u.new_zeros(n, n)
+    hessian[row, column] = bend
+    hessian[column, row] = bend
+    scale = float(hessian.norm())
+    relative = float((error[n + 1 :] / half).norm()) / scale if scale > 0.0 else math.inf
+    model = LocalModel(
+        float(base) + size * float(solution[0]),
+        size * gradient,
+        size * hessian,
+        None,
+        size * error[1 : n + 1],
+        size * error[n + 1 :][row == column],
+    )
+    return model, relative

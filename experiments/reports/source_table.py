@@ -66,7 +66,7 @@ HEADERS = (
     "task",
     "method",
     *(f"{level:g} %: {what}" for level in LEVELS for what in ("source", "ours, seconds", "ours, evaluations")),
-    "other order than in the source",
+    "order as in the source",
 )
 
 
@@ -78,9 +78,17 @@ def rows(found: pd.DataFrame, metric: str) -> list[list[object]]:
         at = cells.set_index("level")
         name = at["ours"].iloc[0]
         values = [_cell(at[what][level]) for level in LEVELS for what in ("printed", "seconds", "evaluations")]
-        differ = ", ".join(f"{level:g} %" for level in LEVELS if at["differs"][level])
-        lines.append([str(task).upper(), f"`{name}`" if name else f"{method}, not measured", *values, differ])
+        lines.append([str(task).upper(), f"`{name}`" if name else f"{method}, not measured", *values, _order(at)])
     return lines
+
+
+def _order(cells: pd.DataFrame) -> str:
+    """Return at which levels a method is on the source's side of OurHVPA; a dash if both have no ratio together."""
+    comparable = [level for level in LEVELS if not math.isnan(cells["printed"][level] * cells["seconds"][level])]
+    same = [f"{level:g}" for level in comparable if not cells["differs"][level]]
+    if not comparable or len(same) == len(comparable):
+        return "yes" if comparable else "-"
+    return f"at {', '.join(same)} % only" if same else "no"
 
 
 def _cell(ratio: float) -> str:

@@ -45,6 +45,8 @@ def store(
     whence = stored.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
     table = (trained(results) if networks else fitted(results)).assign(**whence)
     print(stored.write(table[[*(one for one in table if one not in stored.ORIGIN), *stored.ORIGIN]], name))
+    if left := [task for task in there.runs if task not in wanted]:
+        print(f"left out, although the command ran them: {', '.join(left)}")
 
 
 def _ordered(results: Results) -> Results:

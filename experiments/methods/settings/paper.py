@@ -91,11 +91,20 @@ RETUNED: dict[str, dict[str, Settings]] = {
     #     "sigma=(3.0,0.01),(3.0,0.3)"; the same for fr22
     # tune mug --method our_h --runs 3 --trials 8 --over trust_region=1.0,3.0,6.0 samples=1,2 \
     #     "line_search=(1,0.0),(3,0.0)" steps=10,20,40 "sigma=(3.0,0.01),(3.0,0.3)"; our_hvp with 0.5,1.0,2.0,4.0
+    # tune mug --method our_hvpa --runs 3 --trials 12 --over trust_region=1.0,2.0,4.0 samples=1,2 recompute=1,5 \
+    #     "line_search=(1,0.0),(2,0.0)" steps=20,40 "sigma=(3.0,0.01),(3.0,0.3)"
     "mug": {
         "fr22": {"learning_rate": 0.6, "sigma": (3.0, 0.3), "steps": 50},
         "our_g": {"learning_rate": 0.6, "steps": 50},
         "our_h": {"trust_region": 6.0, "sigma": (3.0, 0.3), "line_search": (1, 0.0), "steps": 10},
         "our_hvp": {"trust_region": 1.0, "sigma": (3.0, 0.3), "line_search": (1, 0.0), "steps": 20},
+        "our_hvpa": {
+            "trust_region": 2.0,
+            "sigma": (3.0, 0.3),
+            "line_search": (1, 0.0),
+            "recompute": 1,
+            "steps": 20,
+        },
     },
     # tune shad --method fr22 --runs 3 --trials 10 --over learning_rate=0.05,0.1,0.2 samples=1,2,4 steps=50,100 \
     #     "sigma=(1.0,0.01),(1.5,0.01),(0.5,0.01)"; the same for our_g

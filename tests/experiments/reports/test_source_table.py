@@ -37,6 +37,8 @@ def test_ratios_stand_side_by_side() -> None:
             ("mug", "cma_es_bounded", "image", 90.0, 8.0, 5.0),
             ("mug", "our_hvpa", "image", 99.0, math.nan, math.nan),
             ("mug", "our_g", "image", 99.0, 1.0, 30.0),
+            ("mug", "our_hvpa", "image", 99.9, 2.0, 10.0),
+            ("mug", "cma_es_bounded", "image", 99.9, 1.0, 5.0),
         ),
         ["mug"],
     )
@@ -47,7 +49,9 @@ def test_ratios_stand_side_by_side() -> None:
     assert not theirs["differs"]  # both are slower than OurHVPA
     assert math.isnan(at.loc["OurG", "image", 99.0]["seconds"])  # nothing to divide by
     lines = {line[1]: line for line in source_table.rows(found, "image")}
-    assert lines["`our_g`"] == ["MUG", "`our_g`", "3.99", "0.50", "3.00", "3.91", "-", "-", "3.74", "-", "-", "90 %"]
+    assert lines["`our_g`"] == ["MUG", "`our_g`", "3.99", "0.50", "3.00", "3.91", "-", "-", "3.74", "-", "-", "no"]
+    assert lines["`cma_es_bounded`"][-1] == "at 90 % only"
+    assert lines["OurH, not measured"][-1] == "-"
     assert lines["OurH, not measured"][2:5] == ["1.57", "-", "-"]
     assert "OurHVPA" not in "".join(lines)
 

@@ -175,7 +175,7 @@ def test_a_dense_jacobian_costs_no_evaluation_more_than_before(n):
         while one.evaluations < n + 20 and not one.done:
             z = one.ask(limit=n + 20 - one.evaluations)
             seen.append(z)
-            one.tell(z @ A.mT)
+            one.tell((z[:, None] * A).sum(2))  # the same bits in every batch
     assert search.engine == "descent"
     assert "a sparse Jacobian predicts" in search.reason
     assert torch.equal(torch.cat(points[0]), torch.cat(points[1]))

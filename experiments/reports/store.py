@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Number
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,12 +17,16 @@ from experiments.reports.medians import medians, reached
 from experiments.reports.networks import HELD_OUT, per_method
 from experiments.reports.results import Results, Run, load
 
+_ALIKE = ("preset", "limit", "clock", "first_run", "runs", "commit", "machine")
+"""What rows of one table have in common."""
+
 
 def store(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
     /,
     name: str,
     tasks: tuple[str, ...] = (),
+    add: bool = False,
 ) -> None:
     """Write the medians of a folder of results, with their origin, to experiments/results/NAME.csv.
 
@@ -32,6 +37,7 @@ def store(
         folder: written by `run` or `robustness`.
         name: of the table.
         tasks: only these; all of the folder if not given.
+        add: keep the other tasks of a stored table; refused if its commit, machine or protocol is another one.
     """
     there = load(folder)
     wanted = chosen("tasks", tasks, list(there.runs)) if tasks else list(there.runs)
@@ -44,9 +50,26 @@ def store(
     known = read_command(folder)
     whence = stored.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
     table = (trained(results) if networks else fitted(results)).assign(**whence)
-    print(stored.write(table[[*(one for one in table if one not in stored.ORIGIN), *stored.ORIGIN]], name))
+    table = table[[*(one for one in table if one not in stored.ORIGIN), *stored.ORIGIN]]
+    print(stored.write(_added(table, name) if add else table, name))
     if left := [task for task in there.runs if task not in wanted]:
         print(f"left out, although the command ran them: {', '.join(left)}")
+
+
+def _added(table: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Return the rows of a stored table that are of other tasks, and then a table; SystemExit if they do not fit."""
+    old = stored.read(name)
+    old = old[~old["task"].isin(table["task"])]
+    for one in _ALIKE:
+        values = dict.fromkeys(_plain(value) for part in (old, table) for value in part[one])
+        if len(values) > 1:
+            raise SystemExit(f"rows of one table must have one {one}, got {', '.join(values)}")
+    return pd.concat([old, table], ignore_index=True)
+
+
+def _plain(value: object) -> str:
+    """Return a value as it is in a file: 15 for 15.0."""
+    return f"{value:g}" if isinstance(value, Number) else str(value)
 
 
 def _ordered(results: Results) -> Results:

@@ -163,6 +163,29 @@ def test_what_does_not_go_together_is_refused(folder, results, monkeypatch, spoi
     assert not results.exists()
 
 
+def test_tasks_are_added_to_a_table_of_the_same_protocol(folder, results, tmp_path, monkeypatch):
+    more = tmp_path / "more"
+    for run in (3, 4, 5):
+        write(more, "dish", "fr22", run, [100.0, 0.5], each=2)
+    store(folder, name="bowls")
+    with pytest.raises(SystemExit, match="must have one runs, got 3, 2"):  # descent has two runs in the first folder
+        store(more, name="bowls", add=True)
+    write(folder, "bowl", "descent", 5, [100.0, 50.0, 10.0, 1.0], each=3)
+    store(folder, name="bowls")
+    before = rows(results, "bowls")
+    store(more, name="bowls", add=True)
+    assert rows(results, "bowls")[: len(before)] == before
+    assert [one["task"] for one in rows(results, "bowls")[len(before) :]] == ["dish"] * 6
+    store(more, name="bowls", add=True)  # in place of its rows
+    assert len(rows(results, "bowls")) == len(before) + 6
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": "fedcba", "clean": True})
+    other = tmp_path / "other"
+    for run in (3, 4, 5):
+        write(other, "cup", "fr22", run, [100.0, 0.5], each=2)
+    with pytest.raises(SystemExit, match="must have one commit"):
+        store(other, name="bowls", add=True)
+
+
 def test_some_tasks_of_a_folder(folder, results):
     write(folder, "cnn", "our_g", 3, [1.0, 0.1], each=1, settings={"preset": "paper"})
     store(folder, name="bowls", tasks=("bowl",))

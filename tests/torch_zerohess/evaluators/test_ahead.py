@@ -19,6 +19,7 @@ class Stepping(Ahead):
 
     def __init__(self):
         self.steps, self.begun, self.ended = threading.Semaphore(0), threading.Event(), False
+        self.most = 0
         super().__init__()
 
     def _sent(self, fn):
@@ -29,6 +30,7 @@ class Stepping(Ahead):
 
     def _round(self, jobs):
         self.begun.set()
+        self.most = max(self.most, len(jobs))
         self.steps.acquire(timeout=5)
         assert not self.ended
         job = next((job for job in jobs if job.waiting), None)
@@ -67,6 +69,7 @@ def test_submit_does_not_wait_for_the_call_of_another_thread(threads):
         evaluator.steps.release(9)
         assert torch.equal(future.result(60), black_boxes.waves(points(2)))
         assert torch.equal(call.result(60), black_boxes.waves(points(3)))
+        assert evaluator.most == 2
 
 
 def test_calls_end_with_the_evaluator(threads):

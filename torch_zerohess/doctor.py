@@ -1,11 +1,9 @@
 """What this installation can do."""
 
-import ctypes.util
 import importlib.metadata
 import platform
 import re
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import torch
@@ -17,8 +15,6 @@ _OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "numpy")
 _NAME = "torch_zerohess"
 _DEVELOPERS = "test"
 """The extra that only those need who change this package."""
-_TRY = 30.0
-"""Seconds that one variant of Mitsuba may take."""
 
 
 @dataclass(frozen=True)
@@ -56,30 +52,13 @@ def doctor() -> Report:
     versions = {"python": platform.python_version()}
     versions |= {name: version for name in (_NAME, "torch", *_OPTIONAL) if (version := _version(name))}
     devices = ["cpu"] + [f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in range(torch.cuda.device_count())]
-    variants = _variants()
+    probes = mitsuba_variants.variants()
+    variants = {name: "works" if one.works else one.reason for name, one in probes.items()}
     advice = [] if extension.available else [f"for the C++ extension, {extension.HINT}"]
-    if "mitsuba" in versions and variants.get("llvm_ad_rgb") != "works":
-        advice.append(f"for fast renders with derivatives, {_LLVM}")
+    if "mitsuba" in versions and not probes["llvm_ad_rgb"].works:
+        advice.append(f"for fast renders with derivatives, {mitsuba_variants.LLVM}")
     advice += [f"for {', '.join(names)}: pip install '{_NAME}[{extra}]'" for extra, names in _missing()]
     return Report(extension.available, extension.status, devices, variants, versions, advice)
-
-
-_LLVM = f"LLVM {mitsuba_variants.MINIMUM_LLVM} or newer (Debian: apt-get install libllvm19, macOS: brew install llvm)"
-
-
-def _variants() -> dict[str, str]:
-    """Variants of Mitsuba and "works" or the reason why not; all are tried at the same time."""
-
-    def tried(name: str) -> str:
-        if name.startswith("cuda") and not ctypes.util.find_library("cuda"):
-            return "no NVIDIA driver was found"
-        llvm = mitsuba_variants.find_llvm() if name.startswith("llvm") else None
-        found = mitsuba_variants.probe(name, llvm, _TRY)
-        return "works" if found.works else found.reason
-
-    names = mitsuba_variants.CANDIDATES
-    with ThreadPoolExecutor(len(names)) as pool:
-        return dict(zip(names, pool.map(tried, names), strict=True))
 
 
 def _missing() -> Iterator[tuple[str, list[str]]]:

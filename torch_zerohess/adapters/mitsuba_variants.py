@@ -6,6 +6,7 @@ a library of a version known to be new enough that also passes a tiny render in 
 ``scalar_rgb``, which needs nothing, in all other cases.
 """
 
+import ctypes.util
 import importlib.util
 import os
 import re
@@ -13,6 +14,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,8 +22,11 @@ from types import ModuleType
 
 MINIMUM_LLVM = 16
 CANDIDATES = ("scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
+LLVM = f"LLVM {MINIMUM_LLVM} or newer (Debian: apt-get install libllvm19, macOS: brew install llvm)"
 INSTALL = "mitsuba is not installed; pip install mitsuba"
 
+_DRIVERS = ("cuda", "nvcuda")
+"""Names of the library of the NVIDIA driver: of Linux, and of Windows."""
 _FOLDERS = (
     "/usr/lib",
     "/usr/lib/*-linux-gnu*",
@@ -118,17 +123,12 @@ def probe(variant: str, llvm: Path | None = None, timeout: float = 60.0) -> Prob
 
 
 def variants() -> dict[str, Probe]:
-    """Probe of each variant of ``CANDIDATES`` that this Mitsuba was built with; never aborts, never raises.
+    """Probe of each of ``CANDIDATES``, all tried at the same time; never aborts, never raises.
 
-    Returns: name -> :class:`Probe`; all of ``CANDIDATES`` with the same reason when Mitsuba cannot be imported.
+    Returns: name -> :class:`Probe`; what ``select_variant("auto")`` would not take for lack of LLVM does not work.
     """
-    try:
-        import mitsuba
-    except ImportError as error:
-        reason = INSTALL if isinstance(error, ModuleNotFoundError) else f"mitsuba cannot be imported: {error}"
-        return {name: Probe(False, reason) for name in CANDIDATES}
-    built = set(mitsuba.variants())
-    return {name: _try(name) for name in CANDIDATES if name in built}
+    with ThreadPoolExecutor(len(CANDIDATES)) as pool:
+        return dict(zip(CANDIDATES, pool.map(_safe, CANDIDATES), strict=True))
 
 
 def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleType:
@@ -150,7 +150,7 @@ def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleT
     if importlib.util.find_spec("mitsuba") is None:
         raise ModuleNotFoundError(INSTALL, name="mitsuba")
     if variant == "auto":
-        variant = "llvm_ad_rgb" if find_llvm() is not None and _try("llvm_ad_rgb").works else "scalar_rgb"
+        variant = "llvm_ad_rgb" if _safe("llvm_ad_rgb").works else "scalar_rgb"
     elif variant != "scalar_rgb":
         outcome = _try(variant)
         if not outcome.works:
@@ -168,16 +168,24 @@ def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleT
     return mitsuba
 
 
+def _safe(variant: str) -> Probe:
+    """Try a variant only where the library that it needs is there, and is known to be new enough."""
+    if importlib.util.find_spec("mitsuba") is None:
+        return Probe(False, INSTALL)
+    if variant.startswith("llvm") and find_llvm() is None:
+        return Probe(False, f"no LLVM {MINIMUM_LLVM} or newer was found")
+    if variant.startswith("cuda") and not any(map(ctypes.util.find_library, _DRIVERS)):
+        return Probe(False, "no NVIDIA driver was found")
+    return _try(variant)
+
+
 def _try(variant: str) -> Probe:
     return probe(variant, find_llvm() if variant.startswith("llvm") else None)
 
 
 def _advice(variant: str) -> str:
     if variant.startswith("llvm"):
-        return (
-            f"install LLVM {MINIMUM_LLVM} or newer (Debian: libllvm19, macOS: brew install llvm), point "
-            'DRJIT_LIBLLVM_PATH to its libLLVM, or use variant="scalar_rgb"'
-        )
+        return f'install {LLVM}, point DRJIT_LIBLLVM_PATH to its libLLVM, or use variant="scalar_rgb"'
     return 'use variant="auto" or "scalar_rgb"'
 
 

@@ -1,5 +1,6 @@
 """The drop-in layer: a function that can only be called, as a torch module with derivatives to second order."""
 
+import contextlib
 import functools
 from collections.abc import Callable
 from dataclasses import fields
@@ -12,6 +13,7 @@ from torch_zerohess.autograd import control_variate, opaque, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.limit import limited
 from torch_zerohess.autograd.linear_map import project
+from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
@@ -39,7 +41,8 @@ class BlackBox(nn.Module):
             operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
-            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept.
+            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept. Calls of several threads that share a
+            memory follow one another.
         smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
@@ -101,8 +104,11 @@ class BlackBox(nn.Module):
         flat, others = x.reshape(-1, x.shape[-1]), folded_aux(_without_grad(aux), batch)
         if self.call.value == "center" and not transforms.derivative_possible(x):
             result = self._center(flat.detach(), others)
-        else:
+        elif self.memory is None:
             result = self._around(flat.detach(), others)(flat)
+        else:
+            with self.memory.lock:  # the surrogate stays the same until the result is there
+                result = self._around(flat.detach(), others)(flat)
         if torch.compiler.is_compiling() and x.requires_grad:
             # torch differentiates a compiled backward a second time without an error, and gets a wrong number, unless
             # the backward has saved an input of the graph. This term is zero and saves x: now torch raises.
@@ -120,7 +126,8 @@ class BlackBox(nn.Module):
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = working(x).detach().reshape(-1, n).clone()
         self._check_aux(aux)
-        around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
+        with contextlib.nullcontext() if self.memory is None else self.memory.lock:
+            around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
         def frozen(z: Tensor) -> Tensor:
             result = around(z.reshape(-1, n))
@@ -222,19 +229,6 @@ class BlackBox(nn.Module):
 
     def extra_repr(self) -> str:
         return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"
-
-
-class Input(torch.autograd.Function):
-    """The identity. It marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
-        return x.view_as(x)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        return gradient
 
 
 def smooth(

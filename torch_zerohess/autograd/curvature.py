@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import Node
 
-from torch_zerohess.autograd.blackbox import Input
+from torch_zerohess.autograd.marker import Input
 from torch_zerohess.autograd.transforms import made_by
 
 _DENSE = 10_000

@@ -84,11 +84,7 @@ def estimate(
     given, smoothing = smoothing, smoothing.resolved(n)
     chosen = "" if given is smoothing else smoothing.sampling
 
-    control = None if memory is None else Control.of(memory, head, learning=True)
-    term = None
-    if control is not None and control.active:  # before this call's evaluations, which it must not know
-        sigma = smoothing.sigma_vector(n, flat.device)
-        term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, _seed(smoothing), smoothing.order)
+    control, term = None, None
 
     def draw(own: Smoothing) -> Batch:
         return Batch(evaluate(call, flat, aux_rows, own, stored(own, B, n), control), own)
@@ -104,8 +100,16 @@ def estimate(
             chosen=chosen,
         )
 
+    alone = "one batch: no tolerance was given"
+    if memory is not None:
+        with memory.lock:
+            control = Control.of(memory, head, learning=True)
+            if control.active:  # before this call's evaluations, which it must not know
+                sigma = smoothing.sigma_vector(n, flat.device)
+                term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, _seed(smoothing), smoothing.order)
+            return made([draw(smoothing)], alone)
     if tolerance is None:
-        return made([draw(smoothing)], "one batch: no tolerance was given")
+        return made([draw(smoothing)], alone)
     center = value == "center" or smoothing.baseline == "center"
     batches, reason = draw_until(
         draw,

@@ -1,11 +1,12 @@
 """Calls that do not wait for each other: `submit` returns a future, and the points of all calls share the workers.
 
-A call alone is served by the thread that made it. The first `submit` starts a thread that serves all calls from then
-on, in rounds: give points to workers, wait until one of them has news, take it. Calls are begun in their order, so the
-values of an early one come early. The bits of a call are those that it would have alone.
+Calls are served in rounds: give points to workers, wait until one of them has news, take it. A call alone is served by
+the thread that made it. The first `submit`, or a call beside another one, starts a thread that serves all calls from
+then on; a call that is under way is handed to it between two rounds. Calls are begun in their order, so the values of
+an early one come early. The bits of a call are those that it would have alone.
 """
 
-import concurrent.futures
+import contextlib
 import itertools
 import threading
 from abc import ABC, abstractmethod
@@ -54,8 +55,8 @@ class Job:
 
     @property
     def waiting(self) -> bool:
-        """Whether a chunk waits for a worker. From the first chunk on, the future cannot be cancelled."""
-        return bool(not self.over and self.batch.waiting and self._begin())
+        """Whether a chunk waits for a worker. `begin` comes before the first one is taken."""
+        return bool(self.batch.waiting and not self.over)
 
     @property
     def over(self) -> bool:
@@ -65,20 +66,18 @@ class Job:
 
     def settle(self) -> None:
         """Give the future its values or its error."""
-        if not self._begin():
-            return
-        try:
-            if self.error is not None:
-                raise self.error
-            values = self.batch.result(self.function.known)
-        except BaseException as error:
-            self.future.set_exception(error)
-        else:
-            self.function.known = values.dtype, values.shape[1:]
-            self.future.set_result(values.to(self.device))
+        if self.begin():
+            self.future.settle(self._values)
 
-    def _begin(self) -> bool:
-        """Begin, which who waits for a future that was cancelled hears; whether it was not."""
+    def _values(self) -> Tensor:
+        if self.error is not None:
+            raise self.error
+        values = self.batch.result(self.function.known)
+        self.function.known = values.dtype, values.shape[1:]
+        return values.to(self.device)
+
+    def begin(self) -> bool:
+        """Mark the future as running. Return False if it was cancelled; whoever waits for it is then told."""
         if not self._begun:
             self._begun = True
             self._cancelled = not self.future.set_running_or_notify_cancel()
@@ -98,17 +97,20 @@ class Ahead(Closing, ABC):
         self._check_open()
         if len(points) == 0:
             return checked_values(fn(points, *aux), points)
-        if self._thread is None and self._serving.acquire(blocking=False):
-            try:
-                if self._thread is None:
-                    return self._served(self._job(fn, points, aux))
-            finally:
-                self._serving.release()
         if threading.current_thread() is self._thread:
             raise RuntimeError(f"a callback of a future may submit to the {type(self).__name__}, but not wait for it")
-        job = self._queued(fn, points, aux)  # another thread has a call, too
+        job = self._job(fn, points, aux)
+        job.begin()
+        if self._serving.acquire(blocking=False):
+            try:
+                self._serve_alone(job)
+            finally:
+                self._serving.release()
+        else:  # another thread has a call, too
+            self._queue(job)
         self._await(job)
-        return self._result(job)
+        self._calls.lost = job.batch.lost
+        return job.future.result()
 
     def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
         """Return a `concurrent.futures.Future` of what a call with these arguments returns.
@@ -120,13 +122,25 @@ class Ahead(Closing, ABC):
         self._check_open()
         if len(points) == 0:
             return Evaluation.of(lambda: checked_values(fn(points, *aux), points))
-        return self._queued(fn, points, aux).future
+        job = self._job(fn, points.clone(), [one.clone() for one in aux])  # the caller may write to them
+        self._queue(job)
+        return job.future
 
     @property
     def lost(self) -> dict[int, str]:
         """Points of the last call of this thread that have no value, by number, and why."""
         found: dict[int, str] = getattr(self._calls, "lost", {})
         return found
+
+    def close(self) -> None:
+        """End all workers, and with them all calls: those under way raise RuntimeError."""
+        with self._news:
+            self._closed = True
+            self._news.notify()
+        self._wake()
+        with self._serving, self._taking:  # once the round under way has ended, and no black box is being sent
+            self._fail(self._taken())
+            self._end()
 
     @abstractmethod
     def _sent(self, fn: Callable[..., Any]) -> Any:
@@ -144,8 +158,9 @@ class Ahead(Closing, ABC):
     def _give_up(self, jobs: Sequence[Job]) -> None:
         """Let nobody work on these jobs any more."""
 
-    def _prepare(self) -> None:
-        """Have what `_wake` needs; called once, before the thread starts."""
+    @abstractmethod
+    def _end(self) -> None:
+        """End all workers; again is no error."""
 
     def _wake(self) -> None:
         """Let the round that is under way end soon."""
@@ -156,7 +171,8 @@ class Ahead(Closing, ABC):
 
     def _alone(self) -> None:
         """Have no thread, and no calls."""
-        self._serving, self._taking = threading.Lock(), threading.Lock()
+        # reentrant, because a callback or a signal handler may close the evaluator
+        self._serving, self._taking = threading.RLock(), threading.RLock()
         self._thread: threading.Thread | None = None
         self._news = threading.Condition()
         self._inbox: deque[Job] = deque()
@@ -164,40 +180,49 @@ class Ahead(Closing, ABC):
 
     def _job(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> Job:
         with self._taking:
+            self._check_open()
             if self._function is None or not same(self._function.fn, fn):
                 self._function = Function(fn, self._sent(fn))
             function = self._function
         tensors = tuple(one.detach().cpu() for one in (points, *aux))
         return Job(function, tensors, points.device, self._batch(tensors[0]))
 
-    def _served(self, job: Job) -> Tensor:
-        """Serve a call in this thread."""
-        try:
-            while not job.over:
-                self._round([job])
-            job.settle()
-        finally:  # after an error, or Ctrl-C, nobody waits for what they do
-            self._give_up([job])
-        return self._result(job)
-
-    def _result(self, job: Job) -> Tensor:
-        self._calls.lost = job.batch.lost
-        return job.future.result()
-
-    def _queued(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> Job:
-        job = self._job(fn, points.clone(), [one.clone() for one in aux])  # the caller may write to them
-        if self._thread is None:
-            with self._serving:  # the call of another thread ends first
-                if self._thread is None:
-                    self._prepare()
-                    self._thread = threading.Thread(target=self._serve, name="torch_zerohess evaluator", daemon=True)
-                    self._thread.start()
+    def _queue(self, job: Job) -> None:
+        """Leave a job to the thread that serves all calls."""
         with self._news:
             self._check_open()
+            if self._thread is None:
+                thread = threading.Thread(target=self._serve, name="torch_zerohess evaluator", daemon=True)
+                thread.start()
+                self._thread = thread
             self._inbox.append(job)
             self._news.notify()
         self._wake()
-        return job
+
+    def _taken(self) -> list[Job]:
+        """Return the jobs of the inbox, which has none from now on."""
+        with self._news:
+            jobs = list(self._inbox)
+            self._inbox.clear()
+        return jobs
+
+    def _serve_alone(self, job: Job) -> None:
+        """Serve a call in this thread, as long as it is the only one."""
+        try:
+            while not (job.over or self._closed or self._thread):
+                self._round([job])
+        except BaseException:  # Ctrl-C: nobody waits for what the workers do
+            self._give_up([job])
+            raise
+        with self._news:
+            if not (job.over or self._closed):
+                self._inbox.appendleft(job)  # it was the first
+                return
+        if job.over:
+            self._give_up([job])
+            job.settle()
+        else:
+            self._fail([job])
 
     def _await(self, job: Job) -> None:
         try:
@@ -210,52 +235,36 @@ class Ahead(Closing, ABC):
     def _serve(self) -> None:
         """Serve all calls, until the evaluator is closed."""
         jobs: list[Job] = []
-        while True:
-            with self._news:
-                while not (self._closed or self._inbox or jobs):
-                    self._news.wait()
-                jobs += self._inbox
-                self._inbox.clear()
-            if self._closed:
-                break
-            try:
-                if any(not job.over for job in jobs):
-                    self._round(jobs)
-            except BaseException as error:
-                for job in jobs:
-                    job.error = error
-            ended = [job for job in jobs if job.over]
-            self._give_up(ended)
-            jobs = [job for job in jobs if job not in ended]
-            for job in ended:
-                job.settle()
+        with self._serving:  # once the call under way has been handed over
+            while True:
+                with self._news:
+                    while not (self._closed or self._inbox or jobs):
+                        self._news.wait()
+                jobs += self._taken()
+                if self._closed:
+                    break
+                try:
+                    if any(not job.over for job in jobs):
+                        self._round(jobs)
+                except BaseException as error:
+                    for job in jobs:
+                        job.error = error
+                ended = [job for job in jobs if job.over]
+                self._give_up(ended)
+                jobs = [job for job in jobs if job not in ended]
+                _settle(ended)
+            self._fail(jobs)
+
+    def _fail(self, jobs: Sequence[Job]) -> None:
+        """End jobs, because the evaluator is closed."""
         self._give_up(jobs)
         for job in jobs:
             job.future.cancel()  # if it has not begun
             job.error = RuntimeError(f"the {type(self).__name__} was closed before the values were there")
+        _settle(jobs)
+
+
+def _settle(jobs: Sequence[Job]) -> None:
+    for job in jobs:
+        with contextlib.suppress(BaseException):  # of a callback: the other calls still wait for whoever serves
             job.settle()
-
-    def _stop(self) -> None:
-        """End the thread, and with it all calls."""
-        with self._news:
-            self._closed = True
-            self._news.notify()
-        self._wake()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
-
-
-def wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[[], object]) -> None:
-    """Call `then` once, in whichever thread, when the last of the tasks is done."""
-    left, lock = len(tasks), threading.Lock()
-
-    def one_less(_: Any) -> None:
-        nonlocal left
-        with lock:
-            left -= 1
-            last = left == 0
-        if last:
-            then()
-
-    for task in tasks:
-        task.add_done_callback(one_less)

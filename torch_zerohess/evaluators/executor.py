@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
-from torch_zerohess.evaluators.ahead import wait_all
 from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.inline import Closing, Evaluation
@@ -81,19 +80,21 @@ class Executor(Closing):
         batch, tasks = self._tasks(fn, points, aux)
         future, device = Evaluation(), points.device
         future.set_running_or_notify_cancel()  # what was given to the executor is its own
-        wait_all([task for _, task in tasks], lambda: future.settle(lambda: _joined(batch, tasks).to(device)))
+        _wait_all([task for _, task in tasks], lambda: future.settle(lambda: _joined(batch, tasks).to(device)))
         return future
 
     def _tasks(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> tuple[Batch, Tasks]:
         """Submit the chunks of points."""
-        if not same(self._fn, fn):
-            self._fn, self._name = fn, uuid.uuid4().hex
+        with _lock:
+            if not same(self._fn, fn):
+                self._fn, self._name = fn, uuid.uuid4().hex
+            name = self._name
         batch, tasks = Batch(points, 0), Tasks()
         try:
             while batch.waiting:
                 chunk = batch.take()
                 data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
-                tasks.append((chunk, self.executor.submit(evaluated, self._name, fn, data)))
+                tasks.append((chunk, self.executor.submit(evaluated, name, fn, data)))
         except BaseException:
             for _, task in tasks:
                 task.cancel()
@@ -110,6 +111,22 @@ def _joined(batch: Batch, tasks: Tasks) -> Tensor:
     for chunk, task in tasks:  # in order, so that the first error is that of the first point
         batch.came(chunk, transfer.unpacked(task.result())[0])
     return batch.result()
+
+
+def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[[], object]) -> None:
+    """Call `then` once, in whichever thread, when the last of the tasks is done."""
+    left, lock = len(tasks), threading.Lock()
+
+    def one_less(_: Any) -> None:
+        nonlocal left
+        with lock:
+            left -= 1
+            last = left == 0
+        if last:
+            then()
+
+    for task in tasks:
+        task.add_done_callback(one_less)
 
 
 def evaluated(name: str, fn: Callable[..., Any], data: bytes) -> bytes:

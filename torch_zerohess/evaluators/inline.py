@@ -33,18 +33,22 @@ class Evaluation(concurrent.futures.Future[Tensor]):
 
     @classmethod
     def of(cls, call: Callable[[], Tensor]) -> "Evaluation":
-        """Return a future that is done, with what `call` returns or raises."""
+        """Return a future that is done, with what `call` returns or raises; Ctrl-C is raised here."""
         future = cls()
         future.set_running_or_notify_cancel()
         future.settle(call)
+        if isinstance(error := future.exception(), KeyboardInterrupt):
+            raise error
         return future
 
     def settle(self, call: Callable[[], Tensor]) -> None:
         """Take what `call` returns or raises."""
         try:
-            self.set_result(call())
-        except Exception as error:
+            values = call()
+        except BaseException as error:  # SystemExit too: whoever waits must hear of it
             self.set_exception(error)
+        else:
+            self.set_result(values)
 
 
 class Closing:

@@ -7,6 +7,7 @@ end concerns its own chunk alone.
 """
 
 import atexit
+import contextlib
 import multiprocessing
 import multiprocessing.util  # its own end of processes is registered first, hence runs after ours
 import os
@@ -112,28 +113,30 @@ class ProcessPool(Ahead):
         return _again, (self.workers, settings)
 
     def close(self) -> None:
-        """End all workers. A worker that does not end by itself is killed."""
-        if self._process != os.getpid():
-            self._closed = True
-            return
-        self._stop()
+        """End all workers; one that does not end by itself is killed. Calls that are under way raise RuntimeError."""
+        if self._process == os.getpid():
+            super().close()
+        self._closed = True
+
+    def _end(self) -> None:
         every = self._staffed + [one for one, _ in self._leaving]
         for one in self._staffed:
             one.leave()
         until = time.monotonic() + _GRACE
         for one in every:
             one.end(0.0 if one.chunk is not None or one.number is None else max(0.0, until - time.monotonic()))
-        for end in self._bell or ():
+        self._staffed.clear()
+        self._leaving.clear()
+        for end in self._bell:
             end.close()
-        self._forget()
 
     def _forget(self) -> None:
         self._process = os.getpid()
         self._staffed: list[Process] = []
         self._leaving: list[tuple[Process, float]] = []
         self._failed_starts = 0
-        self._bell: tuple[Connection[Any, Any], Connection[Any, Any]] | None = None
-        """A pipe whose messages end a wait, if a thread serves."""
+        self._bell: tuple[Connection[Any, Any], Connection[Any, Any]] = multiprocessing.Pipe(duplex=False)
+        """A pipe whose messages end a wait."""
         self._rung = False
 
     def _check_open(self) -> None:
@@ -157,13 +160,11 @@ class ProcessPool(Ahead):
         for one in [one for one in self._staffed if one.job in jobs]:
             self._remove(one)
 
-    def _prepare(self) -> None:
-        self._bell = multiprocessing.Pipe(duplex=False)
-
     def _wake(self) -> None:
-        if self._bell and not self._rung:
+        if not self._rung:
             self._rung = True
-            self._bell[1].send_bytes(b"")
+            with contextlib.suppress(OSError):  # closed meanwhile
+                self._bell[1].send_bytes(b"")
 
     def _staff(self, jobs: Sequence[Job]) -> None:
         """Have a worker for every chunk, as far as they may be, and none that is due to be replaced."""
@@ -187,7 +188,7 @@ class ProcessPool(Ahead):
             try:
                 if one.number != job.function.number:
                     one.give_function(job.function.number, job.function.sent)
-                else:
+                elif job.begin():
                     one.give(job, job.batch.take(), self.timeout)
             except (BrokenPipeError, ConnectionResetError):
                 pass  # its end is seen by who listens
@@ -199,10 +200,10 @@ class ProcessPool(Ahead):
             if one.deadline is not None:
                 seconds = min(seconds, max(0.0, one.deadline - time.monotonic()))
         handles = [handle for one in self._staffed for handle in one.handles]
-        ready = set(wait(handles + ([self._bell[0]] if self._bell else []), seconds))
-        if self._bell and self._bell[0] in ready:
-            self._bell[0].recv_bytes()
+        ready = set(wait([*handles, self._bell[0]], seconds))
+        if self._bell[0] in ready:
             self._rung = False
+            self._bell[0].recv_bytes()
         for one in list(self._staffed):
             if one.connection in ready:
                 self._hear(one, jobs)
@@ -265,8 +266,9 @@ class ProcessPool(Ahead):
             error = RuntimeError(
                 f"a worker process ended {when}: {reason or how}, {self._failed_starts} times in a row without a value"
             )
-        for each in jobs if error else ():
-            each.error = error
+        for each in jobs if error else ():  # calls with other black boxes go on
+            if number is None or each.function.number == number:
+                each.error = error
 
     def _remove(self, one: Process, grace: float = 0.0) -> str:
         self._staffed.remove(one)

@@ -66,10 +66,10 @@ class Ray(Ahead):
     def __repr__(self) -> str:
         return f"Ray(actors={self.count}, retries={self.retries}, options={self.options})"
 
-    def close(self) -> None:
-        """End the actors, and a Ray that was started for them alone."""
-        self._stop()
-        self._end_actors()
+    def _end(self) -> None:
+        for actor in self.actors if self._ray.is_initialized() else ():
+            self._ray.kill(actor)
+        self.actors, self._idle, self._busy, self._starting, self._function = [], [], {}, {}, None
         if self._own:
             self._own = False
             self._ray.shutdown()
@@ -87,6 +87,8 @@ class Ray(Ahead):
             job = next((job for job in jobs if job.waiting), None)
             if job is None:
                 break
+            if not job.begin():
+                continue
             self._idle.remove(actor)
             chunk = job.batch.take()
             data = transfer.packed([one[chunk.start : chunk.stop] for one in job.tensors])
@@ -126,11 +128,6 @@ class Ray(Ahead):
             count = self.count or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
             self.actors = [self._new() for _ in range(count)]
             self._idle = list(self.actors)
-
-    def _end_actors(self) -> None:
-        for actor in self.actors if self._ray.is_initialized() else ():
-            self._ray.kill(actor)
-        self.actors, self._idle, self._busy, self._starting, self._function = [], [], {}, {}, None
 
     def _answered(self, one: Any, chunk: Chunk, batch: Batch) -> bool:
         """Treat what became of a chunk; False if its actor has ended."""

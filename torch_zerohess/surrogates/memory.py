@@ -1,5 +1,6 @@
 """Evaluations that are kept, and the surrogate fitted to them: a control variate for later estimates."""
 
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -84,6 +85,8 @@ class Memory:
         """Evaluations taken so far, those that are no longer kept included."""
         self.pathwise: bool | None = None
         """How the surrogate's term is differentiated, see `estimation.surrogate_term`; None: to be measured."""
+        self.lock = threading.RLock()
+        """Held during a call, so that the surrogate does not change in it."""
         self._points: list[Tensor] = []
         self._outputs: list[Tensor] = []
         self._size = 0
@@ -247,6 +250,12 @@ class Memory:
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
         if self._rows > 1:
             self._fit_rows()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, lock=threading.RLock())
 
     def __repr__(self) -> str:
         kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"

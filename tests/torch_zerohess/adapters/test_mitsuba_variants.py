@@ -1,11 +1,14 @@
 """Choice of the Mitsuba variant: a library that aborts must never take the caller with it."""
 
+import ctypes.util
 import os
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
+import torch_zerohess as zh
 from torch_zerohess.adapters import mitsuba_variants as adapter
 
 ABORTING = [path for path in map(Path, ["/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1"]) if path.exists()]
@@ -73,10 +76,37 @@ def test_scalar_always_works_and_a_probe_is_remembered() -> None:
     assert all(outcome.works or outcome.reason for outcome in outcomes.values())
 
 
+def test_variants_are_tried_at_the_same_time_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    together, seen = threading.Barrier(len(adapter.CANDIDATES)), set()
+
+    def probe(*arguments: object) -> adapter.Probe:
+        together.wait(30)
+        seen.add(arguments)
+        return adapter.Probe(True, "")
+
+    monkeypatch.setattr(adapter, "probe", probe)
+    monkeypatch.setattr(adapter, "find_llvm", lambda: Path("libLLVM.so.19"))
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: "nvcuda.dll" if name == "nvcuda" else None)
+    assert set(zh.doctor().mitsuba.values()) == {"works"}
+    assert set(adapter.variants()) == {variant for variant, *_ in seen}
+    assert len(seen) == len(adapter.CANDIDATES), "both ask for the same tries, which are remembered"
+
+
+def test_what_auto_does_not_take_does_not_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adapter, "probe", lambda *_: adapter.Probe(True, ""))
+    monkeypatch.setattr(adapter, "find_llvm", lambda: None)
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
+    outcomes = adapter.variants()
+    assert outcomes["scalar_rgb"].works
+    assert outcomes["llvm_ad_rgb"] == adapter.Probe(False, "no LLVM 16 or newer was found")
+    assert outcomes["cuda_ad_rgb"] == adapter.Probe(False, "no NVIDIA driver was found")
+    assert adapter.select_variant().variant() == "scalar_rgb"
+
+
 def test_select_returns_the_module_with_the_variant_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", os.environ.get("DRJIT_LIBLLVM_PATH", ""))
     assert adapter.select_variant("scalar_rgb", threads=1).variant() == "scalar_rgb"
-    expected = "llvm_ad_rgb" if adapter.variants()["llvm_ad_rgb"].works and adapter.find_llvm() else "scalar_rgb"
+    expected = "llvm_ad_rgb" if adapter.variants()["llvm_ad_rgb"].works else "scalar_rgb"
     assert adapter.select_variant().variant() == expected
 
 

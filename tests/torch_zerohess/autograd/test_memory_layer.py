@@ -1,6 +1,9 @@
 """A layer with a head and a memory: unbiased whatever the surrogate is, exact where it is, and regular in torch."""
 
+import copy
 import math
+import pickle
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -232,6 +235,58 @@ def test_state_dict_carries_the_memory() -> None:
     torch.testing.assert_close(*results, rtol=1e-6, atol=1e-9)
     with pytest.raises((ValueError, RuntimeError), match="memory"):
         layer(None).load_state_dict(first.state_dict())
+
+
+@pytest.mark.parametrize("door", ["layer", "freeze", "estimate"])
+def test_calls_of_two_threads_with_one_memory_follow_one_another(door: str) -> None:
+    """The second call begins while the black box of the first one is called."""
+    x, r = point()
+    memory, head = remembering(SURROGATES["good"]()), zh.heads.SquaredError()
+    smoothing = zh.Smoothing(sigma=SIGMA, samples=3, baseline="none", seed=4)
+    others: list[threading.Thread] = []
+    seen: list[int] = []
+
+    def fn(z: Tensor) -> Tensor:
+        seen.append(threading.get_ident())
+        if others:
+            other = others.pop()
+            other.start()
+            other.join(0.3)
+            seen.append(threading.get_ident())
+        return render(z)
+
+    box = zh.BlackBox(fn, smoothing, head=head, memory=memory, value="smoothed").eval()
+
+    def call() -> Tensor:
+        if door == "estimate":
+            return zh.estimate(fn, x, smoothing, r, head=head, memory=memory).value
+        return box.freeze(x, r)(x) if door == "freeze" else box(x.clone().requires_grad_(), r).detach()
+
+    results = [call()]
+    thread = threading.Thread(target=lambda: results.append(call()))
+    others.append(thread)
+    seen.clear()
+    results.append(call())
+    thread.join()
+    first = seen.count(threading.get_ident())
+    assert set(seen[:first]) == {threading.get_ident()}
+    assert len(set(seen[first:])) == 1
+    if door != "estimate":  # which learns from every call
+        assert torch.equal(results[1], results[0])
+        assert torch.equal(results[2], results[0])
+
+
+def test_a_layer_with_a_memory_can_be_copied() -> None:
+    x, r = point()
+    box = layer(zh.Memory(fresh=1), samples=2)
+    box(x.clone().requires_grad_(), r).sum().backward()
+    twin = copy.deepcopy(box)
+    again = pickle.loads(pickle.dumps(box.memory))
+    for memory in (twin.memory, again):
+        assert memory.lock is not box.memory.lock
+        assert torch.equal(memory.points, box.memory.points)
+    twin(x.clone().requires_grad_(), r).sum().backward()
+    assert (twin.memory.evaluations, box.memory.evaluations) == (8, 4)
 
 
 def test_first_order_leaves_the_curvature_to_the_surrogate() -> None:

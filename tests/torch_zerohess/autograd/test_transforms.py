@@ -10,7 +10,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 import torch_zerohess as zh
 from torch_zerohess.autograd import transforms
-from torch_zerohess.autograd.blackbox import Input
+from torch_zerohess.autograd.marker import Input
 from truths import spread, vector
 
 X, V = vector(0.3, -0.7), vector(1.0, 2.0)

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import multiprocessing
+import threading
 import warnings
 
 import black_boxes
@@ -75,6 +76,31 @@ def test_the_error_is_that_of_the_first_point(threads):
     with pytest.raises(RuntimeError, match="the Executor is closed"):
         evaluator(black_boxes.waves, z)
     assert threads.submit(int).result() == 0  # the executor is the caller's
+
+
+class Interrupted:
+    """An executor of this process. Before its next task another thread does something."""
+
+    def __init__(self):
+        self.other = None
+
+    def submit(self, function, *arguments):
+        other, self.other = self.other, None
+        if other:
+            thread = threading.Thread(target=other)
+            thread.start()
+            thread.join()
+        future = concurrent.futures.Future()
+        future.set_result(function(*arguments))
+        return future
+
+
+def test_threads_that_share_it_get_the_values_of_their_own_black_box():
+    executor, others = Interrupted(), []
+    evaluator = Executor(executor)
+    executor.other = lambda: others.append(evaluator(torch.Tensor.exp, Z))
+    assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
+    assert torch.equal(others[0], Z.exp())
 
 
 def test_what_is_no_executor_is_refused():

@@ -49,10 +49,21 @@ def expected_with(aux):
 def test_an_error_is_that_of_its_own_call(evaluator):
     first = evaluator.submit(black_boxes.waves, points(5))
     wrong = evaluator.submit(black_boxes.failing, torch.tensor([[0.1], [0.7], [0.9]]))
+    left = evaluator.submit(black_boxes.leaving, points(1))
     last = evaluator.submit(black_boxes.waves, points(6))
+    assert isinstance(left.exception(60), SystemExit)
     assert isinstance(wrong.exception(), ArithmeticError)
     assert torch.equal(first.result(), black_boxes.waves(points(5)))
     assert torch.equal(last.result(), black_boxes.waves(points(6)))
+
+
+def interrupted(z):
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_is_raised_where_the_black_box_is_called():
+    with pytest.raises(KeyboardInterrupt):
+        Inline().submit(interrupted, points(1))
 
 
 @pytest.mark.parametrize("name", ["pool", "threads"])

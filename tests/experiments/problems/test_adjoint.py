@@ -231,17 +231,3 @@ def test_scenes_are_released_before_the_next_one_is_loaded(monkeypatch, tmp_path
     monkeypatch.setattr(KeptParts, "rows", lambda *_: [])
     gradients(("shad", "mug"), variant="scalar_rgb", out=tmp_path)
     assert events == ["load shad", "release shad", "load mug", "release mug"]
-
-
-def test_scenes_are_released_before_the_next_one_is_loaded(monkeypatch, tmp_path) -> None:
-    events, load = [], catalogue.load
-
-    def noted(name, *rest):
-        events.append(f"load {name}")
-        task = load(name, *rest)
-        return replace(task, renderer=replace(task.renderer, release=lambda: events.append(f"release {name}")))
-
-    monkeypatch.setattr(catalogue, "load", noted)
-    monkeypatch.setattr(KeptParts, "rows", lambda *_: [])
-    gradients(("shad", "mug"), variant="scalar_rgb", out=tmp_path)
-    assert events == ["load shad", "release shad", "load mug", "release mug"]

@@ -12,8 +12,8 @@ from experiments.reports import supplement_figures
 from experiments.reports.animation import Trace
 from experiments.runs.records import Outcome, Record
 from experiments.studies.estimator_curves import Measurement, draw_operators, orders
-from experiments.studies.figures import FIGURES, GROUPS, arrivals, figures
 from experiments.studies.estimator_methods import ALONE, OPERATORS
+from experiments.studies.figures import FIGURES, GROUPS, arrivals, figures
 from experiments.studies.gallery import trace
 from experiments.studies.lobes import LOBES, distance, draw, inverse
 from experiments.studies.variance import VarianceReport
@@ -51,7 +51,7 @@ def test_draws_have_the_densities(tmp_path) -> None:
 
 @pytest.mark.parametrize("lobe", PLANES)
 def test_draws_of_another_density_are_noticed(lobe) -> None:
-    """Draws of every other lobe; the source draws an off-diagonal element of the Hessian as FR22 all dimensions."""
+    """Draws of every other lobe; FR22 in two dimensions is the off-diagonal lobe."""
     alike = {lobe.name, *(("Hessian, off-diagonal", "FR22") if lobe.density is FR22.density else ())}
     for other in [one.values[0] for one in PLANES]:
         u = other.draw(20_000, 7)

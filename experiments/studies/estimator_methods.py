@@ -142,6 +142,7 @@ METHODS = (
     Method("differences, independent", "aggregate", "center", difference="independent"),
     Method("differences, common", "aggregate", "center", difference="common"),
 )
+NAMES = tuple(method.name for method in METHODS)
 OPERATORS = tuple(
     f"{kind} + {baseline}" for kind in ("uniform", "aggregate", "per-element") for baseline in ("none", "center")
 )

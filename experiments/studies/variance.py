@@ -35,7 +35,7 @@ from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_choice import SIZES, compare, summary
 from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
-from experiments.studies.estimator_methods import ALONE, METHODS, OURS, Method
+from experiments.studies.estimator_methods import ALONE, METHODS, NAMES, OURS, Method
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
 
 _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest budget
@@ -80,7 +80,7 @@ def variance(
     out: Path = Path("results/variance"),
     budgets: tuple[int, ...] = (32, 128, 512, 2048),
     problems: tuple[str, ...] = tuple(PROBLEMS),
-    methods: tuple[str, ...] = tuple(one.name for one in METHODS),
+    methods: tuple[str, ...] = NAMES,
     side: int = 64,
     sizes: tuple[int, ...] = SIZES,
     rivals: int = 100,

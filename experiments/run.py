@@ -49,8 +49,8 @@ def run(
         evaluations: that a run may use; those of the task if not given.
         variant: of Mitsuba; auto takes a just-in-time one only where it is known to work.
         threads: render threads of networks; all cores if not given. Other tasks have one per process.
-        workers: processes for the black box of each run, one thread each but for `threads`; besides that of the run,
-            which then waits. The results do not depend on them, the seconds do.
+        workers: processes that evaluate the black box of each run. The process of the run waits meanwhile. Each has
+            one thread; for networks `threads`.
     """
     names = chosen("TASK", tasks, list(TASKS))
     wanted = None if methods.strip() == "all" else chosen("methods", methods.split(","), list(METHODS))

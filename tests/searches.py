@@ -79,17 +79,17 @@ def misfit(f, solution):
     return lambda y: (y - target).square().mean()
 
 
-def run(search, f, evaluations, target=-math.inf):
-    """Search until so many evaluations, or the target value."""
+def run(search, f, evaluations, target=-math.inf, values=None):
+    """Search until so many evaluations, or the target value; append the value after each batch to a list."""
     while not search.done and search.evaluations < evaluations and search.value > target:
         search.tell(f(search.ask(limit=evaluations - search.evaluations)))
+        if values is not None:
+            values.append(search.value)
     return search
 
 
 def points_of(search, f, evaluations):
     """The points that a search asks for."""
     asked = []
-    while not search.done and search.evaluations < evaluations:
-        asked.append(search.ask(limit=evaluations - search.evaluations))
-        search.tell(f(asked[-1]))
+    run(search, lambda z: f(asked.append(z) or z), evaluations)
     return torch.cat(asked)

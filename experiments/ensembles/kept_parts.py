@@ -6,17 +6,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from experiments.ensembles.provenance import register
+from experiments.ensembles import provenance
 
 NAME = "parts.jsonl"
 Row = TypeVar("Row")
 
 
 class KeptParts:
-    """Parts of a study: each has a name, all settings that its rows depend on, and is measured once.
+    """Parts of a study: each has a name, all settings that its rows depend on, and is measured once by the same code.
 
-    FOLDER/parts.jsonl has one line per part, written as soon as the part is measured. A line that a kill has cut off is
-    dropped, and its part is measured again. FOLDER/command.json has the commands.
+    FOLDER/parts.jsonl has one line per part, written as soon as the part is measured, with the version of the code. A
+    part of other code is measured again, and so is one whose line a kill has cut off. FOLDER/command.json has the
+    commands.
 
     Args:
         folder: of the study; made by the first part that is measured.
@@ -25,6 +26,7 @@ class KeptParts:
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
         self._noted = False
+        self._code = provenance.version()
         self._known: dict[str, list[dict[str, Any]]] = {}
         whole = 0
         for line in self._path.read_bytes().splitlines(keepends=True) if self._path.exists() else ():
@@ -32,7 +34,7 @@ class KeptParts:
                 if not line.endswith(b"\n"):
                     break
                 part = json.loads(line)
-                self._known[_key(part["name"])] = part["rows"]
+                self._known[_key(part["name"], part.get("code"))] = part["rows"]
             except (ValueError, TypeError, KeyError):
                 raise SystemExit(f"{self._path} has a line that is not a part of a study; delete the file") from None
             whole += len(line)
@@ -48,21 +50,21 @@ class KeptParts:
             of: dataclass of the rows.
             measure: returns the rows.
         """
-        key = _key(name)
+        key = _key(name, self._code)
         if key not in self._known:
             found = [asdict(row) for row in measure()]  # type: ignore[call-overload]
-            self._append({"name": dict(name), "rows": found})
+            self._append({"name": dict(name), "code": self._code, "rows": found})
             self._known[key] = found
         return [of(**row) for row in self._known[key]]
 
     def _append(self, part: Mapping[str, Any]) -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         if not self._noted:
-            register(self._path.parent, {})
+            provenance.register(self._path.parent, {})
             self._noted = True
         with self._path.open("ab") as file:
             file.write(json.dumps(part).encode() + b"\n")
 
 
-def _key(name: Mapping[str, Any]) -> str:
-    return json.dumps(name, sort_keys=True)
+def _key(name: Mapping[str, Any], code: Mapping[str, Any] | None) -> str:
+    return json.dumps([name, code], sort_keys=True)

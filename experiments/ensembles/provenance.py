@@ -1,5 +1,6 @@
 """`command.json` of a folder of results: the commands that made it, with which code and settings, on which machine."""
 
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -71,6 +72,22 @@ def code() -> dict[str, Any]:
     commit = _git("rev-parse", "HEAD")
     changes = None if commit is None else _git("status", "--porcelain", "--", *_CODE)
     return {"commit": commit, "clean": None if changes is None else not changes}
+
+
+def version() -> dict[str, Any]:
+    """Return what tells this code from other code: the commit, and with changes or outside of git a digest too."""
+    known = code()
+    return {"commit": known["commit"], "changed": None if known["clean"] else _digest()}
+
+
+def _digest() -> str:
+    """Return the SHA-256 of the sources that results depend on."""
+    found = hashlib.sha256()
+    for folder in ("experiments", "torch_zerohess", "csrc"):
+        for path in sorted((_ROOT / folder).rglob("*")):
+            if path.suffix in (".py", ".cpp", ".h"):
+                found.update(f"{path.relative_to(_ROOT)}\0".encode() + path.read_bytes())
+    return found.hexdigest()
 
 
 def _git(*arguments: str) -> str | None:

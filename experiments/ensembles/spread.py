@@ -1,7 +1,5 @@
 """The black box of a task in worker processes: a run with them has the rows of a run without."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -40,12 +38,16 @@ class BlackBoxOf:
         return task.output.image(x)
 
 
-def spread(task: Task | NetworkTask, pool: ProcessPool, *source: Any) -> Task | NetworkTask:
-    """Return a task whose black box is that of `BlackBoxOf(*source)` in the workers; they have made it already.
+def spread(task: Task | NetworkTask, pool: ProcessPool, fn: Factory) -> Task | NetworkTask:
+    """Return a task whose black box is the one in the workers; they have made it already.
 
     Errors of points, which are not evaluations, are still measured in this process.
+
+    Args:
+        task: whose black box it is.
+        pool: of the workers, which keep what they have made for one `fn`.
+        fn: makes a `BlackBoxOf` the task.
     """
-    fn = Factory(BlackBoxOf, *source)
     if isinstance(task, NetworkTask):
         vars(task)["scene"] = lambda x: pool(fn, x)  # in place of what it would load; it renders the first images
         return task

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from experiments.ensembles.spread import spread
+from experiments.ensembles.spread import BlackBoxOf, spread
 from experiments.methods import METHODS, Method
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
@@ -21,7 +21,7 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
-from torch_zerohess.evaluators import ProcessPool
+from torch_zerohess.evaluators import Factory, ProcessPool
 from torch_zerohess.evaluators.lifetime import end_with_parent, one_thread
 
 _PROGRESS = 0.2
@@ -175,8 +175,7 @@ def _execute(job: Job, connection: Connection) -> Message:
         task = _load(job.task, job.preset, job.variant, job.threads) if isinstance(job.task, str) else job.task
         task = catalogue.budgeted(task, job.budget)
         if job.workers is not None:
-            source = job.task, job.preset, job.variant, job.threads
-            task = spread(task, _pool(job.task_name, job.workers), *source)
+            task = spread(task, *_carrier(job.workers, job.task, job.preset, job.variant, job.threads))
         method = METHODS[job.method] if isinstance(job.method, str) else job.method
         method.load()
         return attempt(
@@ -200,13 +199,14 @@ def _load(name: str, preset: Preset, variant: str, threads: int | None) -> Task 
     return catalogue.load(name, preset, variant, threads)
 
 
-@lru_cache(maxsize=1)
-def _pool(task: str, workers: int) -> ProcessPool:
-    """Return the processes for the black box of a task; those of another task end."""
-    for pool in _pools:
-        pool.close()
-    _pools[:] = [ProcessPool(workers)]
-    return _pools[0]
+_carriers: dict[tuple[Any, ...], tuple[ProcessPool, Factory]] = {}
 
 
-_pools: list[ProcessPool] = []
+def _carrier(workers: int, *source: Any) -> tuple[ProcessPool, Factory]:
+    """Return the processes for `BlackBoxOf(*source)`, and what makes it there once; those of another one end."""
+    key = workers, *source
+    if key not in _carriers:
+        while _carriers:
+            _carriers.popitem()[1][0].close()
+        _carriers[key] = ProcessPool(workers), Factory(BlackBoxOf, *source)
+    return _carriers[key]

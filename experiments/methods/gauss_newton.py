@@ -6,6 +6,7 @@ from typing import Any
 import torch_zerohess as zh
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
+from experiments.methods.ours import drive
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
@@ -14,7 +15,7 @@ DENSE_FEWEST, SPARSE_FEWEST = 100, 20
 
 
 def gauss_newton(trial: Trial, *, sparse: bool, **settings: Any) -> None:
-    """Ask for points, evaluate them and tell, until the evaluations are used.
+    """Search by Gauss-Newton steps until the evaluations are used.
 
     Args:
         trial: the run.
@@ -26,11 +27,7 @@ def gauss_newton(trial: Trial, *, sparse: bool, **settings: Any) -> None:
     given = {"sigma": task.sigma, "restarts": task.evaluations} | settings  # the harness ends the run
     kind = zh.optim.LocalGaussNewton if sparse else zh.optim.BlockGaussNewton
     search = kind(trial.start, loss=task.output.loss, bounds=task.bounds, seed=trial.seed, **given)
-    while not search.done:
-        steps = search.iterations
-        search.tell(trial.image(search.ask(limit=max(trial.remaining, 1))))
-        if search.iterations > steps:
-            trial.report(search.x, sigma=search.sigma * float(search.unit.mean()), loss=search.value)
+    drive(trial, search, trial.image)
 
 
 def _applies(task: Task, *, fewest: int) -> str | None:
@@ -39,19 +36,16 @@ def _applies(task: Task, *, fewest: int) -> str | None:
     return None if task.n >= fewest else f"made for {fewest} parameters and more, the task has {task.n}"
 
 
-METHODS = (
+METHODS = tuple(
     Method(
-        "block_gauss_newton",
-        "ours for images of many parameters: Gauss-Newton on a Jacobian sampled block by block",
-        with_settings(gauss_newton, sparse=False),
-        partial(_applies, fewest=DENSE_FEWEST),
+        name,
+        f"ours for {title}",
+        with_settings(gauss_newton, sparse=sparse),
+        partial(_applies, fewest=SPARSE_FEWEST if sparse else DENSE_FEWEST),
         uses="image",
-    ),
-    Method(
-        "local",
-        "ours for pixels of few parameters each: Gauss-Newton on a sparse Jacobian, found from samples",
-        with_settings(gauss_newton, sparse=True),
-        partial(_applies, fewest=SPARSE_FEWEST),
-        uses="image",
-    ),
+    )
+    for name, sparse, title in (
+        ("block_gauss_newton", False, "images of many parameters: Gauss-Newton on a Jacobian sampled block by block"),
+        ("local", True, "pixels of few parameters each: Gauss-Newton on a sparse Jacobian, found from samples"),
+    )
 )

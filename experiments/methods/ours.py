@@ -8,7 +8,8 @@
 | descent_loss | the same | loss alone |
 """
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -30,7 +31,7 @@ def search(
     sigma: float | None = None,
     output: bool = True,
 ) -> None:
-    """Ask for points, evaluate them and tell, until the evaluations are used.
+    """Search by `zh.optim.TrustRegion` until the evaluations are used.
 
     Args:
         trial: the run.
@@ -50,10 +51,20 @@ def search(
         restarts=task.evaluations,  # the harness ends the run
         seed=trial.seed,
     )
-    while not found.done:
-        found.tell(evaluate(found.ask(limit=max(trial.remaining, 1))))
-        width: Tensor = found.sigma * found.unit
-        trial.report(found.x, sigma=float(width.mean()), loss=found.value)
+    drive(trial, found, evaluate)
+
+
+def drive(trial: Trial, search: Any, evaluate: Callable[[Tensor], Tensor]) -> None:
+    """Ask a search for points, evaluate them, tell it and report, until it or the run is done.
+
+    Args:
+        trial: the run.
+        search: of `zh.optim`.
+        evaluate: points [K, n] to values [K], or outputs [K, *out].
+    """
+    while not search.done:
+        search.tell(evaluate(search.ask(limit=max(trial.remaining, 1))))
+        trial.report(search.x, sigma=float((search.sigma * search.unit).mean()), loss=search.value)
 
 
 def _has_output(task: Task) -> str | None:

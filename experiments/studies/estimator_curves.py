@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib as mpl
 import torch
 
-from experiments.studies.estimator_methods import METHODS, OURS, Method
+from experiments.studies.estimator_methods import ALONE, FIRST_ORDER, METHODS, OURS, Method
 from experiments.studies.estimator_problems import QUANTITIES, Problem
 
 mpl.use("Agg")
@@ -89,7 +89,7 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
     figure, axes = plt.subplots(len(problems), 4, figsize=(22, 6.2 * len(problems)), squeeze=False)
     for row, problem in zip(axes, problems, strict=True):
         for axis, quantity in zip(row, QUANTITIES, strict=True):
-            for method in METHODS:
+            for method in (*METHODS, *ALONE):
                 x, y = curve(measurements, problem.name, method.name, quantity, against)
                 if x:
                     fitted = slope(x, y)
@@ -104,9 +104,10 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
             axis.axhline(1, color="0.6", linewidth=0.8, zorder=0)
             axis.grid(which="major", color="0.9")
             axis.spines[["top", "right"]].set_visible(False)
-            axis.legend(
-                fontsize=7, ncols=2, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), handlelength=3
-            )
+            if axis.get_legend_handles_labels()[0]:
+                axis.legend(
+                    fontsize=7, ncols=2, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), handlelength=3
+                )
         row[0].set_ylabel("relative RMSE")
     figure.suptitle(
         f"Error of the estimators against {AXES[against]} (slope of the log-log fit in parentheses)",
@@ -128,13 +129,12 @@ def draw_operators(measurements: Sequence[Measurement], problem: str, path: Path
     """Draw figure 11: variance of uniform, aggregate and optimal sampling for one problem.
 
     Above against samples per element, as in the source; below against evaluations. Solid lines subtract f(x) from the
-    values, dotted ones nothing.
+    values, dotted ones nothing. Gradients are of methods that estimate nothing else.
     """
     figure, axes = plt.subplots(2, len(OPERATORS), figsize=(12, 7), layout="constrained", sharey="col", squeeze=False)
     for row, against in zip(axes, ("samples", "evaluations"), strict=True):
         for axis, (quantity, title) in zip(row, OPERATORS.items(), strict=True):
-            for method in dict.fromkeys(one.method for one in measurements):
-                kind, _, baseline = method.partition(" + ")
+            for method, (kind, baseline) in _operators(measurements, quantity).items():
                 x, y = curve(measurements, problem, method, quantity, against)
                 line = "-" if baseline == "center" else ":"
                 label = f"{_KINDS[kind]}{'' if baseline == 'center' else ', nothing subtracted'}"
@@ -155,21 +155,29 @@ def orders(measurements: Sequence[Measurement], problem: str) -> list[list[objec
     Variances are compared at the largest place of the axis that all kinds reach, on lines between the logarithms.
     """
     rows: list[list[object]] = []
-    methods = list(dict.fromkeys(one.method for one in measurements))
     for quantity, title in OPERATORS.items():
-        for baseline in dict.fromkeys(method.partition(" + ")[2] for method in methods):
+        methods = _operators(measurements, quantity)
+        for baseline in dict.fromkeys(baseline for _, baseline in methods.values()):
             for against in ("samples", "evaluations"):
                 lines = {
-                    method.partition(" + ")[0]: curve(measurements, problem, method, quantity, against)
-                    for method in methods
-                    if method.endswith(f" + {baseline}")
+                    kind: curve(measurements, problem, method, quantity, against)
+                    for method, (kind, subtracted) in methods.items()
+                    if subtracted == baseline
                 }
                 place = min(max(x) for x, _ in lines.values())
                 there = {kind: _at(place, x, y) ** 2 for kind, (x, y) in lines.items()}
                 order = " < ".join(f"{_KINDS[kind]} {there[kind]:.2g}" for kind in sorted(there, key=there.__getitem__))
-                subtracted = "f(x) subtracted" if baseline == "center" else "nothing subtracted"
-                rows.append([f"{title}, {subtracted}", f"{place:g} {AXES[against]}", order])
+                what = "f(x) subtracted" if baseline == "center" else "nothing subtracted"
+                rows.append([f"{title}, {what}", f"{place:g} {AXES[against]}", order])
     return rows
+
+
+def _operators(measurements: Sequence[Measurement], quantity: str) -> dict[str, tuple[str, str]]:
+    """Return by method kind of sampling and baseline, of the methods for a quantity: gradients alone, or all orders."""
+    alone = quantity == "gradient"
+    names = [name for name in dict.fromkeys(m.method for m in measurements) if name.endswith(FIRST_ORDER) == alone]
+    parts = {name: name.removesuffix(FIRST_ORDER).partition(" + ") for name in names}
+    return {name: (kind, baseline) for name, (kind, _, baseline) in parts.items()}
 
 
 def _at(place: float, x: Sequence[float], y: Sequence[float]) -> float:

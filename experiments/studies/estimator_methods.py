@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -27,6 +27,8 @@ class Method:
     difference: Literal["independent", "common"] | None = None
     memory: Literal["process", "untrained"] | None = None
     """Surrogate of the control variate: a Gaussian process of earlier evaluations, or an untrained random network."""
+    order: Literal[1, 2] = 2
+    """Highest derivative: with 1 there are neither lobes nor sample sets for the second."""
 
     def samples(self, budget: int, n: int) -> int:
         """Return how many evaluations every element of a quantity is a mean of."""
@@ -42,7 +44,7 @@ class Method:
             baseline=self.baseline,
             sampler=self.sampler,
             seed=seed,
-            order=1 if self.difference else 2,
+            order=1 if self.difference else self.order,
         )
         if self.difference:
             budget //= 2
@@ -69,12 +71,8 @@ class Method:
             }
         memory = copy.deepcopy(self._remembered(problem)) if self.memory else None
         result = _estimate(problem, counted, smoothing, memory)
-        return {
-            "value": result.value,
-            "gradient": result.gradient,
-            "hessian": result.hessian(),
-            "hvp": result.hvp(problem.v),
-        }
+        first = {"value": result.value, "gradient": result.gradient}
+        return first if self.order == 1 else {**first, "hessian": result.hessian(), "hvp": result.hvp(problem.v)}
 
     def _remembered(self, problem: Problem) -> zh.Memory:
         """Return a memory that has served a few estimates at the same point."""
@@ -145,3 +143,10 @@ METHODS = (
     Method("differences, common", "aggregate", "center", difference="common"),
 )
 NAMES = tuple(method.name for method in METHODS)
+OPERATORS = tuple(
+    f"{kind} + {baseline}" for kind in ("uniform", "aggregate", "per-element") for baseline in ("none", "center")
+)
+"""Ways to estimate in figure 11."""
+FIRST_ORDER = ", first order"
+"""Ends the names of those that estimate the gradient alone."""
+ALONE = tuple(replace(one, name=one.name + FIRST_ORDER, order=1) for one in METHODS if one.name in OPERATORS)

@@ -14,7 +14,7 @@
 Figures 9, 12 and 13 are those of `gallery`, figure 10 is that of `robustness`. Runs of 7 and 8 have 20 starts.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -29,11 +29,15 @@ from experiments.problems.catalogue import FITTING, Preset, chosen
 from experiments.problems.network_task import NetworkTask
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Trace
+from experiments.reports.medians import medians, objects, reached
 from experiments.reports.networks import conclude
 from experiments.reports.progress import progress
+from experiments.reports.results import Run
 from experiments.reports.tables import table
+from experiments.runs.trial import LEVELS
 from experiments.studies import lobes
 from experiments.studies.estimator_curves import draw_operators, orders
+from experiments.studies.estimator_methods import FIRST_ORDER, OPERATORS
 from experiments.studies.gallery import gallery, trace
 from experiments.studies.robustness import robustness
 from experiments.studies.variance import variance
@@ -49,10 +53,6 @@ TRAINED: Mapping[str, int] = {"cnn": 400, "cnn5": 1200, "cnn_texture": 200}
 """Networks of figure 9, and the renders that they are trained with."""
 DRAWS = 20_000
 """Of every lobe in figure 6."""
-OPERATORS = tuple(
-    f"{kind} + {baseline}" for kind in ("uniform", "aggregate", "per-element") for baseline in ("none", "center")
-)
-"""Ways to estimate in figure 11."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def figures(
 def _lobes(setting: Setting) -> None:
     path = setting.out / "figure6.png"
     found = lobes.draw(path, DRAWS, setting.seed)
-    headers = ["lobe", f"largest difference of {DRAWS} draws to the CDF, or to the shares of bins where n = 2"]
+    headers = ["lobe", f"{DRAWS} draws: largest distance to the CDF; n = 2: of a bin, in standard deviations"]
     print(f"{table(headers, [[name, value] for name, value in found.items()])}\n{path}")
 
 
@@ -115,17 +115,27 @@ def _descents(name: str, number: int) -> Callable[[Setting], None]:
         found: dict[str, list[Trace]] = {group: [] for group in GROUPS}
         for group, run in progress(jobs, name, leave=False):
             found[group].append(trace(task, METHODS[GROUPS[group]], run, setting.limit))
-        rows: list[list[object]] = []
-        for group, traces in found.items():
-            ends = torch.tensor([[one.error[-1] or 0.0, one.records[-1].evaluations] for one in traces]).double()
-            there = sum(one.outcome.status == "finished" for one in traces)
-            rows.append([group, GROUPS[group], f"{there} of {len(traces)}", *ends.median(0).values.tolist()])
         path = setting.out / f"figure{number}.png"
         supplement_figures.descents(found, path)
-        headers = ["", "method", "runs that arrive", "error at the end / at the start", "evaluations"]
-        print(f"{table(headers, rows)}\n{path}")
+        print(f"{table(*arrivals(found))}\n{path}")
 
     return draw
+
+
+def arrivals(found: Mapping[str, Sequence[Trace]]) -> tuple[list[str], list[list[object]]]:
+    """Return headers and a row per group: how many runs reduce the image error by each level, and when.
+
+    Medians of evaluations are over the runs that get there, as in every table, with None for fewer than half.
+    """
+    cells = [((group,), [Run(one.outcome, one.records) for one in traces]) for group, traces in found.items()]
+    there = medians(reached(cells, ("group",)), ("group", "metric", "level"))
+    rows: dict[str, list[object]] = {group: [group, GROUPS[group]] for group in found}
+    for cell in objects(there[there["metric"] == "image"]):
+        rows[cell["group"]] += [f"{cell['reached']} of {cell['runs']}", cell["evaluations"]]
+    headers = ["", "method"]
+    for level in LEVELS:
+        headers += [f"image error reduced by {100 * level:g} %", "evaluations"]
+    return headers, list(rows.values())
 
 
 def _tasks(setting: Setting) -> None:
@@ -178,7 +188,8 @@ def _robustness(setting: Setting) -> None:
 
 def _variance(setting: Setting) -> None:
     folder = setting.out / "variance"
-    report = variance(runs=setting.runs, seed=setting.seed, out=folder, problems=("BOX2",), methods=OPERATORS)
+    methods = (*OPERATORS, *(one + FIRST_ORDER for one in OPERATORS))
+    report = variance(runs=setting.runs, seed=setting.seed, out=folder, problems=("BOX2",), methods=methods, rivals=0)
     path = setting.out / "figure11.png"
     draw_operators(report.measurements, "BOX2", path)
     print(

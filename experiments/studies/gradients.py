@@ -27,6 +27,7 @@ from experiments.ensembles.kept_parts import KeptParts
 from experiments.problems import catalogue
 from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import RenderedTask
+from experiments.problems.scenes.adjoint import resolved
 from experiments.reports.progress import progress
 from experiments.reports.tables import Printer
 
@@ -92,10 +93,11 @@ def gradients(
         raise SystemExit(f"step and sigma must be above 0, got {step} and {sigma}")
     torch.set_num_threads(1)
     names = catalogue.chosen("tasks", tasks, list(catalogue.RENDERED))
-    loaded = [catalogue.load(name, preset, variant) for name in names]
     kept, printer, found = KeptParts(out), Printer("derivatives against the truth", _HEADERS, _WIDTHS), []
+    variant = resolved(variant)
     settings = {"repeats": repeats, "spp": spp, "pairs": list(pairs), "step": step, "sigma": sigma}
-    for task in loaded:
+    for name in names:
+        task = catalogue.load(name, preset, variant)
         assert isinstance(task, RenderedTask)
         reason = task.renderer.no_adjoint()
         if reason:
@@ -107,6 +109,7 @@ def gradients(
             for row in rows:
                 printer(_cells(row))
             found += rows
+        task.renderer.release()  # a scene that stays loaded slows down the next
     print(f"\nkept in {out}")
     return found
 

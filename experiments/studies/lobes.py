@@ -25,6 +25,8 @@ REACH = 5.0
 BOX = 5.0
 """Half width of uniform sampling, in units of sigma."""
 _BINS = 100
+_COMPARED, _LEAST = 10, 5
+"""Bins along a side whose shares are compared, and draws that are expected in each."""
 _SHOWN = 200
 """Sorted draws that are marked beside an inverse CDF."""
 _SETS = 6
@@ -160,10 +162,7 @@ def inverse(cdf: Callable[[Tensor], Tensor], p: Tensor) -> Tensor:
 
 
 def draw(path: Path, count: int, seed: int) -> dict[str, float]:
-    """Draw figure 6 and return, by lobe, the largest difference between draws and density.
-
-    In one dimension it is the distance of Kolmogorov and Smirnov, sup |F_count - F|. In two it is that of the shares of
-    the bins.
+    """Draw figure 6 and return the `distance` of draws and density by lobe.
 
     Args:
         path: of the PNG.
@@ -174,20 +173,42 @@ def draw(path: Path, count: int, seed: int) -> dict[str, float]:
     planes = [lobe for lobe in LOBES if not lobe.cdf]
     width = max(len(lines), len(planes))
     figure, axes = plt.subplots(3, width, figsize=(3.1 * width, 9), layout="constrained")
-    found = {}
+    drawn = {lobe.name: lobe.draw(count, seed) for lobe in LOBES}
     for k, lobe in enumerate(lines):
-        found[lobe.name] = _line(axes[0, k], axes[1, k], lobe, lobe.draw(count, seed))
+        _line(axes[0, k], axes[1, k], lobe, drawn[lobe.name])
     for k, lobe in enumerate(planes):
-        found[lobe.name] = _plane(axes[2, k], lobe, lobe.draw(count, seed))
+        _plane(axes[2, k], lobe, drawn[lobe.name])
     for axis in (*axes[:2, len(lines) :].flat, *axes[2, len(planes) :]):
         axis.axis("off")
     figure.suptitle(f"densities of u, and {count} draws of each")
     figure.savefig(path, dpi=100)
     plt.close(figure)
-    return found
+    return {lobe.name: distance(lobe, drawn[lobe.name]) for lobe in LOBES}
 
 
-def _line(top: Any, below: Any, lobe: Lobe, u: Tensor) -> float:
+def distance(lobe: Lobe, u: Tensor) -> float:
+    """Return the largest difference between draws and density.
+
+    In one dimension it is the distance of Kolmogorov and Smirnov, sup |F_count - F|. In two it is the distance of the
+    share of a bin to its probability p in standard deviations sqrt(p (1 - p) / count), of bins with count p >= 5.
+
+    u: [count] or [count, 2].
+    """
+    count = len(u)
+    if lobe.cdf is not None:
+        F, rank = lobe.cdf(u.sort().values), torch.arange(count + 1) / count
+        return float(torch.maximum(F - rank[:-1], rank[1:] - F).max())
+    shares = torch.histogramdd(u, _COMPARED, range=[-REACH, REACH, -REACH, REACH]).hist / count
+    parts = 40
+    edges = torch.linspace(-REACH, REACH, parts * _COMPARED + 1, dtype=torch.float64)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    density = lobe.density(torch.cartesian_prod(middles, middles)).reshape(1, len(middles), len(middles))
+    p = torch.nn.functional.avg_pool2d(density, parts)[0] * (2 * REACH / _COMPARED) ** 2
+    deviations = (shares - p).abs() / (p * (1 - p) / count).sqrt()
+    return float(deviations[count * p >= _LEAST].max())
+
+
+def _line(top: Any, below: Any, lobe: Lobe, u: Tensor) -> None:
     assert lobe.cdf is not None
     axis = torch.linspace(-REACH, REACH, 1001, dtype=torch.float64)
     edges = torch.linspace(-REACH, REACH, _BINS + 1).numpy()
@@ -206,13 +227,10 @@ def _line(top: Any, below: Any, lobe: Lobe, u: Tensor) -> float:
     below.set(xlabel="p", ylabel="u", ylim=(-REACH, REACH))
     for one in (top, below):
         one.legend(fontsize=7, frameon=False)
-    below_, above = lobe.cdf(ordered) - torch.arange(len(u)) / len(u), torch.arange(1, len(u) + 1) / len(u)
-    return float(torch.maximum(below_, above - lobe.cdf(ordered)).max())
 
 
-def _plane(axis: Any, lobe: Lobe, u: Tensor) -> float:
+def _plane(axis: Any, lobe: Lobe, u: Tensor) -> None:
     bins = _BINS // 2
-    side = 2 * REACH / bins
     shares = torch.histogramdd(u, bins, range=[-REACH, REACH, -REACH, REACH]).hist / len(u)
     axis.imshow(shares.mT.numpy(), origin="lower", extent=(-REACH, REACH, -REACH, REACH), cmap="Greys")
     fine = torch.linspace(-REACH, REACH, 4 * bins + 1, dtype=torch.float64)
@@ -220,5 +238,3 @@ def _plane(axis: Any, lobe: Lobe, u: Tensor) -> float:
     density = lobe.density(torch.cartesian_prod(middles, middles)).reshape(4 * bins, 4 * bins)
     axis.contour(middles.numpy(), middles.numpy(), density.mT.numpy(), levels=6, colors="#c1272d", linewidths=0.8)
     axis.set(title=lobe.name, xlabel="u0", ylabel="u1")
-    expected = torch.nn.functional.avg_pool2d(density[None], 4)[0] * side**2
-    return float((shares - expected).abs().max())

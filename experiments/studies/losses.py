@@ -135,6 +135,7 @@ def losses(
         seed: of the perturbations.
         out: folder of parts.jsonl, which grows, and of losses.json, sweep.csv and sweep.png at the end.
     """
+    torch.set_num_threads(1)
     least = 4 * _SCRAMBLES
     if runs < 2 or min(samples, default=0) < 1 or min(truth, sweep) < least:
         raise SystemExit(
@@ -179,9 +180,9 @@ def _errors(
         ["task", "loss", "where", "evaluations", "inside", "image", "truth: inside", "image"],
         [6, 14, 8, 0, 7, 7, 0, 7],
     )
-    settings = {"samples": list(samples), "runs": runs, "truth": truth, "seed": seed}
+    given = {"samples": list(samples), "runs": runs, "truth": truth, "seed": seed}
     for one, where in progress([(one, where) for one in swept for where in WHERE], "gradients", leave=False):
-        part = {"what": "gradient", "task": one.task.name, "where": where, **settings}
+        part = {"what": "gradient", "task": one.task.name, "where": where, **given}
         found = kept.rows(
             part, GradientError, partial(_gradient_errors, one, where, samples, runs=runs, truth=truth, seed=seed)
         )
@@ -197,13 +198,14 @@ def _fits(kept: KeptParts, shown: Sequence[Pictures], runs: int, evaluations: in
         ["task", "loss", "error", "inside", "quartiles", "share", "image", "quartiles", "share"],
         [6, 14, 9, 6, 12, 5, 6, 12, 5],
     )
-    settings = {"evaluations": evaluations, "limit": limit}
     for one, name in ((task, name) for task in shown for name in task.losses):
+        sigma = settings("descent", one.task.name).get("sigma", one.task.sigma)
+        given = {"evaluations": evaluations, "limit": limit, "sigma": sigma}
         ended: list[tuple[str, Reached]] = []
         jobs = [(form, run) for form in FORMS for run in range(runs)]
         for form, run in progress(jobs, f"fits of {one.task.name}, {name}", leave=False):
-            part = {"what": "fit", "task": one.task.name, "loss": name, "form": form, "run": run, **settings}
-            reached = kept.rows(part, Reached, partial(_fit, one, name, form, run, evaluations, limit))
+            part = {"what": "fit", "task": one.task.name, "loss": name, "form": form, "run": run, **given}
+            reached = kept.rows(part, Reached, partial(_fit, one, name, form, run, **given))
             ended += [(form, row) for row in reached]
         found = list(_medians(one.task.name, name, ended))
         for a, b in _pairs(found):
@@ -260,8 +262,9 @@ def _medians(task: str, loss: str, ended: Sequence[tuple[str, Reached]]) -> Iter
             yield Fit(*(task, loss, form, metric), *spread, *(cell[one] for one in ("share", "seconds", "runs")))
 
 
-def _fit(one: Pictures, loss: str, form: str, run: int, evaluations: int, limit: float) -> list[Reached]:
-    sigma = settings("descent", one.task.name).get("sigma")
+def _fit(
+    one: Pictures, loss: str, form: str, run: int, *, evaluations: int, limit: float, sigma: float
+) -> list[Reached]:
     rows: list[Record] = []
 
     def watch(row: Record) -> None:

@@ -9,9 +9,9 @@ after the other.
 | the caller's time per chunk, to send and to receive | 0.1 ms, 0.1 ms | 0.3 ms, 0.3 ms |
 | latency, each way | 0.05 ms | 1 ms, or 50 ms |
 
-Times of renders are log-normal: their median is stated, the standard deviation of their logarithm is 0.25. The speed-up
-is over one worker with neither latency nor a caller. Efficiency is speed-up over workers. Workers pay as long as it is
-at least one half.
+Times of renders are log-normal: their median is stated, the standard deviation of their logarithm is 0.25.
+Speed-up = sum of all render times / time of the batch. Efficiency is speed-up over workers. Workers pay as long as it
+is at least one half.
 """
 
 import csv

@@ -1,9 +1,9 @@
 """The searches where optimization is hard: stiff, flat, indefinite, partly undefined, and as noisy as it is high.
 
 Every case is a function of two or ten parameters in units of sigma, with a start of value 1 and a minimum of value 0.
-A run has succeeded if the noiseless value at its result is at most the aim of the case. It is wrong if it says so
-(`Minimum.success`) and has not. Under noise such claims are counted and not judged: 200 values whose noise is as large
-as the signal do not tell the minimum. On a plateau without an end the message has to say that all values are equal.
+A run succeeds if the noiseless value at its result is at most `aim`. A run is wrong if `Minimum.success` is true and
+it did not succeed. Under noise such claims are counted and not judged: 200 values whose noise is as large as the signal
+do not tell the minimum. On a plateau without an end the message has to say that all values are equal.
 """
 
 import statistics

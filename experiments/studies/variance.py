@@ -35,7 +35,7 @@ from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_choice import SIZES, compare, summary
 from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
-from experiments.studies.estimator_methods import METHODS, NAMES, OURS, Method
+from experiments.studies.estimator_methods import ALONE, METHODS, NAMES, OURS, Method
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
 
 _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest budget
@@ -113,8 +113,9 @@ def variance(
     if store is not None:
         may_keep(store)
     names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
-    picked = chosen("methods", methods, NAMES)
-    compared = [method for method in METHODS if method.name in picked]
+    known = {method.name: method for method in (*METHODS, *ALONE)}
+    picked = chosen("methods", methods, list(known))
+    compared = [method for name, method in known.items() if name in picked]
     made = [made_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in progress(names, "truth")]
     tallies = [_Tally(one, method, budget) for one in made for method in compared for budget in budgets]
     for run in progress(range(runs), "runs"):

@@ -131,11 +131,17 @@ def _quiet(mi: Any) -> Iterator[None]:
         mi.set_log_level(level)
 
 
+def resolved(variant: str) -> str:
+    """Return the variant that "auto" is here, or the one that is given."""
+    if variant != "auto":
+        return variant
+    llvm = find_llvm()
+    return "llvm_ad_rgb" if llvm is not None and probe("llvm_ad_rgb", llvm).works else "scalar_rgb"
+
+
 def unavailable(variant: str) -> str | None:
     """Why there are no derivatives with a variant, "auto" included; None if there are."""
-    if variant == "auto":
-        llvm = find_llvm()
-        variant = "llvm_ad_rgb" if llvm is not None and probe("llvm_ad_rgb", llvm).works else "scalar_rgb"
+    variant = resolved(variant)
     return None if "_ad_" in variant else f"mitsuba needs llvm_ad_rgb or cuda_ad_rgb for derivatives, here is {variant}"
 
 

@@ -13,6 +13,7 @@ import pytest
 from small import BUMP, CRASH, ELSEWHERE, FAIL, GATE, GIVE_UP, HALVE, MISSING, SEARCH, SHIFT, TASK, search
 
 from experiments.ensembles.ensemble import Ensemble
+from experiments.ensembles.provenance import register
 from experiments.methods import METHODS
 from experiments.runs.attempt import attempt
 from experiments.runs.journal import Journal
@@ -104,6 +105,21 @@ def test_one_table_has_one_preset_and_one_renderer(tmp_path, changes, message):
     with pytest.raises(SystemExit, match=message):
         ensemble(tmp_path, **changes).plan([TASK], [SEARCH])
     ensemble(tmp_path, limit=5).plan([TASK], [SEARCH])  # a method may have its own time
+
+
+@pytest.mark.parametrize("counts", [(2, None), (None, 2), (2, 3)])
+def test_one_table_has_one_number_of_workers(tmp_path, counts):
+    """Seconds are of the clock on the wall with workers, and of the processor without."""
+    first, second = ({"preset": "fast"} | ({} if count is None else {"workers": count}) for count in counts)
+    register(tmp_path, {"bowl": {"a": first}})
+    register(tmp_path, {"bowl": {"a": second}})  # there are no runs yet
+    register(tmp_path, {"bowl": {"a": first}})
+    (tmp_path / "bowl" / "a").mkdir(parents=True)
+    (tmp_path / "bowl" / "a" / "0.json").touch()
+    register(tmp_path, {"bowl": {"b": first}, "dish": {"b": second}})
+    message = rf"a was made with .*workers = {counts[0]} \(now {counts[1]}\); delete it".replace("None", "none")
+    with pytest.raises(SystemExit, match=message):
+        register(tmp_path, {"bowl": {"b": second}})
 
 
 def test_the_folder_says_how_it_was_made(results):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from experiments.ensembles import provenance
 from experiments.ensembles.kept_parts import NAME, KeptParts
 
 
@@ -29,6 +30,28 @@ def test_a_part_is_measured_once_for_each_of_its_settings(tmp_path) -> None:
     assert again.rows({"a": 1, "b": [2]}, Row, lambda: measure("never")) == first  # bit for bit
     assert calls == ["here", "there"]
     assert (tmp_path / "new" / "command.json").is_file()
+
+
+def test_rows_of_other_code_are_measured_again(tmp_path, monkeypatch) -> None:
+    """Of another commit, or of other changes to the same one."""
+    code = {"commit": "one", "clean": True}
+    monkeypatch.setattr(provenance, "code", lambda: code)
+    monkeypatch.setattr(provenance, "_ROOT", tmp_path)
+    source = tmp_path / "csrc" / "kernel.cpp"
+    source.parent.mkdir()
+
+    def measured(commit: str, clean: bool, text: str) -> float:
+        code.update(commit=commit, clean=clean)
+        source.write_text(text)
+        number = len(seen)
+        (row,) = KeptParts(tmp_path / "out").rows({"k": 1}, Row, lambda: [Row("", number)])
+        seen.append(row.error)
+        return row.error
+
+    seen: list[float] = []
+    steps = [("one", True, "a"), ("two", True, "a"), ("one", False, "b"), ("one", False, "c"), (None, None, "c")]
+    assert [measured(*step) for step in steps] == [0, 1, 2, 3, 4]
+    assert [measured(*step) for step in steps] == [0, 1, 2, 3, 4]
 
 
 def test_what_a_kill_cut_off_is_measured_again(tmp_path) -> None:

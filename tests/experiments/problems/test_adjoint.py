@@ -9,7 +9,9 @@ import torch
 from small import TARGET, TASK
 from small_scenes import RADIANCE, REFLECTANCE, VARIANTS, camera, lamp, plane, rgb, screen
 
+from experiments.ensembles.kept_parts import KeptParts
 from experiments.methods import METHODS
+from experiments.problems import catalogue
 from experiments.problems.scenes import adjoint
 from experiments.problems.scenes.adjoint import ADJOINTS, unavailable, value_and_gradient
 from experiments.problems.task import Renderer
@@ -197,8 +199,8 @@ def test_differences_of_a_quadratic_are_its_gradient() -> None:
 
 
 def test_command_measures_sampled_gradients_where_there_are_no_others(capsys, monkeypatch, tmp_path) -> None:
-    def measured() -> list[GradientError]:
-        return gradients(("shad",), repeats=1, spp=4, pairs=(4,), variant="scalar_rgb", out=tmp_path)
+    def measured(variant="scalar_rgb") -> list[GradientError]:
+        return gradients(("shad",), repeats=1, spp=4, pairs=(4,), variant=variant, out=tmp_path)
 
     found = measured()
     assert "shad: mitsuba needs llvm_ad_rgb" in capsys.readouterr().out
@@ -209,8 +211,23 @@ def test_command_measures_sampled_gradients_where_there_are_no_others(capsys, mo
     near = found[-1]
     assert near.way > 0.5  # a step against it leads to the solution
     monkeypatch.setattr("experiments.studies.gradients.differences", None)  # nothing is measured twice
-    again = measured()
+    monkeypatch.setattr(adjoint, "find_llvm", lambda: None)
+    again = measured("auto")  # which is scalar_rgb without an LLVM
     for one, before in zip(again, found, strict=True):
         assert repr(asdict(one)) == repr(asdict(before))  # NaN too
     with pytest.raises(SystemExit, match="at least 1"):
         gradients(("shad",), repeats=0)
+
+
+def test_scenes_are_released_before_the_next_one_is_loaded(monkeypatch, tmp_path) -> None:
+    events, load = [], catalogue.load
+
+    def noted(name, *rest):
+        events.append(f"load {name}")
+        task = load(name, *rest)
+        return replace(task, renderer=replace(task.renderer, release=lambda: events.append(f"release {name}")))
+
+    monkeypatch.setattr(catalogue, "load", noted)
+    monkeypatch.setattr(KeptParts, "rows", lambda *_: [])
+    gradients(("shad", "mug"), variant="scalar_rgb", out=tmp_path)
+    assert events == ["load shad", "release shad", "load mug", "release mug"]

@@ -130,6 +130,10 @@ def another_limit(folder, monkeypatch):
     write(folder, "bowl", "our_g", 3, [1.0, 0.1], each=1, settings={"limit": 60.0})
 
 
+def another_clock(folder, monkeypatch):
+    write(folder, "dish", "our_g", 3, [1.0, 0.1], each=1, settings={"workers": 2})
+
+
 def another_preset(folder, monkeypatch):
     write(folder, "quad", "our_g", 3, [1.0, 0.1], each=1, settings={"preset": "paper"})
 
@@ -151,6 +155,7 @@ def an_unfinished_run(folder, monkeypatch):
         (no_commit, "must be made in a git repository"),
         (another_machine, "must be made on one machine, got .*abacus, 10 cores"),
         (another_limit, "must have one limit, got 15.0, 60.0"),
+        (another_clock, "must have one clock, got processor, wall"),
         (another_preset, "must have one preset, got fast, paper"),
         (a_network, "tasks must all be fitted or all train a network, got bowl, cnn"),
         (an_unfinished_run, "1 runs in .* are unfinished"),
@@ -184,6 +189,16 @@ def test_tasks_are_added_to_a_table_of_the_same_protocol(folder, results, tmp_pa
         write(other, "cup", "fr22", run, [100.0, 0.5], each=2)
     with pytest.raises(SystemExit, match="must have one commit"):
         store(other, name="bowls", add=True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "clock"),
+    [({}, "processor"), ({"threads": 1}, "processor"), ({"threads": None}, "wall"), ({"workers": 1}, "wall")],
+)
+def test_a_table_says_which_clock_its_seconds_are_of(tmp_path, results, settings, clock):
+    write(tmp_path / "runs", "bowl", "our_g", 3, [1.0, 0.1], each=1, settings=settings)
+    store(tmp_path / "runs", name="bowls")
+    assert {one["clock"] for one in rows(results, "bowls")} == {clock}
 
 
 def test_some_tasks_of_a_folder(folder, results):

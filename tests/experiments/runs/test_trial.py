@@ -4,7 +4,6 @@ import importlib.util
 import os
 import random
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,17 +54,19 @@ def test_rows_have_errors_that_cost_nothing():
 
 
 class Clock:
-    """Seconds that pass only when someone says so."""
+    """Seconds of the processor and of the wall that pass only when someone says so."""
 
     def __init__(self, monkeypatch):
-        self.now = 0.0
+        self.now = self.wall = 0.0
         monkeypatch.setattr("experiments.runs.recorder.time.process_time", lambda: self.now)
+        monkeypatch.setattr("experiments.runs.recorder.time.perf_counter", lambda: self.wall)
 
-    def slow(self, seconds, fn):
-        """Return the function, which takes so many seconds."""
+    def slow(self, seconds, fn, wall=0.0):
+        """Return the function, which takes so many seconds of the processor, and of the wall."""
 
         def wait(x):
             self.now += seconds
+            self.wall += wall
             return fn(x)
 
         return wait
@@ -83,10 +84,17 @@ def test_time_for_errors_is_not_counted(monkeypatch):
     assert (trial.seconds, trial.black_box_seconds) == (2.25, 1.5)
 
 
-def test_waiting_for_other_programs_is_not_counted():
-    trial = Trial(replace(TASK, loss=lambda x: (time.sleep(0.2), TASK.loss(x))[1]), "any", 0)
+@pytest.mark.parametrize(("parallel", "seconds"), [(False, 0.5), (True, 20.0)])
+def test_which_clock_counts(monkeypatch, parallel, seconds):
+    """Waiting counts where the black box works in other processes meanwhile, and not where other programs do."""
+    clock = Clock(monkeypatch)
+    slow = replace(TASK, loss=clock.slow(0.5, TASK.loss, wall=20.0))
+    trial = Trial(slow, "any", 0, parallel=parallel)
     trial.loss(torch.zeros(1, 2))
-    assert trial.black_box_seconds <= trial.seconds < 0.1
+    trial.report(trial.start)
+    assert trial.rows[-1].seconds == trial.black_box_seconds == trial.seconds == seconds
+    outcome = attempt(slow, "any", 0, lambda one: one.loss(one.start[None]), parallel=parallel)
+    assert outcome.seconds == outcome.black_box_seconds == seconds
 
 
 @pytest.mark.parametrize("points", [torch.zeros(2), torch.zeros(4, 3)])

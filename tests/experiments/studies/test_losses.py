@@ -104,7 +104,10 @@ def measured(tmp_path_factory) -> Iterator[tuple[LossReport, Path]]:
     out = tmp_path_factory.mktemp("losses")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("experiments.studies.losses.fitting", lambda name: small_box2())
+        threads = []
+        patch.setattr(torch, "set_num_threads", threads.append)
         found = losses(**SMALL, out=out)
+        assert threads == [1]
         written = json.loads((out / "losses.json").read_text())
         assert len(written["biases"]) == len(found.biases) == 2 * 3 * 2
         assert len((out / "sweep.csv").read_text().splitlines()) == 1 + 12 * len(written["positions"])
@@ -115,6 +118,10 @@ def measured(tmp_path_factory) -> Iterator[tuple[LossReport, Path]]:
 @pytest.fixture(scope="module")
 def report(measured) -> LossReport:
     return measured[0]
+
+
+def fail(*_, **__):
+    raise NotImplementedError
 
 
 def test_a_second_call_measures_nothing_again(monkeypatch, measured) -> None:
@@ -132,6 +139,10 @@ def test_a_second_call_measures_nothing_again(monkeypatch, measured) -> None:
     assert again == [3]
     assert (second.biases, second.errors) == (first.biases, first.errors)
     assert [fit.evaluations for fit in second.fits] == [fit.evaluations for fit in first.fits]
+    monkeypatch.setattr("experiments.studies.losses.settings", lambda method, task: {"sigma": 0.7})
+    monkeypatch.setattr("experiments.studies.losses.attempt", fail)
+    with pytest.raises(NotImplementedError):  # fits depend on the settings of their method
+        losses(**SMALL, out=out)
 
 
 def test_the_loss_of_a_mean_picture_is_at_most_the_mean_loss(report) -> None:

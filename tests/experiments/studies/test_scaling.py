@@ -4,6 +4,7 @@ import csv
 import math
 
 import pytest
+import torch
 
 from experiments.studies import scaling as study
 from experiments.studies.scaling import Carrier, Row, paying, simulated
@@ -32,6 +33,42 @@ def test_chunks_are_those_of_the_library() -> None:
     assert simulated(FREE, 10_000, [1.0] * 4096) == 16  # 256 chunks of 16 points
     assert simulated(Carrier("cluster", 0.0, 0.0, 0.0, None), 4096, [1.0] * 4096) == 1
     assert simulated(Carrier("cluster", 0.0, 0.0, 0.0, None), 10, [1.0] * 16) == 2
+
+
+class Pool:
+    """Stands in for workers: a call takes a tenth of a second of a clock that nothing else moves."""
+
+    now = 0.0
+
+    def __init__(self, count):
+        self.count = count
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_): ...
+
+    def __call__(self, fn, x):
+        Pool.now += 0.1 * self.count
+        return fn(x)
+
+
+def test_measured_rows(monkeypatch) -> None:
+    monkeypatch.setattr(study, "ProcessPool", Pool)
+    monkeypatch.setattr(study.time, "perf_counter", lambda: Pool.now)
+    first, second = study.measurement((1, 2), points=3, render=0.0, repeats=1)
+    assert (first.kind, first.carrier, first.workers, first.points) == ("measured", "processes", 1, 3)
+    assert (first.seconds, second.seconds) == pytest.approx((0.1, 0.2))
+    slept: list[float] = []
+    monkeypatch.setattr(study.time, "sleep", slept.append)
+    (row,) = study.measurement((1,), points=4, render=0.05, repeats=2)
+    assert (row.speedup, row.efficiency) == pytest.approx((2.0, 2.0))
+    assert slept == pytest.approx([0.2] * 3)  # all points of a call, one after the other
+
+
+def test_a_black_box_that_waits_returns_a_value_per_point() -> None:
+    x = torch.rand(5, 2)
+    assert torch.equal(study.Waiting(0.0)(x), x[:, 0])
 
 
 def test_what_pays() -> None:

@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from experiments.problems.closed_forms import PlaneWave
-from experiments.studies.estimator_choice import BUDGETS, compare, optax_product, rival_gradients, summary
+from experiments.studies.estimator_choice import (
+    BUDGETS,
+    cases_of,
+    compare,
+    draws_of_the_source,
+    of_the_source,
+    optax_product,
+    rival_gradients,
+    summary,
+)
 from experiments.studies.estimator_methods import METHODS, OURS, PAPER
 from experiments.studies.estimator_problems import looked_up, quadrature
 from experiments.studies.variance import VarianceReport, variance
@@ -85,7 +94,7 @@ def test_problems_have_lower_case_names_too(tmp_path) -> None:
     found = variance(runs=2, budgets=(32,), problems=("wave10", "WAVE10"), out=tmp_path, sizes=(1,), rivals=2)
     assert {m.problem for m in found.measurements} == {"WAVE10"}
     compared = json.loads((tmp_path / "rivals.json").read_text())
-    assert len(compared) == 6 * len(BUDGETS) * 2  # functions, budgets, gradient and product
+    assert len(compared) == 8 * len(BUDGETS) * 2  # functions, budgets, gradient and product
 
 
 def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path) -> None:
@@ -120,26 +129,45 @@ def test_quadrature_and_table_agree_with_a_closed_form() -> None:
 
 def test_auto_settings_have_the_least_error() -> None:
     rows = compare(sizes=(2, 10), budgets=(64,), runs=60)
-    assert len(rows) == 2 * 6 * 2
+    assert sum(row.held_out for row in rows) == 2 * 2 * 2
+    assert len(rows) == 2 * 8 * 2
     assert max(row.ratio for row in rows) < 1.0
     headers, body = summary(rows)
-    assert [row[:4] for row in body][:2] == [
-        ["gradient", 2, 64, "aggregate, sobol, single, mean"],
-        ["hvp", 2, 64, "aggregate, sobol, pairs, mean"],
+    assert [row[:5] for row in body][:4] == [
+        [quantity, 2, 64, kind, f"aggregate, sobol, {signs}, mean"]
+        for quantity, signs in (("gradient", "single"), ("hvp", "pairs"))
+        for kind in ("of the rules", "held out")
     ]
     assert all(len(row) == len(headers) for row in body)
 
 
 def test_rivals_are_unbiased_or_as_biased_as_stated() -> None:
-    """Means of 20 000 runs within 5 standard errors of the closed form: 21 comparisons."""
+    """Means of 20 000 runs within 5 standard errors of the closed form: 27 comparisons."""
     k, R, K = torch.tensor([0.6, -0.8, 0.3], dtype=torch.float64), 20_000, 5
     wave, x, sigma = PlaneWave(k, phase=0.4), torch.zeros(3).double(), torch.ones(3).double()
     u = torch.randn(R, K + 1, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     found = rival_gradients(wave, u)
+    generator = torch.Generator().manual_seed(3)
+    first, second = (draws_of_the_source(R, K, 3, order, generator) for order in (1, 2))
+    found["source"] = of_the_source(wave, *first, None)
     for name, gradients in found.items():
         share = K / (K + 1) if name == "EvoTorch, single" else 1.0
         error = gradients.mean(0) - share * wave.gradient(x, sigma)
         assert float((error.abs() / gradients.std(0) * math.sqrt(R)).max()) < 5, name
-    products = optax_product(wave, u, k)
-    error = products.mean(0) - wave.hessian(x, sigma) @ k
-    assert float((error.abs() / products.std(0) * math.sqrt(R)).max()) < 5
+    for products in (optax_product(wave, u, k), of_the_source(wave, *second, k)):
+        error = products.mean(0) - wave.hessian(x, sigma) @ k
+        assert float((error.abs() / products.std(0) * math.sqrt(R)).max()) < 5
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_truths_of_functions_that_are_held_out(n) -> None:
+    """Stein's identities by the trapezoid rule over all parameters."""
+    line = torch.linspace(-9, 9, 401, dtype=torch.float64)
+    u = torch.cartesian_prod(*[line] * n).view(-1, n)
+    cases = [case for case in cases_of(n) if case.held_out]
+    assert [case.name for case in cases] == ["product of sines", "ridge"]
+    for case in cases:
+        f = case.fn(u) * torch.exp(-0.5 * u.square().sum(1)) * ((line[1] - line[0]) / math.sqrt(2 * math.pi)) ** n
+        torch.testing.assert_close(f @ u, case.gradient, rtol=0, atol=1e-6)
+        second = torch.einsum("k,ki,kj->ij", f, u, u) - f.sum() * torch.eye(n).double()
+        torch.testing.assert_close(second, case.hessian, rtol=0, atol=1e-6)

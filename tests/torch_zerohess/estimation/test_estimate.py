@@ -199,9 +199,9 @@ def test_points_that_are_not_kept_are_the_ones_that_were_evaluated(value: str, m
         estimate(lambda z: writing(z) * math.nan, x, smoothing, value=value)
 
 
-def test_a_million_parameters_take_no_second_copy_of_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_that_are_not_stored_are_not_copied(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(perturbations, "STORED", 0)
-    copies: list[bool] = []
+    copies: list[Tensor] = []
     original = kernels.sample
 
     def sample(*arguments):

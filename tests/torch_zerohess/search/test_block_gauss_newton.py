@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from searches import run
 
 import torch_zerohess as zh
 from torch_zerohess.search.block_gauss_newton import LENGTHS, damped_steps, renewed
@@ -18,15 +19,6 @@ def normal(*shape, seed=0):
 
 def square(target):
     return lambda y: (y - target).square().mean()
-
-
-def solve(search, f, most):
-    """Evaluate until the search has used `most` evaluations, and return the losses after each batch."""
-    losses = []
-    while not search.done and search.evaluations < most:
-        search.tell(f(search.ask(limit=most - search.evaluations)))
-        losses.append(search.value)
-    return losses
 
 
 def test_a_jacobian_is_known_after_a_basis_of_samples():
@@ -93,7 +85,7 @@ def test_linear_least_squares_take_one_jacobian_and_one_step(n, m):
     lowest = float((torch.linalg.lstsq(a.mT, b[:, None]).solution[:, 0] @ a - b).square().mean())
     search = zh.optim.BlockGaussNewton(torch.zeros(n).double(), sigma=8.0, loss=square(b), seed=0)
     assert search.ask().shape == (1 + n, n)
-    solve(search, lambda x: x @ a, 1 + n + len(LENGTHS))
+    run(search, lambda x: x @ a, 1 + n + len(LENGTHS))
     assert search.evaluations == 1 + n + len(LENGTHS)
     assert search.iterations == 1
     assert search.value - lowest < 1e-5 * float(b.square().mean())
@@ -109,7 +101,7 @@ def test_the_curvature_of_any_loss_is_used():
         return (w * (y - b).square()).sum() / 2
 
     search = zh.optim.BlockGaussNewton(torch.zeros(n).double(), sigma=10.0, loss=loss, seed=0)
-    solve(search, lambda x: x @ a, 1 + n + len(LENGTHS))
+    run(search, lambda x: x @ a, 1 + n + len(LENGTHS))
     lowest, first = float(loss(best @ a)), float(loss(torch.zeros(m)))
     assert search.value - lowest < 1e-3 * (first - lowest)
 
@@ -123,7 +115,8 @@ def bent(n, m, seed=0):
 def test_a_bent_black_box_takes_few_blocks():
     f, truth = bent(60, 120)
     search = zh.optim.BlockGaussNewton(torch.zeros(60).double(), sigma=1.0, loss=square(f(truth[None])[0]), seed=0)
-    losses = solve(search, f, 61 + 12 * (15 + 6))
+    losses = []
+    run(search, f, 61 + 12 * (15 + 6), values=losses)
     assert all(later <= earlier for earlier, later in pairwise(losses))
     assert search.value < 1e-4 * losses[0]
     torch.testing.assert_close(search.x, truth, atol=0.05, rtol=0)
@@ -133,7 +126,8 @@ def test_a_solution_that_is_far_is_reached_in_steps_of_growing_length():
     """A distance of 50 first radii: 1 + 2.5 + 2.5^2 + ... is there in five steps."""
     a = torch.linalg.qr(normal(30, 20))[0].mT
     search = zh.optim.BlockGaussNewton(torch.zeros(20).double(), sigma=0.1, loss=square(2.5 * a.sum(0)), seed=0)
-    losses = solve(search, lambda x: x @ a, 21 + 6 * (5 + 6))
+    losses = []
+    run(search, lambda x: x @ a, 21 + 6 * (5 + 6), values=losses)
     assert search.iterations <= 6
     assert search.value < 1e-6 * losses[0]
 
@@ -143,7 +137,8 @@ def test_where_a_long_step_overshoots_a_short_one_of_the_same_batch_is_taken():
     search = zh.optim.BlockGaussNewton(
         torch.ones(4).double(), sigma=8.0, loss=lambda y: y.square().mean(), share=1e-3, seed=0
     )
-    losses = solve(search, lambda x: torch.atan(5 * x), 5 + 6)
+    losses = []
+    run(search, lambda x: torch.atan(5 * x), 5 + 6, values=losses)
     assert search.iterations == 1
     assert search.value < 0.7 * losses[0]
 
@@ -182,7 +177,7 @@ def test_it_stays_within_the_bounds_and_solves_there():
         assert float(x.abs().max()) <= 0.75
         return x @ a
 
-    solve(search, f, 400)
+    run(search, f, 400)
     torch.testing.assert_close(search.x, wanted.clamp(-0.75, 0.75), atol=0.02, rtol=0)
 
 
@@ -195,7 +190,7 @@ def test_a_start_in_a_corner_is_sampled_away_from_it():
     )
     points = search.ask()
     assert float((points[1:] - 1.0).norm(dim=1).min()) > 0.3 * 0.2 * 0.05 * math.sqrt(n)
-    solve(search, lambda x: x @ a, 200)
+    run(search, lambda x: x @ a, 200)
     assert search.value < 1e-4 * float((torch.ones(n).double() @ a).square().mean())
 
 
@@ -230,7 +225,7 @@ def test_values_that_are_not_finite_are_passed_over():
     start = torch.zeros(30).double()
     search = zh.optim.BlockGaussNewton(start, sigma=1.0, loss=square(f(truth[None])[0]), seed=0)
     search.tell(f(search.ask()))
-    solve(search, hole, 400)
+    run(search, hole, 400)
     assert search.value < 1e-2 * float(f(truth[None]).square().mean())
 
 
@@ -289,7 +284,7 @@ def test_single_precision_and_units_per_parameter():
     loss = square(f(truth[None])[0])
     search = zh.optim.BlockGaussNewton(torch.zeros(20), sigma=units, loss=loss, seed=0)
     assert search.ask().dtype == torch.float32
-    solve(search, lambda x: f((x / units).double()), 300)
+    run(search, lambda x: f((x / units).double()), 300)
     torch.testing.assert_close((search.x / units).double(), truth, atol=0.05, rtol=0)
 
 
@@ -298,7 +293,7 @@ def test_outputs_of_any_size(scale):
     f, truth = bent(20, 40)
     target = scale * f(truth[None])[0]
     search = zh.optim.BlockGaussNewton(torch.zeros(20).double(), sigma=1.0, loss=square(target), seed=0)
-    solve(search, lambda x: scale * f(x), 300)
+    run(search, lambda x: scale * f(x), 300)
     torch.testing.assert_close(search.x, truth, atol=0.05, rtol=0)
 
 
@@ -307,7 +302,7 @@ def test_the_model_at_the_best_point_is_gauss_newton():
     target = f(truth[None])[0]
     search = zh.optim.BlockGaussNewton(torch.zeros(10).double(), sigma=0.5, loss=square(target), seed=0)
     assert search.model_at_best() is None
-    solve(search, f, 250)
+    run(search, f, 250)
     model, sigma = search.model_at_best()
     J = torch.func.jacrev(lambda x: f(x[None])[0])(search.x)
     torch.testing.assert_close(model.full_hessian() / (0.5 * sigma) ** 2, 2 / 30 * J.mT @ J, rtol=0.1, atol=0.01)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from searches import run
 
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
@@ -18,13 +19,6 @@ def normal(*shape, seed=0):
 
 def square(target):
     return lambda y: (y - target).square().mean()
-
-
-def solve(search, f, most):
-    """Evaluate until the search has used `most` evaluations."""
-    while not search.done and search.evaluations < most:
-        search.tell(f(search.ask(limit=most - search.evaluations)))
-    return search
 
 
 def image(x):
@@ -44,7 +38,7 @@ def search_for(f, truth, **settings):
 
 def test_texels_are_found_after_one_batch_of_samples():
     """39 evaluations for 144 parameters: the start, 32 samples and the steps."""
-    search = solve(search_for(image, normal(N)), image, 39)
+    search = run(search_for(image, normal(N)), image, 39)
     assert search.value < 1e-4
     assert search.jacobian.explained > 0.99
     torch.testing.assert_close(search.jacobian.dense().view(N, N), torch.eye(N), atol=1e-2, rtol=0)
@@ -53,7 +47,7 @@ def test_texels_are_found_after_one_batch_of_samples():
 def test_overlapping_footprints():
     """Seven batches of samples and steps, where a dense Jacobian takes 145 evaluations before the first step."""
     truth = normal(N)
-    search = solve(search_for(blur, truth, grid=(SIDE, SIDE)), blur, 150)
+    search = run(search_for(blur, truth, grid=(SIDE, SIDE)), blur, 150)
     assert search.value < 1e-3 * float(square(blur(truth[None])[0])(torch.zeros(SIDE, SIDE).double()))
 
 
@@ -64,7 +58,7 @@ def test_steps_in_the_output_are_crossed():
         return (4 * image(x)).round() / 4
 
     truth = normal(N).clamp(-1.5, 1.5)
-    search = solve(search_for(stairs, truth, least_sigma=0.3, share=1.0), stairs, 300)
+    search = run(search_for(stairs, truth, least_sigma=0.3, share=1.0), stairs, 300)
     assert search.value < 0.25**2
 
 
@@ -72,7 +66,7 @@ def test_any_smooth_loss():
     """A loss whose second derivative is no multiple of the identity: log cosh."""
     truth = 0.5 * normal(N)
     loss = lambda y: (y - image(truth[None])[0]).cosh().log().sum()  # noqa: E731
-    search = solve(search_for(image, truth, loss=loss), image, 60)
+    search = run(search_for(image, truth, loss=loss), image, 60)
     assert float((search.x - truth).abs().max()) < 0.02
 
 
@@ -84,7 +78,7 @@ def test_bounds_are_kept_and_hold_parameters():
         seen.append(x)
         return image(x)
 
-    search = solve(search_for(image, truth, bounds=(-0.5, 0.5)), f, 120)
+    search = run(search_for(image, truth, bounds=(-0.5, 0.5)), f, 120)
     every = torch.cat(seen)
     assert float(every.abs().max()) <= 0.5
     torch.testing.assert_close(search.x, truth.clamp(-0.5, 0.5), atol=0.05, rtol=0)
@@ -93,7 +87,7 @@ def test_bounds_are_kept_and_hold_parameters():
 def test_parameters_that_no_pixel_depends_on_stay_and_are_named():
     truth, start = normal(N), torch.full((N + 10,), 0.25).double()
     search = LocalGaussNewton(start, sigma=1.0, loss=square(image(truth[None])[0]), seed=0)
-    solve(search, lambda x: image(x[:, :N]), 39)
+    run(search, lambda x: image(x[:, :N]), 39)
     assert search.value < 0.05
     assert set(search.jacobian.untouched.nonzero()[:, 0].tolist()) <= set(range(N, N + 10))
     left = search.jacobian.untouched
@@ -107,7 +101,7 @@ def test_noise():
     def noisy(x):
         return image(x) + 0.05 * torch.randn(len(x), SIDE, SIDE, generator=generator, dtype=torch.float64)
 
-    search = solve(search_for(image, truth), noisy, 150)
+    search = run(search_for(image, truth), noisy, 150)
     assert float((search.x - truth).square().mean()) < 4 * 0.05**2
 
 
@@ -117,7 +111,7 @@ def test_values_that_are_not_finite_are_avoided():
     def hole(x):
         return torch.where((x.norm(dim=1) > 1.05 * math.sqrt(N))[:, None, None], math.nan, image(x))
 
-    search = solve(search_for(image, truth), hole, 150)
+    search = run(search_for(image, truth), hole, 150)
     assert search.value < 1e-2
 
 
@@ -152,7 +146,7 @@ def test_a_sparse_jacobian_is_chosen_by_evidence():
     search = door(N, square(image(normal(1, N))[0]))
     assert search.engine == "descent"
     assert "are to tell" in search.reason
-    solve(search, image, 39)
+    run(search, image, 39)
     assert search.engine == "local"
     assert "100% of the change of held-out outputs, a dense one" in search.reason
     assert search.value < 1e-4

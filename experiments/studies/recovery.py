@@ -191,10 +191,10 @@ def draw_jacobian(task: Task, path: Path, *, samples: int = 128, seed: int = 0) 
     height = found.shape[0]
     pixel, parameter = (height // 2) * found.shape[1] + found.shape[1] // 2, (side // 2) * side + side // 2
     figure, axes = plt.subplots(2, 2, figsize=(6, 6), layout="constrained")
-    for row, pick, shape in ((0, lambda J: J[pixel], (side, side)), (1, lambda J: J[:, parameter], tuple(found.shape))):
-        most = float(pick(exact).abs().max())
-        for column, jacobian in enumerate((exact, sampled)):
-            axes[row, column].imshow(pick(jacobian).view(shape).numpy(), cmap="RdBu", vmin=-most, vmax=most)
+    for column, jacobian in enumerate((exact, sampled)):
+        for row, part, whole in ((0, jacobian[pixel], exact[pixel]), (1, jacobian[:, parameter], exact[:, parameter])):
+            most, shape = float(whole.abs().max()), (side, side) if row == 0 else tuple(found.shape)
+            axes[row, column].imshow(part.view(shape).numpy(), cmap="RdBu", vmin=-most, vmax=most)
             axes[row, column].set(xticks=[], yticks=[])
     axes[0, 0].set(title=f"finite differences, {2 * task.n} evaluations", ylabel="what a pixel depends on")
     axes[0, 1].set(title=f"from samples, {found.evaluations} evaluations")

@@ -82,7 +82,7 @@ class SparseSurrogate:
         index, values = jacobian.index, jacobian.values.double()
         pairs, products = index[:, :, None] * n + index[:, None], values[:, :, None] * values[:, None]
         square = values.new_zeros(n * n).index_add_(0, pairs.flatten(), products.flatten()).view(n, n) / m
-        square.diagonal().add_(_RIDGE * float(square.diagonal().mean()) or 1.0)
+        square.diagonal().add_(max(_RIDGE * float(square.diagonal().mean()), torch.finfo(torch.float64).tiny))
         slope = torch.linalg.cholesky(square)
         whole = jacobian.dense().view(m, n).double()
         basis = (torch.linalg.solve_triangular(slope, whole.mT, upper=False).mT / m).float()

@@ -55,8 +55,8 @@ def test_a_picture_of_a_row_and_a_column(tmp_path, monkeypatch):
     start = torch.zeros(64, dtype=torch.float64)
     task = replace(small.TASK, n=64, start=lambda run: start, output=Output(image, torch.sum))
     draw_jacobian(task, tmp_path / "jacobian.png", samples=60)
-    by_differences, by_samples, changed, found = shown
-    assert [one.shape for one in shown] == [(8, 8), (8, 8), (7, 7), (7, 7)]
+    by_differences, changed, by_samples, found = shown
+    assert [one.shape for one in shown] == [(8, 8), (7, 7), (8, 8), (7, 7)]
     assert by_differences[3:5, 3:5].flatten().tolist() == pytest.approx([0.25] * 4)  # pixel (3, 3) averages these
     assert by_differences.sum() == pytest.approx(1.0)
     assert changed[3:5, 3:5].flatten().tolist() == pytest.approx([0.25] * 4)  # parameter (4, 4) is in these

@@ -52,6 +52,7 @@ COMMANDS = {
     "optimizers": Command(
         "experiments.studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True
     ),
+    "recovery": Command("experiments.studies.recovery:recovery", "sparse Jacobians from few samples", long=True),
     "figures": Command("experiments.studies.figures:figures", "figures of the source, by their numbers", long=True),
     "gallery": Command("experiments.studies.gallery:gallery", "pictures and animations of all tasks", long=True),
     "caustic": Command("experiments.studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),

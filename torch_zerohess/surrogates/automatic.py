@@ -1,6 +1,8 @@
-"""A surrogate chosen by the evaluations: a Gaussian process or an affine map, whichever predicts held-out ones better.
+"""A surrogate chosen by the evaluations: the one that predicts held-out ones best.
 
-Outputs of many elements are represented by coordinates in the span of some of them (`LowRank`).
+Up to 32 parameters it is a Gaussian process or an affine map. For more parameters it is an affine map: of least norm,
+or with a sparse Jacobian where elements of the output depend on few parameters each. Outputs of many elements are
+represented by coordinates (`LowRank`).
 """
 
 import torch
@@ -9,6 +11,8 @@ from torch import Tensor
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank
 from torch_zerohess.surrogates.process import ProcessSurrogate
+from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
+from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
 from torch_zerohess.surrogates.surrogate import Surrogate, checked
 
 _PROCESS = 32
@@ -17,6 +21,8 @@ _HELD_OUT = 5
 """One point in so many is held out to compare the two."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
+_SQUARE, _JACOBIAN = 4096, 1 << 27
+"""Parameters, and entries of a dense Jacobian, up to which a sparse map is represented by coordinates, too."""
 
 
 class AutomaticSurrogate:
@@ -39,6 +45,8 @@ class AutomaticSurrogate:
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
         points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        if self._is_sparse(points, outputs):
+            return
         self.space = LowRank.of(outputs, self._rank(points)) if outputs[0].numel() > _WIDE else None
         known = outputs if self.space is None else self.space.encode(outputs)
         models = self._candidates(points)
@@ -53,6 +61,22 @@ class AutomaticSurrogate:
             models = [models[errors.index(min(errors))]]
         models[0].fit(points, known)
         self.model = models[0]
+
+    def _is_sparse(self, points: Tensor, outputs: Tensor) -> bool:
+        """Take a sparse map if it predicts held-out outputs better than the map of least norm."""
+        (P, n), m = points.shape, outputs[0].numel()
+        if n <= _PROCESS or m <= _WIDE or P < FEWEST_SAMPLES:
+            return False
+        sparse = SparseSurrogate(capacity=self.capacity)
+        sparse.fit(points, outputs)
+        assert sparse.jacobian is not None
+        if sparse.jacobian.explained <= max(sparse.jacobian.explained_dense, 0.0):
+            return False
+        self.space, self.model = None, sparse
+        if n <= _SQUARE and m * n <= _JACOBIAN:
+            self.space, middle, slope = sparse.coordinates()
+            self.model = LinearSurrogate.of(middle, slope)
+        return True
 
     def _rank(self, points: Tensor) -> int:
         """An affine map in n dimensions has outputs of rank n, which may be more than `rank`."""

@@ -44,6 +44,14 @@ class LinearSurrogate:
         else:
             self._slope = z.mT @ _solve(z @ z.mT, y, _RIDGE)
 
+    @classmethod
+    def of(cls, middle: Tensor, slope: Tensor) -> "LinearSurrogate":
+        """Return the map z -> (z - middle) slope, of a point [n] and a matrix [n, m]."""
+        made = cls()
+        made._middle, made._slope, made._shape = middle.double(), slope.double(), slope.shape[1:]
+        made._mean = slope.new_zeros(slope.shape[1]).double()
+        return made
+
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         predicted = self._mean + (z.double() - self._middle) @ self._slope

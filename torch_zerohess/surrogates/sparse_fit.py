@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, thresholds
+from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, spaced, thresholds
 
 FEWEST_SAMPLES = 8
 """That a fit needs."""
@@ -30,8 +30,8 @@ _ROUNDS = 3
 """In which entries are found where no old ones are known."""
 _RIDGES = ((1e-4, 1e-4), (0.03, 0.03), (0.3, 0.1), (0.3, 0.3), (1.0, 0.3))
 """Squares of the ridge of old and of new entries, in units of the samples."""
-_FEWEST, _BAND = 1024, 4
-"""Elements for the held-out test, at least about, in bands of so many rows of the image."""
+_FEWEST, _BAND, _BANDS = 1024, 4, 4
+"""Elements for the held-out test, at least about, in bands of so many rows of the image, and bands at least."""
 _BLOCK = 1 << 22
 """Elements of A held at a time."""
 _DENSE_RIDGE = 1e-6
@@ -111,7 +111,7 @@ def _validated(
     first: bool,
 ) -> tuple[tuple[float, float], float, float]:
     """Return the ridges that predict held-out samples best, and the shares that they and a dense fit predict."""
-    part, inner = _subset(grids, len(changes[0]), changes.device)
+    part, inner = _subset(grids, changes)
     d = changes[:, part]
     before = replace(
         previous, index=previous.index[part], values=previous.values[part], standard_error=previous.values[part]
@@ -260,13 +260,14 @@ def _least_norm(u: Tensor, d: Tensor, v: Tensor) -> Tensor:
     return (v @ u.mT) @ torch.linalg.solve(gram, d)
 
 
-def _subset(grids: Grids, m: int, device: torch.device) -> tuple[Tensor, Grids]:
-    """Return elements in evenly spaced bands of the image, and how these lie."""
-    rows, row = grids.pixels[0], grids.row
-    bands = -(-_FEWEST // (row * _BAND))
+def _subset(grids: Grids, changes: Tensor) -> tuple[Tensor, Grids]:
+    """Return elements in bands of the image where it changes [K, m], and how these lie."""
+    (rows, *_), row, device = grids.pixels, grids.row, changes.device
+    bands = max(_BANDS, -(-_FEWEST // (row * _BAND)))
     every = torch.arange(rows, device=device)
     if bands * _BAND < rows:
-        starts = torch.linspace(0, rows - _BAND, bands, device=device).long()
+        energy = (changes - changes.mean(0)).square().sum(0).view(rows, row).sum(1)
+        starts = torch.tensor(spaced(energy, bands), device=device).sub(_BAND // 2).clamp(0, rows - _BAND)
         every = (starts[:, None] + torch.arange(_BAND, device=device)).flatten().unique()
     part = (every[:, None] * row + torch.arange(row, device=device)).flatten()
     return part, Grids((len(every), *grids.pixels[1:]), grids.parameters)

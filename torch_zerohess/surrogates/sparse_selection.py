@@ -72,7 +72,7 @@ class Thresholds:
 
 
 def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds:
-    """Return the thresholds at a rate of false discoveries, from evenly spaced rows of the image if there are many.
+    """Return the thresholds at a rate of false discoveries, from some rows of the image if there are many.
 
     u: [K, n], rest: [K, m], both of columns with mean 0.
     """
@@ -80,7 +80,9 @@ def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds
     directions, decoys = _normalized(u), _normalized(u.roll(1, 0))
     counts = [torch.zeros(_BINS, dtype=torch.float64) for _ in range(4)]
     blocks = list(_blocks(grids, n))
-    for first, last in blocks[:: max(1, round(grids.pixels[0] * grids.row * n / _COUNTED))]:
+    energy = torch.stack([rest[:, first * grids.row : last * grids.row].square().sum() for first, last in blocks])
+    step = max(1, round(grids.pixels[0] * grids.row * n / _COUNTED))
+    for first, last in (blocks[k] for k in spaced(energy, -(-len(blocks) // step))):
         changes = _normalized(rest[:, first * grids.row : last * grids.row])
         for which, one in enumerate((directions, decoys)):
             squares = (changes.mT @ one).square_()
@@ -89,6 +91,18 @@ def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds
                 counts[2 + which] += _histogram(grids.mean(squares), _LEAST_JOINT / K)
     own, joint = (_threshold(counts[k], counts[k + 1], rate) for k in (0, 2))
     return Thresholds(own, joint)
+
+
+def spaced(energy: Tensor, count: int) -> list[int]:
+    """Return at most `count` of the parts of an image, with as much of the energy [parts] between any two of them.
+
+    Parts that do not change, as a background, are left out where others change.
+    """
+    total = energy.double().cpu().cumsum(0)
+    if count >= len(energy) or not float(total[-1]) > 0.0:
+        return list(range(len(energy)))[:: max(1, len(energy) // max(1, count))]
+    aims = (torch.arange(count).double() + 0.5) / count * total[-1]
+    return torch.searchsorted(total, aims).unique().tolist()
 
 
 def candidates(u: Tensor, rest: Tensor, grids: Grids, least: Thresholds) -> Iterator[tuple[Tensor, Tensor, Tensor]]:

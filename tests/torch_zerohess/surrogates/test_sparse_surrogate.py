@@ -1,0 +1,112 @@
+"""An affine map whose outputs depend on few parameters each, from fewer points than parameters."""
+
+import pytest
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
+
+n, SHAPE, P = 150, (10, 12), 60
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def sparse_map(entries=2):
+    """[120, n], so many entries in every row; the last parameter has none."""
+    generator = torch.Generator().manual_seed(1)
+    A = torch.zeros(120, n)
+    for row in A:
+        row[torch.randperm(n - 1, generator=generator)[:entries]] = 1.0 + torch.rand(entries, generator=generator)
+    return A
+
+
+A = sparse_map()
+
+
+def image(z):
+    return (1.0 + z @ A.to(z).mT).unflatten(1, SHAPE)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    surrogate = SparseSurrogate(keep=4)
+    surrogate.fit(normal(P, n), image(normal(P, n)))
+    return surrogate
+
+
+def error(surrogate):
+    """Mean square at other points, over the variance."""
+    z = normal(40, n, seed=5)
+    return float((surrogate(z) - image(z)).square().mean() / image(z).var())
+
+
+def test_it_predicts_from_fewer_points_than_parameters(fitted):
+    linear = LinearSurrogate()
+    linear.fit(normal(P, n), image(normal(P, n)))
+    assert error(linear) > 0.4
+    assert error(fitted) < 1e-3
+    assert fitted.jacobian.explained > 0.9
+    assert fitted.jacobian.explained_dense < 0.6
+    assert bool(fitted.jacobian.untouched[-1])
+
+
+def test_its_derivative_is_the_map(fitted):
+    z = normal(n, seed=6).double()
+    jacobian = torch.func.jacrev(lambda one: fitted(one[None])[0])(z)
+    torch.testing.assert_close(jacobian.flatten(0, 1), fitted.jacobian.dense().view(120, n).double())
+    assert float((jacobian.flatten(0, 1) - A).norm() / A.norm()) < 0.03
+
+
+def test_distances_of_coordinates_are_mean_squares(fitted):
+    space, middle, slope = fitted.coordinates()
+    z, other = normal(7, n, seed=7), image(normal(7, n, seed=8)) + normal(7, *SHAPE, seed=9)
+    known, outside = space.split(other)
+    found = ((z - middle).double() @ slope - known).square().sum(1) + outside
+    torch.testing.assert_close(found.float(), (fitted(z) - other).square().mean((1, 2)), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(space.decode((z - middle) @ slope.float()), fitted(z), rtol=1e-4, atol=1e-4)
+
+
+def test_a_memory_takes_it_where_it_predicts_better():
+    memory = zh.Memory()
+    memory.add(normal(P, n), image(normal(P, n)))
+    memory.fit()
+    assert isinstance(memory.surrogate, AutomaticSurrogate)
+    assert memory.surrogate.space is not None
+    assert error(memory.surrogate) < 1e-3
+
+
+def test_a_dense_map_and_few_points_keep_the_map_of_least_norm():
+    dense = normal(n, 120, seed=3) / n**0.5
+    automatic, linear = AutomaticSurrogate(), LinearSurrogate()
+    z = normal(P, n)
+    for one in (automatic, linear):
+        one.fit(z, (z @ dense).unflatten(1, SHAPE))
+    torch.testing.assert_close(automatic(2 * z), linear(2 * z), rtol=1e-3, atol=1e-3)
+    automatic.fit(z[:5], image(z[:5]))
+    torch.testing.assert_close(automatic(z[:5]), image(z[:5]), rtol=1e-3, atol=1e-3)
+
+
+def test_very_few_points_give_their_mean():
+    surrogate = SparseSurrogate()
+    surrogate.fit(normal(5, n), image(normal(5, n)))
+    torch.testing.assert_close(surrogate(normal(2, n)), image(normal(5, n)).mean(0).expand(2, *SHAPE))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"keep": 0}, "keep must be at least 1, got 0"),
+        ({"capacity": 1}, "capacity must be at least 2, got 1"),
+        ({"rate": 2.0}, "rate must be between 0 and 1, got 2.0"),
+        ({"grid": (3, 4)}, "grid must be rows and columns"),
+    ],
+)
+def test_wrong_settings_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        SparseSurrogate(**settings).fit(normal(P, n), image(normal(P, n)))
+    with pytest.raises(RuntimeError, match="fit the surrogate"):
+        SparseSurrogate()(normal(2, n))

@@ -24,8 +24,6 @@ __all__ = ["Iterate", "Minimum", "minimize"]
 
 _AGREED = 3
 """Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
-_LUCK = 2.0
-"""Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
 _OTHER_NAMES = {
     "maxiter": "max_evaluations",
     "max_iter": "max_evaluations",
@@ -85,22 +83,23 @@ def minimize(
         vectorized: False for an fn of one point, [n] -> scalar or [*out].
         evaluator: where evaluations run; in this process if None.
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
-            does not depend on their number. More than one has work only with a `batch`. A point that no process
-            survives has the value NaN.
+            does not depend on their number. Most steps are single points: give a `batch`, too, so that all workers
+            have work. A point that no process survives has the value NaN.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this.
         xtol: the search ends when its region is within this of the best point in every parameter.
         ftol: the search ends when its model, where it holds, promises a decrease of at most this.
-        time_limit: seconds after which no further batch is evaluated.
+        time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
             from it: the function and all settings must be the same.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up or three rounds in a row have arrived at the same point.
         noise: standard deviation of repeated losses at one point. If None it is measured: x0 is evaluated twice, and
-            six times more if the values differ. In noise an eighth of the evaluations is kept for the end. They go to
-            the points that may be best. `value` is the mean of those at x, `value_error` its standard error.
+            six times more if the values differ. If fn is noisy, an eighth of `max_evaluations` (4 to 48) is kept for
+            the end. The best candidates are then evaluated again, and x is the one with the lowest mean. `value` is
+            that mean and `value_error` its standard error.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn
@@ -142,40 +141,45 @@ def minimize(
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or own or Inline())
     path = None if checkpoint is None else Path(checkpoint)
-    running = Running(make, call, noise, batch, max_evaluations, path, verbose=verbose)
+    running = Running(make, call, noise, batch, smallest, max_evaluations, path, verbose=verbose)
 
     def ended() -> tuple[Status, str] | None:
         search = running.search
+        if not running.history:
+            return None
         if search.done:
-            return "solved" if search.solved and not running.flat else "stalled", search.message
-        if target is not None and search.value <= target - _LUCK * (running.noise or 0.0):
+            return running.ending(arrived=search.solved), search.message
+        if target is not None and running.reaches(target):
             return "target", f"the value is at most the target {target}"
         if xtol is not None and bool((search.width <= xtol).all()):
-            return "solved", f"the region is within xtol ({xtol}) of x"
+            return running.ending(arrived=True), f"the region is within xtol ({xtol}) of x"
         if ftol is not None and search.promise <= ftol:
-            return "solved", f"the model promises a decrease of at most ftol ({ftol})"
+            return running.ending(arrived=True), f"the model promises a decrease of at most ftol ({ftol})"
         if search.solved and (xtol, ftol) != (None, None):
-            return "solved", "the search has arrived at x, within xtol and ftol"
+            return running.ending(arrived=True), "the search has arrived at x, within xtol and ftol"
         if restarts is None and search.agreed >= _AGREED:
             return "solved", f"{search.agreed} rounds in a row have arrived at x"
         if running.left < 1:
             return "budget", f"max_evaluations ({max_evaluations}) used up"
-        if time_limit is not None and running.history and running.seconds > time_limit:
+        if time_limit is not None and running.seconds > time_limit:
             return "time", f"time_limit ({time_limit} s) used up"
         return None
 
     end: tuple[Status, str]
+    asked: tuple[Status, str] | None = None
     try:
         while True:
-            reached = ended()
-            if reached is not None:
-                end = reached
+            reached = ended() or asked
+            if reached is None:
+                iterate = running.step()
+                if callback is not None and _is_true(callback(iterate)):
+                    asked = "callback", "the callback asked to end"
+                continue
+            end = reached
+            if end[0] != "time":
+                running.decide()
+            if end[0] != "target" or ended() == end:  # in noise the decision may refute it
                 break
-            iterate = running.step()
-            if callback is not None and _is_true(callback(iterate)) and ended() is None:
-                end = "callback", "the callback asked to end"
-                break
-        running.decide()
     except KeyboardInterrupt:
         if not running.history:
             raise

@@ -77,6 +77,37 @@ def test_units():
     assert float((fit.gradient * units).abs().max()) < 1e-3
 
 
+@pytest.mark.parametrize("bounds", [None, (-4.0, 4.0)])
+@pytest.mark.parametrize(("n", "restarts"), [(2, 0), (2, 3), (5, 0), (5, 1), (10, 0)])
+def test_the_hessian_of_a_quadratic_is_exact(n, bounds, restarts):
+    """Also where the search ended far from the best point, in a round from a random one."""
+    axes, _ = torch.linalg.qr(torch.randn(n, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64))
+    hessian = axes @ torch.diag(torch.linspace(1, 10, n, dtype=torch.float64)) @ axes.mT
+    center = torch.linspace(-1, 1, n, dtype=torch.float64)
+
+    def f(z):
+        return 0.5 * (((z - center) @ hessian) * (z - center)).sum(1)
+
+    most = {0: 250, 1: 80, 3: 60}[restarts]
+    fit = zh.minimize(f, zeros(n), sigma=1.0, seed=0, bounds=bounds, restarts=restarts, max_evaluations=most)
+    assert float((fit.hessian - hessian).norm()) < 1e-6 * float(hessian.norm())
+    assert float((fit.gradient - hessian @ (fit.x - center)).norm()) < 1e-6
+
+
+def test_the_hessian_of_a_stepped_function_is_that_of_the_smoothed_one(monkeypatch):
+    """No quadratic goes through steps: the model of the search stays."""
+
+    def steps(z):
+        return 0.05 * (20 * bowl(z)).round()
+
+    settings = {"sigma": 1.0, "seed": 0, "max_evaluations": 40}
+    fit = zh.minimize(steps, zeros(), **settings)
+    monkeypatch.setattr("torch_zerohess.search.running.quadratic_around", lambda *given: None)
+    own = zh.minimize(steps, zeros(), **settings)
+    assert torch.equal(fit.hessian, own.hessian)
+    assert torch.equal(fit.sigma, own.sigma)
+
+
 def test_gauss_newton_of_an_output():
     """Of |J (z - c)|^2 the Hessian is 2 J^T J, up to its damping."""
     J = torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, -1.0], [3.0, 0.0, 1.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
@@ -391,6 +422,12 @@ def test_tolerances_end_it_early(name):
     assert fit.evaluations < 30
     assert fit.value < 0.5 + 1e-3
     assert float((fit.x - CENTER).norm()) < 0.03
+
+
+def test_a_tolerance_ends_nothing_before_it_has_begun():
+    fit = zh.minimize(bowl, zeros(), sigma=2.0, seed=0, xtol=9.0)
+    assert len(fit.history) == 1
+    assert fit.value == float(bowl(fit.x[None]))
 
 
 def test_a_time_limit_ends_it():

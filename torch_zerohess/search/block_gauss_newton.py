@@ -96,8 +96,12 @@ class BlockMethod(Method[BlockProgress]):
         return self._sample(known, generator)
 
     def model_at_best(self, known: BlockProgress) -> tuple[LocalModel, float] | None:
-        """The model of the latest Jacobian, without standard errors; None before it is complete."""
-        if not len(known.output) or (known.iterations == 0 and known.phase == "sample"):
+        """The model of the latest Jacobian, which is one at the center, without standard errors.
+
+        None around another point, and before the Jacobian is complete.
+        """
+        incomplete = not len(known.output) or (known.iterations == 0 and known.phase == "sample")
+        if incomplete or not torch.equal(known.best.point, known.center):
             return None
         gradient, hessian = self._derivatives(known)
         sigma, unknown = known.sigma, torch.full_like(known.center, math.inf)

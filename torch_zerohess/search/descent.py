@@ -146,7 +146,7 @@ class LocalQuadratics(Method[DescentProgress]):
             lowest=lowest,
             shape=evaluated.shape,
             evaluations=known.evaluations + len(evaluated),
-            refused=0 if bool(finite.all()) else known.refused + 1,
+            refused=0 if bool(evaluated.needed.finite.all()) else known.refused + 1,
         )
 
     def _judged(self, known: DescentProgress, evaluated: Evaluated, loss: float) -> DescentProgress:

@@ -37,7 +37,7 @@ class DescentProgress(Progress):
     paired: bool = False
     """Whether these come in pairs x + d, x - d."""
     refused: int = 0
-    """Batches in a row with values that were not finite."""
+    """Batches in a row with values that were not finite at points that the search needed."""
     patience: int = 0
     """How often a plateau has been met in a row."""
     faithful: bool = False

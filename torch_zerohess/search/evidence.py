@@ -115,8 +115,10 @@ class EvidenceMethod(Method[EvidenceProgress]):
 
     def model_at_best(self, known: EvidenceProgress) -> tuple[LocalModel, float] | None:
         if known.local is not None:
-            return self.local.model_at_best(known.local)
-        return None if known.descent is None else self.descent.model_at_best(known.descent)
+            return self.local.model_at_best(replace(known.local, best=known.best))
+        if known.descent is None:
+            return None
+        return self.descent.model_at_best(replace(known.descent, best=known.best))
 
 
 def _gathered(known: EvidenceProgress, evaluated: Evaluated) -> EvidenceProgress:

@@ -136,9 +136,12 @@ class LocalMethod(Method[LocalProgress]):
         return known if known.phase == "trial" else None
 
     def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
-        """The model of the latest Jacobian, without standard errors; None for more than a thousand parameters."""
+        """The model of the latest Jacobian, which is one at the center, without standard errors.
+
+        None around another point, and for more than a thousand parameters.
+        """
         n = self.settings.n
-        if known.jacobian is None or n > _FULL:
+        if known.jacobian is None or n > _FULL or not torch.equal(known.best.point, known.center):
             return None
         gradient, product = self._derivatives(known, known.jacobian)
         hessian = torch.stack([product(one) for one in torch.eye(n).to(known.center)])

@@ -36,19 +36,18 @@ class LossModel:
         shape: torch.Size,
         optimism: float,
     ) -> None:
-        self.process, self.optimism, self._known, m = process, optimism, len(process.points), len(output)
+        self.process, self.optimism = process, optimism
+        self.elements, self._known = len(output), len(process.points)
         directions = torch.cat([(process.mean - output)[None], process.weights])
         expanded = loss_curvature(loss, output.view(shape))
-        self.value, slope, bend = (
-            expanded.value,
-            expanded.slope.flatten(),
-            expanded.products(directions.view(-1, *shape)),
-        )
-        self.slope, self.bend = directions @ slope, directions @ bend.mT
+        slope = expanded.slope.flatten()
+        bend = expanded.products(directions.view(-1, *shape))
+        self.value = expanded.value
+        self.slope = directions @ slope
+        self.bend = directions @ bend.mT
         self.steepness = float(slope.square().sum()), bend @ slope, bend @ bend.mT
-        self.elements = m
         size = float(directions.square().sum())
-        self.trace = m * max(float(self.bend.diagonal().sum()), 0.0) / size if size > 0.0 else 0.0
+        self.trace = self.elements * max(float(self.bend.diagonal().sum()), 0.0) / size if size > 0.0 else 0.0
 
     def __call__(self, x: Tensor) -> Tensor:
         """Optimistic losses [Q] of points [Q, n]."""

@@ -115,7 +115,7 @@ class LossProcess(ProcessMethod[LossProgress]):
         known = self.avoiding(known, evaluated.points[~finite])
         for k in finite.nonzero().flatten().tolist():  # what tells the process something new
             if float((known.pool.points - evaluated.points[k]).norm(dim=1).min()) > APART:
-                known = self.remembered(known, evaluated.those(torch.tensor([k])), max(self.capacity, len(known.pool)))
+                known = self.remembered(known, evaluated.those(torch.tensor([k])))
         best = now.best if now.best.loss <= known.best.loss else known.best
         known = replace(
             known,

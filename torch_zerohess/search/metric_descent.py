@@ -154,7 +154,7 @@ class MetricQuadratics(Method[MetricProgress]):
 
     def model_at_best(self, known: MetricProgress) -> tuple[LocalModel, float] | None:
         if known.wide is not None:
-            return self._wide.model_at_best(known.wide)
+            return self._wide.model_at_best(replace(known.wide, best=known.best))
         best = known.best
         if len(known.values) <= self._n or not torch.equal(known.lowest.point, best.point):
             return None

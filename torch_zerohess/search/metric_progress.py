@@ -46,7 +46,7 @@ class MetricProgress(Progress):
     tied: int = 0
     """Steps in a row whose end has exactly the value of the best point."""
     lost: int = 0
-    """Batches in a row with values that were not finite."""
+    """Batches in a row with values that were not finite at points that the search needed."""
     wide: DescentProgress | None = None
     """Isotropic descent on the smoothed loss, which takes over on a plateau."""
 
@@ -76,5 +76,5 @@ class MetricProgress(Progress):
             points=points[-capacity:],
             values=values[-capacity:],
             evaluations=self.evaluations + len(evaluated),
-            lost=0 if len(new) == len(evaluated) else self.lost + 1,
+            lost=0 if bool(evaluated.needed.finite.all()) else self.lost + 1,
         )

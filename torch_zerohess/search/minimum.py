@@ -54,8 +54,9 @@ class Minimum:
     """Whether the target was reached, or x is a point at which the search has arrived."""
     status: Status = "budget"
     """target: the value is at most the target. solved: the search has ended at a minimum, possibly a local one.
-    stalled: it has ended without one. budget, time: evaluations or seconds are used up. callback, interrupted: the
-    caller has ended it. failed: the black box has raised."""
+    stalled: it has ended without one, or in noise, where a small region is no evidence of one. budget, time:
+    evaluations or seconds are used up. callback, interrupted: the caller has ended it. failed: the black box has
+    raised."""
     value_error: float = 0.0
     """Standard error of the value, which in noise is a mean of evaluations at x; 0 without noise."""
     noise: float = 0.0

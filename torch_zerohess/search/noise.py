@@ -40,12 +40,13 @@ def distinct(points: Sequence[Tensor]) -> Tensor:
 
 def lowest_mean(
     evaluate: Callable[[Tensor], Tensor], points: Tensor, evaluations: int, noise: float
-) -> tuple[int, float, float]:
+) -> tuple[int, float, float] | None:
     """Evaluate points [C, n] again; return which has the lowest mean, and its mean and standard error.
 
     The first half of the evaluations chooses: all points that are left get the same number, then the better half is
-    left (successive halving: Karnin, Koren and Somekh 2013). The second half are all at the point that is chosen. The
-    mean has only these: those for which a point is chosen are lucky ones.
+    left (successive halving: Karnin, Koren and Somekh 2013). The second half are all at the point that is chosen. Only
+    the second half enters the mean: the values by which a point was chosen are too low on average. Where none of it is
+    finite the first half has to do; None if none of that is finite, either.
 
     Args:
         evaluate: points [K, n] -> losses [K].
@@ -65,5 +66,10 @@ def lowest_mean(
             better = losses.mean(1).argsort()[: math.ceil(len(left) / 2)]
             left, losses = left[better], losses[better]
     told = evaluate(points[left[:1]].repeat(evaluations, 1))
+    told = told[torch.isfinite(told)]
+    if not len(told):
+        told = losses[0][torch.isfinite(losses[0])]
+    if not len(told):
+        return None
     spread = max(noise, deviation(told)) if len(told) > 1 else noise
     return int(left[0]), float(told.mean()), spread / math.sqrt(len(told))

@@ -53,7 +53,7 @@ _EXPANSIONS = 3
 """Expansions of the loss around predicted minima, until one predicts the loss there. If none does, the process is one
 of the loss itself from then on."""
 _POOL, _BATCHES = 60, 8
-"""Evaluations kept, and batches of several points kept at least."""
+"""Evaluations kept, and batches of several points kept at least, unless `pool` says it."""
 _NEAR, _WIDENING, _WIDEST = 1e-3, 1.5, 10.0
 """Weight from which an evaluation counts as near the best point; sigma is widened by the factor up to the last one."""
 
@@ -75,16 +75,16 @@ class ProcessMethod(Method[Q]):
         finite, trial = evaluated.finite, known.phase == "trial"
         known = replace(
             known,
+            room=max(known.room, _BATCHES * len(evaluated) if evaluated.extra else 0),
             shape=evaluated.shape,
             evaluations=known.evaluations + len(evaluated),
             iterations=known.iterations + trial,
-            refused=0 if bool(finite.all()) else known.refused + 1,
+            refused=0 if bool(evaluated.needed.finite.all()) else known.refused + 1,
         )
         before = known.best.point
         if known.refused >= _REFUSED:
             return replace(known, done=True, message=f"{_REFUSED} batches in a row had values that are not finite")
-        capacity = max(self.capacity, _BATCHES * len(evaluated)) if evaluated.extra else self.capacity
-        known = self.remembered(known, evaluated.those(finite), capacity)
+        known = self.remembered(known, evaluated.those(finite))
         known = self.avoiding(known, evaluated.points[~finite])
         if evaluated.extra:
             known = replace(known, moved=max(known.moved, self._length(known.best.point - before)))
@@ -156,10 +156,11 @@ class ProcessMethod(Method[Q]):
 
     # What was evaluated.
 
-    def remembered(self, known: Q, new: Evaluated, capacity: int) -> Q:
+    def remembered(self, known: Q, new: Evaluated) -> Q:
         """Add evaluations with finite values to the pool."""
         if not len(new):
             return known
+        capacity = self.capacity if self.settings.pool else max(self.capacity, known.room)
         best = known.best.point
         pool = known.pool
         while len(pool) + len(new) > capacity > len(new) and not known.noisy:

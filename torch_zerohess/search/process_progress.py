@@ -18,6 +18,8 @@ class ProcessProgress(Progress):
     """
 
     pool: Pool
+    room: int = 0
+    """Evaluations that the pool keeps at least, since there were batches."""
     phase: Literal["start", "trial"] = "start"
     """What is asked for: the start and points around it, or the end of a step."""
     record: Best
@@ -33,7 +35,7 @@ class ProcessProgress(Progress):
     exploring: int = 0
     """Steps that are still to be more optimistic than others."""
     refused: int = 0
-    """Batches in a row with values that were not finite."""
+    """Batches in a row with values that were not finite at points that the search needed."""
     holes: Tensor
     """Points [H, n] whose values were not finite."""
     solved: Tensor

@@ -73,9 +73,11 @@ class AskTell(ABC, Generic[P]):
         generator.manual_seed(int(torch.randint(2**63 - 1, ())) if seed is None else seed)
         self._state = self._after(*self._method.first(generator), generator)
         self._out: Tensor | None = self._state.asked[:0]
-        """Points out for evaluation [K, n], None if `load_state_dict` does not know: bookkeeping, not state."""
+        """Points out for evaluation [K, n], None if `load_state_dict` does not know."""
         self._early: dict[int, Tensor] = {}
         """Values of some of them, by number, that came before the others."""
+        self._drawn: tuple[int, Tensor] | None = None
+        """The batch that `ask` drew points for last, and these points, so that no model is fitted twice."""
         self.told = torch.empty(0, dtype=torch.float64)
         """Losses [K] of the points told last."""
 
@@ -166,10 +168,10 @@ class AskTell(ABC, Generic[P]):
         return f"{name}(engine={self.engine!r}, n={len(self.unit)}, evaluations={self.evaluations}, {told}, {end})"
 
     def model_at_best(self, x: Tensor | None = None) -> tuple[LocalModel, float] | None:
-        """A quadratic model around `x` and its sigma: that at which x was found, or wider if few evaluations are near.
+        """Return a quadratic model around the best point, or around `x` [n] if given, and its sigma.
 
-        None before the first `tell`, or if no evaluations near x are kept. In noise it may be wanted around another
-        point x [n] than the best one.
+        That is the sigma at which the point was found; it is wider if few evaluations lie near. None before the first
+        `tell`, or if no evaluations near the point are kept.
         """
         progress = self._state.progress
         if x is not None and not torch.equal(x, self.x):
@@ -178,6 +180,8 @@ class AskTell(ABC, Generic[P]):
 
     def ask(self, batch: int = 1, *, limit: int | None = None) -> Tensor:
         """Return the next points to evaluate [K, n]; the same ones until they are told.
+
+        Once some of their values are told, these are the points whatever the batch.
 
         Args:
             batch: how many evaluations run at once. If the search itself has fewer points to ask for, others are
@@ -192,31 +196,34 @@ class AskTell(ABC, Generic[P]):
                 raise ValueError(f"{name} must be at least 1, got {value}")
         if self.done:
             raise RuntimeError(f"the search is done: {self.message}")
-        self._out = self._points(batch)[:limit]
+        if self._early:
+            points = self._given
+        else:
+            if self._drawn is None or self._drawn[0] != batch:
+                self._drawn = batch, self._points(batch)
+            points = self._drawn[1]
+        self._out = points[:limit]
         return self._space.parameters(self._out)
 
     @property
     def missing(self) -> list[int]:
         """Numbers of the points, among those that `ask` returned, whose values are not told."""
-        points = self._state.asked if self._out is None else self._out
-        return [k for k in range(len(points)) if k not in self._early]
+        return [k for k in range(len(self._given)) if k not in self._early]
 
     def tell(self, values: Any, which: Sequence[int] | None = None) -> None:
         """Take the values of the points that `ask` returned: [K], or [K, *out] if there is a `loss`.
 
         With `which` [k], numbers of points, these are the values of some of them: [k] or [k, *out], in any order. The
         step is taken when the last one is told, and does not depend on the order. Without `which` they are the values
-        of all points that are `missing`. After `load_state_dict` ask for a batch again before telling parts of it.
+        of all points that are `missing`. If a batch was asked for after `state_dict`, ask for it again after
+        `load_state_dict` before telling parts of it.
 
         Points whose values are not finite are avoided. Raises ValueError for a wrong shape, or if the start itself has
         no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
         raises. The search is then as before, and the same values can be told again.
         """
-        values = torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
-        points = self._out
-        if points is None and which is not None:
-            points = self._state.asked
-        elif points is None:
+        values, points = self._converted(values), self._given
+        if self._out is None and which is None and not self._early:
             count = len(values) if values.ndim else 1
             points = self._points(count)[:count]
         if not len(points):
@@ -233,11 +240,11 @@ class AskTell(ABC, Generic[P]):
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
-        self._out, self._early, self.told = points[:0], {}, evaluated.losses
+        self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.losses
 
     def losses(self, values: Any) -> Tensor:
         """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""
-        values = torch.as_tensor(values, dtype=torch.float64)
+        values = self._converted(values)
         return self._evaluated(values, self.unit.expand(len(values) if values.ndim else 0, -1)).losses
 
     def state_dict(self) -> dict[str, Any]:
@@ -245,9 +252,9 @@ class AskTell(ABC, Generic[P]):
 
         Tensors, numbers, strings, lists and dicts: `torch.save`, and `torch.load` with weights_only=True.
         """
-        given = 0 if self._out is None or not self._early else len(self._out)
-        early = {"early": dict(self._early), "given": given}
-        return {"search": self._kind, "unit": self.unit, **early, **plain(self._state)}
+        alone = len(self._given) in (0, len(self._state.asked))  # nothing is out, or what the search itself asked for
+        out = {"early": dict(self._early), "out": None if alone else self._given}
+        return {"search": self._kind, "unit": self.unit, **out, **plain(self._state)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a `state_dict`; the settings and the loss stay those given here.
@@ -262,10 +269,15 @@ class AskTell(ABC, Generic[P]):
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         progress = restored(self._method.progress, state["progress"], device)
+        early = {k: value.to(device) for k, value in state["early"].items()}
+        out = None if state["out"] is None else state["out"].to(device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
-        self._early = dict(state.get("early", {}))
-        # Without early values it is not known how many points were evaluated before the search was saved.
-        self._out = self._points(state["given"])[: state["given"]] if self._early else None
+        self._out, self._early, self._drawn = out, early, None
+
+    @property
+    def _given(self) -> Tensor:
+        """Points out for evaluation [K, n], as far as is known."""
+        return self._state.asked if self._out is None else self._out
 
     @property
     def _kind(self) -> str:
@@ -285,8 +297,10 @@ class AskTell(ABC, Generic[P]):
         further = self._method.more(self._state.progress, points, batch - len(points), generator)
         return torch.cat([points, self._space.rounded(further)])
 
-    def _evaluated(self, values: Any, points: Tensor) -> Evaluated:
+    def _converted(self, values: Any) -> Tensor:
+        return torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
+
+    def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:
         """Return what was told about points [K, n], of which those beyond the search's own are from `Method.more`."""
-        shape = self._state.progress.shape
-        found = told(values, points, self._method.settings.loss, shape, self.unit.device)
+        found = told(values, points, self._method.settings.loss, self._state.progress.shape)
         return replace(found, extra=max(len(points) - len(self._state.asked), 0))

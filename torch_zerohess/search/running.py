@@ -4,6 +4,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,23 @@ _PAUSE = 1.0
 """Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
 _OTHERS = 2
 """Points with low values, besides the best one and where the search is, that may be best in noise."""
+_LUCK = 2.0
+"""Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
 _FITTED = 40
 """Parameters up to which a quadratic is fitted to all evaluations at the end."""
 _EXACT = 1e-3
 """Relative standard error of its Hessian, below which it takes the place of the model that the search has."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Which of the best points in noise has the lowest mean, its mean, and the standard error of that."""
+
+    x: Tensor
+    value: float
+    error: float
+    evaluations: int
+    """With those for the decision."""
 
 
 class Running:
@@ -34,6 +48,7 @@ class Running:
         call: outputs or losses of points [K, n].
         noise: that standard deviation; measured at the start if None.
         batch: points that are evaluated at once.
+        least: evaluations that the search needs for one step.
         most: evaluations that there may be.
         path: of the file, or None.
         verbose: whether to write a line to stderr every second.
@@ -45,6 +60,7 @@ class Running:
         call: Callable[[Tensor, Sequence[Tensor]], Tensor],
         noise: float | None,
         batch: int,
+        least: int,
         most: int,
         path: Path | None,
         *,
@@ -53,15 +69,16 @@ class Running:
         self.history = list[Iterate]()
         self.noise = noise
         """Standard deviation of repeated losses; None before it is known."""
-        self._make, self._call, self._batch, self._most = make, call, batch, most
+        self._make, self._call, self._batch, self._least, self._most = make, call, batch, least, most
         self._path, self._verbose = path, verbose
         self._begun = self._written = self._said = time.monotonic()
-        self._decided: tuple[Tensor, float, float] | None = None
+        self._decided: Decision | None = None
         saved: dict[str, Any] | None = None
         if path is not None and path.exists():
             saved = torch.load(path, weights_only=True)
             self.noise = saved["noise"]
             self.history = [Iterate(**one) for one in saved["history"]]
+            self._decided = None if saved["decided"] is None else Decision(**saved["decided"])
         self.search = make(self.noise or 0.0)
         if saved is not None:
             self.search.load_state_dict(saved["search"])
@@ -78,8 +95,10 @@ class Running:
 
     @property
     def left(self) -> int:
-        """Evaluations that the search may still use."""
-        return self._most - self.evaluations - (reserved(self._most) if self.noise else 0)
+        """Evaluations that the search may still use. In noise it leaves those that it does not need for the end."""
+        rest = self._most - self.evaluations
+        needed = max(self._least - self.search.evaluations, 0)
+        return rest - (min(reserved(self._most), max(rest - needed, 0)) if self.noise else 0)
 
     @property
     def flat(self) -> bool:
@@ -97,18 +116,37 @@ class Running:
         search.tell(self._call(points.clone(), ()))
         return self._noted(points, search.told)
 
+    def ending(self, *, arrived: bool) -> Status:
+        """Return what an end is where the search has `arrived`: in noise a small region is no evidence of a minimum."""
+        return "solved" if arrived and not self.flat and not self.noise else "stalled"
+
+    def reaches(self, target: float) -> bool:
+        """Whether the value is at most the target; in noise, that of the decision, or one that is worth a decision.
+
+        That is the value of the search. After a decision for another value it is the lowest one since.
+        """
+        if self._last is not None:
+            return self._last.value <= target
+        value, decided = self.search.value, self._decided
+        if decided is not None:
+            since = [one.values for one in self.history if one.evaluations > decided.evaluations]
+            value = float(torch.cat(since).nan_to_num(nan=math.inf).min())
+        return value <= target - _LUCK * (self.noise or 0.0)
+
     def decide(self) -> None:
         """In noise, find out which of the best points has the lowest mean, with the evaluations kept for that."""
         search = self.search
-        if not self.noise or not self.history or self._most <= self.evaluations:
+        if not self.noise or not self.history or self._most <= self.evaluations or self._last is not None:
             return
         points = torch.cat([one.points for one in self.history])
         losses = torch.cat([one.values for one in self.history])
         lowest = torch.where(torch.isfinite(losses), losses, torch.inf).argsort()[:_OTHERS]
         candidates = distinct([search.x, search.center, *points[lowest]])
         most = min(reserved(self._most), self._most - self.evaluations)
-        k, value, error = lowest_mean(self._evaluated, candidates, most, self.noise)
-        self._decided = candidates[k], value, error
+        found = lowest_mean(self._evaluated, candidates, most, self.noise)
+        if found is not None:
+            k, value, error = found
+            self._decided = Decision(candidates[k], value, error, self.evaluations)
 
     def write(self) -> None:
         """Write the file; it is never half written."""
@@ -116,14 +154,15 @@ class Running:
             return
         self._written = time.monotonic()
         draft = self._path.with_name(f"{self._path.name}.part")
-        history = [vars(one) for one in self.history]
-        torch.save({"search": self.search.state_dict(), "history": history, "noise": self.noise}, draft)
+        decided = None if self._decided is None else vars(self._decided)
+        saved = {"history": [vars(one) for one in self.history], "noise": self.noise, "decided": decided}
+        torch.save(saved | {"search": self.search.state_dict()}, draft)
         draft.replace(self._path)
 
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""
         search = self.search
-        x, value, value_error = self._decided or (search.x, search.value, self.noise or 0.0)
+        x, value, error = self._best(self.history[0].points, self.history[0].values)
         found = self._model(x)
         gradient = hessian = errors = None
         unit = search.unit
@@ -136,26 +175,44 @@ class Running:
             errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
         if self.flat and len(search.unit) < self.evaluations and status != "target":
             message += f"; all {self.evaluations} values are equal: enlarge sigma"
-        # In noise a small sigma is no evidence of a minimum.
-        success = status in ("target", "solved") or (search.solved and not self.flat and not self.noise)
+        success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
         if success and status in ("budget", "time"):
             message += "; the search had arrived at x, a minimum at least of its surroundings"
         return Minimum(
-            x,
-            value,
-            gradient,
-            hessian,
-            errors,
-            unit.to(x),
-            self.evaluations,
-            self.history,
-            message,
-            search.engine,
-            success,
-            status,
-            value_error,
-            self.noise or 0.0,
+            x=x,
+            value=value,
+            gradient=gradient,
+            hessian=hessian,
+            standard_errors=errors,
+            sigma=unit.to(x),
+            evaluations=self.evaluations,
+            history=self.history,
+            message=message,
+            engine=search.engine,
+            success=success,
+            status=status,
+            value_error=error,
+            noise=self.noise or 0.0,
         )
+
+    @property
+    def _last(self) -> Decision | None:
+        """The decision, unless the search has gone on since."""
+        decided = self._decided
+        return decided if decided is not None and decided.evaluations == self.evaluations else None
+
+    def _best(self, points: Tensor, losses: Tensor) -> tuple[Tensor, float, float]:
+        """Return the best point, its value and the error of that.
+
+        Until the search was told values these are of the start, among the first points [K, n] with losses [K].
+        """
+        if self._last is not None:
+            return self._last.x, self._last.value, self._last.error
+        search, noise = self.search, self.noise or 0.0
+        if search.evaluations:
+            return search.x, search.value, noise
+        losses = losses[(points == search.x).all(1) & torch.isfinite(losses)]
+        return search.x, float(losses.mean()), noise / math.sqrt(len(losses))
 
     def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
         """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better."""
@@ -177,7 +234,7 @@ class Running:
             self.search.tell(values[:-1])
             losses = torch.cat([self.search.told, self.search.losses(values[-1:])])
             return self._noted(torch.cat([points, start]), losses)
-        count = min(REPEATED - 2, max(self._most - len(values) - 2, 0))
+        count = min(REPEATED - 2, max(self._most - len(values) - self._least, 0))
         again = self._call(start.repeat(count, 1), ()) if count else values[:0]
         losses = self.search.losses(torch.cat([values, again]))
         at_start = torch.cat([losses[:1], losses[len(points) :]])
@@ -189,20 +246,21 @@ class Running:
 
     def _evaluated(self, points: Tensor) -> Tensor:
         """Return the losses [K] of points [K, n], which are not told to the search."""
-        losses = self.search.losses(self._call(points.clone(), ()))
-        self._noted(points, losses)
-        return losses
+        losses = []
+        for part in points.split(max(self._batch, self._least - 1)):  # no more at once than in the first batch
+            losses.append(self.search.losses(self._call(part.clone(), ())))
+            self._noted(part, losses[-1])
+        return torch.cat(losses)
 
     def _noted(self, points: Tensor, losses: Tensor) -> Iterate:
         """Return what is known after a batch at points [K, n] with losses [K], and write it where it is due."""
-        search = self.search
-        self.history.append(
-            Iterate(self.evaluations + len(points), search.value, search.x, points.clone(), losses.clone())
-        )
+        first = self.history[0] if self.history else None
+        x, value, _ = self._best(points, losses) if first is None else self._best(first.points, first.values)
+        self.history.append(Iterate(self.evaluations + len(points), value, x, points.clone(), losses.clone()))
         now = time.monotonic()
         if self._verbose and now - self._said >= _PAUSE:
             self._said = now
-            said = f"{self.evaluations} evaluations, value {search.value:.6g}, sigma {search.sigma:.3g}"
+            said = f"{self.evaluations} evaluations, value {value:.6g}, sigma {self.search.sigma:.3g}"
             print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)
         if now - self._written >= _PAUSE:
             self.write()

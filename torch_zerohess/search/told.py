@@ -1,7 +1,6 @@
 """What a caller tells about the points of a search: checked, and kept until all of them are known."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,17 +8,14 @@ from torch import Tensor
 from torch_zerohess.search.state import Evaluated
 
 
-def evaluated(
-    values: Any, points: Tensor, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size, device: torch.device
-) -> Evaluated:
+def evaluated(values: Tensor, points: Tensor, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size) -> Evaluated:
     """Return what was told about points [K, n] as losses and outputs.
 
-    values: [K], or [K, *out] if there is a loss.
+    values: [K], or [K, *out] if there is a loss, float64.
     shape: of earlier outputs [*out]; empty if there are none.
 
     Raises ValueError or TypeError for values, or losses of them, that cannot be that.
     """
-    values = torch.as_tensor(values, dtype=torch.float64).detach().to(device)
     if loss is None and values.shape == (len(points), 1):
         values = values[:, 0]
     if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
@@ -43,12 +39,11 @@ def evaluated(
     )
 
 
-def joined(early: dict[int, Tensor], values: Any, which: Sequence[int], count: int) -> dict[int, Tensor]:
+def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count: int) -> dict[int, Tensor]:
     """Return the values of points by number, those known early and further ones [k, *out] of the points `which` [k].
 
     Raises ValueError for a number that is not one of `count` points or is known, or for values of another shape.
     """
-    values = torch.as_tensor(values, dtype=torch.float64).detach().cpu()
     numbers = [int(one) for one in which]
     for k, one in enumerate(numbers):
         if not 0 <= one < count or one in early or one in numbers[:k]:

@@ -103,10 +103,10 @@ class GaussianProcess:
         return cls(points, kernel, length, mean, weights, variance, noise, factor)
 
     def pending(self, x: Tensor) -> "GaussianProcess":
-        """Return the process that is also told, at x [n], the output that it expects there.
+        """Return the process as if its prediction at x [n] had been evaluated.
 
-        It expects the same outputs everywhere and is certain at x. Source: Desautels, Krause and Burdick (2014),
-        section 3.2.
+        Its predictions stay the same; its uncertainty at x falls to the noise. Source: Desautels, Krause and Burdick
+        (2014), section 3.2.
         """
         row = torch.linalg.solve_triangular(self.factor, self.covariance(x[None]).mT, upper=False)[:, 0]
         rest = (1.0 + CONSTANT + self.noise - row.square().sum()).clamp_min(self.noise).sqrt()

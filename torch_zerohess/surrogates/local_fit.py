@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_zerohess.surrogates.quadratic import LocalModel
 
-_SPARE = 3
+_SPARE = 5
 """Evaluations beyond the coefficients of a quadratic, at least: the residuals give the standard errors."""
 _WIDER = 1.3
 """Factor between the numbers of evaluations that are tried."""
@@ -64,8 +64,9 @@ def _least_squares(u: Tensor, values: Tensor) -> tuple[LocalModel, float] | None
     inverse = torch.linalg.solve_triangular(r, torch.eye(len(r)).to(r), upper=True)
     target = (values - base) / size
     solution = inverse @ (q.mT @ target)
-    variance = float((target - design @ solution).square().sum()) / (P - design.shape[1])
-    error = math.sqrt(variance) * inverse.norm(dim=1)
+    # What is not quadratic is no noise: it does not average out over the evaluations (Cauchy and Schwarz).
+    missed = float((target - design @ solution).norm()) * math.sqrt(P / (P - design.shape[1]))
+    error = missed * inverse.norm(dim=1)
     gradient, bend = solution[1 : n + 1], solution[n + 1 :]
     hessian = u.new_zeros(n, n)
     hessian[row, column] = bend

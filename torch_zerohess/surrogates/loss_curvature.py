@@ -16,16 +16,18 @@ class LossCurvature:
 
     value: float
     slope: Tensor
-    product: Callable[[Tensor], Tensor]
-    scale: float | None = None
-    """The second derivative, where it is this multiple of the identity."""
+    second: float | Callable[[Tensor], Tensor]
+    """The second derivative: this multiple of the identity, or else its product with s."""
+
+    def product(self, s: Tensor) -> Tensor:
+        """Return the second derivative times s [*out]."""
+        return self.second * s if isinstance(self.second, float) else self.second(s)
 
     def products(self, directions: Tensor) -> Tensor:
         """Return the products with directions [r, *out], [r, m] in their type."""
-        flat = directions.reshape(len(directions), -1)
-        if self.scale is not None:
-            return self.scale * flat
-        return torch.stack([self.product(one.to(self.slope)).flatten() for one in directions]).to(directions)
+        if isinstance(self.second, float):
+            return self.second * directions.reshape(len(directions), -1)
+        return torch.stack([self.second(one.to(self.slope)).flatten() for one in directions]).to(directions)
 
 
 def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurvature:
@@ -46,13 +48,13 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
 
     fixed = _finite(slope.detach())
     if not slope.requires_grad:
-        return LossCurvature(float(value.detach()), fixed, torch.zeros_like, 0.0)
+        return LossCurvature(float(value.detach()), fixed, 0.0)
     # A generic vector is an eigenvector only of a multiple of the identity.
     probe = torch.cos(torch.arange(1.0, y.numel() + 1.0, dtype=y.dtype, device=y.device)).view_as(y)
     image, square = product(probe), float(probe.square().sum())
     scale = float((image * probe).sum()) / square
     if float((image - scale * probe).norm()) <= _EIGEN * abs(scale) * square**0.5:
-        return LossCurvature(float(value.detach()), fixed, lambda s: scale * s, scale)
+        return LossCurvature(float(value.detach()), fixed, scale)
     return LossCurvature(float(value.detach()), fixed, product)
 
 

@@ -81,6 +81,77 @@ def test_a_batch_survives_a_restart(name):
         assert resumed.value == search.value
 
 
+def saved(search):
+    """The state after it was written to a file and read."""
+    file = io.BytesIO()
+    torch.save(search.state_dict(), file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@every_search
+def test_points_that_are_out_stay_out_until_all_are_told(name):
+    """Whatever batch is asked for, and after a restart: values are those of the points they were told for."""
+    search, other, f = make(name), make(name), SEARCHES[name][2]
+    for _ in range(4):
+        points = search.ask(8, limit=5)
+        values = f(points)
+        search.tell(values[[4, 1]], which=[4, 1])
+        for batch in (1, 8, 6):
+            assert torch.equal(search.ask(batch), points)
+        assert search.missing == [0, 2, 3]
+        state, search = saved(search), make(name, seed=5)
+        search.load_state_dict(state)
+        assert search.missing == [0, 2, 3]
+        assert torch.equal(search.ask(), points)
+        search.tell(values[[0, 2, 3]])
+        other.ask(8, limit=5)
+        state = saved(other)
+        other = make(name, seed=6)
+        other.load_state_dict(state)
+        other.tell(values)  # without asking again
+        assert search.value == other.value
+        assert search.evaluations == other.evaluations
+        assert torch.equal(search.ask(8), other.ask(8))
+
+
+@every_search
+def test_loading_takes_no_loss_and_fails_as_a_whole(name):
+    search = make(name)
+    values = SEARCHES[name][2](search.ask(8))
+    search.tell(values)
+    search.tell(SEARCHES[name][2](search.ask(8)[:1]), which=[0])
+    state = search.state_dict()
+
+    def loss(output):
+        raise ZeroDivisionError
+
+    resumed = make(name, loss=loss if SEARCHES[name][3] else None)
+    fresh = resumed.ask()
+    for key in state:
+        with pytest.raises(KeyError):
+            resumed.load_state_dict({one: value for one, value in state.items() if one != key})
+        assert torch.equal(resumed.ask(), fresh)
+        assert resumed.evaluations == 0
+    resumed.load_state_dict(state)
+    assert resumed.value == search.value
+
+
+def test_points_of_a_batch_are_drawn_once(monkeypatch):
+    """To draw them again would fit the same model."""
+    search, drawn = make("process of the output"), []
+    more = search._method.more
+    monkeypatch.setattr(search._method, "more", lambda *given: drawn.append(given) or more(*given))
+    for count in (1, 2):
+        first = search.ask(8)
+        for limit in (None, 5, None):
+            assert torch.equal(search.ask(8, limit=limit), first[:limit])
+        assert len(drawn) == count
+        search.tell(waves(first))
+    assert len(search.ask(6)) == 6  # another batch
+    assert len(drawn) == 3
+
+
 @every_search
 def test_the_best_of_all_points_counts(name):
     search, f = make(name), SEARCHES[name][2]
@@ -119,6 +190,40 @@ def test_values_that_are_not_finite_are_avoided(name):
         search.tell(values)
         assert math.isfinite(search.value)
     assert search.evaluations >= 36
+
+
+@pytest.mark.parametrize("name", [name for name in SEARCHES if name != "by evidence"])
+def test_further_points_beyond_an_edge_do_not_end_a_search(name):
+    """Only values that the search needs count: it goes on as with one point at a time."""
+    search, f = make(name), SEARCHES[name][2]
+    for _ in range(12):
+        alone, points = search.ask(), search.ask(8)
+        values = f(points)
+        values[len(alone) :] = math.nan
+        search.tell(values)
+    assert not search.done
+    assert search.rounds == 0
+
+
+def kept(search):
+    return len(search.state_dict()["progress"]["pool"]["values"])
+
+
+@pytest.mark.parametrize("name", ["process of the output", "process of the loss"])
+def test_a_pool_is_as_large_as_it_is_said_to_be(name):
+    search, f = make(name, pool=10), SEARCHES[name][2]
+    for _ in range(4):
+        search.tell(f(search.ask(8)))
+        assert kept(search) <= 10
+
+
+def test_a_pool_that_batches_have_widened_stays_so():
+    search = make("process of the output")
+    for _ in range(5):
+        search.tell(waves(search.ask(16)))
+    assert kept(search) == 80  # 60 without batches
+    search.tell(waves(search.ask()))
+    assert kept(search) == 81
 
 
 def test_further_points_of_a_process_are_apart():

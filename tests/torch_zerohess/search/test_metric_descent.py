@@ -47,6 +47,11 @@ def test_on_a_plateau_isotropic_quadratics_take_over():
     search = Descent(vector(2.0, 1.0), sigma=0.5, seed=1)
     run(search, plateau, 3)
     assert search.state_dict()["progress"]["wide"] is not None
+    run(search, plateau, 60)
+    assert search.value < -0.9
+    model, sigma = search.model_at_best(vector(2.0, 1.0))  # a model around the start, not around the best point
+    assert sigma < 2.0
+    assert model.value > -0.2
     smooth = Descent(vector(2.0, 1.0), sigma=0.5, seed=1)
     run(smooth, rosenbrock, 60)
     assert smooth.state_dict()["progress"]["wide"] is None

@@ -21,6 +21,10 @@ def noisy(seed, spread=0.3, fn=bowl):
     return f
 
 
+def distinct_points(fit):
+    return len(torch.unique(fit.points, dim=0))
+
+
 class Counted:
     def __init__(self, fn):
         self.fn, self.points = fn, []
@@ -112,6 +116,7 @@ def test_a_lucky_draw_does_not_reach_the_target():
         )
         assert fit.status != "target"
         assert not fit.success
+        assert distinct_points(fit) >= 80  # nor is it worth a decision
 
 
 def test_noise_survives_a_checkpoint(tmp_path):
@@ -122,6 +127,105 @@ def test_noise_survives_a_checkpoint(tmp_path):
     fit = zh.minimize(f, zeros(2), max_evaluations=60, **settings)
     assert fit.noise > 0.1
     assert len(torch.unique(f.points[0], dim=0)) == len(f.points[0])
+
+
+def test_few_evaluations_go_to_the_search_first():
+    for declared in (0.1, None):
+        for most in (4, 6, 12):
+            fit = zh.minimize(noisy(0, 0.1), [1.0], sigma=1.0, noise=declared, seed=0, max_evaluations=most)
+            assert fit.evaluations == most
+            assert fit.status == "budget"
+            assert float(bowl(fit.x[None])[0]) - 1 < fit.value < float(bowl(torch.ones(1, 1))[0]) + 1
+    fit = zh.minimize(noisy(0), zeros(5), sigma=1.0, seed=0, max_evaluations=16)
+    assert distinct_points(fit) == 6 + 5 + 1  # to measure noise, and samples and a step of the search in noise
+
+
+def test_before_the_search_knows_anything_the_value_is_the_mean_at_the_start():
+    """Noise was measured with the loss alone: the search that is for noise has other first points."""
+    seen = []
+
+    def callback(one):
+        seen.append(one)
+        raise KeyboardInterrupt
+
+    f = Counted(noisy(0))
+    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, callback=callback)
+    points, values = fit.points, fit.values
+    mean = float(values[(points == 0).all(1)].mean())
+    assert seen[0].value == fit.value == mean == pytest.approx(float(bowl(zeros(2)[None])[0]), abs=0.6)
+    assert fit.value_error == fit.noise / math.sqrt(8)
+    assert torch.equal(fit.x, zeros(2))
+
+
+def test_a_decision_survives_a_checkpoint(tmp_path):
+    """A search that has ended is only read: the mean is not exchanged for the luckiest draw."""
+    settings = {"sigma": 2.0, "seed": 0, "checkpoint": tmp_path / "search.pt", "max_evaluations": 40}
+    fit = zh.minimize(noisy(2), zeros(2), **settings)
+    again = zh.minimize(lambda z: 1 / 0, zeros(2), **settings)
+    assert torch.equal(again.x, fit.x)
+    assert (again.value, again.value_error, again.status) == (fit.value, fit.value_error, fit.status)
+    assert fit.value > float(fit.values.min())
+
+
+def test_lost_evaluations_leave_the_mean_to_the_others():
+    """The second half of 16 evaluations is of one point; where all of it is lost the first half has to do."""
+    points = torch.stack([TARGET, TARGET + 2])
+    for lost in ({9}, set(range(8, 16))):
+        count = iter(range(16))
+
+        def f(z, count=count, lost=lost):
+            numbers = [next(count) for _ in z]
+            values = [
+                math.nan if k in lost else float(k) + 100 * bool((one != TARGET).any())
+                for k, one in zip(numbers, z, strict=True)
+            ]
+            return vector(*values)
+
+        k, value, error = lowest_mean(f, points, 16, 0.1)
+        told = [k for k in (range(8, 16) if len(lost) == 1 else range(0, 8, 2)) if k not in lost]
+        assert k == 0
+        assert value == pytest.approx(sum(told) / len(told))
+        assert 0 < error < math.inf
+    assert lowest_mean(lambda z: torch.full((len(z),), math.nan), points, 16, 0.1) is None
+    assert lowest_mean(lambda z: torch.full((len(z),), math.nan), points[:1], 1, 0.1) is None
+
+
+@pytest.mark.parametrize(("target", "status"), [(-1.0, "budget"), (6.0, "target")])
+def test_a_target_that_the_mean_refutes_does_not_end_the_search(target, status):
+    """Draw 2 is lucky: far below the lowest loss, which is 0. The search goes on and reaches what there is."""
+    f, count = noisy(0, 0.1), iter(range(1000))
+
+    def lucky(z):
+        values = f(z)
+        return torch.where(vector(*(next(count) for _ in z)) == 2, -10.0, values)
+
+    fit = zh.minimize(lucky, zeros(2), sigma=2.0, seed=0, max_evaluations=100, noise=0.1, target=target)
+    assert fit.status == status
+    assert fit.success == (status == "target")
+    assert fit.evaluations - distinct_points(fit) <= 2 * reserved(100)  # one decision, and one at the end
+    assert fit.value == pytest.approx(float(bowl(fit.x[None])[0]), abs=5 * fit.value_error)
+    if status == "target":
+        assert fit.value <= target
+
+
+def test_a_time_limit_holds_in_noise():
+    fit = zh.minimize(noisy(0), zeros(2), sigma=2.0, seed=0, max_evaluations=60, time_limit=0.0, noise=0.3)
+    assert (fit.status, fit.evaluations, fit.value_error) == ("time", 3, 0.3)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 5])
+def test_the_decision_keeps_the_batch(batch):
+    f = Counted(noisy(0))
+    fit = zh.minimize(f, zeros(1), sigma=2.0, seed=0, max_evaluations=60, batch=batch, noise=0.3)
+    assert fit.evaluations == 60
+    assert max(map(len, f.points)) == max(batch, 2)  # the start and a sample
+
+
+@pytest.mark.parametrize("settings", [{"xtol": 0.5}, {"restarts": 0, "tolerance": 0.5}, {"xtol": 9.0, "ftol": 9.0}])
+def test_a_small_region_is_no_minimum_in_noise(settings):
+    fit = zh.minimize(noisy(0), zeros(2), sigma=2.0, seed=0, max_evaluations=300, noise=0.3, **settings)
+    assert (fit.status, fit.success) == ("stalled", False)
+    assert fit.value_error > 0
 
 
 def test_more_evaluations_go_to_points_that_may_be_best():

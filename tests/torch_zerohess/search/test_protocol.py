@@ -98,6 +98,27 @@ def test_looking_at_the_model_changes_nothing(name):
         search.tell(f(search.ask()))
 
 
+@every_search
+def test_a_model_is_one_around_the_point_that_is_given(name):
+    """Not one around the best point: its value is nearer to that of the given point."""
+    search, f, loss = make(name), black_box(name), loss_of(name)
+    points, values = [], []
+    for _ in range(12):
+        points.append(search.ask())
+        told = f(points[-1])
+        search.tell(told)
+        values += [float(one if loss is None else loss(one)) for one in told]
+    value = sorted(values)[len(values) // 4]
+    x = torch.cat(points)[values.index(value)]
+    assert value > search.value
+    assert search.model_at_best() is not None
+    found = search.model_at_best(x)
+    if "Gauss-Newton" in name or name == "by evidence":  # they know the Jacobian at the center alone
+        assert found is None
+    elif found is not None:
+        assert abs(found[0].value - value) < abs(found[0].value - search.value)
+
+
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     st.integers(1, 4),

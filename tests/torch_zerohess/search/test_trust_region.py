@@ -49,6 +49,20 @@ def test_the_engine_may_be_chosen_and_is_that_class(engine, kind, n, with_loss):
         assert torch.equal(getattr(other, name), getattr(search, name))
 
 
+def test_a_model_of_the_search_that_evidence_has_chosen_is_around_the_given_point():
+    """Of |A z - b|^2 the gradient is 2 A^T (A x - b)."""
+    generator = torch.Generator().manual_seed(0)
+    A, b = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((60, 20), (60,)))
+    search = TrustRegion(zeros(20), sigma=1.0, loss=lambda y: (y - b).square().sum(), seed=0)
+    points_of(search, lambda z: z @ A.mT, 40)
+    assert search.engine == "descent"
+    for step in 0.2 * torch.randn(4, 20, generator=generator, dtype=torch.float64):
+        x = search.x + step
+        model, sigma = search.model_at_best(x)
+        truth = 2 * A.mT @ (A @ x - b)
+        assert float((model.full_gradient() / sigma - truth).norm()) < 0.05 * float(truth.norm())
+
+
 @pytest.mark.parametrize("bounds", [None, (-1.0, vector(1.0, INFINITE)), (vector(-1.0, -INFINITE), 1.0)])
 def test_a_process_needs_a_finite_box(bounds):
     for make in (GaussianProcessSearch, lambda x0, **settings: TrustRegion(x0, engine="gaussian_process", **settings)):

@@ -247,7 +247,7 @@ def _ratios(query: Query) -> pd.DataFrame:
     table, *_ = _selected(table, query)
     query.end()
     found = pd.DataFrame(speed_ups(with_ratios(table, reference), reference))
-    return found.assign(reference=reference, **{one: _only(table, one) for one in stored.ORIGIN})
+    return found.assign(reference=reference, **{one: _only(table, one) for one in stored.ORIGIN if one in table})
 
 
 def _only(table: pd.DataFrame, column: str) -> str:

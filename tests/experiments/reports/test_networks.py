@@ -95,5 +95,5 @@ def test_onnx_predicts_the_same(tmp_path):
 
 @pytest.mark.parametrize("names", ["adam", "our_g,adam", ""])
 def test_unknown_methods_are_named(names):
-    with pytest.raises(SystemExit, match="methods must be some of fr22, fr22_source, fr22_tuned, our_g, "):
+    with pytest.raises(SystemExit, match="methods must be some of fr22, fr22_source, our_g, "):
         run(("cnn",), methods=names)

@@ -33,6 +33,12 @@ def report(tmp_path_factory) -> VarianceReport:
     return result
 
 
+@pytest.fixture
+def no_figures(monkeypatch) -> None:
+    """They take most of the time of a few runs."""
+    monkeypatch.setattr("experiments.studies.variance.draw", lambda *_: None)
+
+
 @pytest.mark.parametrize("quantity", ["value", "gradient", "hessian", "hvp"])
 def test_error_of_random_samples_falls_with_the_root_of_evaluations(report, quantity) -> None:
     slope = report.slope("WAVE10", OURS, quantity)
@@ -49,7 +55,7 @@ def test_shared_samples_beat_a_sample_set_per_element(report) -> None:
     assert ratio.ratio_error < ratio.ratio / 3
 
 
-def test_budgets_are_kept_and_nearly_used(tmp_path) -> None:
+def test_budgets_are_kept_and_nearly_used(tmp_path, no_figures) -> None:
     alone = tuple(method.name for method in METHODS if not method.memory)
     problems = ("WAVE2", "WAVE10")
     report = variance(runs=2, budgets=(32, 512), problems=problems, methods=alone, out=tmp_path, rivals=0)
@@ -87,7 +93,7 @@ def test_wrong_arguments_are_named(tmp_path, wrong, message) -> None:
         variance(**{"runs": 2, "rivals": 0, "out": tmp_path, **wrong})
 
 
-def test_problems_have_lower_case_names_too(tmp_path) -> None:
+def test_problems_have_lower_case_names_too(tmp_path, no_figures) -> None:
     found = variance(
         runs=2, budgets=(32,), problems=("wave10", "WAVE10"), methods=(OURS,), out=tmp_path, sizes=(1,), rivals=2
     )
@@ -96,10 +102,10 @@ def test_problems_have_lower_case_names_too(tmp_path) -> None:
     assert len(compared) == 6 * len(BUDGETS) * 2  # functions, budgets, gradient and product
 
 
-def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path) -> None:
+def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path, no_figures) -> None:
     methods = tuple(OURS + more for more in ("", ", memory", ", untrained network"))
     problems = ("BOX2", "WAVE2")
-    report = variance(runs=12, budgets=(32,), problems=problems, methods=methods, side=8, out=tmp_path, rivals=0)
+    report = variance(runs=8, budgets=(32,), problems=problems, methods=methods, side=8, out=tmp_path, rivals=0)
     for quantity in ("value", "gradient", "hessian", "hvp"):
         for problem, gain in (("WAVE2", 0.2), ("BOX2", 1.2)):  # images of BOX2 are hard to predict
             plain, memory, untrained = (report.get(problem, name, 32, quantity).rmse for name in methods)

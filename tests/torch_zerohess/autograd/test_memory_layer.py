@@ -42,7 +42,7 @@ class Fixed:
 class Untrained(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        torch.manual_seed(6)
+        torch.manual_seed(5)
         self.layers = nn.Sequential(nn.Linear(2, 8), nn.Tanh(), nn.Linear(8, 3)).double()
 
     def forward(self, z: Tensor) -> Tensor:
@@ -106,7 +106,7 @@ def test_unbiased_for_every_surrogate(name: str, pathwise: bool) -> None:
 
 
 def test_an_exact_surrogate_leaves_no_noise_of_new_samples() -> None:
-    torch.manual_seed(6)
+    torch.manual_seed(4)
     x, r = point()
     memory = remembering(Fixed(render), draws=2048)
     box = layer(memory, samples=1).eval()

@@ -69,6 +69,8 @@ class Method:
 
     def load(self) -> None:
         """Import the packages, so that the first run does not pay for it."""
+        if not self.packages:
+            return  # the list of all that is installed takes a third of a second
         for module, packages in importlib.metadata.packages_distributions().items():
             # A wheel may name a folder that it does not install, as that of botorch does.
             if set(packages) & set(self.packages) and importlib.util.find_spec(module):

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import qmc
 from torch import Tensor
 
 from experiments.methods.bayesian import Cube
@@ -71,6 +70,8 @@ def turbo(trial: Trial, *, evaluations: int = EVALUATIONS, steps: int = 50) -> N
         evaluations: after which the method ends.
         steps: of Adam, for every fit.
     """
+    from scipy.stats import qmc  # most of a second, which other methods need not wait for
+
     n, cube, best = trial.task.n, Cube(trial), Best(trial)
     generator = np.random.default_rng(trial.seed)
     used, first = 0, cube.start

@@ -89,4 +89,4 @@ def _decomposed(points: Tensor, kernel: Kernel, left: float) -> tuple[Tensor, Te
         rest = (rest - rows[len(pivots)].square()).clamp_min(0.0)
         rest[pivot] = 0.0
         pivots.append(pivot)
-    return rows[: len(pivots)].mT.contiguous(), torch.tensor(pivots, device=points.device)
+    return rows[: len(pivots)].mT.contiguous(), torch.tensor(pivots, dtype=torch.long, device=points.device)

@@ -179,6 +179,25 @@ def test_tuned_settings_are_from_the_space_they_were_chosen_from(task, method) -
         assert value in SPACES[method][key]
 
 
+def unrendered(task: Task) -> Task:
+    """A paraboloid of the same parameters, with few evaluations: enough to see what a method takes as arguments."""
+    solution = task.start(1).double()
+    output = least_squares(lambda x: x, lambda image: image - solution)
+
+    def error(x: torch.Tensor) -> float:
+        return float((x - solution).square().mean())
+
+    truth = replace(task.truth, image_error=error, parameter_error=error)
+    return replace(
+        task,
+        evaluations=30,
+        loss=lambda x: (x - solution).square().mean(1),
+        output=output if task.output else None,
+        truth=truth,
+        picture=None,
+    )
+
+
 def test_tuned_settings_are_of_methods_that_apply() -> None:
     for name, methods in TUNED.items():
         task = catalogue.load(name)
@@ -187,7 +206,7 @@ def test_tuned_settings_are_of_methods_that_apply() -> None:
             assert reason in (None, task.renderer and task.renderer.no_adjoint())
             if reason:  # Mitsuba has no variant with derivatives here
                 continue
-            small = replace(task, evaluations=30)  # enough to see that these are arguments of the method
+            small = unrendered(task)
             outcome = attempt(small, method, 0, lambda trial, m=method, s=settings: METHODS[m].solve(trial, s))
             assert outcome.status != "failed", (name, method, outcome.reason)
 

@@ -41,9 +41,10 @@ def bowl(n: int, evaluations: int = 20_000) -> Task:
 
 @pytest.mark.parametrize("name", PAPER)
 def test_every_method_solves_a_bowl_with_its_defaults(name):
-    for run in range(3):
-        outcome = attempt(bowl(3), name, run, lambda trial: METHODS[name].solve(trial, {}))
-        assert (outcome.status, outcome.reason) == ("finished", "both errors reduced by 99.9 %")
+    task = bowl(3)
+    near = dataclasses.replace(task, start=lambda run: task.start(run) / 3)
+    outcome = attempt(near, name, 0, lambda trial: METHODS[name].solve(trial, {}))
+    assert (outcome.status, outcome.reason) == ("finished", "both errors reduced by 99.9 %")
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_sigma_falls_linearly_and_the_radius_with_it():
 def test_a_run_can_be_repeated():
     for name in PAPER:
         first, second = (
-            attempt(bowl(2, evaluations=900), name, 4, lambda trial, name=name: METHODS[name].solve(trial, {}))
+            attempt(bowl(2, evaluations=300), name, 4, lambda trial, name=name: METHODS[name].solve(trial, {}))
             for _ in range(2)
         )
         assert first.x == second.x, name
@@ -225,23 +226,28 @@ def test_settings_are_arguments_of_the_methods(name):
         assert outcome.status != "failed", outcome.reason
 
 
-@pytest.mark.timeout(600)
 def test_second_order_beats_first_order_on_quad_as_in_the_source():
     """Evaluations to 99 %, one start; the authors' code takes 23 300, 44 400, 2 300, 2 300 and 1 400."""
-    task, found = catalogue.load("quad"), {}
-    for name in PAPER:
+    task = catalogue.load("quad")
+
+    def evaluations(name: str, most: int) -> float:
+        """To 99 %; infinite if it takes more than `most`."""
         trials = []
 
-        def solve(trial: Trial, name=name, trials=trials) -> None:
+        def solve(trial: Trial) -> None:
             trials.append(trial)
             METHODS[name].solve(trial, settings(name, "quad"))
 
-        attempt(task, name, 1000, solve)
+        attempt(dataclasses.replace(task, evaluations=most), name, 1000, solve)
         rows = trials[0].rows
-        found[name] = next(row.evaluations for row in rows if row.image_error <= 0.01 * rows[0].image_error)
-    assert found["our_hvpa"] <= 1400
-    assert max(found["our_h"], found["our_hvp"]) <= 2300
-    assert min(found["fr22"], found["our_g"]) > 5 * max(found[name] for name in PAPER[2:])
+        assert len(rows) > 5
+        return next((row.evaluations for row in rows if row.image_error <= 0.01 * rows[0].image_error), math.inf)
+
+    second = {name: evaluations(name, 2300) for name in PAPER[2:]}
+    assert second["our_hvpa"] <= 1400
+    assert max(second.values()) <= 2300
+    for name in PAPER[:2]:
+        assert evaluations(name, 5 * max(second.values())) == math.inf
 
 
 def test_a_draw_has_no_repetition_and_everything_if_there_is_little():
@@ -270,7 +276,7 @@ def test_every_space_draws_settings_that_a_method_takes():
             continue
         for drawn in draw(space(name, 0.5), 3, seed=0):
             outcome = attempt(
-                bowl(2, evaluations=150), name, 1000, lambda trial, d=drawn, name=name: METHODS[name].solve(trial, d)
+                bowl(2, evaluations=60), name, 1000, lambda trial, d=drawn, name=name: METHODS[name].solve(trial, d)
             )
             assert outcome.status != "failed", f"{name} {drawn}: {outcome.reason}"
     assert space("our_h", 0.2)["trust_region"] == pytest.approx((0.02, 0.04, 0.1, 0.2, 0.4, 1.0))

@@ -29,7 +29,7 @@ def ended(folder, methods, runs=2):
     return ensemble.run(ensemble.plan([BUMP], methods))
 
 
-def test_networks_end_in_logs_figures_encoder_and_table(tmp_path, capsys):
+def test_networks_end_in_logs_figures_encoder_and_table(tmp_path, one_process, capsys):
     methods = ["our_g", SHIFT]
     outcomes = ended(tmp_path, methods)
     results, folder = conclude(BUMP, outcomes, tmp_path), tmp_path / "bump"
@@ -54,7 +54,7 @@ def test_networks_end_in_logs_figures_encoder_and_table(tmp_path, capsys):
     assert {path: path.read_bytes() for path in folder.glob("*/*.jsonl")} == logs  # nothing is trained twice
 
 
-def test_a_trained_network_has_a_column_in_the_overview(tmp_path, monkeypatch):
+def test_a_trained_network_has_a_column_in_the_overview(tmp_path, one_process, monkeypatch):
     assert network_column(tmp_path, "bump") is None
     ended(tmp_path, ["our_g", SHIFT], runs=1)
     (tmp_path / "bump" / HELD_OUT).touch()  # what `conclude` writes
@@ -76,7 +76,7 @@ def test_a_trained_network_has_a_column_in_the_overview(tmp_path, monkeypatch):
         assert found.caption.startswith(f"{outcome['evaluations']} evaluations, error ")
 
 
-def test_runs_that_fail_are_named_and_left_out(tmp_path, capsys):
+def test_runs_that_fail_are_named_and_left_out(tmp_path, one_process, capsys):
     outcomes = ended(tmp_path, [SHIFT, FAIL_TO_TRAIN], runs=1)
     assert [one.method for one in conclude(BUMP, outcomes, tmp_path)] == ["shift"]
     assert "bump fail_to_train 0 failed: ZeroDivisionError: as this method does" in capsys.readouterr().out

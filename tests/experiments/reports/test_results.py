@@ -347,7 +347,7 @@ def test_measures_as_text():
     assert described({"PSNR": 31.25, "SSIM": 0.98765, "d": 0.00123}) == "PSNR 31.2 dB, SSIM 0.988, d 0.00123"
 
 
-def test_report_writes_the_page(folder, tmp_path, capsys):
+def test_report_writes_the_page(folder, tmp_path, no_curves, capsys):
     report(folder)
     assert (folder / "report.html").read_text() == page(folder)
     report(folder, tmp_path / "other.html")
@@ -420,7 +420,7 @@ def test_wrong_arguments_are_named(arguments, message, tmp_path):
         run(arguments.pop("tasks"), out=tmp_path, **arguments)
 
 
-def test_tasks_that_no_method_goes_with_are_left_out(tmp_path, capsys):
+def test_tasks_that_no_method_goes_with_are_left_out(tmp_path, one_process, capsys):
     run(("cnn", "quad"), methods="cobyqa,dfo_ls", runs=1, out=tmp_path)
     printed = capsys.readouterr().out
     for said in (
@@ -450,7 +450,7 @@ def test_networks_and_fits_are_run_by_one_command(tmp_path, capsys, monkeypatch)
     ]
 
 
-def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path):
+def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path, one_process):
     run(("quad",), methods="cobyqa", runs=1, out=tmp_path)
     (tmp_path / "quad" / "cobyqa" / "0.json").write_text("")
     with pytest.raises(SystemExit, match=r"0.json is not the outcome of a run"):
@@ -458,7 +458,7 @@ def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path):
     assert not (tmp_path / "quad" / "cobyqa" / "1.json").exists()
 
 
-def test_commands_that_are_printed_can_be_pasted(tmp_path, capsys):
+def test_commands_that_are_printed_can_be_pasted(tmp_path, one_process, capsys):
     out = tmp_path / "two words"
     run(("quad",), methods="cobyqa", runs=1, out=out)
     lines = capsys.readouterr().out.splitlines()
@@ -466,7 +466,7 @@ def test_commands_that_are_printed_can_be_pasted(tmp_path, capsys):
     assert hints == [["python", "-m", "experiments", name, str(out)] for name in ("plot", "report")]
 
 
-def test_run_runs_prints_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+def test_run_runs_prints_and_says_how_to_go_on(tmp_path, one_process, no_curves, capsys, monkeypatch):
     run(("quad",), methods="cobyqa, cma_es", runs=2, out=tmp_path, seed=3)
     printed = capsys.readouterr().out
     assert "4 of 4 runs have ended" in printed

@@ -240,7 +240,7 @@ def test_rows_count_runs_that_got_there():
     assert row(Cell("t", "spp", "1x", "m", "t"), runs[1:2]).evaluations_99 is None
 
 
-def test_command(tmp_path: Path, capsys):
+def test_command(tmp_path: Path, one_process, capsys):
     def command():
         return robustness(
             ("box2",),

@@ -21,13 +21,15 @@ from experiments.studies.estimator_methods import METHODS, OURS, PAPER
 from experiments.studies.estimator_problems import looked_up, quadrature
 from experiments.studies.variance import VarianceReport, variance
 
+SOBOL = "aggregate + center, sobol"
+
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> VarianceReport:
     out = tmp_path_factory.mktemp("variance")
-    alone = tuple(method.name for method in METHODS if not method.memory)
+    few = (OURS, PAPER, SOBOL)
     result = variance(
-        runs=16, budgets=(32, 128, 512), problems=("BOX2", "WAVE10"), methods=alone, side=32, out=out, rivals=0
+        runs=16, budgets=(32, 128, 512), problems=("BOX2", "WAVE10"), methods=few, side=16, out=out, rivals=0
     )
     result_files = {path.name: path for path in out.iterdir()}
     pictures = ["variance_evaluations.png", "variance_samples.png", "variance_seconds.png"]
@@ -40,13 +42,19 @@ def report(tmp_path_factory) -> VarianceReport:
     return result
 
 
+@pytest.fixture
+def no_figures(monkeypatch) -> None:
+    """They take most of the time of a few runs."""
+    monkeypatch.setattr("experiments.studies.variance.draw", lambda *_: None)
+
+
 @pytest.mark.parametrize("quantity", ["value", "gradient", "hessian", "hvp"])
 def test_error_of_random_samples_falls_with_the_root_of_evaluations(report, quantity) -> None:
     slope = report.slope("WAVE10", OURS, quantity)
     # The RMSE of a normal number over 16 runs has a relative standard deviation of 1/sqrt(32) = 0.18; the slope between
     # two of them, log(16) apart, one of 0.18 sqrt(2) / 2.8 = 0.09. Four of these are allowed.
     assert slope == pytest.approx(-0.5, abs=0.36)
-    assert report.slope("WAVE10", "aggregate + center, sobol", quantity) < -0.4
+    assert report.slope("WAVE10", SOBOL, quantity) < -0.4
 
 
 def test_shared_samples_beat_a_sample_set_per_element(report) -> None:
@@ -56,7 +64,11 @@ def test_shared_samples_beat_a_sample_set_per_element(report) -> None:
     assert ratio.ratio_error < ratio.ratio / 3
 
 
-def test_budgets_are_kept_and_nearly_used(report) -> None:
+def test_budgets_are_kept_and_nearly_used(tmp_path, no_figures) -> None:
+    alone = tuple(method.name for method in METHODS if not method.memory)
+    problems = ("WAVE2", "WAVE10")
+    report = variance(runs=2, budgets=(32, 512), problems=problems, methods=alone, out=tmp_path, rivals=0)
+    assert len({(m.problem, m.method, m.budget) for m in report.measurements}) == 4 * len(alone)
     for m in report.measurements:
         samples_of_one_per_element = 2 * (1 + 10 + 55) + 1
         if m.method.startswith("per-element") and m.problem == "WAVE10" and m.budget < samples_of_one_per_element:
@@ -90,17 +102,19 @@ def test_wrong_arguments_are_named(tmp_path, wrong, message) -> None:
         variance(**{"runs": 2, "rivals": 0, "out": tmp_path, **wrong})
 
 
-def test_problems_have_lower_case_names_too(tmp_path) -> None:
-    found = variance(runs=2, budgets=(32,), problems=("wave10", "WAVE10"), out=tmp_path, sizes=(1,), rivals=2)
+def test_problems_have_lower_case_names_too(tmp_path, no_figures) -> None:
+    found = variance(
+        runs=2, budgets=(32,), problems=("wave10", "WAVE10"), methods=(OURS,), out=tmp_path, sizes=(1,), rivals=2
+    )
     assert {m.problem for m in found.measurements} == {"WAVE10"}
     compared = json.loads((tmp_path / "rivals.json").read_text())
     assert len(compared) == 8 * len(BUDGETS) * 2  # functions, budgets, gradient and product
 
 
-def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path) -> None:
+def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path, no_figures) -> None:
     methods = tuple(OURS + more for more in ("", ", memory", ", untrained network"))
     problems = ("BOX2", "WAVE2")
-    report = variance(runs=16, budgets=(32,), problems=problems, methods=methods, side=32, out=tmp_path, rivals=0)
+    report = variance(runs=8, budgets=(32,), problems=problems, methods=methods, side=16, out=tmp_path, rivals=0)
     for quantity in ("value", "gradient", "hessian", "hvp"):
         for problem, gain in (("WAVE2", 0.2), ("BOX2", 1.2)):  # images of BOX2 are hard to predict
             plain, memory, untrained = (report.get(problem, name, 32, quantity).rmse for name in methods)

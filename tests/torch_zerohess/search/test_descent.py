@@ -21,8 +21,10 @@ def test_quadratics(n, evaluations, seed):
     assert search.value < 1e-4
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("n", "evaluations", "reached"), [(1, 12, 1e-6), (2, 200, 1e-3), (10, 1500, 0.5)])
+@pytest.mark.parametrize(
+    ("n", "evaluations", "reached", "seed"),
+    [*[(1, 12, 1e-6, seed) for seed in range(3)], *[(2, 200, 1e-3, seed) for seed in range(3)], (10, 1500, 0.5, 0)],
+)
 def test_rosenbrock(n, evaluations, reached, seed):
     start = torch.full((n,), -1.2, dtype=torch.float64)
     search = run(Descent(start, sigma=0.5, seed=seed, restarts=0), rosenbrock, evaluations)
@@ -209,7 +211,7 @@ def test_rounds_that_start_where_nothing_is_finite():
         assert search.value < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_hopeless_round_is_not_the_last_one(seed):
     search = Descent(zeros(2), sigma=1.0, seed=seed)
     run(search, lambda z: torch.where(z[:, 0] > 1.2, math.nan, bowl(z)), 10_000)

@@ -16,14 +16,14 @@ def search_for(f, x0, evaluations, **settings):
     return search
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_it_crosses_a_plateau_and_leaves_a_local_minimum(seed):
     search = search_for(well, vector(-2.0, 1.5), 200, sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
     assert search.value < 1e-6
     assert torch.allclose(search.x, vector(2.0, -2.0), atol=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("condition", [1.0, 1e4])
 def test_a_paraboloid_is_solved_to_the_last_digit(condition, seed):
     """A process alone ends at a millionth of the variance of the loss."""
@@ -35,7 +35,7 @@ def test_a_paraboloid_is_solved_to_the_last_digit(condition, seed):
     assert search.value < 1e-12 * condition
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_it_follows_a_curved_valley(seed):
     def rosenbrock(z):
         return (1 - z[:, 0]).square() + 100 * (z[:, 1] - z[:, 0].square()).square()
@@ -44,7 +44,7 @@ def test_it_follows_a_curved_valley(seed):
     assert torch.allclose(search.x, vector(1.0, 1.0), atol=1e-2)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_it_leaves_a_plateau_that_is_exactly_flat(seed):
     """Ten sigma wide: nothing that was evaluated differs from anything else."""
 
@@ -118,7 +118,7 @@ def test_it_ends_after_its_rounds_and_says_why():
     assert "3 times" in search.message
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_process_and_quadratics_take_turns(seed):
     """Two steps of the process below 0.1 in a row, 3 (n + 1) evaluations without something better, or 16 (n + 1) in
     all hand over to quadratics with a sigma of at most 0.3, unless these have ended within 0.05 of the best point; they

@@ -35,3 +35,12 @@ def test_duplicates_are_not_chosen_twice() -> None:
     assert len(twice.points) <= len(once.points) + 3
     assert len(twice.points) <= len(points)
     torch.testing.assert_close(twice(points), outputs, atol=0.05, rtol=0)
+
+
+def test_where_all_is_noise_no_point_is_chosen_and_the_mean_is_predicted() -> None:
+    points, outputs = data()
+    found = InducedProcess.condition(points, outputs, matern, 1e6)
+    assert len(found.points) == 0
+    torch.testing.assert_close(found(points[:3]), outputs.mean(0).expand(3, 3))
+    spread = (outputs - outputs.mean(0)).square().mean() / 1e6  # variance of the process, a millionth of the noise
+    torch.testing.assert_close(found.uncertainty(points[:3]), 2.0 * spread.expand(3), rtol=1e-6, atol=0)

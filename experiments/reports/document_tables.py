@@ -156,7 +156,7 @@ def _fitted(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     note = f"Median {what} until the {metric} error is reduced by {level} %"
     note += ", of the starts that get there; in brackets the share of starts that get there, if not all do"
     note += " (95 % interval)." if interval else "."
-    note += " Behind a median its quartiles." if quartiles else ""
+    note += " The quartiles stand in brackets after each median." if quartiles else ""
     if any(str(one).startswith("image") for one in about["uses"]):
         note += " Where a task has no image, a method that uses the image uses the loss."
     return markdown(headers, rows), table, note

@@ -16,6 +16,8 @@ _REFINEMENTS = 6
 """Further sets of candidates around the best one,"""
 _WIDTH, _NARROWING = 0.3, 0.4
 """at this distance, which shrinks by this factor where none is better."""
+_SAME = 1e-4
+"""Distance below which a point is known already."""
 
 
 def lowest(
@@ -48,6 +50,11 @@ def farthest(points: Tensor, count: int, lower: Tensor, upper: Tensor, generator
         chosen.append(spots[int(distance.argmax())])
         distance = torch.minimum(distance, (spots - chosen[-1]).norm(dim=1))
     return torch.stack(chosen)
+
+
+def is_known(process: GaussianProcess, x: Tensor) -> bool:
+    """Whether a point [n] is one of those that the process knows."""
+    return float((process.points - x).norm(dim=1).min()) < _SAME
 
 
 def least_known(process: GaussianProcess, lower: Tensor, upper: Tensor, generator: torch.Generator) -> Tensor:

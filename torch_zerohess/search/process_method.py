@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.candidates import farthest, least_known, lowest
+from torch_zerohess.search.candidates import farthest, is_known, least_known, lowest
 from torch_zerohess.search.draws import normal, reflect
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
@@ -35,8 +35,6 @@ _EXPLORING = 2.0
 """The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
 _BESIDE = 0.5
 """Spread of points around the end of a step that are evaluated with it, over the distance of the nearest evaluation."""
-_SAME = 1e-4
-"""Distance below which a point is known already."""
 _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
 _FLOOR = 1e-2
@@ -69,6 +67,7 @@ class ProcessMethod(Method[Q]):
         super().__init__(settings)
         n = settings.n
         self.capacity = max(settings.pool or _POOL, 2 * n + 2)  # at least the start, its samples and steps
+        self._latest: tuple[Pool, LossModel] | None = None  # what `_model` would make again
 
     def take(self, known: Q, evaluated: Evaluated) -> Q:
         """Return what is known after an evaluation."""
@@ -105,7 +104,7 @@ class ProcessMethod(Method[Q]):
         # A process of the loss has less to go by: after an arrival it looks where it knows least.
         explores = known.exploring > 0 and not known.expands
         moved = math.inf if explores else self._length(x - best)
-        if explores or torch.equal(x, best) or _is_known(process, x):
+        if explores or torch.equal(x, best) or is_known(process, x):
             x = least_known(process, settings.lower, settings.upper, generator)
         return replace(known, moved=moved), x[None]
 
@@ -116,7 +115,7 @@ class ProcessMethod(Method[Q]):
         if known.phase == "start" or len(known.pool) < 2:
             around = self._drawn(known.center, 1.0, near, generator)
             return torch.cat([around, farthest(torch.cat([points, around]), count - near, lower, upper, generator)])
-        known, model, _ = self._modelled(known, generator)
+        model = self._model(known)
         reach = _BESIDE * float((known.pool.points - points[0]).norm(dim=1).min()) / math.sqrt(self.settings.n)
         near = near if 0.0 < reach < math.inf else 0
         every = [*points, *self._drawn(points[0], reach, near, generator)]
@@ -125,7 +124,7 @@ class ProcessMethod(Method[Q]):
         while len(every) < len(points) + count:
             model = model.pending(every[-1])
             x = self._lowest(known, model, generator)
-            every.append(least_known(model.process, lower, upper, generator) if _is_known(model.process, x) else x)
+            every.append(least_known(model.process, lower, upper, generator) if is_known(model.process, x) else x)
         return torch.stack(every[len(points) :])
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
@@ -150,6 +149,7 @@ class ProcessMethod(Method[Q]):
             "center": start,
             "pool": Pool.empty(len(start), start.device),
             "expands": self.settings.loss is not None,
+            "expanded": torch.full_like(start, math.inf),
             "holes": start[None][:0],
             "solved": torch.full_like(start, math.inf),
         }
@@ -214,35 +214,64 @@ class ProcessMethod(Method[Q]):
         """Length of a step [n] in units of the first sigma sqrt(n)."""
         return float(step.norm()) / math.sqrt(self.settings.n)
 
+    @torch.no_grad()
     def _modelled(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
         """Return a model of the loss and the point [n] where it is lowest."""
-        return (self._through_output if known.expands else self._from_losses)(known, generator)
+        known, model, x = (self._through_output if known.expands else self._through_losses)(known, generator)
+        self._latest = known.pool, model
+        return known, model, x
 
     @torch.no_grad()
+    def _model(self, known: Q) -> LossModel:
+        """Return the model of the last step: kept, or made again from what is known."""
+        if self._latest is not None and self._latest[0] is known.pool:
+            return self._latest[1]
+        if not known.expands:
+            return self._of_losses(known)[1]
+        _, process, output = self._predicted(known)
+        if bool(torch.isfinite(known.expanded).all()):
+            output = process.predict(known.expanded[None])[0]
+        return self._expanded(known, process, output)
+
     def _through_output(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
-        loss, pool, shape = self.settings.loss, known.pool, known.shape
+        known, process, output = self._predicted(known)
+        loss, at = self.settings.loss, torch.full_like(known.center, math.inf)
+        assert loss is not None
+        for _ in range(_EXPANSIONS):
+            model = self._expanded(known, process, output)
+            x = self._lowest(known, model, generator)
+            output = process.predict(x[None])[0]
+            if model.is_true(x, float(loss(output.view(known.shape)))):
+                return replace(known, expanded=at), model, x
+            at = x
+        return self._through_losses(replace(known, expands=False), generator)
+
+    def _through_losses(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
+        known, model = self._of_losses(known)
+        return known, model, self._lowest(known, model, generator)
+
+    def _predicted(self, known: Q) -> tuple[Q, GaussianProcess, Tensor]:
+        """Return the process of the output, and the output [m] with the lowest loss."""
+        loss, pool = self.settings.loss, known.pool
         assert loss is not None
         assert pool.outputs is not None
         known, process = self._fitted(known, pool.outputs)
-        optimism = _EXPLORING if known.exploring else _OPTIMISM
         outputs, values = pool.outputs, pool.values
         if known.noisy:
             outputs = process.predict(pool.points)
-            values = torch.stack([loss(one.view(shape)).double().reshape(()) for one in outputs])
+            values = torch.stack([loss(one.view(known.shape)).double().reshape(()) for one in outputs])
             values = values.nan_to_num(nan=math.inf, neginf=math.inf)
             known = self._judged(known, values)
-        output = outputs[int(values.argmin())]
-        for _ in range(_EXPANSIONS):
-            model = LossModel(process, output, loss, shape, optimism)
-            x = self._lowest(known, model, generator)
-            output = process.predict(x[None])[0]
-            if model.is_true(x, float(loss(output.view(shape)))):
-                return known, model, x
-        return self._from_losses(replace(known, expands=False), generator)
+        return known, process, outputs[int(values.argmin())]
 
-    def _from_losses(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
-        """Predict the loss, and return the point [n] that is lowest."""
+    def _expanded(self, known: Q, process: GaussianProcess, output: Tensor) -> LossModel:
+        """Return the model of the loss that is expanded at an output [m]."""
+        assert self.settings.loss is not None
+        optimism = _EXPLORING if known.exploring else _OPTIMISM
+        return LossModel(process, output, self.settings.loss, known.shape, optimism)
+
+    def _of_losses(self, known: Q) -> tuple[Q, LossModel]:
         values = known.pool.values
         least, middle = float(values.min()), float(values.median())
         if middle > least:  # what is out of all proportion, such as a penalty, says no more than that it is high
@@ -253,8 +282,7 @@ class ProcessMethod(Method[Q]):
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]
             known = self._judged(known, values * spread + least)
-        model = LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
-        return known, model, self._lowest(known, model, generator)
+        return known, LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
 
     def _fitted(self, known: Q, outputs: Tensor) -> tuple[Q, GaussianProcess]:
         """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again.
@@ -287,8 +315,3 @@ class ProcessMethod(Method[Q]):
         x = lowest(model, best, self.settings.lower, self.settings.upper, generator)
         solved = torch.equal(known.solved, best) and float((x - best).norm()) < APART
         return best if solved else x
-
-
-def _is_known(process: GaussianProcess, x: Tensor) -> bool:
-    """Whether a point [n] is one of those that the process knows."""
-    return float((process.points - x).norm(dim=1).min()) < _SAME

@@ -26,6 +26,8 @@ class ProcessProgress(Progress):
     """The lowest loss that was evaluated."""
     expands: bool
     """Whether the loss of a predicted output is expanded; otherwise the process is one of the loss itself."""
+    expanded: Tensor
+    """Point [n] at whose predicted output the loss was last expanded; infinite if at the best evaluated output."""
     noisy: bool = False
     """Whether outputs differ from call to call."""
     moved: float = math.inf

@@ -9,6 +9,7 @@ from searches import bowl, misfit, rays, rays_loss, rosenbrock, spiral, waves, w
 
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent, GaussianProcessSearch, LocalGaussNewton, TrustRegion
+from torch_zerohess.surrogates.gaussian_process import GaussianProcess
 from truths import vector
 
 SEARCHES = {
@@ -87,6 +88,23 @@ def saved(search):
     torch.save(search.state_dict(), file)
     file.seek(0)
     return torch.load(file, weights_only=True)
+
+
+@pytest.mark.parametrize("name", ["process of the output", "process of the loss"])
+def test_a_process_is_fitted_once_for_a_step_and_the_points_around_it(name, monkeypatch):
+    """A search that was loaded fits it again, to the last bit."""
+    search, f, fits = make(name), SEARCHES[name][2], []
+    real = GaussianProcess.fit
+    monkeypatch.setattr(GaussianProcess, "fit", lambda *a, **k: fits.append(len(a[0])) or real(*a, **k))
+    for _ in range(5):
+        search.tell(f(search.ask(4)))
+        told = len(fits)
+        points = search.ask(4)
+        assert len(fits) == told > 0
+        other = make(name)
+        other.load_state_dict(saved(search))
+        assert torch.equal(other.ask(4), points)
+        assert len(fits) == told + 1
 
 
 @every_search

@@ -8,7 +8,7 @@ import torch
 
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, explained_by, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.sparse_selection import Grids, largest, thresholds
+from torch_zerohess.surrogates.sparse_selection import Grids, largest, spaced, thresholds
 
 
 def normal(*shape, seed=0):
@@ -180,3 +180,21 @@ def test_weights_are_those_of_least_squares():
     weights[::3] = 0.0
     J = fit_sparse(u, d, torch.Size([50]), SparseSettings(6), weights=weights)
     torch.testing.assert_close(J.dense(), A, atol=0.01, rtol=0)
+
+
+def test_a_background_says_nothing_about_what_changes_before_it():
+    """The held-out test, and the rates of false discoveries, are of rows of the image that change."""
+    A, u = sparse_map(8 * 64, 100, 3), normal(60, 100, seed=1)
+    image = torch.zeros(60, 64, 64, dtype=A.dtype)
+    image[:, 20:28] = (u @ A.mT).view(60, 8, 64)
+    found = fit_sparse(u, image.flatten(1), torch.Size([64, 64]), SparseSettings(8))
+    assert found.explained > 0.9
+    assert float((found.dense().view(64, 64, 100)[20:28].flatten(0, 1) - A).norm() / A.norm()) < 0.1
+
+
+def test_parts_are_spaced_by_their_energy():
+    energy = torch.tensor([0.0, 0.0, 1.0, 1.0, 2.0, 0.0])
+    assert spaced(energy, 2) == [2, 4]
+    assert spaced(energy, 4) == [2, 3, 4]
+    assert spaced(energy, 6) == list(range(6))
+    assert spaced(torch.zeros(6), 3) == [0, 2, 4]

@@ -6,7 +6,10 @@ from torch import Tensor
 
 
 class Surrogate(Protocol):
-    """Any object with these two methods; see `ProcessSurrogate`, `LinearSurrogate`, `SparseSurrogate`, `LowRankSurrogate`."""
+    """Any object with these two methods.
+
+    See `ProcessSurrogate`, `LinearSurrogate`, `SparseSurrogate` and `LowRankSurrogate`.
+    """
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n]; what was fitted before is forgotten."""

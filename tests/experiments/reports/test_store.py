@@ -230,7 +230,10 @@ def test_a_table_of_fits(folder):
     assert "- (33 %, 6 to 79 %)" in table_of("bowls", Query.of(["share=interval"]))
     spread = table_of("bowls", Query.of(["quartiles=show"]))
     assert "7.5 [6.75 to 8.25], 1.25 [1.12 to 1.38] s" in spread
-    assert "Behind a median its quartiles." in spread
+    assert "The quartiles stand in brackets after each median." in spread
+    short = table_of("bowls", Query.of(["titles=hide", "origin=commit"])).splitlines()
+    assert short[0] == "| method | uses | BOWL, n = 2 |"
+    assert short[-1].endswith("Seconds are of the processor. Commit `012345678`.")
 
 
 def test_means_of_ratios():

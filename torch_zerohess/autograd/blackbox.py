@@ -1,6 +1,7 @@
 """The drop-in layer: a function that can only be called, as a torch module with derivatives to second order."""
 
 import contextlib
+import copy
 import functools
 from collections.abc import Callable
 from dataclasses import fields
@@ -146,7 +147,7 @@ class BlackBox(nn.Module):
     def _around(self, center: Tensor, aux: list[Tensor], *, zero: bool = True) -> Callable[[Tensor], Tensor]:
         """Evaluate around a center [B, n], and return the estimate as a function of x [B, n].
 
-        zero: promises that x equals the center in value.
+        zero: promises that x equals the center in value, and that the function is called before the surrogate changes.
         """
         if self.memory is None:
             return self._estimated(center, aux, zero)
@@ -161,6 +162,7 @@ class BlackBox(nn.Module):
         try:
             return control_variate.around(
                 self.control,
+                self.memory.surrogate if zero else copy.deepcopy(self.memory.surrogate),
                 center,
                 aux,
                 self.smoothing.sigma_vector(center.shape[1], center.device),

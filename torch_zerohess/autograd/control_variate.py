@@ -1,6 +1,7 @@
 """A layer with a memory: the smoothed surrogate, differentiable by torch, plus the estimate of what it leaves."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ Part = Callable[[Tensor], Tensor]
 
 def around(
     control: Control,
+    surrogate: Any,
     center: Tensor,
     aux: Sequence[Tensor],
     sigma: Tensor,
@@ -29,7 +31,8 @@ def around(
     """Evaluate around a center [B, n] and return the estimate of the layer as a function of x [B, n].
 
     Args:
-        control: surrogate and coefficient.
+        control: coefficient, head and memory.
+        surrogate: of the memory, or a copy where the function outlives this call.
         center: [B, n].
         aux: [B, ...] each.
         sigma: float64 [n].
@@ -50,7 +53,7 @@ def around(
         return change.new_zeros(B, *change.shape[1:]).index_add(0, part, B / fresh * change)
 
     def predicted(z: Tensor) -> Tensor:
-        return control.predict(memory.surrogate, z, aux)
+        return control.predict(surrogate, z, aux)
 
     if not control.active:
         alone = estimated(center[part], [one[part] for one in aux])

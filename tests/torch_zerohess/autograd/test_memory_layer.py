@@ -222,6 +222,22 @@ def test_transforms_agree() -> None:
     assert torch.autograd.gradgradcheck(frozen, (x.clone().requires_grad_(),))
 
 
+def test_a_frozen_function_keeps_its_surrogate() -> None:
+    """Later evaluations, to which the surrogate is fitted, do not change it."""
+    torch.manual_seed(5)
+    x, r = point()
+    box = layer(zh.Memory())
+    for _ in range(5):
+        box(x.clone().requires_grad_(), r)
+    frozen = box.freeze(x, r)
+    before, fitted = frozen(x + 0.1), box.memory._fitted
+    for _ in range(5):
+        box((x + 1.0).requires_grad_(), r)
+    assert box.memory._fitted > fitted > 0
+    assert box.memory.coefficient > 0.1
+    assert torch.equal(frozen(x + 0.1), before)
+
+
 def test_state_dict_carries_the_memory() -> None:
     torch.manual_seed(3)
     x, r = point()

@@ -92,3 +92,13 @@ def test_standard_errors_cover_a_third_derivative(n):
         scores += [bend.abs() / bend_error, model.full_gradient().abs() / gradient_error]
     assert float(torch.cat(scores).quantile(0.95)) < 4.0
     assert float(torch.cat(scores).max()) > 1.0  # they are no larger than need be
+
+
+def test_more_evaluations_are_taken_where_the_nearest_tell_nothing():
+    """Losses of the nearest ones differ by their rounding alone."""
+    f, hessian, x = quadratic(2)
+    near, far = x + 1e-7 * normal(11, 2), x + normal(10, 2, seed=1)
+    points = torch.cat([near, far])
+    model, sigma, error = quadratic_around(x, points, 1e4 + f(points))
+    assert float((model.full_hessian() / sigma**2 - hessian).norm()) < 1e-6 * float(hessian.norm())
+    assert error < 1e-6

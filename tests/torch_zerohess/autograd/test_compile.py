@@ -1,0 +1,90 @@
+"""Compiled layers: the numbers of `estimate` with the same seed, or an error."""
+
+import pytest
+import torch
+from layers import AGGREGATE, BATCH, IMAGE, SCALAR, SETTINGS, close, counting, leaf, network
+
+from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess.estimation import perturbations
+
+COMPILED = {
+    "aggregate": AGGREGATE,
+    "optimal": SETTINGS["optimal"],
+    "sobol": SETTINGS["sobol"],
+    "fr22": AGGREGATE.replace(proposal="fr22"),
+    "auto": SETTINGS["auto"],
+    "auto, random": Smoothing.auto(sigma=AGGREGATE.sigma, samples=3, seed=12),
+}
+
+
+@pytest.fixture(autouse=True)
+def fresh_compiler() -> None:
+    torch.compiler.reset()
+
+
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+@pytest.mark.parametrize("smoothing", COMPILED.values(), ids=COMPILED.keys())
+def test_compiled(smoothing: Smoothing, value: str) -> None:
+    fn, calls = counting(IMAGE.f)
+    layer, x = BlackBox(fn, smoothing, value=value), leaf(BATCH)
+    e = estimate(IMAGE.f, BATCH, smoothing, value=value)
+    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+    y = compiled(x)
+    y.sum().backward()
+    close(y.detach(), e.value)
+    close(x.grad, e.gradient.sum((1, 2)))
+    # At most one call more, at zero, to learn the shape of the output.
+    assert calls in ([e.evaluations], [1, e.evaluations])
+    with torch.no_grad():
+        close(compiled(BATCH), e.value)
+
+
+def test_compiled_layer_sees_new_settings() -> None:
+    layer = BlackBox(SCALAR.f, AGGREGATE)
+    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+    for smoothing in (AGGREGATE, AGGREGATE.replace(sigma=0.05), AGGREGATE.replace(samples=3), AGGREGATE):
+        layer.smoothing, x = smoothing, leaf(BATCH)
+        compiled(x).sum().backward()
+        close(x.grad, estimate(SCALAR.f, BATCH, smoothing).gradient)
+
+
+def test_compiled_layer_stores_perturbations_whatever_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dynamo traces no function that draws them again."""
+    monkeypatch.setattr(perturbations, "STORED", 0)
+    x = leaf(BATCH)
+    torch.compile(BlackBox(SCALAR.f, AGGREGATE), fullgraph=True, backend="aot_eager")(x).sum().backward()
+    close(x.grad, estimate(SCALAR.f, BATCH, AGGREGATE).gradient)
+
+
+@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+def test_compiled_inside_a_network(backend: str) -> None:
+    model, inputs = network(BlackBox(IMAGE.f, AGGREGATE))
+    model(inputs).square().sum().backward()
+    expected = [p.grad.clone() for p in model.parameters()]
+    model.zero_grad()
+    torch.compile(model, fullgraph=True, backend=backend)(inputs).square().sum().backward()
+    for p, gradient in zip(model.parameters(), expected, strict=True):
+        close(p.grad, gradient)
+
+
+@pytest.mark.parametrize("by", ["backward", "grad"])
+@pytest.mark.parametrize("smoothing", COMPILED.values(), ids=COMPILED.keys())
+def test_double_backward_of_a_compiled_layer_is_an_error(smoothing: Smoothing, by: str) -> None:
+    x = leaf()
+    y = torch.compile(BlackBox(SCALAR.f, smoothing), fullgraph=True, backend="aot_eager")(x)
+    (gradient,) = torch.autograd.grad(y, x, create_graph=True)
+    loss = (gradient * x).sum()
+    # Its derivative is g + H x: without an error it would come out as g, a wrong number.
+    with pytest.raises((RuntimeError, ValueError)):
+        loss.backward() if by == "backward" else torch.autograd.grad(loss, x)
+
+
+def test_operators_keep_the_promises_of_their_fake_kernels() -> None:
+    layer, ops = BlackBox(IMAGE.f, AGGREGATE), torch.ops.torch_zerohess
+    tests = ("test_schema", "test_faketensor")
+    for value in ("center", "smoothed"):
+        layer = BlackBox(IMAGE.f, AGGREGATE, value=value)
+        for keep in (True, False):
+            arguments = (layer._handle, 12, keep, BATCH, [])
+            torch.library.opcheck(ops.evaluate.default, arguments, test_utils=tests)
+    torch.library.opcheck(ops.evaluate_center.default, (layer._handle, BATCH, []), test_utils=tests)

@@ -1,0 +1,221 @@
+"""What a layer costs, keeps and accepts: calls, passes, dtypes, state, copies, seeds and threads."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+from layers import AGGREGATE, BATCH, BOTH, SCALAR, N, V, X, close, counting, leaf
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+from torch_zerohess.estimation import perturbations
+from torch_zerohess.sampling import kernels
+from truths import spread, vector
+
+
+def test_value_gradient_and_hessian_cost_one_call() -> None:
+    def by_backward(f) -> None:
+        x = leaf()
+        (g,) = torch.autograd.grad(f(x), x, create_graph=True)
+        torch.autograd.grad(g, x, V, retain_graph=True)
+        torch.autograd.grad(g[0], x)
+
+    def by_dual(f) -> None:
+        with forward_ad.dual_level():
+            f(forward_ad.make_dual(X, V))
+
+    one_point = [
+        by_backward,
+        by_dual,
+        lambda f: torch.func.hessian(f)(X),
+        lambda f: torch.func.jacrev(torch.func.jacrev(f))(X),
+        lambda f: torch.func.jacfwd(f)(X),
+        lambda f: torch.autograd.functional.hessian(f, X, vectorize=True),
+        lambda f: f(leaf()),
+    ]
+    for ask in one_point:
+        fn, calls = counting(SCALAR.f)
+        ask(smooth(fn, AGGREGATE))
+        assert calls == [13]
+    fn, calls = counting(SCALAR.f)
+    torch.func.vmap(torch.func.hessian(smooth(fn, AGGREGATE)))(BATCH)
+    assert calls == [4 * 13]
+
+
+def test_only_the_value_where_no_derivative_can_be_asked_for() -> None:
+    fn, calls = counting(SCALAR.f)
+    layer = BlackBox(fn, AGGREGATE)
+    with torch.no_grad():
+        close(layer(leaf(BATCH)), SCALAR.f(BATCH))
+    close(layer(BATCH), SCALAR.f(BATCH))
+    with torch.inference_mode():
+        close(layer(BATCH), SCALAR.f(BATCH))
+    assert calls == [4, 4, 4]
+    assert not layer(BATCH).requires_grad
+    # The smoothed value needs its samples in any case.
+    calls.clear()
+    with torch.no_grad():
+        close(BlackBox(fn, AGGREGATE, value="smoothed")(X), estimate(fn, X, AGGREGATE, value="smoothed").value)
+    assert calls == [13, 13]
+
+
+def test_auxiliary_inputs_are_not_differentiated() -> None:
+    layer, a = BlackBox(lambda z, a: SCALAR.f(z) * a, AGGREGATE), torch.tensor(2.0, requires_grad=True)
+    with pytest.raises(ValueError, match=r"aux\[0\] requires grad.*detached"):
+        layer(leaf(), a)
+    x = leaf()
+    layer(x, a.detach()).backward()
+    close(x.grad, 2.0 * estimate(SCALAR.f, X, AGGREGATE).gradient)
+    with torch.no_grad():
+        close(layer(X, a), 2.0 * SCALAR.f(X[None])[0])
+
+
+@pytest.mark.parametrize("returned", [torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_of_the_input_is_that_of_the_output(dtype: torch.dtype, returned: torch.dtype) -> None:
+    layer, x = BlackBox(lambda z: SCALAR.f(z).to(returned), AGGREGATE), leaf(X.to(dtype))
+    y = layer(x)
+    y.backward()
+    assert y.dtype == x.grad.dtype == dtype
+    assert torch.func.hessian(layer)(X.to(dtype)).dtype == dtype
+    with torch.no_grad():
+        assert layer(x).dtype == dtype
+    close(x.grad, estimate(layer.call.fn, X.to(dtype), AGGREGATE).gradient)
+
+
+@BOTH
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    seen: list[torch.dtype] = []
+
+    def fn(z: Tensor) -> Tensor:
+        seen.append(z.dtype)
+        return SCALAR.f(z.double()).float()
+
+    layer, x = BlackBox(fn, AGGREGATE), leaf(BATCH.to(dtype))
+    e = estimate(fn, x.detach().float(), AGGREGATE)
+    y = layer(x)
+    y.sum().backward()
+    close(y.detach(), e.value.to(dtype))
+    close(x.grad, e.gradient.to(dtype))
+    close(estimate(fn, x, AGGREGATE).hessian(), e.hessian().to(dtype))
+    close(torch.func.vmap(torch.func.grad(layer))(x.detach()), e.gradient.to(dtype))
+    close(layer.freeze(x)(x.detach()), e.value.to(dtype))
+    with torch.no_grad():
+        close(layer(x), e.value.to(dtype))
+    assert set(seen) == {torch.float32}
+
+
+def test_a_layer_behind_autocast() -> None:
+    model, inputs = nn.Linear(2, N), spread(8, -1.0, 1.0).view(4, 2).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        z = model(inputs)
+        y = BlackBox(SCALAR.f, AGGREGATE)(z)
+    assert y.dtype == z.dtype == torch.bfloat16
+    (gradient,) = torch.autograd.grad(y.sum(), z)
+    close(gradient, estimate(SCALAR.f, z.detach().float(), AGGREGATE).gradient.bfloat16())
+
+
+@BOTH
+def test_a_forward_pass_makes_no_pass_over_the_samples_and_a_gradient_makes_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    passes: list[str] = []
+    for name in ("project", "accumulate"):
+        original = getattr(kernels, name)
+        monkeypatch.setattr(kernels, name, lambda *a, o=original, n=name: passes.append(n) or o(*a))
+    x = leaf()
+    y = BlackBox(SCALAR.f, AGGREGATE)(x)
+    assert passes == []  # the perturbation of x is zero there, and so is its projection
+    y.backward()
+    assert passes == ["accumulate"]
+
+
+def module_level(z: Tensor) -> Tensor:
+    return SCALAR.f(z)
+
+
+def test_state_dict_resumes_the_settings() -> None:
+    annealed = AGGREGATE.replace(sigma=0.0123, samples=4)
+    source = nn.Sequential(nn.Linear(2, N), BlackBox(module_level, annealed)).double()
+    buffer = io.BytesIO()
+    torch.save(source.state_dict(), buffer)
+    buffer.seek(0)
+    for state in (source.state_dict(), torch.load(buffer)):
+        target = nn.Sequential(nn.Linear(2, N), BlackBox(module_level, AGGREGATE)).double()
+        target.load_state_dict(state)
+        assert (target[1].smoothing.sigma, target[1].smoothing.samples) == (0.0123, 4)
+        results = []
+        for model in (source, target):
+            model.zero_grad()
+            model(vector(0.3, 0.4)).backward()
+            results.append(model[0].weight.grad)
+        assert torch.equal(*results)
+
+
+def test_copies_and_pickles_live_on_their_own() -> None:
+    layer = BlackBox(module_level, AGGREGATE)
+    for other in (copy.deepcopy(layer), pickle.loads(pickle.dumps(layer)), copy.copy(layer)):
+        other.smoothing = AGGREGATE.replace(sigma=0.2)
+        assert layer.smoothing is AGGREGATE
+        # A transform finds the layer by number: each must find its own settings.
+        for one in (layer, other):
+            close(torch.func.grad(one)(X), estimate(SCALAR.f, X, one.smoothing).gradient)
+            close(torch.func.hessian(one)(X), estimate(SCALAR.f, X, one.smoothing).hessian())
+
+
+def test_seed() -> None:
+    free, fixed = BlackBox(SCALAR.f, AGGREGATE.replace(seed=None)), BlackBox(SCALAR.f, AGGREGATE)
+
+    def gradients(layer: nn.Module, seed: int) -> list[Tensor]:
+        torch.manual_seed(seed)
+        return [torch.func.grad(layer)(X), torch.func.grad(layer)(X)]
+
+    first, second = gradients(free, 0), gradients(free, 0)
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+    assert not torch.equal(first[0], first[1])
+    assert not torch.equal(first[0], gradients(free, 1)[0])
+    same = gradients(fixed, 0) + gradients(fixed, 1)
+    assert all(torch.equal(one, same[0]) for one in same)
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    gradients(fixed, 5)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("outputs", [1, 20])
+@pytest.mark.parametrize(
+    ("sampler", "samples", "stored"),
+    [("random", 200, True), ("random", 200, False), ("sobol", 200, True), ("orthogonal", 40, True)],
+)
+def test_any_number_of_threads_gives_the_same_bits(
+    sampler: str, samples: int, stored: bool, outputs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not stored:
+        monkeypatch.setattr(perturbations, "STORED", 0)
+    n = 500
+    smoothing, scale = Smoothing(sigma=0.5, samples=samples, sampler=sampler, seed=3), spread(outputs, 0.5, 2.0)
+
+    def fn(z: Tensor) -> Tensor:  # a black box whose own bits do not follow the threads
+        return (z[:, 0] + 0.5 * z[:, 99] - z[:, 300]).sin()[:, None] * scale
+
+    def derivatives(threads: int) -> list[Tensor]:
+        torch.set_num_threads(threads)
+        x = leaf(spread(2 * n, -0.5, 0.5).view(2, n))
+        y = BlackBox(fn, smoothing, value="smoothed")(x)
+        (g,) = torch.autograd.grad(y, x, torch.ones_like(y), create_graph=True)
+        (h,) = torch.autograd.grad(g, x, torch.ones_like(g))
+        e = estimate(fn, x, smoothing, value="smoothed")
+        results = [y.detach(), g.detach(), h, e.value, e.gradient, e.hvp(torch.ones(n)), e.standard_error("gradient")]
+        return [*results, e.hessian_diagonal(), *([e.hessian()] if outputs == 1 else [])]
+
+    before = torch.get_num_threads()
+    try:
+        pairs = zip(derivatives(1), derivatives(2), strict=True)
+        assert not [number for number, (one, two) in enumerate(pairs) if not torch.equal(one, two)]
+    finally:
+        torch.set_num_threads(before)

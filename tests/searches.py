@@ -7,6 +7,7 @@ import torch
 from truths import vector
 
 TARGET = vector(3.0, -1.0)
+CURVATURE = torch.tensor([[2.0, 0.6], [0.6, 5.0]], dtype=torch.float64)
 
 
 def zeros(n, dtype=torch.float64):
@@ -18,6 +19,12 @@ def bowl(z):
     z = z.double()
     center = TARGET.repeat(z.shape[1])[: z.shape[1]]
     return ((z - center) ** 2 * torch.linspace(1, 10, z.shape[1], dtype=torch.float64)).sum(1)
+
+
+def tilted(z):
+    """(z - TARGET)^T CURVATURE (z - TARGET) / 2 + 0.5."""
+    y = z.double() - TARGET
+    return (0.5 + 0.5 * ((y @ CURVATURE) * y).sum(1)).to(z.dtype)
 
 
 def rosenbrock(z):

@@ -18,3 +18,9 @@ def one_process(monkeypatch):
             yield from ((job, message) for message in [*messages, end])
 
     monkeypatch.setattr("experiments.ensembles.ensemble.run_jobs", run_jobs)
+
+
+@pytest.fixture
+def no_curves(monkeypatch):
+    """Curves take most of the time of a page."""
+    monkeypatch.setattr("experiments.reports.error_curves.curves", lambda *_: None)

@@ -1,77 +1,21 @@
 """Ask and tell, the same for every search: what is asked for, what is refused, what resumes."""
 
-import io
 import math
-import random
 
 import numpy as np
 import pytest
 import torch
+from every_search import SEARCHES, black_box, every_search, loss_of, make, same, saved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from searches import TARGET, bowl, points_of, rays, rays_loss, rosenbrock, run, zeros
 
 from torch_zerohess.optim import (
-    BlockGaussNewton,
     Descent,
     GaussianProcessSearch,
-    LocalGaussNewton,
     TrustRegion,
 )
 from truths import vector
-
-# Every search with and without a loss; restarts keep it busy.
-SEARCHES = {
-    "descent of the loss": (Descent, 3, False),
-    "descent of the output": (Descent, 5, True),
-    "process of the loss": (GaussianProcessSearch, 2, False),
-    "process of the output": (GaussianProcessSearch, 2, True),
-    "block Gauss-Newton": (BlockGaussNewton, 5, True),
-    "local Gauss-Newton": (LocalGaussNewton, 20, True),
-    "by evidence": (TrustRegion, 20, True),
-}
-
-
-def make(name, *, seed=0, loss=None, **changes):
-    """Returns the search of this name."""
-    kind, n, with_loss = SEARCHES[name]
-    chosen = (loss or loss_of(name)) if with_loss else None
-    return kind(
-        zeros(n), **{"sigma": 1.0, "bounds": (-3.0, 4.0), "restarts": 1000, "seed": seed, **changes}, loss=chosen
-    )
-
-
-def texels(z):
-    """An output [4, 5] whose numbers depend on one of 20 parameters each."""
-    return (z + 0.3 * torch.sin(z)).unflatten(1, (4, 5))
-
-
-def black_box(name):
-    return texels if SEARCHES[name][1] == 20 else rays if SEARCHES[name][2] else rosenbrock
-
-
-def loss_of(name):
-    n, with_loss = SEARCHES[name][1:]
-    target = texels(torch.ones(1, 20, dtype=torch.float64))[0]
-    one = (lambda output: (output - target).square().mean()) if n == 20 else rays_loss(n)
-    return one if with_loss else None
-
-
-def same(a, b):
-    """Whether two states are equal to the last bit."""
-    if isinstance(a, torch.Tensor):
-        return a.dtype == b.dtype and torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, list):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return type(a) is type(b) and a == b
-
-
-every_search = pytest.mark.parametrize("name", SEARCHES)
-
-
-# What is asked for.
 
 
 @every_search
@@ -236,9 +180,6 @@ def test_the_callers_tensors_are_not_held(name):
     assert math.isfinite(search.value)
 
 
-# Seeds.
-
-
 @every_search
 def test_the_same_seed_gives_the_same_points_whatever_the_global_generator(name):
     f = black_box(name)
@@ -269,126 +210,6 @@ def test_a_sigma_per_parameter_is_a_change_of_units():
         scaled = kind(zeros(3), sigma=units, bounds=(-2.0 * units, 3.0 * units), seed=0)
         assert torch.equal(points_of(scaled, lambda z: rosenbrock(z / units), 60), plain * units)
 
-
-# State.
-
-
-def saved(state):
-    """The state after it was written to a file and read."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=True)
-
-
-@every_search
-def test_it_resumes_bit_by_bit_at_every_step(name):
-    search, f = make(name, seed=3, tolerance=0.2), black_box(name)
-    for _ in range(120):
-        copy = make(name, seed=99, tolerance=0.2)
-        copy.load_state_dict(saved(search.state_dict()))
-        assert same(copy.state_dict(), search.state_dict())
-        points = search.ask()
-        assert torch.equal(copy.ask(), points)
-        values = f(points)
-        search.tell(values)
-        copy.tell(values)
-        assert same(copy.state_dict(), search.state_dict())
-        assert torch.equal(copy.x, search.x)
-        assert torch.equal(copy.center, search.center)
-        for number in ("value", "sigma", "evaluations", "iterations", "rounds", "done", "message"):
-            assert getattr(copy, number) == getattr(search, number)
-    assert search.rounds > 0  # at an arrival, too
-
-
-def test_points_may_be_evaluated_before_the_search_is_loaded():
-    search, copy = make("process of the loss"), make("process of the loss")
-    points = search.ask()
-    copy.load_state_dict(search.state_dict())
-    copy.tell(rosenbrock(points))
-    search.tell(rosenbrock(points))
-    assert same(copy.state_dict(), search.state_dict())
-
-
-@every_search
-def test_values_told_late_and_out_of_order_change_nothing(name):
-    """One point at a time, in any order, saved and loaded in between: the states of one that is told all at once."""
-    search, late, f = make(name, seed=3), make(name, seed=3), black_box(name)
-    chance = random.Random(0)
-    for _ in range(12):
-        points = search.ask()
-        values = f(points)
-        assert torch.equal(late.ask(), points)
-        before = late.state_dict()
-        for k in chance.sample(range(len(points)), len(points)):
-            assert late.missing == [one for one in range(len(points)) if one not in late.state_dict()["early"]]
-            late.tell(values[[k]], which=[k])
-            if k % 3 == 0:
-                state = saved(late.state_dict())
-                late = make(name, seed=99)
-                late.load_state_dict(state)
-        assert len(points) == 1 or not same(late.state_dict(), before)
-        search.tell(values)
-        assert same(late.state_dict(), search.state_dict())
-
-
-def test_values_of_some_points_are_checked():
-    search = Descent(zeros(5), sigma=1.0, seed=0)
-    values = bowl(search.ask())
-    search.tell(values[[4, 1]], which=[4, 1])
-    assert search.missing == [0, 2, 3, 5]
-    for which, one, message in [
-        ([1], values[[1]], r"which must be some of the points whose values are missing, \[0, 2, 3, 5\], got \[1\]"),
-        ([6], values[[0]], r"are missing, \[0, 2, 3, 5\], got \[6\]"),
-        ([0, 0], values[[0, 0]], r"are missing, \[0, 2, 3, 5\], got \[0, 0\]"),
-        ([0, 2], values[[0]], r"values must have one per point in which, \[2, \*out\], got \[1\]"),
-        ([0], values[None, :2], r"values must have outputs \[\] as before, got \[2\]"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            search.tell(one, which=which)
-    assert search.missing == [0, 2, 3, 5]
-    search.ask(limit=3)  # the others are given up
-    search.tell(values[[0, 2]])  # all that are missing
-    assert (search.evaluations, search.missing) == (3, [])
-
-
-def test_a_state_is_not_changed_by_the_search_it_came_from():
-    name = "descent of the output"
-    search, f = run(make(name), black_box(name), 30), black_box(name)
-    state = search.state_dict()
-    first = points_of(search, f, 80)
-    copy = make(name, seed=1)
-    for _ in range(2):
-        copy.load_state_dict(state)
-        assert torch.equal(points_of(copy, f, 80), first)
-
-
-def test_the_settings_stay_those_of_the_search_that_loads():
-    search = run(Descent(zeros(2), sigma=1.0, noise=1e-3, pool=60, seed=0), bowl, 40)
-    copy = Descent(zeros(2), sigma=1.0, noise=1e-3, pool=5, seed=0)
-    copy.load_state_dict(search.state_dict())
-    copy.tell(bowl(copy.ask()))
-    assert len(copy.state_dict()["progress"]["pool"]["values"]) == 5
-
-
-@pytest.mark.parametrize(
-    ("n", "changes", "message"),
-    [
-        (3, {}, "2 parameters, got one with 3"),
-        (2, {"sigma": 2.0}, r"sigma = \[1.0, 1.0\], got \[2.0, 2.0\]"),
-        (2, {"bounds": (-5.0, 5.0)}, "by descent of the loss, got one by gaussian_process of the loss"),
-        (2, {"loss": torch.sum}, "by descent of the loss, got one by descent of the output"),
-    ],
-)
-def test_a_state_of_another_search(n, changes, message):
-    search, other = TrustRegion(zeros(2), sigma=1.0, seed=0), TrustRegion(zeros(n), **{"sigma": 1.0, **changes})
-    asked = search.ask()
-    with pytest.raises(ValueError, match=message):
-        search.load_state_dict(other.state_dict())
-    assert torch.equal(search.ask(), asked)
-
-
-# What is refused.
 
 SETTINGS = [
     ({"x0": torch.zeros(2, 2)}, r"x0 must be a tensor \[n\]"),

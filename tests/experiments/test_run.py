@@ -1,0 +1,121 @@
+"""The commands run, list and report: what they print, refuse and take up again."""
+
+import re
+import shlex
+
+import pytest
+
+from experiments.listing import listing
+from experiments.methods import METHODS
+from experiments.problems.catalogue import FITTING, load
+from experiments.reports.ensemble_page import page
+from experiments.reports.results import load as load_results
+from experiments.reports.summary import as_text, summarize
+from experiments.run import run
+
+
+def test_list_names_everything():
+    text = listing()
+    for name in (*FITTING, *METHODS, "cnn"):
+        assert re.search(rf"^{name} ", text, re.MULTILINE), name
+
+
+def test_list_says_what_is_missing(monkeypatch):
+    def load_without(name, *given):
+        if name == "quad":
+            raise ImportError("task quad needs something", name="something")
+        return load(name, *given)
+
+    monkeypatch.setattr("experiments.problems.catalogue.load", load_without)
+    assert re.search(r"^quad +task quad needs something$", listing(), re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tasks": ("quat",)}, r"TASK must be some of .* got quat \(did you mean quad\?\)"),
+        ({"tasks": ()}, "TASK must be some of .* got none"),
+        ({"tasks": ("quad",), "methods": "cma"}, r"methods must be some of .* got cma \(did you mean cma_es"),
+        ({"tasks": ("quad",), "runs": 0}, "runs must be at least 1, got 0"),
+        ({"tasks": ("quad",), "jobs": -1}, "jobs must be at least 1, got -1"),
+        ({"tasks": ("cnn",), "methods": "cma_es"}, "no method of this command can be run on these tasks"),
+        ({"tasks": ("quad", "cnn"), "threads": 0}, "threads must be at least 1, got 0"),
+        ({"tasks": ("cnn",), "seed": -1}, "seed must be at least 0, got -1"),
+        (
+            {"tasks": ("quad", "cnn_texture"), "methods": "dfo_ls"},
+            "no method of this command can be run on these tasks",
+        ),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message, tmp_path):
+    with pytest.raises(SystemExit, match=message):
+        run(arguments.pop("tasks"), out=tmp_path, **arguments)
+
+
+def test_tasks_that_no_method_goes_with_are_left_out(tmp_path, one_process, capsys):
+    run(("cnn", "quad"), methods="cobyqa,dfo_ls", runs=1, out=tmp_path)
+    printed = capsys.readouterr().out
+    for said in (
+        "cobyqa is left out on cnn: trains no networks",
+        "dfo_ls is left out on cnn: trains no networks",
+        "dfo_ls is left out on quad: the black box returns no residuals",
+        "1 of 1 runs have ended",
+    ):
+        assert said in printed
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["quad"]
+
+
+def test_networks_and_fits_are_run_by_one_command(tmp_path, capsys, monkeypatch):
+    planned = []
+
+    def plan(ensemble, tasks, methods):
+        planned.append((ensemble.runs, ensemble.network_runs, ensemble.threads, tasks, methods))
+        raise SystemExit("planned")
+
+    monkeypatch.setattr("experiments.ensembles.ensemble.Ensemble.plan", plan)
+    for given in ({}, {"runs": 3, "seed": 2, "threads": 4}):
+        with pytest.raises(SystemExit, match="planned"):
+            run(("quad", "cnn"), methods="our_g", out=tmp_path, **given)
+    assert planned == [
+        (range(20), range(1), None, ["quad", "cnn"], ["our_g"]),
+        (range(2, 5), range(2, 5), 4, ["quad", "cnn"], ["our_g"]),
+    ]
+
+
+def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path, one_process):
+    run(("quad",), methods="cobyqa", runs=1, out=tmp_path)
+    (tmp_path / "quad" / "cobyqa" / "0.json").write_text("")
+    with pytest.raises(SystemExit, match=r"0.json is not the outcome of a run"):
+        run(("quad",), methods="cobyqa", runs=2, out=tmp_path)
+    assert not (tmp_path / "quad" / "cobyqa" / "1.json").exists()
+
+
+def test_commands_that_are_printed_can_be_pasted(tmp_path, one_process, capsys):
+    out = tmp_path / "two words"
+    run(("quad",), methods="cobyqa", runs=1, out=out)
+    lines = capsys.readouterr().out.splitlines()
+    hints = [shlex.split(line.partition(": ")[2]) for line in lines if "python -m experiments" in line]
+    assert hints == [["python", "-m", "experiments", name, str(out)] for name in ("plot", "report")]
+
+
+def test_run_runs_prints_and_says_how_to_go_on(tmp_path, one_process, no_curves, capsys, monkeypatch):
+    run(("quad",), methods="cobyqa, cma_es", runs=2, out=tmp_path, seed=3)
+    printed = capsys.readouterr().out
+    assert "4 of 4 runs have ended" in printed
+    assert as_text(summarize(load_results(tmp_path))) in printed
+    for method in ("cobyqa", "cma_es"):
+        assert sorted(path.name for path in (tmp_path / "quad" / method).iterdir()) == [
+            "3.json",
+            "3.jsonl",
+            "4.json",
+            "4.jsonl",
+        ]
+    page_of_quad = page(tmp_path)
+    assert load("quad").title in page_of_quad
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiments.ensembles.ensemble.Ensemble.run", interrupt)
+    with pytest.raises(SystemExit, match="the same command goes on"):
+        run(("quad",), methods="cobyqa", runs=3, out=tmp_path, seed=3)

@@ -1,0 +1,120 @@
+"""The state of every search: saved, loaded and told late, it changes nothing."""
+
+import random
+
+import pytest
+import torch
+from every_search import black_box, every_search, make, same, saved
+from searches import bowl, points_of, rosenbrock, run, zeros
+
+from torch_zerohess.optim import (
+    Descent,
+    TrustRegion,
+)
+
+
+@every_search
+def test_it_resumes_bit_by_bit_at_every_step(name):
+    search, f = make(name, seed=3, tolerance=0.2), black_box(name)
+    for _ in range(120):
+        copy = make(name, seed=99, tolerance=0.2)
+        copy.load_state_dict(saved(search.state_dict()))
+        assert same(copy.state_dict(), search.state_dict())
+        points = search.ask()
+        assert torch.equal(copy.ask(), points)
+        values = f(points)
+        search.tell(values)
+        copy.tell(values)
+        assert same(copy.state_dict(), search.state_dict())
+        assert torch.equal(copy.x, search.x)
+        assert torch.equal(copy.center, search.center)
+        for number in ("value", "sigma", "evaluations", "iterations", "rounds", "done", "message"):
+            assert getattr(copy, number) == getattr(search, number)
+    assert search.rounds > 0  # at an arrival, too
+
+
+def test_points_may_be_evaluated_before_the_search_is_loaded():
+    search, copy = make("process of the loss"), make("process of the loss")
+    points = search.ask()
+    copy.load_state_dict(search.state_dict())
+    copy.tell(rosenbrock(points))
+    search.tell(rosenbrock(points))
+    assert same(copy.state_dict(), search.state_dict())
+
+
+@every_search
+def test_values_told_late_and_out_of_order_change_nothing(name):
+    """One point at a time, in any order, saved and loaded in between: the states of one that is told all at once."""
+    search, late, f = make(name, seed=3), make(name, seed=3), black_box(name)
+    chance = random.Random(0)
+    for _ in range(12):
+        points = search.ask()
+        values = f(points)
+        assert torch.equal(late.ask(), points)
+        before = late.state_dict()
+        for k in chance.sample(range(len(points)), len(points)):
+            assert late.missing == [one for one in range(len(points)) if one not in late.state_dict()["early"]]
+            late.tell(values[[k]], which=[k])
+            if k % 3 == 0:
+                state = saved(late.state_dict())
+                late = make(name, seed=99)
+                late.load_state_dict(state)
+        assert len(points) == 1 or not same(late.state_dict(), before)
+        search.tell(values)
+        assert same(late.state_dict(), search.state_dict())
+
+
+def test_values_of_some_points_are_checked():
+    search = Descent(zeros(5), sigma=1.0, seed=0)
+    values = bowl(search.ask())
+    search.tell(values[[4, 1]], which=[4, 1])
+    assert search.missing == [0, 2, 3, 5]
+    for which, one, message in [
+        ([1], values[[1]], r"which must be some of the points whose values are missing, \[0, 2, 3, 5\], got \[1\]"),
+        ([6], values[[0]], r"are missing, \[0, 2, 3, 5\], got \[6\]"),
+        ([0, 0], values[[0, 0]], r"are missing, \[0, 2, 3, 5\], got \[0, 0\]"),
+        ([0, 2], values[[0]], r"values must have one per point in which, \[2, \*out\], got \[1\]"),
+        ([0], values[None, :2], r"values must have outputs \[\] as before, got \[2\]"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            search.tell(one, which=which)
+    assert search.missing == [0, 2, 3, 5]
+    search.ask(limit=3)  # the others are given up
+    search.tell(values[[0, 2]])  # all that are missing
+    assert (search.evaluations, search.missing) == (3, [])
+
+
+def test_a_state_is_not_changed_by_the_search_it_came_from():
+    name = "descent of the output"
+    search, f = run(make(name), black_box(name), 30), black_box(name)
+    state = search.state_dict()
+    first = points_of(search, f, 80)
+    copy = make(name, seed=1)
+    for _ in range(2):
+        copy.load_state_dict(state)
+        assert torch.equal(points_of(copy, f, 80), first)
+
+
+def test_the_settings_stay_those_of_the_search_that_loads():
+    search = run(Descent(zeros(2), sigma=1.0, noise=1e-3, pool=60, seed=0), bowl, 40)
+    copy = Descent(zeros(2), sigma=1.0, noise=1e-3, pool=5, seed=0)
+    copy.load_state_dict(search.state_dict())
+    copy.tell(bowl(copy.ask()))
+    assert len(copy.state_dict()["progress"]["pool"]["values"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("n", "changes", "message"),
+    [
+        (3, {}, "2 parameters, got one with 3"),
+        (2, {"sigma": 2.0}, r"sigma = \[1.0, 1.0\], got \[2.0, 2.0\]"),
+        (2, {"bounds": (-5.0, 5.0)}, "by descent of the loss, got one by gaussian_process of the loss"),
+        (2, {"loss": torch.sum}, "by descent of the loss, got one by descent of the output"),
+    ],
+)
+def test_a_state_of_another_search(n, changes, message):
+    search, other = TrustRegion(zeros(2), sigma=1.0, seed=0), TrustRegion(zeros(n), **{"sigma": 1.0, **changes})
+    asked = search.ask()
+    with pytest.raises(ValueError, match=message):
+        search.load_state_dict(other.state_dict())
+    assert torch.equal(search.ask(), asked)

@@ -1,0 +1,219 @@
+"""When `minimize` stops, what it says then, and what an interruption keeps."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from searches import TARGET, tilted, zeros
+
+import torch_zerohess as zh
+
+
+class Counted:
+    """Counts the points that a function is called with."""
+
+    def __init__(self, fn):
+        self.fn, self.points, self.calls = fn, 0, 0
+
+    def __call__(self, z):
+        self.points += len(z)
+        self.calls += 1
+        return self.fn(z)
+
+
+def test_history_goes_down_and_adds_up():
+    f = Counted(tilted)
+    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=50)
+    assert len(fit.history) == f.calls
+    assert fit.evaluations == f.points == fit.history[-1].evaluations
+    for before, after in zip(fit.history, fit.history[1:], strict=False):
+        assert after.evaluations > before.evaluations
+        assert after.value <= before.value
+    for one in fit.history:
+        assert one.value == float(tilted(one.x[None]))
+    assert fit.history[-1].value == fit.value
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_never_more_evaluations_than_allowed(n):
+    for most in range(n + 2, n + 30):
+        f = Counted(lambda z: z.square().sum(1) + z.sum(1).sin())
+        fit = zh.minimize(f, torch.ones(n, dtype=torch.float64), sigma=1.0, seed=0, max_evaluations=most)
+        assert fit.evaluations == f.points == most
+        assert fit.message.startswith(f"max_evaluations ({most}) used up")
+        assert fit.status == "budget"
+
+
+@pytest.mark.parametrize("most", [-1, 0, 3])
+def test_too_few_evaluations(most):
+    f = Counted(tilted)
+    with pytest.raises(ValueError, match=f"max_evaluations must be at least 4.*2 parameters, got {most}"):
+        zh.minimize(f, zeros(2), sigma=1.0, max_evaluations=most)
+    assert f.points == 0
+
+
+def test_target():
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, target=0.6)
+    assert fit.value <= 0.6
+    assert all(one.value > 0.6 for one in fit.history[:-1])
+    assert fit.message == "the value is at most the target 0.6"
+
+
+def test_callback():
+    seen = []
+
+    def callback(one):
+        seen.append(one)
+        return len(seen) == 4
+
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=callback)
+    for answer in (torch.tensor(True), np.True_):
+        one = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=lambda one: answer)  # noqa: B023
+        assert len(one.history) == 1
+    assert seen == fit.history
+    assert len(seen) == 4
+    assert fit.message == "the callback asked to end"
+    none = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=20, callback=lambda one: "go on")
+    assert none.evaluations == 20
+
+
+def interrupted(fn, call):
+    """Return fn, with Ctrl-C in the given call of it (from 0)."""
+    count = iter(range(call + 1))
+
+    def counting(argument):
+        if next(count) == call:
+            raise KeyboardInterrupt
+        return fn(argument)
+
+    return counting
+
+
+@pytest.mark.parametrize("where", ["fn", "callback"])
+def test_interrupted(where):
+    """Ctrl-C in the fifth call returns what was found until then."""
+    if where == "fn":
+        fit = zh.minimize(interrupted(tilted, 4), zeros(2), sigma=2.0, seed=0)
+    else:
+        fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=interrupted(lambda one: None, 4))
+    plain = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=lambda one: one.evaluations == fit.evaluations)
+    assert fit.message == "interrupted"
+    assert len(fit.history) == (4 if where == "fn" else 5)
+    assert torch.equal(fit.x, plain.x)
+    assert fit.value == plain.value == min(one.value for one in fit.history)
+
+
+def test_interrupted_before_anything_was_evaluated():
+    with pytest.raises(KeyboardInterrupt):
+        zh.minimize(interrupted(tilted, 0), zeros(2), sigma=1.0)
+
+
+def test_an_exception_passes():
+    calls = []
+
+    def f(z):
+        calls.append(len(z))
+        if len(calls) == 4:
+            raise ZeroDivisionError("in the black box")
+        return tilted(z)
+
+    with pytest.raises(ZeroDivisionError, match="in the black box") as caught:
+        zh.minimize(f, zeros(2), sigma=1.0, seed=0)
+    assert len(calls) == 4
+    found = caught.value.minimum
+    assert (found.status, found.success, found.evaluations) == ("failed", False, sum(calls[:3]))
+    assert len(found.history) == 3
+
+
+def test_values_that_are_not_finite_on_the_way():
+    fit = zh.minimize(lambda z: torch.where(z[:, 0] > 2, math.nan, tilted(z)), zeros(2), sigma=2.0, seed=0)
+    assert math.isfinite(fit.value)
+    assert float(fit.x[0]) <= 2.0
+    assert fit.value < 2.0  # 11.2 at the start, 1.4 at best
+    only = zh.minimize(lambda z: torch.where(z.square().sum(1) > 0, math.nan, tilted(z)), zeros(2), sigma=2.0, seed=0)
+    assert "10 batches in a row had values that are not finite" in only.message
+    assert torch.equal(only.x, zeros(2))
+
+
+def test_a_convex_function_ends_when_three_rounds_agree():
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0)
+    assert (fit.status, fit.success) == ("solved", True)
+    assert fit.message == "3 rounds in a row have arrived at x"
+    assert fit.evaluations < 150
+
+
+def test_the_budget_ends_it_and_success_says_whether_it_has_arrived():
+    few = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=5)
+    assert (few.status, few.success) == ("budget", False)
+    most = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=60, restarts=9)
+    assert (most.status, most.success) == ("budget", True)
+    assert "had arrived at x" in most.message
+
+
+@pytest.mark.parametrize("name", ["xtol", "ftol"])
+def test_tolerances_end_it_early(name):
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, **{name: 1e-3})
+    assert (fit.status, fit.success) == ("solved", True)
+    assert name in fit.message
+    assert fit.evaluations < 30
+    assert fit.value < 0.5 + 1e-3
+    assert float((fit.x - TARGET).norm()) < 0.03
+
+
+def test_a_tolerance_ends_nothing_before_it_has_begun():
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, xtol=9.0)
+    assert len(fit.history) == 1
+    assert fit.value == float(tilted(fit.x[None]))
+
+
+def test_a_time_limit_ends_it():
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, time_limit=0.0)
+    assert (fit.status, fit.success) == ("time", False)
+    assert len(fit.history) == 1
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+def test_a_total_plateau_is_said(bounds):
+    fit = zh.minimize(lambda z: torch.ones(len(z)), zeros(3), sigma=0.1, seed=0, bounds=bounds, max_evaluations=40)
+    assert not fit.success
+    assert fit.message.endswith(f"all {fit.evaluations} values are equal: enlarge sigma")
+
+
+def test_history_has_every_point_and_value():
+    f = Counted(tilted)
+    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=30)
+    points, values = (torch.cat([getattr(one, name) for one in fit.history]) for name in ("points", "values"))
+    assert len(points) == f.points == 30
+    assert torch.equal(values, tilted(points))
+    assert fit.value == float(values.min())
+
+
+def test_a_checkpoint_goes_on_where_it_was(tmp_path):
+    path = tmp_path / "search.pt"
+    whole = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=40)
+    with pytest.raises(ZeroDivisionError):
+        zh.minimize(raising(tilted, 6), zeros(2), sigma=2.0, seed=0, max_evaluations=40, checkpoint=path)
+    f = Counted(tilted)
+    rest = zh.minimize(f, zeros(2), sigma=2.0, seed=1, max_evaluations=40, checkpoint=path)
+    assert f.points < 40
+    assert torch.equal(rest.x, whole.x)
+    assert [one.evaluations for one in rest.history] == [one.evaluations for one in whole.history]
+
+
+def raising(fn, call):
+    """Return fn that raises in the given call (from 0)."""
+    count = iter(range(call + 1))
+
+    def counting(z):
+        if next(count) == call:
+            raise ZeroDivisionError
+        return fn(z)
+
+    return counting
+
+
+def test_verbose_says_how_far_it_is(monkeypatch, capsys):
+    monkeypatch.setattr("torch_zerohess.search.running._PAUSE", 0.0)
+    zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=10, verbose=True)
+    assert "10 evaluations, value " in capsys.readouterr().err

@@ -3,6 +3,7 @@
 | row | measured | compared with |
 |---|---|---|
 | noise | picks, perturbations, points and density ratios of proposal "aggregate" | `torch.randn` of the same count |
+| noise on cuda | the same on a CUDA device, where there is one | the same |
 | Hessian | `Estimate.hessian` | the bare matrix product of its samples |
 | gradient + HVP | one gradient and one product from perturbations that are drawn again | three passes of noise |
 | threads | the noise with one thread | with two |
@@ -48,17 +49,32 @@ def ratios(repeats: int, wide: tuple[int, ...] = (512, 2048), large: int = 1_000
         large: parameters of the gradient and the product that draw their perturbations again.
     """
     rows = [_noise(dtype, repeats) for dtype in (torch.float32, torch.float64)]
+    if torch.cuda.is_available():
+        rows += [_noise(dtype, repeats, 1 << 20, 16, "cuda") for dtype in (torch.float32, torch.float64)]
     rows += [_hessian(n, repeats) for n in wide]
     rows.append(_redrawn(large, max(1, repeats // 5)))
     rows.append(_threads(repeats))
     return rows
 
 
-def _noise(dtype: torch.dtype, repeats: int, n: int = 1024, samples: int = 64) -> Ratio:
-    x, sigma = torch.zeros(1, n, dtype=dtype), torch.ones(n, dtype=torch.float64)
-    noise = _sampler(x, sigma, samples)
-    seconds, compared = in_turn(noise, lambda: torch.randn(samples, n, dtype=dtype), repeats)
-    return Ratio(f"noise, {str(dtype).removeprefix('torch.')}", n, samples, seconds, compared, 2.0)
+def _noise(dtype: torch.dtype, repeats: int, n: int = 1024, samples: int = 64, device: str = "cpu") -> Ratio:
+    x, sigma = torch.zeros(1, n, dtype=dtype, device=device), torch.ones(n, dtype=torch.float64, device=device)
+    noise = _finished(_sampler(x, sigma, samples), device)
+    compared_with = _finished(lambda: torch.randn(samples, n, dtype=dtype, device=device), device)
+    seconds, compared = in_turn(noise, compared_with, repeats)
+    name = f"noise{'' if device == 'cpu' else ' on ' + device}, {str(dtype).removeprefix('torch.')}"
+    return Ratio(name, n, samples, seconds, compared, 2.0 if device == "cpu" else 1.0)
+
+
+def _finished(function: Callable[[], object], device: str) -> Callable[[], object]:
+    """Return the function with a wait for what it left running on the device."""
+
+    def run() -> object:
+        result = function()
+        torch.cuda.synchronize()
+        return result
+
+    return run if device == "cuda" else function
 
 
 def _hessian(n: int, repeats: int, samples: int = 64) -> Ratio:

@@ -1,13 +1,16 @@
 """The operations that the C++ extension speeds up, each beside its literal reference in torch.
 
-CPU tensors go to the extension if it was built. Tensors on other devices, and all tensors of an installation without
-a compiler, go to the reference. Both draw the same bits. Their sums of n terms differ by rounding: n units in the last
-place of the sum of magnitudes at most.
+CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms` and `sample`
+go to Triton kernels, which were never run on a real GPU; where one fails, a warning says so and the reference is used
+from then on. All other tensors, and those of an installation without a compiler, go to the reference. All of them draw
+the same bits. Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
 """
 
+import importlib.util
 import itertools
-from collections.abc import Iterator
-from typing import NamedTuple
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -70,6 +73,11 @@ def _compiled(tensor: Tensor) -> bool:
     return extension.available and tensor.is_cpu
 
 
+def _drawn(tensor: Tensor) -> bool:
+    """Whether there is an operator that draws on this device."""
+    return extension.available and (tensor.is_cpu or (tensor.is_cuda and _triton))
+
+
 def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: torch.device) -> Tensor:
     """See `proposals.pick_rows`."""
     pick = torch.ops.torch_zerohess.pick_rows if extension.available else proposals.pick_rows
@@ -79,14 +87,14 @@ def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: 
 
 def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
     """See `proposals.draw`."""
-    if _compiled(rows):
+    if _drawn(rows):
         return torch.ops.torch_zerohess.draw(rows.contiguous(), n, single)
     return proposals.draw(rows, n, single)
 
 
 def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> Tensor:
     """See `philox.uniforms`; first is even."""
-    if _compiled(row):
+    if _drawn(row):
         return torch.ops.torch_zerohess.uniforms(seed.contiguous(), row.contiguous(), first, count, stream)
     return philox.uniforms(seed, row, first, count, stream)
 
@@ -125,7 +133,7 @@ def sample(
     see `proposals.pick_rows`, `proposals.draw` and `proposals.place`. E = K + 1 with x as the last point where
     `center`, else K.
     """
-    if _compiled(x):
+    if _drawn(x):
         return torch.ops.torch_zerohess.sample(seed, S, x.contiguous(), sigma, antithetic, proposal, center, keep)
     (B, n), single = x.shape, x.dtype == torch.float32
     rows = pick_rows(seed, 0, B * S, n, proposal, x.device)
@@ -215,3 +223,35 @@ def _total(pieces: Iterator[Tensor]) -> Tensor:
     for piece in pieces:
         total = total + piece
     return total
+
+
+_triton = importlib.util.find_spec("triton") is not None
+"""Whether tensors on CUDA devices are drawn by `triton_kernels`, which the first of them imports."""
+
+
+def _on_cuda(function: Callable[..., Any]) -> None:
+    """Register the function of `triton_kernels` with the name of this one, and this one for where it fails."""
+
+    def run(*arguments: Any) -> Any:
+        global _triton
+        if _triton:
+            try:
+                module = importlib.import_module("torch_zerohess.sampling.triton_kernels")
+                return getattr(module, function.__name__)(*arguments)
+            except torch.OutOfMemoryError:
+                raise
+            except Exception as error:  # no compiler for its launcher, a device that is too old
+                _triton = False
+                warnings.warn(
+                    f"torch_zerohess draws with torch instead of Triton, the same numbers but slower: {error!r}",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+        return function(*arguments)
+
+    torch.library.impl(f"torch_zerohess::{function.__name__}", "cuda", run)
+
+
+if extension.available:
+    for _function in (draw, uniforms, sample):
+        _on_cuda(_function)

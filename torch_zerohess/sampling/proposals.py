@@ -117,16 +117,19 @@ def place(
 
 def weights(u: Tensor, proposal: int) -> Tensor:
     """Return N(u) / p(u) for u [..., n]."""
-    n = u.shape[-1]
+    squares = u * u
+    return density_ratio(u.abs().sum(-1), squares.sum(-1), (squares - 1.0).abs().sum(-1), u.shape[-1], proposal)
+
+
+def density_ratio(l1: Tensor, l2: Tensor, hole: Tensor, n: int, proposal: int) -> Tensor:
+    """Return N(u) / p(u) from sum |u|, sum u^2 and sum |u^2 - 1|."""
     if proposal in (GAUSSIAN, SIGNED_LOBES):
-        return torch.ones_like(u[..., 0])
-    l1, l2 = u.abs().sum(-1), (u * u).sum(-1)
+        return torch.ones_like(l1)
     if proposal == UNIFORM:
         return torch.exp(n * _LOG_BOX - 0.5 * l2)
     gradient = _SQRT_HALF_PI * (l1 / n)
     if proposal == FIRST_ORDER:
         return 2.0 / (1.0 + gradient)
-    hole = (u * u - 1.0).abs().sum(-1)
     return 3.0 / (1.0 + gradient + (_HALF_PI * (l1 * l1 - l2) + _DIAGONAL_LOBE_SCALE * hole) / (n * n))
 
 

@@ -258,6 +258,7 @@ def test_redrawn_equals_stored(n: int, single: bool, antithetic: bool, monkeypat
 
 
 def test_any_number_of_threads_gives_the_same_bits() -> None:
+    """Threads share nothing: each writes elements of its own, in ranges that `parallel_for` cuts."""
     n, B, S, M = 300, 2, 150, 3
     rows = kernels.pick_rows(11, 0, B * S, n, proposals.SECOND_ORDER, CPU)
     x, sigma = torch.zeros(B, n, dtype=torch.float64), torch.ones(n, dtype=torch.float64)
@@ -270,17 +271,24 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
         recipe = (rows, x, sigma, True, False)
         sums = [ops.project(u, t), ops.accumulate(u, a, False), ops.accumulate(u, a, True), ops.hessian(u, a)]
         sums += [ops.project_drawn(*recipe, t), ops.accumulate_drawn(*recipe, a, False)]
-        return [drawn, points, u, weights, *sampled, *sums, ops.accumulate_drawn(*recipe, a, True)]
+        mirrored = spread(n * n, -1.0, 1.0).view(1, n, n)
+        ops.mirror(mirrored)
+        parts = [
+            ops.uniforms(rows[:, 0].contiguous(), rows[:, 1].contiguous(), 0, n, 2),
+            ops.shape(rows, drawn.sigmoid()),
+        ]
+        whole = [drawn, points, u, weights, mirrored, *parts]
+        return [*whole, *sampled, *sums, ops.accumulate_drawn(*recipe, a, True)]
 
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
         one = everything()
-        torch.set_num_threads(2)
-        two = everything()
+        for threads in (2, 3, 5, 8):
+            torch.set_num_threads(threads)
+            assert all(torch.equal(p, q) for p, q in zip(one, everything(), strict=True)), threads
     finally:
         torch.set_num_threads(before)
-    assert all(torch.equal(p, q) for p, q in zip(one, two, strict=True))
 
 
 @pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 100])

@@ -1,0 +1,146 @@
+"""The Triton kernels against the C++ operators and the torch references, bit for bit, in Triton's interpreter.
+
+No GPU runs here. What the interpreter does not see, contraction and approximate functions of the device, is looked for
+in the PTX that the kernels are compiled to.
+"""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torch_zerohess.sampling import extension, kernels, proposals
+
+FOLDER = Path(extension.__file__).parents[2]  # of the package under test: a checkout or an installation
+needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
+
+SAME_BITS = """
+import torch, triton, triton.language as tl
+from torch_zerohess.sampling import philox, proposals, quantiles, triton_kernels
+
+assert triton_kernels._sample.__class__.__name__ == "InterpretedFunction"
+ops = torch.ops.torch_zerohess
+SEEDS = torch.tensor([0, 1, 2**32 + 1, 2**63 - 1, -5])
+
+
+def rows(made):
+    index = torch.arange(len(made))
+    return torch.cat([torch.stack([SEEDS[index % 5], index * (2**33 + 1)], 1), torch.tensor(made)], 1)
+
+
+every = rows([(kind, i, j) for kind in range(6) for i in range(3) for j in range(3)])
+edges = rows([(proposals.OFF_DIAGONAL_LOBE, 20, 15), (proposals.DIAGONAL_LOBE, 16, 16)])
+alone = rows([(kind, 0, 0) for kind in range(6)])
+for tile, made, n in ((1024, every, 3), (16, edges, 21), (32, alone, 1)):
+    triton_kernels._TILE = tile  # the second: two blocks of columns, the last one not full
+    for single in (False, True):
+        expected = ops.draw(made, n, single)
+        assert torch.equal(expected, proposals.draw(made, n, single))
+        assert torch.equal(triton_kernels.draw(made, n, single), expected), (n, single)
+
+triton_kernels._TILE = 1 << 15
+tails = torch.tensor([[3, r, proposals.NORMAL, 0, 0] for r in range(32)])
+assert int((ops.draw(tails, 1024, True).abs() > 4.33).sum()) > 0
+assert torch.equal(triton_kernels.draw(tails, 1024, True), ops.draw(tails, 1024, True))
+
+triton_kernels._TILE = 16
+index = torch.tensor([2**40, -1])
+for first in (2**32 - 4, 2**33 - 6):  # the counter of blocks of two columns ends at 2^32
+    got = triton_kernels.uniforms(SEEDS[3:], index, first, 19, philox.EXTRA)
+    assert torch.equal(got, philox.uniforms(SEEDS[3:], index, first, 19, philox.EXTRA))
+    assert torch.equal(got, ops.uniforms(SEEDS[3:], index, first, 19, philox.EXTRA))
+
+for proposal in range(5):
+    triton_kernels._TILE = 16 if proposal == proposals.SECOND_ORDER else 64
+    for dtype, B, S, n, both in ((torch.float32, 2, 3, 5, True), (torch.float64, 1, 1, 18, proposal % 2 == 0)):
+        x, sigma = torch.linspace(-3, 3, B * n, dtype=dtype).view(B, n), torch.linspace(1e-9, 2, n).double()
+        center, keep, single = proposal != 1, proposal != 2, dtype == torch.float32
+        got = triton_kernels.sample(2**40 + 1, S, x, sigma, both, proposal, center, keep)
+        expected = ops.sample(2**40 + 1, S, x, sigma, both, proposal, center, keep)
+        assert all(torch.equal(p, q) for p, q in zip(got[:3], expected[:3], strict=True)), (proposal, dtype)
+        u = proposals.draw(got[0], n, single)
+        weights = proposals.place(u, x.double(), sigma, both, single, proposal)[2]
+        bound = 2.0**-52 * (12 * n + 8 if proposal == proposals.UNIFORM else 2 * n + 9)
+        assert bool(((got[3] - weights).abs() <= bound * weights).all())
+
+
+@triton.jit
+def all_quantiles(p, out, N: tl.constexpr):
+    here = tl.arange(0, N)[None, :]
+    tl.store(out + here, triton_kernels._normal(tl.load(p + here)))
+    tl.store(out + N + here, triton_kernels._gradient_lobe(tl.load(p + here)))
+    tl.store(out + 2 * N + here, triton_kernels._hessian_lobe(tl.load(p + here)))
+
+
+p = torch.linspace(0.001, 0.999, 151, dtype=torch.float64)
+steps = 2.0 ** torch.arange(-50, -15, dtype=torch.float64)  # next to branch points, and in the far tail
+p = torch.cat([p, steps, 0.25 - steps, 0.25 + steps])
+p = torch.cat([p, 1.0 - p])
+out = torch.empty(3, len(p), dtype=torch.float64)
+all_quantiles[(1,)](p, out, len(p))
+for got, quantile in zip(out, ("normal_quantile", "gradient_lobe_quantile", "hessian_lobe_quantile"), strict=True):
+    assert torch.equal(got, getattr(quantiles, quantile)(p)), quantile
+"""
+
+PTX = """
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from torch_zerohess.sampling import triton_kernels
+
+names = triton_kernels._sample.arg_names
+for x, single in (("*fp64", False), ("*fp32", True)):
+    types = {"rows": "*i64", "x": x, "points": x, "sigma": "*fp64", "ratios": "*fp32", "out": "*fp64", "sums": "*fp64"}
+    constants = {"SINGLE": single, "SIGNS": 2, "ROWS": 32, "BLOCK": 4}
+    signature = {name: "constexpr" if name in constants else types.get(name, "i32") for name in names}
+    source = ASTSource(triton_kernels._sample, signature, constants)
+    compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=triton_kernels._OPTIONS)
+    print(compiled.asm["ptx"])
+"""
+
+
+def python(code: str, folder: Path, **environment: str) -> str:
+    """Run a file, which is where triton looks for the source of a kernel; return what it prints."""
+    script = folder / "script.py"
+    script.write_text(code)
+    settings = {**os.environ, "PYTHONPATH": str(FOLDER), "TRITON_CACHE_DIR": str(folder / "cache"), **environment}
+    done = subprocess.run([sys.executable, str(script)], cwd=folder, env=settings, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@needs_triton
+def test_same_bits_in_the_interpreter(tmp_path: Path) -> None:
+    python(SAME_BITS, tmp_path, TRITON_INTERPRET="1")
+
+
+@needs_triton
+def test_every_operation_of_the_compiled_kernels_is_rounded_to_nearest(tmp_path: Path) -> None:
+    ptx = python(PTX, tmp_path)
+    operations = set(re.findall(r"^\s+(?:@\S+ )?([a-z]+\.[\w.]+)", ptx, re.MULTILINE))
+    arithmetic = {
+        one for one in operations if re.match(r"(add|sub|mul|div|sqrt|fma|mad|rcp|ex2|lg2).*\.f(32|64)$", one)
+    }
+    assert arithmetic >= {"div.rn.f64", "sqrt.rn.f64", "mul.rn.f64", "mul.rn.f32", "add.rn.f32"}
+    assert not {one for one in arithmetic if ".rn." not in one or one.startswith(("fma", "mad"))}
+
+
+def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    registered = {}
+    monkeypatch.setattr(torch.library, "impl", lambda name, device, run: registered.update({name: (device, run)}))
+    for function in (kernels.draw, kernels.uniforms, kernels.sample):
+        kernels._on_cuda(function)
+    assert {device for device, _ in registered.values()} == {"cuda"}
+    rows = proposals.pick_rows(3, 0, 4, 5, proposals.SECOND_ORDER)
+    monkeypatch.setattr(kernels, "_triton", True)
+    monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", None)  # its import fails
+    _, run = registered["torch_zerohess::draw"]
+    with pytest.warns(RuntimeWarning, match="torch instead of Triton"):
+        got = run(rows, 5, False)
+    assert torch.equal(got, proposals.draw(rows, 5))
+    assert torch.equal(run(rows, 5, False), got)  # and no second warning

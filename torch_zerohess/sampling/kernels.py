@@ -1,11 +1,13 @@
 """The operations that the C++ extension speeds up, each beside its literal reference in torch.
 
 CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms` and `sample`
-go to Triton kernels, which were never run on a real GPU; where one fails, a warning says so and the reference is used
-from then on. All other tensors, and those of an installation without a compiler, go to the reference. All of them draw
-the same bits. Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
+go to Triton kernels, which were never run on a real GPU. The first call on a device compares some of their numbers
+with the reference. Where they differ, or a kernel fails, a warning says so and the reference is used from then on. All
+other tensors, and those of an installation without a compiler, go to the reference. All of them draw the same bits.
+Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
 """
 
+import functools
 import importlib.util
 import itertools
 import warnings
@@ -229,6 +231,18 @@ _triton = importlib.util.find_spec("triton") is not None
 """Whether tensors on CUDA devices are drawn by `triton_kernels`, which the first of them imports."""
 
 
+@functools.cache
+def _triton_kernels(device: torch.device) -> Any:
+    """Import `triton_kernels`; RuntimeError if it does not draw on this device what the reference draws."""
+    module = importlib.import_module("torch_zerohess.sampling.triton_kernels")
+    n = 8
+    rows = proposals.pick_rows(0, 0, 64, n, proposals.SECOND_ORDER)
+    for single in (False, True):
+        if not torch.equal(module.draw(rows.to(device), n, single).cpu(), proposals.draw(rows, n, single)):
+            raise RuntimeError(f"its numbers on {device} are not those of the reference")
+    return module
+
+
 def _on_cuda(function: Callable[..., Any]) -> None:
     """Register the function of `triton_kernels` with the name of this one, and this one for where it fails."""
 
@@ -236,8 +250,8 @@ def _on_cuda(function: Callable[..., Any]) -> None:
         global _triton
         if _triton:
             try:
-                module = importlib.import_module("torch_zerohess.sampling.triton_kernels")
-                return getattr(module, function.__name__)(*arguments)
+                device = next(one.device for one in arguments if isinstance(one, Tensor))
+                return getattr(_triton_kernels(device), function.__name__)(*arguments)
             except torch.OutOfMemoryError:
                 raise
             except Exception as error:  # no compiler for its launcher, a device that is too old

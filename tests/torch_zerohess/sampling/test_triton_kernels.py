@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -130,7 +131,17 @@ def test_every_operation_of_the_compiled_kernels_is_rounded_to_nearest(tmp_path:
     assert not {one for one in arithmetic if ".rn." not in one or one.startswith(("fma", "mad"))}
 
 
-def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (None, "ModuleNotFoundError"),  # its import fails
+        (SimpleNamespace(draw=lambda rows, n, single: torch.zeros(len(rows), n)), "not those of the reference"),
+    ],
+)
+def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(
+    module: SimpleNamespace | None, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernels._triton_kernels.cache_clear()
     registered = {}
     monkeypatch.setattr(torch.library, "impl", lambda name, device, run: registered.update({name: (device, run)}))
     for function in (kernels.draw, kernels.uniforms, kernels.sample):
@@ -138,9 +149,9 @@ def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(monkeypatc
     assert {device for device, _ in registered.values()} == {"cuda"}
     rows = proposals.pick_rows(3, 0, 4, 5, proposals.SECOND_ORDER)
     monkeypatch.setattr(kernels, "_triton", True)
-    monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", None)  # its import fails
+    monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", module)
     _, run = registered["torch_zerohess::draw"]
-    with pytest.warns(RuntimeWarning, match="torch instead of Triton"):
+    with pytest.warns(RuntimeWarning, match=f"torch instead of Triton.*{message}"):
         got = run(rows, 5, False)
     assert torch.equal(got, proposals.draw(rows, 5))
     assert torch.equal(run(rows, 5, False), got)  # and no second warning

@@ -80,7 +80,11 @@ class Smoothing:
                 raise TypeError(f"{name} must be an integer, got {number!r}")
             if number < lowest:
                 raise ValueError(f"{name} must be at least {lowest}, got {number}")
-        object.__setattr__(self, "samples", operator.index(self.samples))
+        for name in ("samples", "order", "seed", "scrambles"):  # numbers of Python: a state_dict holds nothing else
+            number = getattr(self, name)
+            if hasattr(number, "__index__") and not isinstance(number, bool):
+                object.__setattr__(self, name, operator.index(number))
+        seed = operator.index(seed)
         if self.order > 2:
             raise ValueError(f"order must be 1 or 2, got {self.order}")
         if seed >= 2**63:
@@ -93,6 +97,8 @@ class Smoothing:
         ):
             if value not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+        if self.antithetic != "auto":
+            object.__setattr__(self, "antithetic", bool(self.antithetic))
         if self.scrambles is not None and (
             isinstance(self.scrambles, bool) or self.scrambles < 1 or self.samples % self.scrambles
         ):
@@ -110,6 +116,19 @@ class Smoothing:
             )
         if self.baseline == "mean" and self.samples < 2 and self.proposal != "optimal":
             raise ValueError("baseline 'mean' needs the mean of other draws: samples must be at least 2, got 1")
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all settings are the same."""
+        return isinstance(other, Smoothing) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[Any, ...]:
+        """Every setting, as numbers and texts."""
+        settings = (getattr(self, one.name) for one in fields(self))
+        return tuple(tuple(one.tolist()) if isinstance(one, Tensor) else one for one in settings)
 
     @classmethod
     def auto(cls, *, sigma: float | Tensor, **settings: Any) -> "Smoothing":

@@ -1,5 +1,8 @@
 """What surroundings may do to a layer, and what a layer may not do to them."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -179,3 +182,25 @@ def test_settings_that_cannot_work_say_so():
     with pytest.raises(ValueError, match="every batch dimension > 0"):
         layer(torch.zeros(0, 2))
     assert zh.Smoothing(sigma=1.0, samples=np.int64(4)).samples == 4
+
+
+@pytest.mark.parametrize("default", [torch.float32, torch.float64])
+def test_numbers_of_python_follow_x_and_not_the_default_dtype(default):
+    """The sparse fit mixes them with tensors of x's dtype."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(default)
+    try:
+        for dtype in (torch.float32, torch.float64):
+            scale = torch.arange(1, 31, dtype=dtype).sqrt()
+            found = zh.sparse_jacobian(lambda z, s=scale: z * s, torch.zeros(30, dtype=dtype), S.replace(samples=40))
+            torch.testing.assert_close(found.dense().to(dtype), scale.diag(), rtol=1e-2, atol=1e-2)
+    finally:
+        torch.set_default_dtype(before)
+
+
+def test_adapters_are_there_without_an_import_of_their_own():
+    code = "import torch_zerohess as zh; print(zh.adapters.process.Program.__name__, 'onnx' in dir(zh.adapters))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["Program", "True"]
+    with pytest.raises(AttributeError, match="no attribute 'blender'"):
+        zh.adapters.blender  # noqa: B018

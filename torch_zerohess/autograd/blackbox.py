@@ -87,7 +87,9 @@ class BlackBox(nn.Module):
         self.smoothing = smoothing
         if memory is not None and not isinstance(memory, Memory):
             raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
-        self.call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite, head)
+        self.call = BlackBoxCall(
+            fn, vectorized, Inline() if evaluator is None else evaluator, value, on_nonfinite, head
+        )
         self.memory = memory
         self.control: Control | None = None
         """The memory during the present call."""

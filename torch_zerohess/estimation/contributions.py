@@ -30,6 +30,7 @@ def contributions(stein: Stein, a: Tensor, draws: Sequence[Tensor], n: int, orde
         return []
     B, P = len(a), a.shape[2]
     a = a[:, :, :: -(-P // _OUTPUTS)].mT
+    order = min(order, stein.highest or order)
     quantities: list[Quantity] = ["gradient", "hessian_diagonal"] if order == 2 else ["gradient"]
     found = []
     for quantity in quantities:

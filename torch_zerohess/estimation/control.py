@@ -80,7 +80,7 @@ class Control:
                     f"the surrogate of the memory must return [K, {_listed(outputs.shape[2:])}] like the black box, "
                     f"got a prediction of {list(predicted.shape)} for values of {list(values.shape)}"
                 )
-            if not bool(torch.isfinite(predicted).all()):
+            if self.active and not bool(torch.isfinite(predicted).all()):
                 raise ValueError("the surrogate of the memory predicted a value that is not finite")
         if self.learning:
             if predicted is not None:
@@ -106,7 +106,7 @@ class Control:
             losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]
             return losses
         outputs: Tensor = surrogate(z.flatten(0, 1))
-        if self.memory.scalar and outputs.shape[1:] == (1,):  # it was fitted to a column
+        if self.memory.scalar and outputs.shape[1:] == (1,):
             outputs = outputs[:, 0]
         outputs = outputs.unflatten(0, (B, E))
         return outputs if head is None else apply_head(head, outputs, aux)

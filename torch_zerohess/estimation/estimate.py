@@ -75,7 +75,7 @@ def estimate(
     """
     if not isinstance(smoothing, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
-    call = BlackBoxCall(fn, vectorized, evaluator or Inline(), value, on_nonfinite, head)
+    call = BlackBoxCall(fn, vectorized, Inline() if evaluator is None else evaluator, value, on_nonfinite, head)
     check_limits(tolerance, max_evaluations)
     _check_memory(head, memory, tolerance)
     x = checked_input(x).detach().clone()

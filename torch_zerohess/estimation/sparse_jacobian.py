@@ -84,7 +84,7 @@ def sparse_jacobian(
         )
     settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True)
     check_samples(smoothing.samples, keep)
-    call = BlackBoxCall(fn, vectorized, evaluator or Inline(), "smoothed", on_nonfinite)
+    call = BlackBoxCall(fn, vectorized, Inline() if evaluator is None else evaluator, "smoothed", on_nonfinite)
     work = x if x.dtype == torch.float64 else x.float()
     u, changes, weights, shape, evaluations = _sampled(call, work, smoothing)
     check_samples(len(u), keep)

@@ -1,5 +1,6 @@
 """What a black box returned, as a tensor with one value per point."""
 
+import sys
 from typing import Any
 
 import torch
@@ -7,8 +8,16 @@ from torch import Tensor
 
 
 def as_tensor(result: Any) -> Tensor:
-    """Return what a black box returned as a tensor. Numbers of Python are float64, alone and in lists."""
+    """Return what a black box returned as a tensor of real or complex numbers.
+
+    Numbers of Python are float64, alone and in lists, and so are integers and truth values of any kind: counts,
+    images of bytes, a loss that is 0 on a plateau.
+    """
     try:
+        if hasattr(result, "__array_interface__"):  # of NumPy, with strides and types that torch may not know
+            long = result.dtype.kind == "f" and result.dtype.itemsize > 8
+            kind = float if long else result.dtype.newbyteorder("=")
+            result = sys.modules["numpy"].require(result, dtype=kind, requirements="CW")
         leaf = result  # whatever the default dtype of torch
         while isinstance(leaf, (list, tuple)) and len(leaf):
             leaf = leaf[0]
@@ -16,9 +25,12 @@ def as_tensor(result: Any) -> Tensor:
             return torch.as_tensor(result, dtype=torch.float64)
         tensor = torch.as_tensor(result)
         mixed = isinstance(leaf, int) and tensor.is_floating_point()  # [1, 2.5]
-        return torch.as_tensor(result, dtype=torch.float64) if mixed else tensor
+        exact = not (tensor.is_floating_point() or tensor.is_complex())
+        return torch.as_tensor(result, dtype=torch.float64) if mixed or exact else tensor
     except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"fn must return a tensor or a NumPy array, got {type(result).__name__}") from error
+        raise TypeError(
+            f"fn must return a tensor or a NumPy array of numbers, got {type(result).__name__}: {error}"
+        ) from error
 
 
 def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tensor:
@@ -27,7 +39,7 @@ def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tens
     if values.requires_grad:
         raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")
     if not values.is_floating_point():
-        raise TypeError(f"fn must return real floating-point values, got {values.dtype}: convert, e.g. .float()")
+        raise TypeError(f"fn must return real numbers, got {values.dtype}: return .real, .abs() or both parts")
     if values.dim() == 0 or len(values) != len(points):
         raise ValueError(
             f"fn must return one value per point, [{len(points)}, *out] for points "

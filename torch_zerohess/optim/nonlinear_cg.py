@@ -101,7 +101,7 @@ class NonlinearCG(SecondOrder):
         and what the closure raises; parameters and state are then as they were.
         """
         group: dict[str, Any] = self.param_groups[0]
-        before, state = self._copy(), {one: dict(self.state[one]) for one in self._parameters}
+        before, state = self._copy(), {one: dict(kept) for one, kept in self.state.items()}
         try:
             model = self._evaluate(closure)
             loss, direction = model.loss, self._direction(model.gradient, group)
@@ -115,6 +115,7 @@ class NonlinearCG(SecondOrder):
                     break
         except BaseException:
             self._restore(before)
+            self.state.clear()
             self.state.update(state)
             raise
         return loss

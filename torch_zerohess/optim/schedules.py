@@ -1,7 +1,11 @@
 """Sigma annealing with the interface of a learning-rate schedule."""
 
+import math
 from collections.abc import Iterable
+from numbers import Integral, Real
 from typing import Any
+
+from torch import nn
 
 from torch_zerohess.autograd.blackbox import BlackBox
 
@@ -13,7 +17,7 @@ class LinearSigma:
     value, each `step()` the next, and `state_dict` / `load_state_dict` resume it.
 
     Args:
-        modules: a `BlackBox` or several.
+        module_or_modules: a `BlackBox`, a module that contains some, or several of either.
         start, end: sigma in units of the black box's input, positive.
         steps: number of `step()` calls from start to end, at least 1.
         hold: number of `step()` calls before that.
@@ -28,22 +32,21 @@ class LinearSigma:
     """
 
     def __init__(
-        self, modules: BlackBox | Iterable[BlackBox], start: float, end: float, steps: int, hold: int = 0
+        self, module_or_modules: nn.Module | Iterable[nn.Module], start: float, end: float, steps: int, hold: int = 0
     ) -> None:
-        self._modules = [modules] if isinstance(modules, BlackBox) else list(modules)
-        if not self._modules or not all(isinstance(one, BlackBox) for one in self._modules):
-            raise TypeError(f"modules must be a BlackBox or several, got {modules!r}")
-        for one in self._modules:
+        self._layers = _layers_of(module_or_modules)
+        for one in self._layers:
             if not isinstance(one.smoothing.sigma, float):
                 raise ValueError(
-                    f"modules must have one sigma for all parameters, got {one.smoothing.sigma}: scale the parameters "
-                    "of the black box instead"
+                    f"module_or_modules must have one sigma for all parameters, got {one.smoothing.sigma}: scale the "
+                    "parameters of the black box instead"
                 )
         for name, value in (("start", start), ("end", end)):
-            if not value > 0:
-                raise ValueError(f"{name} must be a positive sigma, got {value}")
-        if steps < 1 or hold < 0:
-            raise ValueError(f"steps must be at least 1 and hold at least 0, got steps={steps}, hold={hold}")
+            if not isinstance(value, Real) or not 0 < value < math.inf:
+                raise ValueError(f"{name} must be a positive sigma, got {value!r}")
+        for name, count, least in (("steps", steps, 1), ("hold", hold, 0)):
+            if not isinstance(count, Integral) or count < least:
+                raise ValueError(f"{name} must be an integer of at least {least}, got {count!r}")
         self.start, self.end, self.steps, self.hold, self.count = float(start), float(end), steps, hold, 0
         self._apply()
 
@@ -69,5 +72,20 @@ class LinearSigma:
         self._apply()
 
     def _apply(self) -> None:
-        for one in self._modules:
+        for one in self._layers:
             one.smoothing = one.smoothing.replace(sigma=self.sigma)
+
+
+def _layers_of(module_or_modules: nn.Module | Iterable[nn.Module]) -> list[BlackBox]:
+    """Return the black boxes in modules, each once."""
+    several = isinstance(module_or_modules, Iterable) and not isinstance(module_or_modules, nn.Module)
+    modules = list(module_or_modules) if several else [module_or_modules]
+    found: dict[BlackBox, None] = {}
+    for one in modules:
+        inside = [part for part in one.modules() if isinstance(part, BlackBox)] if isinstance(one, nn.Module) else []
+        if not inside:
+            raise TypeError(f"module_or_modules must be a BlackBox, or modules with a BlackBox inside, got {one!r}")
+        found.update(dict.fromkeys(inside))
+    if not found:
+        raise TypeError(f"module_or_modules must have at least one BlackBox, got {module_or_modules!r}")
+    return list(found)

@@ -143,12 +143,15 @@ class SecondOrder(Optimizer):
             if not losses.requires_grad:
                 raise ValueError("closure must return a loss with a graph, got one without: no parameter is in it")
             parts = list(losses.reshape(-1).unbind()) if separate else [losses.mean()]
-            return Model(
-                losses,
-                [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts],
-                self._output_modification,
-                jacobian,
-            )
+            try:
+                of_parts = [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts]
+            except RuntimeError as error:
+                if "backward through the graph a second time" in str(error):
+                    raise RuntimeError(
+                        "closure must return the loss without calling backward: the graph of the loss is freed by it"
+                    ) from error
+                raise
+            return Model(losses, of_parts, self._output_modification, jacobian)
 
     def _add(self, step: Tensor) -> None:
         """Add step [N] to the parameters."""

@@ -36,7 +36,7 @@ class LinearSurrogate:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
         points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
         self._shape = outputs.shape[1:]
-        z, y = points.double(), outputs.flatten(1).double()
+        z, y = points.double(), outputs.reshape(len(outputs), -1).double()
         self._middle, self._mean = z.mean(0), y.mean(0)
         z, y = z - self._middle, y - self._mean
         if len(z) > z.shape[1]:
@@ -55,7 +55,7 @@ class LinearSurrogate:
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         predicted = self._mean + (z.double() - self._middle) @ self._slope
-        return predicted.unflatten(1, self._shape).to(z.dtype)
+        return predicted.reshape(len(z), *self._shape).to(z.dtype)
 
 
 def _solve(square: Tensor, right: Tensor, ridge: float) -> Tensor:

@@ -117,7 +117,7 @@ class Memory:
 
     @property
     def scalar(self) -> bool:
-        """Whether the black box returns one number per point, [K]. A surrogate is then fitted to outputs [P, 1]."""
+        """Whether the black box returns one number per point, [K]. A surrogate may then return [K] or [K, 1]."""
         return bool(self._outputs) and self._outputs[0].dim() == 1
 
     def add(self, points: Tensor, outputs: Tensor) -> None:
@@ -158,8 +158,7 @@ class Memory:
 
     def _fit_rows(self) -> None:
         if hasattr(self.surrogate, "fit"):
-            points, outputs = self.points[: self._rows], self.outputs[: self._rows]
-            self.surrogate.fit(points, outputs if outputs.dim() > 1 else outputs[:, None])
+            self.surrogate.fit(self.points[: self._rows], self.outputs[: self._rows])
 
     def refresh(self) -> None:
         """Fit the surrogate if that is due: `evaluations` has grown by 30 % since the last fit."""

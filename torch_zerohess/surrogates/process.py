@@ -55,7 +55,7 @@ class ProcessSurrogate:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
         points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
         self._shape = outputs.shape[1:]
-        z, y = points.double(), outputs.flatten(1).double()
+        z, y = points.double(), outputs.reshape(len(outputs), -1).double()
         spread = z.std(0)
         spread = torch.where(spread > 0.0, spread, torch.ones_like(spread))
         u = z / spread
@@ -67,7 +67,7 @@ class ProcessSurrogate:
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         predicted = self.process(z.double() / self._lengths)
-        return predicted.unflatten(1, self._shape).to(z.dtype)
+        return predicted.reshape(len(z), *self._shape).to(z.dtype)
 
     def uncertainty(self, z: Tensor) -> Tensor:
         """Variance [K] of an element of the output at z [K, n]."""

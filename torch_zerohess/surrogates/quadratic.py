@@ -123,6 +123,9 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
     # Posterior variances: the prior one less what the evaluations tell.
     known = best.whiten(root[:, None] * s / n).square().sum(0)
     bent = best.whiten(root[:, None] * (s.square() + 0.5 * trace[:, None]) / n**2).square().sum(0)
+    # The prior knows one size of curvature for all parameters. Fewer evaluations than coefficients tell no more.
+    told = len(u) >= (n + 1) * (n + 2) // 2
+    unknown = torch.full_like(bent, math.inf)
     at_zero = _CONSTANT * alpha.sum() - 0.25 * (alpha @ trace) / n
     return LocalModel(
         float(mean + scale * at_zero),
@@ -130,7 +133,7 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
         scale * hessian,
         basis,
         spread * (1.0 / n - known).clamp_min(0.0).sqrt(),
-        spread * (3.0 / n**2 - bent).clamp_min(0.0).sqrt(),
+        spread * (3.0 / n**2 - bent).clamp_min(0.0).sqrt() if told else unknown,
         -math.inf if flat else best.log - constant.log,
     )
 

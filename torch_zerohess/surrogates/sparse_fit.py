@@ -216,7 +216,7 @@ def _slopes(
         same = (own[:, :, None] == previous.index[some][:, None]) & (previous.values[some] != 0)[:, None]
         old = (same * previous.values[some][:, None]).sum(2) * live
         A = rows[own] * live[:, :, None]  # [b, width, K]
-        prior = torch.where(old != 0, ridges[0], ridges[1]) * K * _scale(u, own)
+        prior = torch.where(old != 0, u.new_tensor(ridges[0]), u.new_tensor(ridges[1])) * K * _scale(u, own)
         gram = A @ A.mT
         gram.diagonal(dim1=1, dim2=2).add_(prior)
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))

@@ -53,7 +53,7 @@ class SparseSurrogate:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
         points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
         shape, (P, n) = outputs.shape[1:], points.shape
-        z, y = points.float(), outputs.flatten(1).float()
+        z, y = points.float(), outputs.reshape(len(outputs), -1).float()
         self._middle, self._mean = z.mean(0), y.mean(0)
         keep = min(self.keep, n, P - 2)
         if P < FEWEST_SAMPLES:
@@ -70,7 +70,7 @@ class SparseSurrogate:
             (change[:, index] * values.to(z)).sum(2)
             for index, values in zip(jacobian.index.split(size), jacobian.values.split(size), strict=True)
         ]
-        return (self._mean.to(z) + torch.cat(parts, 1)).unflatten(1, jacobian.shape)
+        return (self._mean.to(z) + torch.cat(parts, 1)).reshape(len(z), *jacobian.shape)
 
     def coordinates(self) -> tuple[LowRank, Tensor, Tensor]:
         """Return coordinates of outputs, a point [n], and the slope [n, n] of the map from its differences to them.

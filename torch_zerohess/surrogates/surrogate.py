@@ -24,6 +24,6 @@ def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
     """Return points [P, n] and outputs [P, *out] without their graphs; ValueError if a shape is wrong."""
     if points.ndim != 2 or len(points) < 2:
         raise ValueError(f"points must be [P, n] with P >= 2, got {list(points.shape)}")
-    if outputs.ndim < 2 or len(outputs) != len(points):
+    if outputs.ndim < 1 or len(outputs) != len(points):
         raise ValueError(f"outputs must be [{len(points)}, *out], one per point, got {list(outputs.shape)}")
     return points.detach(), outputs.detach()

@@ -346,3 +346,51 @@ def test_wrong_arguments_say_so() -> None:
         zh.BlackBox(render, smoothing, head=lambda y, one: y)(x, r)
     with pytest.raises(ValueError, match="references must be"):
         zh.BlackBox(render, smoothing, head=zh.heads.SquaredError())(x, r[:, :2])
+
+
+class Column:
+    """A surrogate of one number that keeps what it is given."""
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        self.shape, self.mean = outputs.shape, outputs.mean()
+
+    def __call__(self, z: Tensor) -> Tensor:
+        return self.mean.expand(len(z)) * float(self.shape[0] > 0)
+
+
+@pytest.mark.parametrize("surrogate", [None, Column()], ids=["automatic", "own"])
+def test_outputs_of_a_black_box_of_one_number_are_one_number_each(surrogate: Any) -> None:
+    memory = zh.Memory(surrogate)
+    box = zh.BlackBox(lambda z: z.square().sum(1), zh.Smoothing(sigma=0.3, samples=8, seed=0), memory=memory)
+    for step in range(4):
+        x = torch.linspace(-1.0, 1.0 + step, 6).view(3, 2).requires_grad_()
+        box(x).sum().backward()
+    if isinstance(surrogate, Column):
+        assert len(surrogate.shape) == 1
+    else:
+        assert memory.surrogate(torch.zeros(5, 2)).shape == (5,)
+        torch.testing.assert_close(memory.surrogate(torch.ones(1, 2)), torch.tensor([2.0]), rtol=0.05, atol=0.05)
+
+
+def test_memory_with_samples_of_first_order() -> None:
+    x = torch.linspace(-1.0, 1.0, 6).view(3, 2)
+    settings = zh.Smoothing(sigma=0.3, samples=8, proposal="fr22")
+    box = zh.BlackBox(lambda z: z.square().sum(1), settings, memory=zh.Memory())
+    for _ in range(4):
+        leaf = x.clone().requires_grad_()
+        box(leaf).sum().backward()
+    assert box.memory is not None
+    assert box.memory.coefficient > 0.9
+
+
+def test_a_surrogate_that_predicts_no_numbers_is_left_out() -> None:
+    x = torch.linspace(-1.0, 1.0, 6).view(3, 2)
+    settings = zh.Smoothing(sigma=0.3, samples=8, seed=0)
+    memory = zh.Memory(Fixed(lambda z: z.sum(1) * math.nan))
+    box, plain = (zh.BlackBox(lambda z: z.square().sum(1), settings, memory=one) for one in (memory, None))
+    for _ in range(4):
+        leaf, other = x.clone().requires_grad_(), x.clone().requires_grad_()
+        box(leaf).sum().backward()
+        plain(other).sum().backward()
+        assert torch.equal(leaf.grad, other.grad)
+    assert memory.coefficient == 0.0

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -138,8 +139,32 @@ def test_numbers_of_python_are_float64(name: str) -> None:
 def test_lists_keep_the_precision_of_what_is_in_them() -> None:
     for dtype in (torch.float32, torch.float64):
         assert estimate(lambda z, t=dtype: list(z[:, 0].to(t)), X, S).values.dtype == dtype
-    with pytest.raises(TypeError, match=r"real floating-point values, got torch\.int64"):
-        estimate(lambda z: [1] * len(z), X, S)
+    assert estimate(lambda z: [1] * len(z), X, S).values.dtype == torch.float64
+
+
+COUNTS = {
+    "truth values": lambda z: z[:, 0] > 0.2,
+    "of NumPy": lambda z: (z[:, 0] > 0.2).numpy(),
+    "of bytes": lambda z: (z[:, 0] > 0.2).byte(),
+    "of Python": lambda z: [bool(one > 0.2) for one in z[:, 0]],
+    "big-endian": lambda z: (z[:, 0] > 0.2).double().numpy().astype(">f8"),
+    "long doubles": lambda z: (z[:, 0] > 0.2).numpy().astype(np.longdouble),
+}
+
+
+@pytest.mark.parametrize("fn", COUNTS.values(), ids=COUNTS.keys())
+def test_integers_and_truth_values_are_numbers(fn) -> None:
+    expected = estimate(lambda z: (z[:, 0] > 0.2).double(), X, S)
+    assert torch.equal(estimate(fn, X, S).gradient, expected.gradient)
+    one = estimate(lambda z: int(z[0] > 0.2), X, S, vectorized=False)  # all of them 0 on a plateau
+    assert torch.equal(one.gradient, expected.gradient)
+
+
+@pytest.mark.parametrize("make", [lambda a: a[:, ::-1], lambda a: np.broadcast_to(a[:, :1], a.shape)])
+def test_arrays_in_any_order_and_without_the_right_to_write(make, recwarn) -> None:
+    got = estimate(lambda z: make(z.numpy()), X, S).gradient
+    assert torch.equal(got, estimate(lambda z: torch.from_numpy(make(z.numpy()).copy()), X, S).gradient)
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize("x_dtype", [torch.float32, torch.float64])

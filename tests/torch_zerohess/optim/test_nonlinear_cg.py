@@ -224,7 +224,7 @@ def test_where_the_loss_is_finite_nowhere_else_the_parameters_stay():
     with pytest.raises(ValueError, match=r"the loss \(inf\) or its gradient is not finite, nor anywhere down to"):
         optimizer.step(lambda: torch.where(x[0] == 1.0, x.sum(), torch.inf))
     assert x.tolist() == [1.0, 1.0]
-    assert optimizer.state_dict()["state"] in (before["state"], {0: {}})
+    assert optimizer.state_dict()["state"] == before["state"]
     with pytest.raises(ValueError, match=r"the loss \(nan\) or its gradient is not finite; no step"):
         optimizer.step(lambda: torch.nan * x.sum())
     with pytest.raises(ValueError, match="curvature of the loss is not finite"):

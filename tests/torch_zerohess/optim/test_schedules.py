@@ -1,6 +1,7 @@
 """The sigma schedule: its values step by step, and resuming."""
 
 import pytest
+import torch
 
 import torch_zerohess as zh
 
@@ -17,9 +18,31 @@ def test_linear_sigma():
     schedule.count = 2
     other.load_state_dict(schedule.state_dict())
     assert layer.smoothing.sigma == pytest.approx(0.8)
-    for settings in ({"start": 0.0}, {"end": -1.0}, {"steps": 0}, {"hold": -1}):
+    wrong = (
+        {"start": 0.0},
+        {"start": "a"},
+        {"end": -1.0},
+        {"end": float("inf")},
+        {"steps": 0},
+        {"steps": 2.5},
+        {"hold": -1},
+    )
+    for settings in wrong:
         arguments = {"start": 1.0, "end": 0.5, "steps": 2} | settings
         with pytest.raises(ValueError, match=next(iter(settings))):
             zh.LinearSigma(layer, **arguments)
     with pytest.raises(TypeError, match="BlackBox"):
         zh.LinearSigma([lambda z: z], 1.0, 0.5, steps=2)
+    for nothing in ([], 5, torch.nn.Linear(1, 1)):
+        with pytest.raises(TypeError, match=r"module_or_modules must .*got"):
+            zh.LinearSigma(nothing, 1.0, 0.5, steps=2)
+
+
+def test_layers_inside_of_modules():
+    layers = [zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0)) for _ in range(3)]
+    network = torch.nn.Sequential(torch.nn.Linear(2, 2), layers[0], torch.nn.Sequential(layers[1]))
+    schedule = zh.LinearSigma(module_or_modules=network, start=1.0, end=0.5, steps=2)
+    schedule.step()
+    assert [layer.smoothing.sigma for layer in layers] == [0.75, 0.75, 9.0]
+    zh.LinearSigma([network, layers[2], layers[2]], 2.0, 1.0, 1)
+    assert [layer.smoothing.sigma for layer in layers] == [2.0, 2.0, 2.0]

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+import torch_zerohess as zh
 from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.optim.second_order import Model
 from truths import spread, vector
@@ -40,3 +41,19 @@ def test_products_with_vectors_of_any_length(scale: float) -> None:
     expected = 2 * float(scale * 1e8 ** (1 if scale < 1 else -1)) * v
     torch.testing.assert_close(found.products(v)[0], expected, rtol=1e-6, atol=0.0)
     assert torch.equal(found.products(0 * v), torch.zeros(1, 2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
+def test_a_closure_that_calls_backward_is_told_not_to(kind: type) -> None:
+    p = torch.nn.Parameter(vector(1.0, 2.0))
+    optimizer = kind([p])
+
+    def closure() -> torch.Tensor:
+        loss = (p**4).sum()
+        loss.backward()
+        return loss
+
+    with pytest.raises(RuntimeError, match="closure must return the loss without calling backward"):
+        optimizer.step(closure)
+    assert torch.equal(p.detach(), vector(1.0, 2.0))
+    assert dict(optimizer.state) == {}

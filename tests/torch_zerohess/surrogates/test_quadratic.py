@@ -90,6 +90,17 @@ def test_few_points_in_many_dimensions_tell_the_mean_curvature(c):
     assert all(bool(torch.isinf(error).all()) for error in model.full_errors())
 
 
+def test_fewer_evaluations_than_coefficients_do_not_tell_the_errors_of_a_diagonal():
+    """sum_i i u_i^2: the diagonal is 2, 4, ..., and the fit is between the two ends of it."""
+    generator = torch.Generator().manual_seed(0)
+    sizes = torch.arange(1.0, 11.0, dtype=torch.float64)
+    for count, told in ((65, False), (66, True)):  # (n + 1) (n + 2) / 2 = 66
+        u = normal(generator, count, 10)
+        _, bend = fit_values(u, u.square() @ sizes, torch.ones(count, dtype=torch.float64)).full_errors()
+        assert bool(torch.isfinite(bend).all()) == told
+        assert bool(torch.isinf(bend).all()) != told
+
+
 @pytest.mark.parametrize("constant", [0.0, 0.1, -7.0, 1e12, 1e-300])
 @pytest.mark.parametrize("count", [1, 2, 10])
 def test_constant_values_are_a_plateau(constant, count):

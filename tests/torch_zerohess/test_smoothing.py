@@ -1,0 +1,33 @@
+"""Settings as values: equal, hashable, and made of numbers that any file keeps."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+
+import torch_zerohess as zh
+
+
+def test_equal_settings_are_equal():
+    one = zh.Smoothing(sigma=[0.1, 0.2], samples=4)
+    assert one == one.replace()
+    assert hash(one) == hash(zh.Smoothing(sigma=torch.tensor([0.1, 0.2], dtype=torch.float64), samples=4))
+    others = [one.replace(samples=5), one.replace(sigma=0.1), one.replace(sigma=[0.1, 0.3]), one.replace(seed=1)]
+    assert len({one, *others}) == 5
+    assert one != "text"
+
+
+@pytest.mark.parametrize("number", [np.int64(4), np.uint8(4), torch.tensor(4)])
+def test_integers_of_every_kind_are_those_of_python(number):
+    settings = zh.Smoothing(
+        sigma=1.0, samples=number, seed=number, scrambles=number, sampler="sobol", order=number // 4, antithetic=1
+    )
+    assert {type(getattr(settings, name)) for name in ("samples", "seed", "scrambles", "order")} == {int}
+    assert settings.antithetic is True
+    file = io.BytesIO()
+    torch.save(zh.BlackBox(torch.sum, settings).state_dict(), file)
+    file.seek(0)
+    other = zh.BlackBox(torch.sum, zh.Smoothing(sigma=3.0))
+    other.load_state_dict(torch.load(file))  # with weights_only
+    assert other.smoothing == settings

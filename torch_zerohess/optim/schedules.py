@@ -78,8 +78,8 @@ class LinearSigma:
 
 def _layers_of(module_or_modules: nn.Module | Iterable[nn.Module]) -> list[BlackBox]:
     """Return the black boxes in modules, each once."""
-    several = isinstance(module_or_modules, Iterable) and not isinstance(module_or_modules, nn.Module)
-    modules = list(module_or_modules) if several else [module_or_modules]
+    single = isinstance(module_or_modules, nn.Module) or not isinstance(module_or_modules, Iterable)
+    modules: list[Any] = [module_or_modules] if single else [*module_or_modules]  # type: ignore[misc]
     found: dict[BlackBox, None] = {}
     for one in modules:
         inside = [part for part in one.modules() if isinstance(part, BlackBox)] if isinstance(one, nn.Module) else []

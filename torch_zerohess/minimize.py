@@ -15,12 +15,12 @@ from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.optim.second_order import check_count
-from torch_zerohess.search.minimum import Iterate, Minimum, Status
+from torch_zerohess.search.minimum import Iterate, Minimum, Observation, Status
 from torch_zerohess.search.running import Running
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 
-__all__ = ["Iterate", "Minimum", "minimize"]
+__all__ = ["Iterate", "Minimum", "Observation", "minimize"]
 
 _AGREED = 3
 """Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
@@ -145,7 +145,7 @@ def minimize(
 
     def ended() -> tuple[Status, str] | None:
         search = running.search
-        if not running.history:
+        if not running.evaluations:
             return None
         if search.done:
             return running.ending(arrived=search.solved), search.message
@@ -181,11 +181,11 @@ def minimize(
             if end[0] != "target" or ended() == end:  # in noise the decision may refute it
                 break
     except KeyboardInterrupt:
-        if not running.history:
+        if not running.evaluations:
             raise
         end = "interrupted", "interrupted"
     except Exception as error:
-        if running.history:
+        if running.evaluations:
             error.minimum = running.minimum("failed", f"fn raised {error!r}")  # type: ignore[attr-defined]
         raise
     finally:

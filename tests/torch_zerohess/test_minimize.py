@@ -183,8 +183,7 @@ def test_the_engine_is_chosen_and_may_be_given(bounds):
     given = {engine: zh.minimize(tilted, zeros(2), engine=engine, **settings) for engine in {"descent", auto.engine}}
     for engine, fit in given.items():
         assert fit.engine == engine
-        same = torch.equal(torch.stack([one.x for one in fit.history]), torch.stack([one.x for one in auto.history]))
-        assert same == (engine == auto.engine)
+        assert torch.equal(fit.points, auto.points) == (engine == auto.engine)
 
 
 def test_seed():
@@ -195,7 +194,7 @@ def test_seed():
     points = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
-        points.append(torch.stack([one.x for one in zh.minimize(tilted, zeros(2), **settings).history]))
+        points.append(zh.minimize(tilted, zeros(2), **settings).points)
     assert torch.equal(points[0], points[1])
     assert not torch.equal(points[0], points[2])
 
@@ -283,8 +282,7 @@ def test_starts_of_lists_and_arrays():
 def test_bounds_in_every_form(bounds):
     """The minimum without them is at (3, -1)."""
     fit = zh.minimize(tilted, vector(0.0, 1.0), sigma=1.0, seed=0, bounds=bounds, max_evaluations=60)
-    points = torch.cat([one.points for one in fit.history])
-    assert bool(((points >= vector(-1.0, 0.0)) & (points <= vector(2.0, 9.0))).all())
+    assert bool(((fit.points >= vector(-1.0, 0.0)) & (fit.points <= vector(2.0, 9.0))).all())
     torch.testing.assert_close(fit.x, vector(2.0, 0.0), rtol=0, atol=1e-4)
 
 

@@ -102,8 +102,9 @@ def minimize(
             that mean and `value_error` its standard error.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
-    Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn
-    passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the message says so.
+    Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn,
+    loss or callback passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the
+    message says so.
 
     Example:
         >>> import torch
@@ -166,14 +167,17 @@ def minimize(
         return None
 
     end: tuple[Status, str]
+    black_box = blamed = "fn" if loss is None else "fn or loss"
     asked: tuple[Status, str] | None = None
     try:
         while True:
             reached = ended() or asked
             if reached is None:
                 iterate = running.step()
+                blamed = "callback"
                 if callback is not None and _is_true(callback(iterate)):
                     asked = "callback", "the callback asked to end"
+                blamed = black_box
                 continue
             end = reached
             if end[0] != "time":
@@ -186,7 +190,7 @@ def minimize(
         end = "interrupted", "interrupted"
     except Exception as error:
         if running.evaluations:
-            error.minimum = running.minimum("failed", f"fn raised {error!r}")  # type: ignore[attr-defined]
+            error.minimum = running.minimum("failed", f"{blamed} raised {error!r}")  # type: ignore[attr-defined]
         raise
     finally:
         running.write()

@@ -1,5 +1,6 @@
 """When `minimize` stops, what it says then, and what an interruption keeps."""
 
+import itertools
 import math
 
 import numpy as np
@@ -27,7 +28,7 @@ def test_iterates_go_down_and_add_up():
     fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=50, callback=seen.append)
     assert len(seen) == f.calls
     assert fit.evaluations == f.points == seen[-1].evaluations
-    for before, after in zip(seen, seen[1:], strict=False):
+    for before, after in itertools.pairwise(seen):
         assert after.evaluations > before.evaluations
         assert after.value <= before.value
     for one in seen:
@@ -175,6 +176,19 @@ def test_a_time_limit_ends_it():
     fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, time_limit=0.0, callback=seen.append)
     assert (fit.status, fit.success) == ("time", False)
     assert len(seen) == 1
+
+
+def test_an_exception_says_whose_it_is():
+    settings = {"sigma": 2.0, "seed": 0}
+    with pytest.raises(ZeroDivisionError) as caught:
+        zh.minimize(tilted, zeros(2), callback=raising(lambda one: None, 1), **settings)
+    assert caught.value.minimum.message == "callback raised ZeroDivisionError()"
+    with pytest.raises(ZeroDivisionError) as caught:
+        zh.minimize(raising(tilted, 1), zeros(2), callback=lambda one: None, **settings)
+    assert caught.value.minimum.message == "fn raised ZeroDivisionError()"
+    with pytest.raises(ZeroDivisionError) as caught:
+        zh.minimize(lambda z: z, zeros(2), loss=raising(torch.sum, 9), **settings)
+    assert caught.value.minimum.message == "fn or loss raised ZeroDivisionError()"
 
 
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])

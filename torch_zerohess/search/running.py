@@ -75,15 +75,15 @@ class Running:
         self._batches = list[tuple[Tensor, Tensor]]()
         self._begun = self._written = self._said = time.monotonic()
         self._decided: Decision | None = None
-        saved: dict[str, Any] | None = None
-        if path is not None and path.exists():
-            saved = torch.load(path, weights_only=True)
-            self.noise = saved["noise"]
-            self._batches, self.evaluations = [(saved["points"], saved["values"])], len(saved["points"])
-            self._decided = None if saved["decided"] is None else Decision(**saved["decided"])
-        self.search = make(self.noise or 0.0)
-        if saved is not None:
-            self.search.load_state_dict(saved["search"])
+        if path is None or not path.exists():
+            self.search = make(self.noise or 0.0)
+            return
+        try:
+            self._resume(torch.load(path, map_location="cpu", weights_only=True))
+        except Exception as error:
+            why = str(error) if isinstance(error, ValueError) else type(error).__name__
+            wanted = "a new file, or one that minimize wrote with the same settings"
+            raise ValueError(f"checkpoint must be {wanted}, got {path}: {why}") from error
 
     @property
     def seconds(self) -> float:
@@ -199,6 +199,18 @@ class Running:
             value_error=error,
             noise=self.noise or 0.0,
         )
+
+    def _resume(self, saved: dict[str, Any]) -> None:
+        """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
+        self.noise = saved["noise"]
+        self.search = self._make(self.noise or 0.0)
+        x, points, losses = self.search.x, saved["points"], saved["values"]
+        if points.dtype != x.dtype:
+            raise ValueError(f"x0 must be {points.dtype} as there, got {x.dtype}")
+        self.search.load_state_dict(saved["search"])
+        self._batches, self.evaluations = [(points.to(x.device), losses.to(x.device))], len(points)
+        if saved["decided"] is not None:
+            self._decided = Decision(**saved["decided"] | {"x": saved["decided"]["x"].to(x)})
 
     @property
     def _last(self) -> Decision | None:

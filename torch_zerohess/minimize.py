@@ -4,23 +4,22 @@ import difflib
 import inspect
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.evaluation import BlackBoxCall
-from torch_zerohess.estimation.inputs import checked_input, working
+from torch_zerohess.estimation.inputs import working
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.evaluators.process_pool import ProcessPool
-from torch_zerohess.optim.second_order import check_count
-from torch_zerohess.search.minimum import Iterate, Minimum, Status
+from torch_zerohess.search.arguments import check_callable, checked_file, checked_integer, checked_number
+from torch_zerohess.search.minimum import Iterate, Minimum, Observation, Status
 from torch_zerohess.search.running import Running
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 
-__all__ = ["Iterate", "Minimum", "minimize"]
+__all__ = ["Iterate", "Minimum", "Observation", "minimize"]
 
 _AGREED = 3
 """Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
@@ -70,11 +69,12 @@ def minimize(
     Args:
         fn: [K, n] -> [K] or [K, 1], the loss; or, with `loss`, -> [K, *out], an image or another output. NumPy and
             anything else that cannot be differentiated is fine.
-        x0: start [n]: a tensor, a NumPy array, a list or a tuple.
+        x0: start [n]: a tensor, a NumPy array, a list or a tuple. Integers become float64.
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution.
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
             there is one, give it: each evaluation then tells as many equations as the output has numbers.
-        bounds: (lower, upper), numbers or [n] or None; a list of n tuples (lower, upper); or `scipy.optimize.Bounds`.
+        bounds: (lower, upper), numbers or [n] or None; n pairs (lower, upper), a list of tuples or an array [n, 2]; or
+            `scipy.optimize.Bounds`.
         max_evaluations: points that fn may be called with.
         engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
             and, for an output of 20 parameters or more, by the first evaluations.
@@ -93,7 +93,7 @@ def minimize(
         ftol: the search ends when its model, where it holds, promises a decrease of at most this.
         time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
-            from it: the function and all settings must be the same.
+            from it: the function and all settings must be the same. ValueError if it is no such file.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up or three rounds in a row have arrived at the same point.
         noise: standard deviation of repeated losses at one point. If None it is measured: x0 is evaluated twice, and
@@ -102,8 +102,9 @@ def minimize(
             that mean and `value_error` its standard error.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
-    Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn
-    passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the message says so.
+    Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn,
+    loss or callback passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the
+    message says so.
 
     Example:
         >>> import torch
@@ -112,13 +113,18 @@ def minimize(
         (True, True, 'solved')
     """
     _check_names(settings)
-    for name, value in (("xtol", xtol), ("ftol", ftol), ("time_limit", time_limit)):
-        if value is not None and not value >= 0.0:
-            raise ValueError(f"{name} must be at least 0, got {value}")
+    check_callable(callback=callback, evaluator=evaluator)
+    max_evaluations = checked_integer("max_evaluations", max_evaluations)
+    batch = checked_integer("batch", batch, 1)
+    target = None if target is None else checked_number("target", target)
+    xtol = None if xtol is None else checked_number("xtol", xtol, 0.0)
+    ftol = None if ftol is None else checked_number("ftol", ftol, 0.0)
+    time_limit = None if time_limit is None else checked_number("time_limit", time_limit, 0.0)
+    path = None if checkpoint is None else checked_file("checkpoint", checkpoint)
     if evaluator is not None and workers is not None:
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
-    start = working(checked_input(x0)) if isinstance(x0, Tensor) else checked_start(x0)
-    rounds = max(max_evaluations if restarts is None else restarts, 0)
+    start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
+    rounds = max(max_evaluations, 0) if restarts is None else restarts
     seed = int(torch.randint(2**63 - 1, ())) if seed is None else seed
 
     def make(noise: float) -> TrustRegion:
@@ -137,15 +143,23 @@ def minimize(
             f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(start)} "
             f"parameters, got {max_evaluations}"
         )
-    check_count(max_evaluations=max_evaluations, batch=batch)
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or own or Inline())
-    path = None if checkpoint is None else Path(checkpoint)
-    running = Running(make, call, noise, batch, smallest, max_evaluations, path, verbose=verbose)
+
+    def evaluated(points: Tensor, aux: Sequence[Tensor]) -> Tensor:
+        values = call(points, aux)
+        if loss is None and values.shape[1:] not in ((), (1,)):
+            raise ValueError(
+                f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
+                f"{len(points)} points"
+            )
+        return values
+
+    running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, verbose=verbose)
 
     def ended() -> tuple[Status, str] | None:
         search = running.search
-        if not running.history:
+        if not running.evaluations:
             return None
         if search.done:
             return running.ending(arrived=search.solved), search.message
@@ -166,14 +180,17 @@ def minimize(
         return None
 
     end: tuple[Status, str]
+    black_box = blamed = "fn" if loss is None else "fn or loss"
     asked: tuple[Status, str] | None = None
     try:
         while True:
             reached = ended() or asked
             if reached is None:
                 iterate = running.step()
+                blamed = "callback"
                 if callback is not None and _is_true(callback(iterate)):
                     asked = "callback", "the callback asked to end"
+                blamed = black_box
                 continue
             end = reached
             if end[0] != "time":
@@ -181,12 +198,12 @@ def minimize(
             if end[0] != "target" or ended() == end:  # in noise the decision may refute it
                 break
     except KeyboardInterrupt:
-        if not running.history:
+        if not running.evaluations:
             raise
         end = "interrupted", "interrupted"
     except Exception as error:
-        if running.history:
-            error.minimum = running.minimum("failed", f"fn raised {error!r}")  # type: ignore[attr-defined]
+        if running.evaluations:
+            error.minimum = running.minimum("failed", f"{blamed} raised {error!r}")  # type: ignore[attr-defined]
         raise
     finally:
         running.write()

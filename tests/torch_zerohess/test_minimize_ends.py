@@ -1,5 +1,6 @@
 """When `minimize` stops, what it says then, and what an interruption keeps."""
 
+import itertools
 import math
 
 import numpy as np
@@ -22,17 +23,17 @@ class Counted:
         return self.fn(z)
 
 
-def test_history_goes_down_and_adds_up():
-    f = Counted(tilted)
-    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=50)
-    assert len(fit.history) == f.calls
-    assert fit.evaluations == f.points == fit.history[-1].evaluations
-    for before, after in zip(fit.history, fit.history[1:], strict=False):
+def test_iterates_go_down_and_add_up():
+    f, seen = Counted(tilted), []
+    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=50, callback=seen.append)
+    assert len(seen) == f.calls
+    assert fit.evaluations == f.points == seen[-1].evaluations
+    for before, after in itertools.pairwise(seen):
         assert after.evaluations > before.evaluations
         assert after.value <= before.value
-    for one in fit.history:
+    for one in seen:
         assert one.value == float(tilted(one.x[None]))
-    assert fit.history[-1].value == fit.value
+    assert seen[-1].value == fit.value
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
@@ -70,8 +71,8 @@ def test_callback():
     fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=callback)
     for answer in (torch.tensor(True), np.True_):
         one = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=lambda one: answer)  # noqa: B023
-        assert len(one.history) == 1
-    assert seen == fit.history
+        assert len(one.history) == seen[0].evaluations
+    assert seen[-1].evaluations == fit.evaluations
     assert len(seen) == 4
     assert fit.message == "the callback asked to end"
     none = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=20, callback=lambda one: "go on")
@@ -93,13 +94,15 @@ def interrupted(fn, call):
 @pytest.mark.parametrize("where", ["fn", "callback"])
 def test_interrupted(where):
     """Ctrl-C in the fifth call returns what was found until then."""
+    seen = []
     if where == "fn":
-        fit = zh.minimize(interrupted(tilted, 4), zeros(2), sigma=2.0, seed=0)
+        fit = zh.minimize(interrupted(tilted, 4), zeros(2), sigma=2.0, seed=0, callback=seen.append)
     else:
-        fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=interrupted(lambda one: None, 4))
+        fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=interrupted(seen.append, 4))
     plain = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=lambda one: one.evaluations == fit.evaluations)
     assert fit.message == "interrupted"
-    assert len(fit.history) == (4 if where == "fn" else 5)
+    assert len(seen) == 4
+    assert (fit.evaluations == seen[-1].evaluations) == (where == "fn")
     assert torch.equal(fit.x, plain.x)
     assert fit.value == plain.value == min(one.value for one in fit.history)
 
@@ -123,7 +126,7 @@ def test_an_exception_passes():
     assert len(calls) == 4
     found = caught.value.minimum
     assert (found.status, found.success, found.evaluations) == ("failed", False, sum(calls[:3]))
-    assert len(found.history) == 3
+    assert len(found.history) == sum(calls[:3])
 
 
 def test_values_that_are_not_finite_on_the_way():
@@ -162,15 +165,30 @@ def test_tolerances_end_it_early(name):
 
 
 def test_a_tolerance_ends_nothing_before_it_has_begun():
-    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, xtol=9.0)
-    assert len(fit.history) == 1
+    seen = []
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, xtol=9.0, callback=seen.append)
+    assert len(seen) == 1
     assert fit.value == float(tilted(fit.x[None]))
 
 
 def test_a_time_limit_ends_it():
-    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, time_limit=0.0)
+    seen = []
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, time_limit=0.0, callback=seen.append)
     assert (fit.status, fit.success) == ("time", False)
-    assert len(fit.history) == 1
+    assert len(seen) == 1
+
+
+def test_an_exception_says_whose_it_is():
+    settings = {"sigma": 2.0, "seed": 0}
+    with pytest.raises(ZeroDivisionError) as caught:
+        zh.minimize(tilted, zeros(2), callback=raising(lambda one: None, 1), **settings)
+    assert caught.value.minimum.message == "callback raised ZeroDivisionError()"
+    with pytest.raises(ZeroDivisionError) as caught:
+        zh.minimize(raising(tilted, 1), zeros(2), callback=lambda one: None, **settings)
+    assert caught.value.minimum.message == "fn raised ZeroDivisionError()"
+    with pytest.raises(ZeroDivisionError) as caught:
+        zh.minimize(lambda z: z, zeros(2), loss=raising(torch.sum, 9), **settings)
+    assert caught.value.minimum.message == "fn or loss raised ZeroDivisionError()"
 
 
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
@@ -180,13 +198,37 @@ def test_a_total_plateau_is_said(bounds):
     assert fit.message.endswith(f"all {fit.evaluations} values are equal: enlarge sigma")
 
 
-def test_history_has_every_point_and_value():
-    f = Counted(tilted)
-    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=30)
-    points, values = (torch.cat([getattr(one, name) for one in fit.history]) for name in ("points", "values"))
-    assert len(points) == f.points == 30
-    assert torch.equal(values, tilted(points))
-    assert fit.value == float(values.min())
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_history_has_every_point_and_value_in_order(dtype):
+    seen = []
+
+    def f(z):
+        values = tilted(z)
+        seen.extend(zip(z.clone(), values.tolist(), strict=True))
+        z.zero_()
+        return values
+
+    fit = zh.minimize(f, zeros(2, dtype=dtype), sigma=2.0, seed=0, batch=3, max_evaluations=30)
+    assert len(fit.history) == fit.evaluations == len(seen) == 30
+    for (x, value), (point, loss) in zip(fit.history, seen, strict=True):
+        assert x.dtype == dtype
+        assert torch.equal(x, point)
+        assert value == loss
+    assert torch.equal(fit.points, torch.stack([x for x, _ in fit.history]))
+    assert fit.values.tolist() == [one.value for one in fit.history]
+    assert fit.value == min(fit.values.tolist())
+
+
+def test_a_callback_cannot_change_the_search():
+    def callback(one):
+        for tensor in (one.x, one.points, one.values):
+            tensor.zero_()
+
+    plain, fit = (
+        zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=30, callback=one) for one in (None, callback)
+    )
+    for name in ("x", "points", "values", "gradient", "hessian"):
+        assert torch.equal(getattr(fit, name), getattr(plain, name))
 
 
 def test_a_checkpoint_goes_on_where_it_was(tmp_path):
@@ -198,7 +240,8 @@ def test_a_checkpoint_goes_on_where_it_was(tmp_path):
     rest = zh.minimize(f, zeros(2), sigma=2.0, seed=1, max_evaluations=40, checkpoint=path)
     assert f.points < 40
     assert torch.equal(rest.x, whole.x)
-    assert [one.evaluations for one in rest.history] == [one.evaluations for one in whole.history]
+    assert torch.equal(rest.points, whole.points)
+    assert torch.equal(rest.values, whole.values)
 
 
 def raising(fn, call):

@@ -1,7 +1,8 @@
 """What a minimisation tells while it goes on and at its end."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +13,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Status = Literal["target", "solved", "stalled", "budget", "time", "callback", "interrupted", "failed"]
+
+
+class Observation(NamedTuple):
+    """A point at which the function was evaluated [n], and the loss there."""
+
+    x: Tensor
+    value: float
 
 
 @dataclass(frozen=True)
@@ -44,8 +52,10 @@ class Minimum:
     sigma: Tensor
     """Width of the model per parameter [n]."""
     evaluations: int
-    history: list[Iterate]
-    """After every batch, with all points and losses in order."""
+    points: Tensor
+    """All points that were evaluated, in order [evaluations, n]."""
+    values: Tensor
+    """The losses at `points` [evaluations], float64."""
     message: str
     """Why the search ended."""
     engine: str
@@ -62,15 +72,10 @@ class Minimum:
     noise: float = 0.0
     """Standard deviation of repeated losses at one point, as it was given or measured; 0 without noise."""
 
-    @property
-    def points(self) -> Tensor:
-        """All points that were evaluated, in order [evaluations, n]."""
-        return torch.cat([one.points for one in self.history])
-
-    @property
-    def values(self) -> Tensor:
-        """The losses at `points` [evaluations]."""
-        return torch.cat([one.values for one in self.history])
+    @cached_property
+    def history(self) -> list[Observation]:
+        """Every point and its loss, in order: x [n], a row of `points`, and value, a float."""
+        return [Observation(x, value) for x, value in zip(self.points, self.values.tolist(), strict=True)]
 
     def plot(self, axes: "Axes | None" = None) -> "Axes":
         """Draw the loss of every evaluation, and the lowest so far as a line, and return the axes.

@@ -8,6 +8,7 @@ To add a search: a subclass of `Progress` with its fields, a subclass of `Method
 """
 
 import math
+import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
+from torch_zerohess.search.arguments import check_callable, checked_integer, checked_number
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
@@ -59,18 +61,19 @@ class AskTell(ABC, Generic[P]):
         seed: int | None = None,
     ) -> None:
         x0 = checked_start(x0)
-        for name, value in (("restarts", restarts), ("noise", noise)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be finite and at least 0, got {value}")
-        if not 0.0 < tolerance < 1.0:
+        check_callable(loss=loss)
+        restarts = checked_integer("restarts", restarts, 0)
+        if not 0 <= checked_number("noise", noise) < math.inf:
+            raise ValueError(f"noise must be finite and at least 0, got {noise}")
+        if not 0.0 < checked_number("tolerance", tolerance) < 1.0:
             raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
-        if pool is not None and pool < 4:
-            raise ValueError(f"pool must be at least 4, got {pool}")
+        pool = None if pool is None else checked_integer("pool", pool, 4)
+        seed = int(torch.randint(2**63 - 1, ())) if seed is None else checked_integer("seed", seed)
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
         self._method = self._make(Settings(start, lower, upper, loss, restarts, tolerance, float(noise), pool))
         generator = torch.Generator()
-        generator.manual_seed(int(torch.randint(2**63 - 1, ())) if seed is None else seed)
+        generator.manual_seed(seed)
         self._state = self._after(*self._method.first(generator), generator)
         self._out: Tensor | None = self._state.asked[:0]
         """Points out for evaluation [K, n], None if `load_state_dict` does not know."""
@@ -191,9 +194,8 @@ class AskTell(ABC, Generic[P]):
 
         ValueError for a batch or limit below 1, RuntimeError if the search is done.
         """
-        for name, value in (("batch", batch), ("limit", limit)):
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+        batch = checked_integer("batch", batch, 1)
+        limit = None if limit is None else checked_integer("limit", limit, 1)
         if self.done:
             raise RuntimeError(f"the search is done: {self.message}")
         if self._early:
@@ -298,7 +300,11 @@ class AskTell(ABC, Generic[P]):
         return torch.cat([points, self._space.rounded(further)])
 
     def _converted(self, values: Any) -> Tensor:
-        return torch.as_tensor(values, dtype=torch.float64).detach().to(self.unit.device)
+        try:
+            values = torch.as_tensor(values, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}") from error
+        return values.detach().to(self.unit.device)
 
     def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:
         """Return what was told about points [K, n], of which those beyond the search's own are from `Method.more`."""

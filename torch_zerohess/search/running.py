@@ -66,22 +66,24 @@ class Running:
         *,
         verbose: bool,
     ) -> None:
-        self.history = list[Iterate]()
+        self.evaluations = 0
+        """Values so far, those that measure noise included."""
         self.noise = noise
         """Standard deviation of repeated losses; None before it is known."""
         self._make, self._call, self._batch, self._least, self._most = make, call, batch, least, most
         self._path, self._verbose = path, verbose
+        self._batches = list[tuple[Tensor, Tensor]]()
         self._begun = self._written = self._said = time.monotonic()
         self._decided: Decision | None = None
-        saved: dict[str, Any] | None = None
-        if path is not None and path.exists():
-            saved = torch.load(path, weights_only=True)
-            self.noise = saved["noise"]
-            self.history = [Iterate(**one) for one in saved["history"]]
-            self._decided = None if saved["decided"] is None else Decision(**saved["decided"])
-        self.search = make(self.noise or 0.0)
-        if saved is not None:
-            self.search.load_state_dict(saved["search"])
+        if path is None or not path.exists():
+            self.search = make(self.noise or 0.0)
+            return
+        try:
+            self._resume(torch.load(path, map_location="cpu", weights_only=True))
+        except Exception as error:
+            why = str(error) if isinstance(error, ValueError) else type(error).__name__
+            wanted = "a new file, or one that minimize wrote with the same settings"
+            raise ValueError(f"checkpoint must be {wanted}, got {path}: {why}") from error
 
     @property
     def seconds(self) -> float:
@@ -89,9 +91,12 @@ class Running:
         return time.monotonic() - self._begun
 
     @property
-    def evaluations(self) -> int:
-        """Values so far, those that measure noise included."""
-        return self.history[-1].evaluations if self.history else 0
+    def told(self) -> tuple[Tensor, Tensor]:
+        """All points [evaluations, n] and their losses [evaluations], in order; there must be some."""
+        if len(self._batches) > 1:
+            points, losses = zip(*self._batches, strict=True)
+            self._batches = [(torch.cat(points), torch.cat(losses))]
+        return self._batches[0]
 
     @property
     def left(self) -> int:
@@ -103,8 +108,8 @@ class Running:
     @property
     def flat(self) -> bool:
         """Whether all values are equal."""
-        first = self.history[0].values[0] if self.history else math.nan
-        return all(bool((one.values == first).all()) for one in self.history)
+        losses = self.told[1]
+        return bool((losses == losses[0]).all())
 
     def step(self) -> Iterate:
         """Evaluate what the search asks for next; in the first batch the start twice, if noise is to be measured."""
@@ -129,17 +134,15 @@ class Running:
             return self._last.value <= target
         value, decided = self.search.value, self._decided
         if decided is not None:
-            since = [one.values for one in self.history if one.evaluations > decided.evaluations]
-            value = float(torch.cat(since).nan_to_num(nan=math.inf).min())
+            value = float(self.told[1][decided.evaluations :].nan_to_num(nan=math.inf).min())
         return value <= target - _LUCK * (self.noise or 0.0)
 
     def decide(self) -> None:
         """In noise, find out which of the best points has the lowest mean, with the evaluations kept for that."""
         search = self.search
-        if not self.noise or not self.history or self._most <= self.evaluations or self._last is not None:
+        if not self.noise or not self.evaluations or self._most <= self.evaluations or self._last is not None:
             return
-        points = torch.cat([one.points for one in self.history])
-        losses = torch.cat([one.values for one in self.history])
+        points, losses = self.told
         lowest = torch.where(torch.isfinite(losses), losses, torch.inf).argsort()[:_OTHERS]
         candidates = distinct([search.x, search.center, *points[lowest]])
         most = min(reserved(self._most), self._most - self.evaluations)
@@ -150,19 +153,20 @@ class Running:
 
     def write(self) -> None:
         """Write the file; it is never half written."""
-        if self._path is None or not self.history:
+        if self._path is None or not self.evaluations:
             return
         self._written = time.monotonic()
         draft = self._path.with_name(f"{self._path.name}.part")
         decided = None if self._decided is None else vars(self._decided)
-        saved = {"history": [vars(one) for one in self.history], "noise": self.noise, "decided": decided}
+        points, losses = self.told
+        saved = {"points": points, "values": losses, "noise": self.noise, "decided": decided}
         torch.save(saved | {"search": self.search.state_dict()}, draft)
         draft.replace(self._path)
 
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""
         search = self.search
-        x, value, error = self._best(self.history[0].points, self.history[0].values)
+        (x, value, error), (points, losses) = self._best(), self.told
         found = self._model(x)
         gradient = hessian = errors = None
         unit = search.unit
@@ -186,7 +190,8 @@ class Running:
             standard_errors=errors,
             sigma=unit.to(x),
             evaluations=self.evaluations,
-            history=self.history,
+            points=points,
+            values=losses,
             message=message,
             engine=search.engine,
             success=success,
@@ -195,34 +200,42 @@ class Running:
             noise=self.noise or 0.0,
         )
 
+    def _resume(self, saved: dict[str, Any]) -> None:
+        """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
+        self.noise = saved["noise"]
+        self.search = self._make(self.noise or 0.0)
+        x, points, losses = self.search.x, saved["points"], saved["values"]
+        if points.dtype != x.dtype:
+            raise ValueError(f"x0 must be {points.dtype} as there, got {x.dtype}")
+        self.search.load_state_dict(saved["search"])
+        self._batches, self.evaluations = [(points.to(x.device), losses.to(x.device))], len(points)
+        if saved["decided"] is not None:
+            self._decided = Decision(**saved["decided"] | {"x": saved["decided"]["x"].to(x)})
+
     @property
     def _last(self) -> Decision | None:
         """The decision, unless the search has gone on since."""
         decided = self._decided
         return decided if decided is not None and decided.evaluations == self.evaluations else None
 
-    def _best(self, points: Tensor, losses: Tensor) -> tuple[Tensor, float, float]:
-        """Return the best point, its value and the error of that.
-
-        Until the search was told values these are of the start, among the first points [K, n] with losses [K].
-        """
+    def _best(self) -> tuple[Tensor, float, float]:
+        """Return the best point, its value and the error of that; of the start until the search was told values."""
         if self._last is not None:
             return self._last.x, self._last.value, self._last.error
         search, noise = self.search, self.noise or 0.0
         if search.evaluations:
             return search.x, search.value, noise
+        points, losses = self.told
         losses = losses[(points == search.x).all(1) & torch.isfinite(losses)]
         return search.x, float(losses.mean()), noise / math.sqrt(len(losses))
 
     def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
         """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better."""
         found = self.search.model_at_best(x)
-        if self.noise or not self.history or len(x) > _FITTED:
+        if self.noise or len(x) > _FITTED:
             return found
-        unit = self.search.unit
-        points = torch.cat([one.points for one in self.history]).to(unit) / unit
-        losses = torch.cat([one.values for one in self.history]).to(unit)
-        around = quadratic_around(x.to(unit) / unit, points, losses)
+        unit, (points, losses) = self.search.unit, self.told
+        around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit))
         return found if around is None or (found is not None and around[2] > _EXACT) else around[:2]
 
     def _first(self, points: Tensor) -> Iterate:
@@ -254,9 +267,9 @@ class Running:
 
     def _noted(self, points: Tensor, losses: Tensor) -> Iterate:
         """Return what is known after a batch at points [K, n] with losses [K], and write it where it is due."""
-        first = self.history[0] if self.history else None
-        x, value, _ = self._best(points, losses) if first is None else self._best(first.points, first.values)
-        self.history.append(Iterate(self.evaluations + len(points), value, x, points.clone(), losses.clone()))
+        self._batches.append((points, losses))
+        self.evaluations += len(points)
+        x, value, _ = self._best()
         now = time.monotonic()
         if self._verbose and now - self._said >= _PAUSE:
             self._said = now
@@ -264,4 +277,4 @@ class Running:
             print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)
         if now - self._written >= _PAUSE:
             self.write()
-        return self.history[-1]
+        return Iterate(self.evaluations, value, x, points.clone(), losses.clone())

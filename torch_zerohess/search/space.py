@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 Bounds = Any
-"""(lower, upper), numbers or [n] or None; a list of n pairs (lower, upper); or `scipy.optimize.Bounds`."""
+"""(lower, upper), numbers or [n] or None; n pairs (lower, upper), a list or [n, 2]; or `scipy.optimize.Bounds`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,16 @@ class Space:
 def checked_start(x0: Any) -> Tensor:
     """Return a start as a tensor [n]; ValueError if it is not finite, or neither float32 nor float64.
 
-    A NumPy array of floats keeps its type. Lists, tuples and integers of NumPy become float64.
+    A NumPy array of floats keeps its type. Lists, tuples and integers of NumPy or torch become float64.
     """
     if not isinstance(x0, Tensor):
+        kept = str(getattr(x0, "dtype", "")) in ("float32", "complex64", "complex128")
         try:
-            x0 = torch.as_tensor(x0, dtype=None if str(getattr(x0, "dtype", "")) == "float32" else torch.float64)
+            x0 = torch.as_tensor(x0, dtype=None if kept else torch.float64)
         except (TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"x0 must be a tensor, an array or a list of n numbers, got {x0!r}") from error
+    elif not x0.is_floating_point() and not x0.is_complex():
+        x0 = x0.double()
     if x0.dtype not in (torch.float32, torch.float64) or x0.ndim != 1 or not len(x0):
         raise ValueError(f"x0 must be a tensor [n], float32 or float64, got {x0!r}")
     if not bool(torch.isfinite(x0).all()):
@@ -61,7 +64,10 @@ def checked_start(x0: Any) -> Tensor:
 
 def _unit(sigma: float | Tensor | Sequence[float], x0: Tensor) -> Tensor:
     """Return sigma as float64 [n]."""
-    unit = torch.as_tensor(sigma, dtype=torch.float64, device=x0.device).detach()
+    try:
+        unit = torch.as_tensor(sigma, dtype=torch.float64, device=x0.device).detach()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"sigma must be a number, or one per parameter [{len(x0)}], got {sigma!r}") from error
     if unit.shape not in ((), x0.shape) or not bool((torch.isfinite(unit) & (unit > 0)).all()):
         raise ValueError(f"sigma must be positive and finite, one value or one per parameter [{len(x0)}], got {sigma}")
     start = x0.detach()
@@ -102,10 +108,14 @@ def _bounds(bounds: Bounds | None, x0: Tensor) -> tuple[Tensor, Tensor]:
 def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
     """Return lower and upper of bounds in any form; ValueError if two forms are possible.
 
-    A list of tuples is a list of pairs.
+    A list of tuples is a list of pairs. An array or tensor is read as the list of its rows.
     """
     if hasattr(bounds, "lb") and hasattr(bounds, "ub"):  # scipy.optimize.Bounds
         return bounds.lb, bounds.ub
+    if hasattr(bounds, "tolist"):
+        bounds = bounds.tolist()
+    if isinstance(bounds, str) or not hasattr(bounds, "__iter__"):
+        raise TypeError(f"bounds must be (lower, upper) or a list of {n} pairs, got {bounds!r}")
     if not isinstance(bounds, (tuple, list)):
         bounds = tuple(bounds)
     pairs = len(bounds) == n and all(isinstance(one, (tuple, list)) and len(one) == 2 for one in bounds)
@@ -114,7 +124,7 @@ def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
         return columns[0], columns[1]
     if pairs and n == 2 and _in_order(*bounds) and _in_order(*columns):
         raise ValueError(
-            f"bounds of 2 parameters must be (lower, upper) as tensors, or a list of tuples, got {bounds}, "
+            f"bounds of 2 parameters must be (lower, upper), each a tensor, or a list of tuples, got {bounds}, "
             f"meaning lower = {columns[0]} or lower = {list(bounds[0])}"
         )
     if pairs and (n != 2 or not _in_order(*bounds)):
@@ -131,6 +141,9 @@ def _in_order(lower: Any, upper: Any) -> bool:
 
 def _side(one: Any, none: float) -> Tensor:
     """Return a bound as float64; `none` where there is none."""
-    if isinstance(one, (tuple, list)):
-        one = [none if each is None else float(each) for each in one]
-    return torch.as_tensor(none if one is None else one, dtype=torch.float64)
+    try:
+        if isinstance(one, (tuple, list)):
+            one = [none if each is None else float(each) for each in one]
+        return torch.as_tensor(none if one is None else one, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"bounds must be numbers, tensors [n] or None, got {one!r}") from error

@@ -98,8 +98,8 @@ def test_an_output_with_noise_is_noticed():
 def test_every_evaluation_is_in_the_history():
     f = Counted(noisy(1))
     fit = zh.minimize(f, zeros(2), sigma=2.0, bounds=(-5, 5), seed=0, max_evaluations=60)
-    assert torch.equal(torch.cat([one.points for one in fit.history]), torch.cat(f.points))
-    assert fit.evaluations == fit.history[-1].evaluations == len(torch.cat(f.points)) <= 60
+    assert torch.equal(torch.stack([one.x for one in fit.history]), torch.cat(f.points))
+    assert fit.evaluations == len(fit.history) == len(torch.cat(f.points)) <= 60
 
 
 def test_a_lucky_draw_does_not_reach_the_target():

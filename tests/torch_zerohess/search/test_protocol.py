@@ -233,7 +233,7 @@ SETTINGS = [
     ({"bounds": (-1.0, 1.0, 2.0)}, "got 3 entries"),
     ({"bounds": (0.5, 1.0)}, "x0 must be within the bounds, got 0.0 at index 0"),
     ({"bounds": (-1.0, vector(1.0, -0.5))}, "got 0.0 at index 1"),
-    ({"restarts": -1}, "restarts must be finite and at least 0, got -1"),
+    ({"restarts": -1}, "restarts must be at least 0, got -1"),
     ({"noise": -1.0}, "noise must be finite and at least 0"),
     ({"noise": math.nan}, "noise must be finite and at least 0"),
     ({"tolerance": 0.0}, "tolerance must be between 0 and 1"),

@@ -1,0 +1,115 @@
+"""What `minimize` refuses: the error names the argument and its value, and comes before the first evaluation."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from searches import tilted, zeros
+
+import torch_zerohess as zh
+
+REFUSED = [
+    ({"engine": "newton"}, ValueError, "engine must be one of .*, got 'newton'"),
+    ({"x0": ["a", 0.0]}, ValueError, r"x0 must be a tensor, an array or a list of n numbers, got \['a', 0.0\]"),
+    ({"x0": zeros(2) + 1j}, ValueError, r"x0 must be a tensor \[n\], float32 or float64, got tensor.*complex128"),
+    ({"x0": np.zeros(2) + 1j}, ValueError, r"x0 must be a tensor \[n\], float32 or float64, got tensor.*complex128"),
+    ({"x0": torch.zeros(2, 2)}, ValueError, r"x0 must be a tensor \[n\]"),
+    ({"maxiter": 5}, TypeError, "no argument maxiter; did you mean max_evaluations"),
+    ({"restart": 5}, TypeError, "no argument restart; did you mean restarts"),
+    ({"qqq": 5}, TypeError, "no argument qqq; there are"),
+    ({"max_evaluations": None}, TypeError, "max_evaluations must be an integer, got None"),
+    ({"max_evaluations": 1e3}, TypeError, "max_evaluations must be an integer, got 1000.0"),
+    ({"batch": "a"}, TypeError, "batch must be an integer, got 'a'"),
+    ({"batch": 0}, ValueError, "batch must be at least 1, got 0"),
+    ({"xtol": -1.0}, ValueError, "xtol must be at least 0, got -1.0"),
+    ({"xtol": "a"}, TypeError, "xtol must be a number, got 'a'"),
+    ({"ftol": math.nan}, ValueError, "ftol must be at least 0, got nan"),
+    ({"time_limit": "1"}, TypeError, "time_limit must be a number, got '1'"),
+    ({"target": math.nan}, ValueError, "target must be a number, got nan"),
+    ({"callback": 5}, TypeError, "callback must be callable, got 5"),
+    ({"evaluator": 5}, TypeError, "evaluator must be callable, got 5"),
+    ({"loss": "mse"}, TypeError, "loss must be callable, got 'mse'"),
+    ({"fn": 3}, TypeError, "fn must be callable, got 3"),
+    ({"seed": "a"}, TypeError, "seed must be an integer, got 'a'"),
+    ({"seed": 1.5}, TypeError, "seed must be an integer, got 1.5"),
+    ({"restarts": -1}, ValueError, "restarts must be at least 0, got -1"),
+    ({"restarts": 1.5}, TypeError, "restarts must be an integer, got 1.5"),
+    ({"noise": "a"}, TypeError, "noise must be a number, got 'a'"),
+    ({"noise": math.inf}, ValueError, "noise must be finite and at least 0, got inf"),
+    ({"tolerance": 2.0}, ValueError, "tolerance must be between 0 and 1"),
+    ({"tolerance": None}, TypeError, "tolerance must be a number, got None"),
+    ({"pool": 10.5}, TypeError, "pool must be an integer, got 10.5"),
+    ({"sigma": 0.0}, ValueError, "sigma must be positive"),
+    ({"sigma": None}, TypeError, r"sigma must be a number, or one per parameter \[2\], got None"),
+    ({"sigma": "a"}, TypeError, r"sigma must be a number, or one per parameter \[2\], got 'a'"),
+    ({"bounds": (1.0, -1.0)}, ValueError, "lower < upper"),
+    ({"bounds": (1.0, 2.0)}, ValueError, "x0 must be within the bounds"),
+    ({"bounds": ((-1, 1), (0, 9))}, ValueError, "meaning lower = "),
+    ({"bounds": np.array([[-1, 1], [0, 9]])}, ValueError, "meaning lower = "),
+    ({"bounds": torch.tensor([[-1, 1], [0, 9]])}, ValueError, "meaning lower = "),
+    ({"bounds": np.zeros((3, 2))}, ValueError, "a list of 2 pairs, got 3 entries"),
+    ({"bounds": "ab"}, TypeError, "bounds must be .lower, upper. or a list of 2 pairs, got 'ab'"),
+    ({"bounds": 5}, TypeError, "bounds must be .lower, upper. or a list of 2 pairs, got 5"),
+    ({"bounds": ("a", "b")}, TypeError, r"bounds must be numbers, tensors \[n\] or None, got 'a'"),
+    ({"checkpoint": 5}, TypeError, "checkpoint must be a path, got 5"),
+    (
+        {"checkpoint": "/nonexist/a.pt"},
+        ValueError,
+        "checkpoint must be a file in a folder.*'/nonexist/a.pt'",
+    ),
+]
+RETURNED = [
+    (lambda z: z, ValueError, r"fn must return one number per point if there is no loss=, got shape \[4, 2\]"),
+    (lambda z: z.sum(), ValueError, "fn must return one value per point"),
+    (lambda z: z.sum(1) * math.nan, ValueError, "not finite at the start"),
+    (lambda z: "nothing", TypeError, "must return a tensor or a NumPy array"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "error", "message"), REFUSED, ids=[str(list(one[0].items())) for one in REFUSED])
+def test_what_is_refused_before_the_first_evaluation(wrong, error, message):
+    def fn(z):
+        raise AssertionError
+
+    settings = {"fn": fn, "x0": zeros(2), "sigma": 1.0, "seed": 0, **wrong}
+    with pytest.raises(error, match=message):
+        zh.minimize(settings.pop("fn"), settings.pop("x0"), **settings)
+
+
+@pytest.mark.parametrize(("fn", "error", "message"), RETURNED)
+def test_what_a_function_may_not_return(fn, error, message):
+    with pytest.raises(error, match=message):
+        zh.minimize(fn, zeros(2), sigma=1.0, seed=0)
+
+
+@pytest.mark.parametrize("value", [2.5, "a", None])
+def test_what_a_search_is_not_asked_for(value):
+    search = zh.optim.TrustRegion(zeros(2), sigma=1.0, seed=0)
+    with pytest.raises(TypeError, match=f"batch must be an integer, got {value!r}"):
+        search.ask(value)
+    search.ask()
+    if value != 2.5:
+        with pytest.raises(TypeError, match=f"values must be a tensor, an array or numbers, got {value!r}"):
+            search.tell(value)
+
+
+def test_a_checkpoint_that_is_none(tmp_path):
+    settings = {"sigma": 2.0, "seed": 0, "max_evaluations": 9}
+    good = tmp_path / "good.pt"
+    zh.minimize(tilted, zeros(2), checkpoint=good, **settings)
+    for name, content in (("corrupt", b"example"), ("empty", b""), ("cut", good.read_bytes()[:500])):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f"checkpoint must be a new file, or one that minimize.*{name}"):
+            zh.minimize(tilted, zeros(2), checkpoint=path, **settings)
+        assert path.read_bytes() == content
+    torch.save({"noise": 0.0}, tmp_path / "other.pt")
+    with pytest.raises(ValueError, match=r"checkpoint must be .*other\.pt: KeyError"):
+        zh.minimize(tilted, zeros(2), checkpoint=tmp_path / "other.pt", **settings)
+    with pytest.raises(ValueError, match=r"good\.pt: x0 must be torch\.float64 as there, got torch\.float32"):
+        zh.minimize(tilted, zeros(2, dtype=torch.float32), checkpoint=good, **settings)
+    with pytest.raises(ValueError, match=r"good\.pt: state must be of a search with 3 parameters, got one with 2"):
+        zh.minimize(tilted, zeros(3), checkpoint=good, **settings)
+    with pytest.raises(ValueError, match="checkpoint must be a file in a folder"):
+        zh.minimize(tilted, zeros(2), checkpoint=tmp_path, **settings)

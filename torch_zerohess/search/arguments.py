@@ -1,0 +1,51 @@
+"""Checks of single arguments, with messages that name the argument and what it was."""
+
+import math
+import operator
+import os
+from pathlib import Path
+from typing import Any
+
+
+def check_callable(**arguments: Any) -> None:
+    """Raise TypeError for an argument that is neither None nor callable."""
+    for name, value in arguments.items():
+        if value is not None and not callable(value):
+            raise TypeError(f"{name} must be callable, got {value!r}")
+
+
+def checked_integer(name: str, value: Any, least: int | None = None) -> int:
+    """Return an integer as one of Python. TypeError if it is none, ValueError if it is below `least`."""
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None:
+        raise TypeError(f"{name} must be an integer, got {value!r}")
+    if least is not None and number < least:
+        raise ValueError(f"{name} must be at least {least}, got {value!r}")
+    return number
+
+
+def checked_number(name: str, value: Any, least: float = -math.inf) -> float:
+    """Return a number. TypeError if it is none, ValueError if it is NaN or below `least`."""
+    try:
+        number = None if isinstance(value, (str, bytes)) else float(value)
+    except (TypeError, ValueError, RuntimeError):
+        number = None
+    if number is None:
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    if not number >= least:
+        wanted = "a number" if least == -math.inf else f"at least {least:g}"
+        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    return number
+
+
+def checked_file(name: str, value: Any) -> Path:
+    """Return the path of a file, new or not. TypeError if it is no path, ValueError if no file can be there."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise TypeError(f"{name} must be a path, got {value!r}")
+    path = Path(value)
+    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{name} must be a file in a folder that exists and can be written to, got {str(value)!r}")
+    return path

@@ -85,6 +85,9 @@ class LossProcess(ProcessMethod[LossProgress]):
             return self._finish.model_at_best(quadratics)
         return super().model_at_best(known)
 
+    def is_minimum(self, known: LossProgress) -> bool:
+        return super().is_minimum(known) and torch.equal(known.solved, known.best.point)
+
     def _after_process(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:

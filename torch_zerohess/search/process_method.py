@@ -22,7 +22,7 @@ from torch_zerohess.search.draws import normal, reflect
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.process_progress import ProcessProgress
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -95,10 +95,9 @@ class ProcessMethod(Method[Q]):
         best, settings = known.best.point, self.settings
         if known.done:
             return known, best[None][:0]
-        if known.phase == "start":
-            return known, torch.cat([best[None], self._around(best, generator)])
-        if len(known.pool) < 2:
-            return known, self._around(best, generator)
+        if known.phase == "start" or len(known.pool) < 2:
+            around = self._around(best, generator)
+            return known, torch.cat([best[None], around]) if known.phase == "start" else around
         known, model, x = self._modelled(known, generator)
         process, best = model.process, known.best.point
         # A process of the loss has less to go by: after an arrival it looks where it knows least.
@@ -180,9 +179,15 @@ class ProcessMethod(Method[Q]):
         """End, or explore."""
         known = replace(known, settled=0, exploring=_ROUND * self.settings.n, rounds=known.rounds + 1)
         known = replace(known, arrived=min(known.arrived, known.best.loss))
+        if self.is_minimum(known):
+            known = agreeing(known, known.best.point, self.settings.tolerance)
         if known.rounds > self.settings.restarts:
             return replace(known, done=True, message=f"{reason}, {known.rounds} times")
         return known
+
+    def is_minimum(self, known: Q) -> bool:
+        """Whether neither noise nor a plateau has chosen the best point."""
+        return not known.noisy and not known.pool.ties(known.best.point, known.best.loss, self.settings.tolerance)
 
     def _settled(self, known: Q) -> Q:
         """Arrive where step after step stays at the best point."""

@@ -49,6 +49,9 @@ class LossProgress(ProcessProgress):
     searched: int = 0
     """Evaluations of the process in a row."""
 
+    def is_minimum(self, tolerance: float) -> bool:
+        return torch.equal(self.solved, self.best.point) and ProcessProgress.is_minimum(self, tolerance)
+
 
 class LossProcess(ProcessMethod[LossProgress]):
     """A process of the loss and quadratics in turn."""
@@ -84,9 +87,6 @@ class LossProcess(ProcessMethod[LossProgress]):
         if quadratics is not None and torch.equal(quadratics.best.point, known.best.point):
             return self._finish.model_at_best(quadratics)
         return super().model_at_best(known)
-
-    def is_minimum(self, known: LossProgress) -> bool:
-        return super().is_minimum(known) and torch.equal(known.solved, known.best.point)
 
     def _after_process(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator

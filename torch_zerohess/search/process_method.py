@@ -22,7 +22,7 @@ from torch_zerohess.search.draws import normal, reflect
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.process_progress import ProcessProgress
-from torch_zerohess.search.state import Best, Evaluated, agreeing
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -179,15 +179,10 @@ class ProcessMethod(Method[Q]):
         """End, or explore."""
         known = replace(known, settled=0, exploring=_ROUND * self.settings.n, rounds=known.rounds + 1)
         known = replace(known, arrived=min(known.arrived, known.best.loss))
-        if self.is_minimum(known):
-            known = agreeing(known, known.best.point, self.settings.tolerance)
+        known = known.agreeing(self.settings.tolerance)
         if known.rounds > self.settings.restarts:
             return replace(known, done=True, message=f"{reason}, {known.rounds} times")
         return known
-
-    def is_minimum(self, known: Q) -> bool:
-        """Whether neither noise nor a plateau has chosen the best point."""
-        return not known.noisy and not known.pool.ties(known.best.point, known.best.loss, self.settings.tolerance)
 
     def _settled(self, known: Q) -> Q:
         """Arrive where step after step stays at the best point."""

@@ -4,8 +4,8 @@ The quadratic is the one of least change through the nearest evaluations (`least
 in a metric, x = best + sigma B u with |u| <= 1. B moves towards |H|^(-1/2) (`learned`), so a narrow valley is as wide
 as long in u, and no evaluation is spent on its walls.
 
-On a plateau, where the loss is exactly constant, there is no quadratic. Isotropic quadratics of the smoothed loss take
-over there (`LocalQuadratics`), whose sigma grows.
+On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
+grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
 """
 
 import math
@@ -67,7 +67,7 @@ _AWAY = 2.0
 """Standard deviation of a further start from the first one, where there is no box to draw it from."""
 
 _SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place")
-"""What isotropic quadratics go on with on a plateau."""
+"""What further rounds, and isotropic quadratics on a plateau, go on with."""
 
 
 class MetricQuadratics(Method[MetricProgress]):
@@ -114,9 +114,9 @@ class MetricQuadratics(Method[MetricProgress]):
             loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
             known = replace(known, iterations=known.iterations + 1, tied=known.tied + 1 if loss == before else 0)
             if known.tied >= _TIES:
-                short = float((evaluated.points[0] - known.lowest.point).norm()) < self.settings.tolerance
-                reason = f"{_TIES} steps in a row changed nothing"
-                return self._arrived(known, reason, generator) if short else self._on_plateau(known, generator)
+                if float((evaluated.points[0] - known.lowest.point).norm()) < self.settings.tolerance:
+                    return self._arrived(known, f"{_TIES} steps in a row changed nothing", generator)
+                return self._on_plateau(known, generator)
             if loss < math.inf:
                 known, bad = self._judged(known, (before - loss) / known.promised)
                 if bad is not None:
@@ -239,13 +239,7 @@ class MetricQuadratics(Method[MetricProgress]):
             center = center.clamp(settings.lower, settings.upper)
         fresh = replace(
             self._begun(Best(center)),
-            best=known.best,
-            rounds=rounds,
-            arrived=known.arrived,
-            agreed=known.agreed,
-            place=known.place,
-            evaluations=known.evaluations,
-            iterations=known.iterations,
+            **{name: getattr(known, name) for name in ("iterations", *_SHARED)} | {"rounds": rounds},
         )
         return self._started(fresh, generator)
 
@@ -254,9 +248,8 @@ class MetricQuadratics(Method[MetricProgress]):
     def _on_plateau(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let isotropic quadratics go on from the best point."""
         pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
-        wide = self._wide.go_on(pool, known.lowest, 1.0)
-        wide = replace(wide, first=known.first, **{name: getattr(known, name) for name in _SHARED})
-        wide = wide.sampling(self._n, paired=False)
+        shared = {name: getattr(known, name) for name in ("first", *_SHARED)}
+        wide = replace(self._wide.go_on(pool, known.lowest, 1.0), **shared).sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
     def _widely(self, known: MetricProgress, wide: DescentProgress, points: Tensor) -> tuple[MetricProgress, Tensor]:

@@ -171,7 +171,7 @@ def minimize(
             return running.ending(arrived=True), f"the model promises a decrease of at most ftol ({ftol})"
         if search.solved and (xtol, ftol) != (None, None):
             return running.ending(arrived=True), "the search has arrived at x, within xtol and ftol"
-        if restarts is None and search.agreed >= _AGREED:
+        if restarts is None and not running.noise and search.agreed >= _AGREED:
             return "solved", f"{search.agreed} rounds in a row have arrived at x"
         if running.left < 1:
             return "budget", f"max_evaluations ({max_evaluations}) used up"

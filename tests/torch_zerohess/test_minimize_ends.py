@@ -146,6 +146,63 @@ def test_a_convex_function_ends_when_three_rounds_agree():
     assert fit.evaluations < 150
 
 
+CENTER = torch.tensor([0.4, -0.3], dtype=torch.float64)
+
+
+def identity_misfit(output):
+    return (output - CENTER).square().sum()
+
+
+@pytest.mark.parametrize(
+    ("fn", "dtype", "settings", "most"),
+    [
+        (lambda z: 0.5 + (z - CENTER.to(z)).square().sum(1), torch.float32, {}, 80),
+        (lambda z: z, torch.float64, {"loss": identity_misfit}, 300),
+        (lambda z: z, torch.float64, {"loss": identity_misfit, "bounds": (-5.0, 5.0)}, 250),
+        (lambda z: (z - CENTER).square().sum(1), torch.float64, {"bounds": (-5.0, 5.0)}, 250),
+    ],
+    ids=["float32", "output", "output in a box", "loss in a box"],
+)
+def test_every_search_ends_when_three_rounds_agree(fn, dtype, settings, most):
+    fit = zh.minimize(fn, zeros(2, dtype), sigma=1.0, seed=0, max_evaluations=400, **settings)
+    assert (fit.status, fit.success, fit.message) == ("solved", True, "3 rounds in a row have arrived at x")
+    assert fit.evaluations < most
+    assert float((fit.x.double() - CENTER).norm()) < 1e-3
+
+
+def test_arrivals_at_a_worse_minimum_do_not_end_a_search_in_a_box():
+    for seed in range(2):
+        fit = zh.minimize(waved, -zeros(1) - 2.0, sigma=0.5, seed=seed, bounds=(-4.0, 4.0), max_evaluations=90)
+        assert float(fit.x) == pytest.approx(2.0, abs=1e-2)
+
+
+def waved(z):
+    """A minimum of 0.5 near -2 and one of 0 at 2."""
+    return torch.minimum((z[:, 0] + 2).square() + 0.5, 2 * (z[:, 0] - 2).square())
+
+
+def test_a_plateau_is_no_agreement():
+    for bounds in (None, (-5.0, 5.0)):
+        search = zh.optim.TrustRegion(zeros(2), sigma=1.0, seed=0, bounds=bounds, restarts=99)
+        for _ in range(40):
+            search.tell(torch.ones(len(search.ask())))
+            assert search.agreed == 0
+
+
+def test_agreement_goes_on_from_a_state():
+    settings = {"sigma": 1.0, "seed": 0, "loss": identity_misfit, "restarts": 99}
+    search, again = (zh.optim.TrustRegion(zeros(2), **settings) for _ in range(2))
+    while search.agreed < 1:
+        search.tell(search.ask())
+    again.load_state_dict(search.state_dict())
+    while search.agreed < 2 and search.evaluations < 400:
+        assert torch.equal(search.ask(), again.ask())
+        search.tell(search.ask())
+        again.tell(again.ask())
+        assert search.agreed == again.agreed
+    assert search.agreed == 2
+
+
 def test_the_budget_ends_it_and_success_says_whether_it_has_arrived():
     few = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=5)
     assert (few.status, few.success) == ("budget", False)

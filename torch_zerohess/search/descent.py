@@ -12,7 +12,7 @@ from torch_zerohess.search.draws import normal, reflect, uniform
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
 
@@ -163,7 +163,7 @@ class LocalQuadratics(Method[DescentProgress]):
         """End, or start another round: at a random point and around the best one in turn."""
         settings, rounds = self.settings, known.rounds + 1
         if known.refused < _REFUSED and known.sigma < settings.tolerance:
-            known = replace(known, arrived=min(known.arrived, known.lowest.loss))
+            known = replace(self._agreeing(known), arrived=min(known.arrived, known.lowest.loss))
         if last or rounds > settings.restarts:
             return replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
         center = known.best.point
@@ -187,6 +187,15 @@ class LocalQuadratics(Method[DescentProgress]):
             recent=(),
             earlier=math.inf,
         )
+
+    def _agreeing(self, known: DescentProgress) -> DescentProgress:
+        """Count a round that has arrived. One around the best point confirms nothing, and neither does a plateau."""
+        end, tolerance = known.lowest, self.settings.tolerance
+        if known.pool.ties(end.point, end.loss, tolerance):
+            return replace(known, agreed=0)
+        counted = agreeing(known, end.point, tolerance)
+        random = known.rounds == 0 or known.rounds % 2 == 1
+        return counted if random else replace(counted, agreed=min(counted.agreed, known.agreed))
 
     # Samples and steps.
 

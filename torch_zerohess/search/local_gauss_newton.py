@@ -23,7 +23,7 @@ from torch_zerohess.search.jacobian_progress import JacobianProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
@@ -40,6 +40,8 @@ _FAITHFUL = 0.1
 _SLOW, _FAST, _MOST = 0.02, 0.1, 2
 """The next batch has twice the samples if the loss fell by less than the first share of it, and half of them if it fell
 by more than the second. It has so many times the first number of samples at most."""
+_PREDICTED = 0.5
+"""Share of the held-out change from which on the end of a round is a minimum."""
 _ITERATIONS = 100
 """Products of the Hessian for a step."""
 _FULL = 1000
@@ -218,6 +220,8 @@ class LocalMethod(Method[LocalProgress]):
     def _arrived(self, known: LocalProgress) -> LocalProgress:
         """Start again with the first radius and sigma, or end."""
         rounds = known.rounds + 1
+        if known.jacobian is not None and known.jacobian.explained > _PREDICTED:
+            known = agreeing(known, known.center, self.settings.tolerance)
         if rounds > self.settings.restarts:
             message = f"steps were below {self.settings.tolerance} of sigma, {rounds} times"
             return replace(known, rounds=rounds, done=True, message=message)

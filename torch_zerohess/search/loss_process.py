@@ -49,6 +49,9 @@ class LossProgress(ProcessProgress):
     searched: int = 0
     """Evaluations of the process in a row."""
 
+    def is_minimum(self, tolerance: float) -> bool:
+        return torch.equal(self.solved, self.best.point) and ProcessProgress.is_minimum(self, tolerance)
+
 
 class LossProcess(ProcessMethod[LossProgress]):
     """A process of the loss and quadratics in turn."""

@@ -4,8 +4,8 @@ The quadratic is the one of least change through the nearest evaluations (`least
 in a metric, x = best + sigma B u with |u| <= 1. B moves towards |H|^(-1/2) (`learned`), so a narrow valley is as wide
 as long in u, and no evaluation is spent on its walls.
 
-On a plateau, where the loss is exactly constant, there is no quadratic. Isotropic quadratics of the smoothed loss take
-over there (`LocalQuadratics`), whose sigma grows.
+On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
+grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
 """
 
 import math
@@ -20,7 +20,7 @@ from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.draws import normal, reflect, uniform
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_progress import MetricProgress
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_values
@@ -65,6 +65,9 @@ _HALVING = 0.5
 """Factor for sigma after points of which no value is finite."""
 _AWAY = 2.0
 """Standard deviation of a further start from the first one, where there is no box to draw it from."""
+
+_SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place")
+"""What further rounds, and isotropic quadratics on a plateau, go on with."""
 
 
 class MetricQuadratics(Method[MetricProgress]):
@@ -111,6 +114,8 @@ class MetricQuadratics(Method[MetricProgress]):
             loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
             known = replace(known, iterations=known.iterations + 1, tied=known.tied + 1 if loss == before else 0)
             if known.tied >= _TIES:
+                if float((evaluated.points[0] - known.lowest.point).norm()) < self.settings.tolerance:
+                    return self._arrived(known, f"{_TIES} steps in a row changed nothing", generator)
                 return self._on_plateau(known, generator)
             if loss < math.inf:
                 known, bad = self._judged(known, (before - loss) / known.promised)
@@ -222,10 +227,8 @@ class MetricQuadratics(Method[MetricProgress]):
         """End, or start another round at a random point."""
         settings, rounds = self.settings, known.rounds + 1
         if known.lost < _LOST:
-            at_best = float((known.lowest.point - known.best.point).norm()) < settings.tolerance
-            lower = known.lowest.loss < known.arrived - settings.tolerance * abs(known.arrived)
-            agreed = (1 if lower else known.agreed + 1) if at_best else 0
-            known = replace(known, arrived=min(known.arrived, known.lowest.loss), agreed=agreed)
+            known = agreeing(known, known.lowest.point, settings.tolerance)
+            known = replace(known, arrived=min(known.arrived, known.lowest.loss))
         if last or rounds > settings.restarts:
             known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
             return known, known.points[:0]
@@ -236,12 +239,7 @@ class MetricQuadratics(Method[MetricProgress]):
             center = center.clamp(settings.lower, settings.upper)
         fresh = replace(
             self._begun(Best(center)),
-            best=known.best,
-            rounds=rounds,
-            arrived=known.arrived,
-            agreed=known.agreed,
-            evaluations=known.evaluations,
-            iterations=known.iterations,
+            **{name: getattr(known, name) for name in ("iterations", *_SHARED)} | {"rounds": rounds},
         )
         return self._started(fresh, generator)
 
@@ -250,15 +248,13 @@ class MetricQuadratics(Method[MetricProgress]):
     def _on_plateau(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let isotropic quadratics go on from the best point."""
         pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
-        wide = self._wide.go_on(pool, known.lowest, 1.0)
-        wide = replace(wide, first=known.first, best=known.best, rounds=known.rounds, evaluations=known.evaluations)
-        wide = replace(wide, arrived=known.arrived)
-        wide = wide.sampling(self._n, paired=False)
+        shared = {name: getattr(known, name) for name in ("first", *_SHARED)}
+        wide = replace(self._wide.go_on(pool, known.lowest, 1.0), **shared).sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
     def _widely(self, known: MetricProgress, wide: DescentProgress, points: Tensor) -> tuple[MetricProgress, Tensor]:
         """Return what isotropic quadratics know, and their points."""
-        names = ("best", "center", "sigma", "evaluations", "iterations", "rounds", "arrived", "done", "message")
+        names = (*_SHARED, "center", "sigma", "iterations", "done", "message")
         return replace(known, wide=wide, **{name: getattr(wide, name) for name in names}), points
 
     # Models and steps.

@@ -95,10 +95,9 @@ class ProcessMethod(Method[Q]):
         best, settings = known.best.point, self.settings
         if known.done:
             return known, best[None][:0]
-        if known.phase == "start":
-            return known, torch.cat([best[None], self._around(best, generator)])
-        if len(known.pool) < 2:
-            return known, self._around(best, generator)
+        if known.phase == "start" or len(known.pool) < 2:
+            around = self._around(best, generator)
+            return known, torch.cat([best[None], around]) if known.phase == "start" else around
         known, model, x = self._modelled(known, generator)
         process, best = model.process, known.best.point
         # A process of the loss has less to go by: after an arrival it looks where it knows least.
@@ -180,6 +179,7 @@ class ProcessMethod(Method[Q]):
         """End, or explore."""
         known = replace(known, settled=0, exploring=_ROUND * self.settings.n, rounds=known.rounds + 1)
         known = replace(known, arrived=min(known.arrived, known.best.loss))
+        known = known.agreeing(self.settings.tolerance)
         if known.rounds > self.settings.restarts:
             return replace(known, done=True, message=f"{reason}, {known.rounds} times")
         return known

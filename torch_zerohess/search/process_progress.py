@@ -1,13 +1,18 @@
 """What a search by a Gaussian process knows between two evaluations."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
 
 from torch import Tensor
 
-from torch_zerohess.search.state import Best, Progress
+from torch_zerohess.search.state import Best, Progress, agreeing
 from torch_zerohess.surrogates.pool import Pool
+
+_LOOKING = 10
+"""Evaluations over n + 1 that a round has at least to look for something better before it counts as one that agrees."""
+
+Q = TypeVar("Q", bound="ProcessProgress")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,3 +47,23 @@ class ProcessProgress(Progress):
     """Points [H, n] whose values were not finite."""
     solved: Tensor
     """A minimum that is known to the last digit [n]; infinite if none is."""
+    counted: int = 0
+    """Evaluations at the latest arrival that has counted as a round of those that agree."""
+
+    def agreeing(self: Q, tolerance: float) -> Q:
+        """Count an arrival at the best point.
+
+        It agrees with those before if the search has since looked elsewhere for as long as it had taken until then:
+        what was hard to find may have something better beside it that is just as hard to find.
+        """
+        if not self.is_minimum(tolerance):
+            return self
+        looked, least = self.evaluations - self.counted, _LOOKING * (len(self.center) + 1)
+        known = agreeing(self, self.best.point, tolerance)
+        if known.agreed > 1 and looked < max(self.counted, least):
+            return self
+        return replace(known, counted=self.evaluations)
+
+    def is_minimum(self, tolerance: float) -> bool:
+        """Whether neither noise nor a plateau has chosen the best point."""
+        return not self.noisy and not self.pool.ties(self.best.point, self.best.loss, tolerance)

@@ -141,7 +141,7 @@ class AskTell(ABC, Generic[P]):
 
     @property
     def agreed(self) -> int:
-        """Rounds in a row, from random points, that have arrived at the best point."""
+        """Rounds in a row that have arrived at one point, the best one."""
         return self._state.progress.agreed
 
     @property

@@ -40,7 +40,9 @@ class Progress:
     arrived: float = math.inf
     """Lowest loss at which it has arrived."""
     agreed: int = 0
-    """Rounds in a row that have arrived at the best point, where rounds begin at random points."""
+    """Rounds in a row that have arrived at one point, the best one."""
+    place: Tensor | None = None
+    """Where the first of them arrived [n]."""
     done: bool = False
     message: str = ""
     """Why the search is done."""
@@ -49,6 +51,20 @@ class Progress:
 
 
 P = TypeVar("P", bound=Progress)
+
+
+def agreeing(known: P, end: Tensor, tolerance: float) -> P:
+    """Count a round that has arrived at a point [n] whose loss is the lowest of the round.
+
+    It agrees with the rounds before it if it ends at the best point, and if that is still where they arrived. Points
+    are the same within the tolerance, root mean square over the parameters.
+    """
+    best, tolerance = known.best.point, tolerance * math.sqrt(len(end))
+    if float((end - best).norm()) >= tolerance:
+        return dataclasses.replace(known, agreed=0)
+    if known.place is not None and float((best - known.place).norm()) < tolerance:
+        return dataclasses.replace(known, agreed=known.agreed + 1)
+    return dataclasses.replace(known, agreed=1, place=best)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,6 +87,11 @@ class Pool:
         groups, origin = torch.unique(self.origin[rest], return_inverse=True)
         return Pool(self.points[rest], self.values[rest], outputs, self.centers[groups], self.sigmas[groups], origin)
 
+    def ties(self, x: Tensor, value: float, distance: float) -> bool:
+        """Whether an evaluation farther than this from x [n], root mean square, has exactly the value: a plateau."""
+        far = (self.points - x).square().mean(1).sqrt() > distance
+        return bool((self.values[far] == value).any())
+
     def weights(self, x: Tensor, sigma: float) -> Tensor:
         """Weights [P] for a fit around x [n], at most 7.4; 1 for an evaluation at x itself."""
         if not len(self):

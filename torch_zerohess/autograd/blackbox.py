@@ -280,7 +280,7 @@ def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool, plain
 
 
 def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> Tensor:
-    stein, c = expansion.stein, expansion.flat
+    stein, c = expansion.stein, expansion.coefficients
 
     def ratios(d: Tensor, zero: bool) -> Tensor:
         d = d if stein.highest is None else limited(d, stein.highest)
@@ -294,7 +294,7 @@ def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> 
 
 def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
     """Return the expansion around `center` at x [B, n], to first order."""
-    slope = expansion.stein.gradient(expansion.flat.mT.contiguous()) / expansion.sigma
+    slope = expansion.stein.gradient(expansion.coefficients.mT.contiguous()) / expansion.sigma
     change = (slope @ (x.double() - center.double())[..., None])[..., 0]
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
 

@@ -35,6 +35,6 @@ class ClosedForm(torch.autograd.Function):
                 value = ctx.general(x)
             (result,) = torch.autograd.grad(value, x, gradient, create_graph=again)
             return result, None, None
-        c = ctx.expansion.flat
+        c = ctx.expansion.coefficients
         a = (c @ gradient.to(c.dtype).reshape(len(c), -1, 1)).mT
         return (ctx.expansion.stein.gradient(a)[:, 0] / ctx.expansion.sigma).to(x.dtype), None, None

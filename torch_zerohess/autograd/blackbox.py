@@ -100,18 +100,25 @@ class BlackBox(nn.Module):
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
         _before_compiling()
         dtype, x = checked_input(x).dtype, working(x)
-        if x.requires_grad and not transforms.watched(x) and not transforms.has_tangent(x):
-            x = Input.apply(x)
         self._check_aux(aux)
-        batch = x.shape[:-1]
-        flat, others = x.reshape(-1, x.shape[-1]), folded_aux(_without_grad(aux), batch)
+        batch, n = x.shape[:-1], x.shape[-1]
+        center, others = x.detach().reshape(-1, n), folded_aux(_without_grad(aux), batch)
         if self.call.value == "center" and not transforms.derivative_possible(x):
-            result = self._center(flat.detach(), others)
-        elif self.memory is None:
-            result = self._around(flat.detach(), others)(flat)
+            result = self._center(center, others)
+            return result.reshape((*batch, *result.shape[1:])).to(dtype)
+        watched = transforms.watched(x)
+        alone = self.memory is None and not isinstance(self.call.head, LocalEntropy)
+        if alone and not watched and not transforms.forward_mode_active():
+            expansion = self._evaluate(center, others)
+            result = ClosedForm.apply(x, expansion, functools.partial(_general, expansion, center=center, zero=True))
+            return result.to(dtype)
+        if x.requires_grad and not watched and not transforms.has_tangent(x):
+            x = Input.apply(x)
+        if self.memory is None:
+            result = self._around(center, others)(x.reshape(-1, n))
         else:
             with self.memory.lock:  # the surrogate stays the same until the result is there
-                result = self._around(flat.detach(), others)(flat)
+                result = self._around(center, others)(x.reshape(-1, n))
         if torch.compiler.is_compiling() and x.requires_grad:
             # torch differentiates a compiled backward a second time without an error, and gets a wrong number, unless
             # the backward has saved an input of the graph. This term is zero and saves x: now torch raises.
@@ -184,10 +191,8 @@ class BlackBox(nn.Module):
         if active and self.memory is not None and self.memory.order == 1:
             return lambda x: _tangent(expansion, x, center)
 
-        plain = zero and self.control is None and not entropy  # nothing but the expansion stands between x and values
-
         def estimated(x: Tensor) -> Tensor:
-            result = _value(expansion, x, center, zero=zero, plain=plain)
+            result = _general(expansion, x, center=center, zero=zero)
             return control_variate.local_entropy_value(result, self.call.value) if entropy else result
 
         return estimated
@@ -268,21 +273,9 @@ def smooth(
     )
 
 
-def _value(expansion: Expansion, x: Tensor, center: Tensor, *, zero: bool, plain: bool) -> Tensor:
-    """Return the expansion around `center` at x [B, n], with a graph.
-
-    zero: says that x equals `center` in value.
-    plain: allows the closed form where no transform is active; it needs `zero`.
-    """
-    general = functools.partial(_general, expansion, center=center, zero=zero)
-    if plain and not transforms.watched(x) and not transforms.forward_mode_active():
-        result: Tensor = ClosedForm.apply(x, expansion, general)
-        return result
-    return general(x)
-
-
 def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> Tensor:
-    stein, c = expansion.stein, expansion.flat
+    """Return the expansion around `center` at x [B, n], with a graph; zero: says that x equals `center` in value."""
+    stein, c = expansion.stein, expansion.coefficients
 
     def ratios(d: Tensor, zero: bool) -> Tensor:
         d = d if stein.highest is None else limited(d, stein.highest)
@@ -296,7 +289,7 @@ def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> 
 
 def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
     """Return the expansion around `center` at x [B, n], to first order."""
-    slope = expansion.stein.gradient(expansion.flat.mT.contiguous()) / expansion.sigma
+    slope = expansion.stein.gradient(expansion.coefficients.mT.contiguous()) / expansion.sigma
     change = (slope @ (x.double() - center.double())[..., None])[..., 0]
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
 

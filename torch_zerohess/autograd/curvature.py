@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import Node
 
+from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.autograd.transforms import made_by
 
@@ -192,7 +193,7 @@ def _entries(node: Node | None) -> list[Tensor]:
         current = stack.pop()
         if current is None:
             continue
-        if made_by(current, Input):
+        if made_by(current, Input) or made_by(current, ClosedForm):
             found.append(current.saved_tensors[0])  # type: ignore[attr-defined]
         for following, _ in current.next_functions:
             if following not in seen:

@@ -23,7 +23,7 @@ class Batch:
     @cached_property
     def a(self) -> Tensor:
         """Coefficients [B, P, K], P outputs."""
-        return self.evaluations.expansion.flat.mT.contiguous()
+        return self.evaluations.expansion.coefficients.mT.contiguous()
 
     @property
     def stein(self) -> Stein:
@@ -41,7 +41,9 @@ class Batch:
         pooled = self._pooled / unit if self._coupled(quantity) else None
         length = torch.ones_like(unit) if t is None else _power_of_two(t.abs().amax(2, keepdim=True))
         t = None if t is None else t / length
-        variance, degrees = self.stein.variance(quantity, self.a / unit, self.evaluations.share, index, t, pooled)
+        variance, degrees = self.stein.variance(
+            quantity, self.a / unit, self.evaluations.share[..., 0], index, t, pooled
+        )
         shape = (*unit.shape[:2], *(1,) * (variance.dim() - 2))
         return variance.sqrt() * unit.reshape(shape) * length.reshape(shape), degrees
 
@@ -55,8 +57,7 @@ class Batch:
     @property
     def _pooled(self) -> Tensor:
         """(f - mean of f) * share, [B, P, K], where f is what is smoothed."""
-        share = self.evaluations.share[..., None]
-        f = self.evaluations.rest.reshape(*share.shape[:2], -1).double()
+        share, f = self.evaluations.share, self.evaluations.rest.double()
         origin = f[:, :1]  # differences to one of the values keep the precision of a small variation
         return (((f - origin) - ((f - origin) * share).sum(1, keepdim=True)) * share).mT.contiguous()
 

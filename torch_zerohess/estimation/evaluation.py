@@ -98,25 +98,40 @@ class Evaluations:
     Shapes: B batch, K perturbations, n parameters.
     """
 
-    kept: Tensor | None
-    """Perturbed points [B, K, n], in the dtype of x, if they are kept."""
-    values: Tensor
-    """Values there, [B, K, *out], as the black box returned them; zero where they were dropped."""
-    center: Tensor | None
-    """f(x), [B, *out], where it was evaluated."""
+    everywhere: Tensor | None
+    """Points [B, E, n], in the dtype of x, if they are kept: the K perturbed ones, and x where it was evaluated."""
+    everything: Tensor
+    """Values there, [B, E, *out], as the black box returned them; zero where they were dropped."""
     share: Tensor
-    """Weight of each row in a mean, [B, K]: 1/K; where rows were dropped, zero for them and more for the others."""
-    rest: Tensor
-    """What is smoothed, [B, K, *out]: the values, less what a control variate explains."""
+    """Weight of each row in a mean, [B, K, 1]: 1/K; where rows were dropped, zero for them and more for the others."""
+    remaining: Tensor
+    """What is smoothed, [B, E, *out]: the values, less what a control variate explains."""
     baseline: Tensor
-    """What was subtracted from `rest`, its mean over the rows, [B, P]."""
+    """What was subtracted from `rest`, its mean over the rows, [B, 1, P]."""
     expansion: Expansion
+
+    @property
+    def values(self) -> Tensor:
+        """Values at the perturbed points, [B, K, *out]."""
+        return self.everything[:, : self.share.shape[1]]
+
+    @property
+    def center(self) -> Tensor | None:
+        """f(x), [B, *out], where it was evaluated."""
+        K = self.share.shape[1]
+        return self.everything[:, K] if self.everything.shape[1] > K else None
+
+    @property
+    def rest(self) -> Tensor:
+        """What is smoothed at the perturbed points, [B, K, P]."""
+        B, K, _ = self.share.shape
+        return self.remaining[:, :K].reshape(B, K, -1)
 
     @property
     def points(self) -> Tensor:
         """Perturbed points [B, K, n], in the dtype of x: made again where they are not kept."""
-        if self.kept is not None:
-            return self.kept
+        if self.everywhere is not None:
+            return self.everywhere[:, : self.share.shape[1]]
         stein = self.expansion.stein
         assert isinstance(stein, LikelihoodRatio)
         assert isinstance(stein.u, Redrawn)
@@ -128,9 +143,9 @@ class Evaluations:
 
         Without a control variate this is the estimate of F(x).
         """
-        B, K = self.share.shape
-        rest, a = self.rest.reshape(B, K, -1), self.expansion.flat.mT
-        return self.expansion.stein.smoothed(rest, self.baseline, a).reshape(self.expansion.base.shape)
+        expansion = self.expansion
+        a = expansion.coefficients.mT
+        return expansion.stein.smoothed(self.rest, self.baseline[:, 0], a).reshape(expansion.base.shape)
 
     @property
     def dropped(self) -> int:
@@ -169,74 +184,67 @@ def evaluate(
     if spare and redrawn is not None and not math.isfinite(float(values.sum())):
         everywhere = completed(redrawn.points(), x, with_center)  # as they were before fn
     values, kept = finite_values(values, everywhere, call.on_nonfinite, K, smoothing, stein)
-    center = values[:, K] if with_center else None
-    share = torch.full((B, K), 1.0 / K, dtype=torch.float64, device=x.device)
+    share = torch.full((B, K, 1), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
-        share = kept / kept.sum(1, keepdim=True).double()
+        share = (kept / kept.sum(1, keepdim=True).double())[..., None]
 
     def added(all_values: Tensor) -> list[Tensor]:
-        rows = all_values.reshape(*all_values.shape[:2], -1)
-        a = _coefficients(rows[:, :K], rows[:, K] if with_center else None, share[..., None], smoothing, n)[1]
+        a = _coefficients(all_values.reshape(*all_values.shape[:2], -1), share, smoothing, n)[1]
         return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
 
     counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
     explain = None if control is None else partial(control.explain, values, everywhere, outputs, aux, added, counted)
-    rest, rest_center = _remaining(call, values, center, share, aux, control, explain, stein)
-    values = values[:, :K]
-    baseline, coefficients = _coefficients(rest.reshape(B, K, -1), rest_center, share[..., None], smoothing, n)
+    remaining = _remaining(call, values, share, aux, control, explain, stein)
+    baseline, coefficients = _coefficients(remaining.reshape(B, K + with_center, -1), share, smoothing, n)
     # The sum of finite numbers may be infinite, but that of others is never finite.
     if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
         raise ValueError(
-            f"fn returned values up to {float(values.abs().max()):.3g}, whose differences are not finite in float64: "
-            "scale what fn returns"
+            f"fn returned values up to {float(values[:, :K].abs().max()):.3g}, whose differences are not finite in "
+            "float64: scale what fn returns"
         )
-    coefficients = coefficients.reshape(rest.shape)
-    if isinstance(call.head, LocalEntropy):
+    entropy = isinstance(call.head, LocalEntropy)
+    if entropy:
         coefficients[..., 1:] = 0.0  # of constants
-    if call.value == "center" and center is not None and not isinstance(call.head, LocalEntropy):
-        base = center.double()
+    if call.value == "center" and not entropy:
+        base = values[:, K].double()
     else:
-        flat = coefficients.reshape(B, K, -1)
-        base = stein.smoothed(rest.reshape(B, K, -1), baseline, flat.mT).reshape((B, *rest.shape[2:]))
-        if isinstance(call.head, LocalEntropy):
+        rest = remaining[:, :K]
+        base = stein.smoothed(rest.reshape(B, K, -1), baseline[:, 0], coefficients.mT).reshape((B, *rest.shape[2:]))
+        if entropy:
             base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
     expansion = Expansion(base, coefficients, perturbations.sigma, stein)
-    return Evaluations(None if spare else everywhere[:, :K], values, center, share, rest, baseline, expansion)
+    return Evaluations(None if spare else everywhere, values, share, remaining, baseline, expansion)
 
 
 def _remaining(
     call: BlackBoxCall,
     values: Tensor,
-    center: Tensor | None,
     share: Tensor,
     aux: Sequence[Tensor],
     control: Control | None,
     explain: Callable[[], Tensor | None] | None,
     stein: Stein,
-) -> tuple[Tensor, Tensor | None]:
-    """Return what is to be smoothed, [B, K, *out], and the same at the center [B, *out].
+) -> Tensor:
+    """Return what is to be smoothed, [B, E, *out], for values [B, E, *out], the one at the center last.
 
     These are the values, less what the control variate explains; for a local entropy the packed values.
     """
-    K = share.shape[1]
     if isinstance(call.head, LocalEntropy):
+        K, own = share.shape[1], share.mT
         losses = values[:, :K].double()
-        mean = (stein.value((losses * share)[:, None]) / stein.value(share[:, None]))[:, 0]
+        mean = (stein.value(losses[:, None] * own) / stein.value(own))[:, 0]
         T, m = local_entropy.scales(losses, mean, call.head.temperature)
         if control is not None:
             T, m = control.scales(aux) or (T, m)
-        rows, packed_center = local_entropy.packed(values[:, :K], center, T, m)
+        rows = local_entropy.packed(values, K, T, m)
         predicted = None if explain is None else explain()
         if predicted is not None:
-            rows[..., 0] -= local_entropy.tempered(predicted[:, :K], T, m)
-            if packed_center is not None:
-                packed_center[:, 0] -= local_entropy.tempered(predicted[:, K:], T, m)[:, 0]
-        return rows, packed_center
+            rows[..., 0] -= local_entropy.tempered(predicted, T, m)
+        return rows
     predicted = None if explain is None else explain()
     if control is None or predicted is None:
-        return values[:, :K], center
-    rest = values.double() - control.coefficient * predicted
-    return rest[:, :K], None if center is None else rest[:, K]
+        return values
+    return values.double() - control.coefficient * predicted
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -248,18 +256,20 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     return values
 
 
-def _coefficients(
-    values: Tensor, center: Tensor | None, share: Tensor, smoothing: Smoothing, n: int
-) -> tuple[Tensor, Tensor]:
-    """Return the mean baseline [B, P] and (f - baseline) * share [B, K, P], for values [B, K, P], share [B, K, 1]."""
-    f = values.double()
+def _coefficients(values: Tensor, share: Tensor, smoothing: Smoothing, n: int) -> tuple[Tensor, Tensor]:
+    """Return the mean baseline [B, 1, P] and (f - baseline) * share [B, K, P], for values [B, E, P], share [B, K, 1].
+
+    The value at the center is the last one, if there is one.
+    """
+    values, K = values.double(), share.shape[1]
+    f = values[:, :K]
     if smoothing.baseline == "none":
-        return torch.zeros_like(f[:, 0]), f * share
-    if smoothing.baseline == "center" and center is not None:
-        mean = center.double().reshape(len(f), -1)
-        return mean, (f - mean[:, None]) * share
+        return torch.zeros_like(f[:, :1]), f * share
+    if smoothing.baseline == "center":
+        center = values[:, K:]
+        return center, (f - center) * share
     baseline = _mean_of_others(f, share, draws(smoothing, n))
-    return total(baseline * share)[:, 0], (f - baseline) * share
+    return total(baseline * share), (f - baseline) * share
 
 
 def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:

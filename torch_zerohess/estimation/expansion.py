@@ -1,5 +1,6 @@
 """The smoothed function near x, as one batch of evaluations tells it: what estimates and the layer are made of."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,16 +22,10 @@ class Expansion:
     base: Tensor
     """f(x) or the smoothed value, float64 [B, *out]"""
     coefficients: Tensor
-    """c = (f_k - baseline) / K, float64 [B, K, *out]"""
+    """c = (f_k - baseline) / K, float64 [B, K, P] for P outputs"""
     sigma: Tensor
     """float64 [n]"""
     stein: Stein
-
-    @property
-    def flat(self) -> Tensor:
-        """The coefficients with one dimension of outputs, [B, K, P]."""
-        B, K = self.coefficients.shape[:2]
-        return self.coefficients.reshape(B, K, -1)
 
     def tensors(self) -> list[Tensor]:
         """Return the tensors that represent the expansion, for `rebuild`; `base` and `sigma` are copies.
@@ -49,4 +44,4 @@ class Expansion:
     def layout(smoothing: Smoothing, B: int, K: int, n: int, out: Sequence[int], keep: bool) -> list[Layout]:
         """Return what `tensors` of a batch will look like, for outputs of shape `out`."""
         own = family(smoothing).layout(smoothing, B, K, n, keep)
-        return [Layout((B, *out)), Layout((B, K, *out)), Layout((n,), batched=False), *own]
+        return [Layout((B, *out)), Layout((B, K, math.prod(out))), Layout((n,), batched=False), *own]

@@ -22,11 +22,8 @@ def tempered(losses: Tensor, T: Tensor, m: Tensor) -> Tensor:
     return ((m[:, None] - losses) / T[:, None]).clamp(max=60.0).exp()
 
 
-def packed(losses: Tensor, center: Tensor | None, T: Tensor, m: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Return the packed outputs [B, K, 4] of losses [B, K], and those of the losses at the center [B], [B, 4]."""
-    last = torch.zeros_like(T) if center is None else center.double()
-    constants = torch.stack([T, m, last], 1)
-    rows = torch.cat([tempered(losses.double(), T, m)[..., None], constants[:, None].expand(-1, losses.shape[1], 3)], 2)
-    if center is None:
-        return rows, None
-    return rows, torch.cat([tempered(center.double()[:, None], T, m), constants], 1)
+def packed(losses: Tensor, K: int, T: Tensor, m: Tensor) -> Tensor:
+    """Return the packed outputs [B, E, 4] of losses [B, E], of which the one after the first K is at the center."""
+    center = losses[:, K].double() if losses.shape[1] > K else torch.zeros_like(T)
+    constants = torch.stack([T, m, center], 1)[:, None].expand(-1, losses.shape[1], 3)
+    return torch.cat([tempered(losses.double(), T, m)[..., None], constants], 2)

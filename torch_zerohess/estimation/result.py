@@ -235,5 +235,5 @@ class Estimate:
         if not isinstance(v, Tensor) or v.shape not in ((n,), (*self._batch, n)):
             given = list(v.shape) if isinstance(v, Tensor) else type(v).__name__
             raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")
-        t = (v.detach().to(self._sigma) / self._sigma).expand(*self._batch, n).reshape(-1, 1, n)
-        return t.expand(-1, self._out.numel(), -1).contiguous()
+        t = (v.detach().to(self._sigma) / self._sigma).reshape(-1, 1, n)
+        return t.expand(self._batch.numel(), self._out.numel(), n).contiguous()

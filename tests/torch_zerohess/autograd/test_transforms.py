@@ -10,6 +10,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 import torch_zerohess as zh
 from torch_zerohess.autograd import transforms
+from torch_zerohess.autograd.curvature import black_box_inputs
 from torch_zerohess.autograd.marker import Input
 from truths import spread, vector
 
@@ -140,14 +141,14 @@ def test_the_input_marker_is_the_identity_and_remembers_its_input() -> None:
     assert torch.equal(y, x)
     assert y.grad_fn.saved_tensors[0] is x
     assert torch.autograd.gradcheck(Input.apply, x)
-    out = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=0.5, samples=2, seed=0))(x)
-    seen, stack = set(), [out.grad_fn]
-    while stack:
-        node = stack.pop()
-        if node is not None and node not in seen:
-            seen.add(node)
-            stack += [following for following, _ in node.next_functions]
-    assert [node.saved_tensors[0] is x for node in seen if transforms.made_by(node, Input)] == [True]
+    fn, smoothing = lambda z: z.sum(1), zh.Smoothing(sigma=0.5, samples=2, seed=0)
+    assert [one is x for one in black_box_inputs(zh.BlackBox(fn, smoothing, memory=zh.Memory())(x))] == [True]
+    out = zh.BlackBox(fn, smoothing)(x)
+    assert [one is x for one in black_box_inputs(out)] == [True]
+    (slope,) = torch.autograd.grad(out.sum(), x, create_graph=True)
+    assert [one is x for one in black_box_inputs(slope)] == [True]
+    slopes = torch.vmap(lambda one: torch.autograd.grad(out, x, one, create_graph=True)[0])(torch.eye(2).to(out))
+    assert [one is x for one in black_box_inputs(slopes)] == [True]
 
 
 def test_a_failing_probe_says_what_to_do() -> None:

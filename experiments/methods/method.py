@@ -72,8 +72,10 @@ class Method:
         if not self.packages:
             return  # the list of all that is installed takes a third of a second
         for module, packages in importlib.metadata.packages_distributions().items():
-            # A wheel may name a folder that it does not install, as that of botorch does.
-            if set(packages) & set(self.packages) and importlib.util.find_spec(module):
+            spec = importlib.util.find_spec(module) if set(packages) & set(self.packages) else None
+            # A wheel may name a folder that it does not install, or that is no module: that of botorch has one called
+            # "sphinx", which SciPy takes for Sphinx.
+            if spec is not None and spec.origin is not None:
                 importlib.import_module(module)
 
 

@@ -1,5 +1,6 @@
 """Tables say what a method uses; here its calls on one task are counted."""
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -31,3 +32,14 @@ def test_a_method_calls_what_it_says_that_it_uses(name):
 
     attempt(TASK, name, 0, solve)
     assert called == {METHODS[name].uses.split(",")[0]}
+
+
+def test_folders_that_are_no_modules_are_not_loaded(tmp_path, monkeypatch):
+    """A wheel may bring a folder with the name of another package, which would then seem to be there."""
+    (tmp_path / "stray_folder").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    found = {"cma": ["cma"], "stray_folder": ["cma"], "not_there": ["cma"]}
+    monkeypatch.setattr("importlib.metadata.packages_distributions", lambda: found)
+    METHODS["cma_es_bounded"].load()
+    assert "cma" in sys.modules
+    assert "stray_folder" not in sys.modules

@@ -214,7 +214,7 @@ def test_a_sigma_per_parameter_is_a_change_of_units():
 SETTINGS = [
     ({"x0": torch.zeros(2, 2)}, r"x0 must be a tensor \[n\]"),
     ({"x0": torch.zeros(0)}, r"x0 must be a tensor \[n\]"),
-    ({"x0": torch.zeros(2, dtype=torch.int64)}, "float32 or float64"),
+    ({"x0": torch.zeros(2, dtype=torch.complex64)}, "float32 or float64"),
     ({"x0": torch.zeros(2, dtype=torch.float16)}, "float32 or float64"),
     ({"x0": ["a", 0.0]}, "list of n numbers"),
     ({"x0": vector(0.0, math.nan)}, "x0 must be finite"),

@@ -235,7 +235,7 @@ SETTINGS = [
     ({"bounds": (-1.0, vector(1.0, -0.5))}, "got 0.0 at index 1"),
     ({"restarts": -1}, "restarts must be at least 0, got -1"),
     ({"noise": -1.0}, "noise must be finite and at least 0"),
-    ({"noise": math.nan}, "noise must be finite and at least 0"),
+    ({"noise": math.nan}, "noise must be a number, got nan"),
     ({"tolerance": 0.0}, "tolerance must be between 0 and 1"),
     ({"pool": 2}, "pool must be at least 4, got 2"),
 ]

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import check_callable, checked_file, checked_integer, checked_number
 from torch_zerohess.estimation.evaluation import BlackBoxCall
 from torch_zerohess.estimation.inputs import working
-from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
-from torch_zerohess.search.arguments import check_callable, checked_file, checked_integer, checked_number
 from torch_zerohess.search.minimum import Iterate, Minimum, Observation, Status
 from torch_zerohess.search.running import Running
 from torch_zerohess.search.space import Bounds, checked_start
@@ -144,7 +144,7 @@ def minimize(
             f"parameters, got {max_evaluations}"
         )
     own = None if workers is None else ProcessPool(workers)
-    call = BlackBoxCall(fn, vectorized=vectorized, evaluator=evaluator or own or Inline())
+    call = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
 
     def evaluated(points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         values = call(points, aux)

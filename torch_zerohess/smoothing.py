@@ -1,6 +1,5 @@
 """Settings of the Gaussian smoothing: the one object that says how a black box is sampled."""
 
-import operator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -8,6 +7,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.choice import chosen_baseline, chosen_sampler, chosen_scrambles, chosen_signs
 
 Proposal = Literal["aggregate", "gaussian", "optimal", "uniform", "fr22", "auto"]
@@ -74,21 +74,14 @@ class Smoothing:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
-        seed = 0 if self.seed is None else self.seed
-        for name, number, lowest in (("samples", self.samples, 1), ("order", self.order, 1), ("seed", seed, 0)):
-            if isinstance(number, bool) or not hasattr(number, "__index__"):
-                raise TypeError(f"{name} must be an integer, got {number!r}")
-            if number < lowest:
-                raise ValueError(f"{name} must be at least {lowest}, got {number}")
-        for name in ("samples", "order", "seed", "scrambles"):  # numbers of Python: a state_dict holds nothing else
+        for name, least in (("samples", 1), ("order", 1), ("seed", 0), ("scrambles", 1)):
             number = getattr(self, name)
-            if hasattr(number, "__index__") and not isinstance(number, bool):
-                object.__setattr__(self, name, operator.index(number))
-        seed = operator.index(seed)
+            if number is not None or name in ("samples", "order"):  # as integers of Python, for `state_dict`
+                object.__setattr__(self, name, checked_integer(name, number, least))
         if self.order > 2:
             raise ValueError(f"order must be 1 or 2, got {self.order}")
-        if seed >= 2**63:
-            raise ValueError(f"seed must be below 2**63, got {seed}")
+        if self.seed is not None and self.seed >= 2**63:
+            raise ValueError(f"seed must be below 2**63, got {self.seed}")
         for name, value, allowed in (
             ("proposal", self.proposal, get_args(Proposal)),
             ("baseline", self.baseline, get_args(Baseline)),
@@ -99,9 +92,7 @@ class Smoothing:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
         if self.antithetic != "auto":
             object.__setattr__(self, "antithetic", bool(self.antithetic))
-        if self.scrambles is not None and (
-            isinstance(self.scrambles, bool) or self.scrambles < 1 or self.samples % self.scrambles
-        ):
+        if self.scrambles is not None and self.samples % self.scrambles:
             raise ValueError(f"scrambles must divide samples, got {self.scrambles} of {self.samples}")
         if self.scrambles is not None and self.sampler != "sobol":
             raise ValueError(f"scrambles are those of sampler 'sobol', got {self.scrambles} with {self.sampler!r}")

@@ -6,7 +6,7 @@ Each module needs its own optional package, and is imported when it is first use
 import importlib
 from types import ModuleType
 
-_MODULES = ("mitsuba", "mitsuba_parameters", "mitsuba_variants", "onnx", "process")
+_MODULES = ("mitsuba", "onnx", "process")
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -21,7 +21,7 @@ from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
-from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory
@@ -87,9 +87,7 @@ class BlackBox(nn.Module):
         self.smoothing = smoothing
         if memory is not None and not isinstance(memory, Memory):
             raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
-        self.call = BlackBoxCall(
-            fn, vectorized, Inline() if evaluator is None else evaluator, value, on_nonfinite, head
-        )
+        self.call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
         self.memory = memory
         self.control: Control | None = None
         """The memory during the present call."""

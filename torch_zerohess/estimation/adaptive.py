@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.estimation.batch import Batch
 from torch_zerohess.smoothing import Smoothing
 
@@ -73,5 +74,5 @@ def check_limits(tolerance: float | None, max_evaluations: int | None) -> None:
         raise TypeError(f"tolerance must be a positive number, got {tolerance!r}")
     if not 0 < tolerance < math.inf:
         raise ValueError(f"tolerance must be positive and finite, a relative error such as 0.1, got {tolerance}")
-    if max_evaluations is not None and (isinstance(max_evaluations, bool) or not isinstance(max_evaluations, int)):
-        raise TypeError(f"max_evaluations must be an integer, got {max_evaluations!r}")
+    if max_evaluations is not None:
+        checked_integer("max_evaluations", max_evaluations)

@@ -16,7 +16,7 @@ from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
-from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory
@@ -75,7 +75,7 @@ def estimate(
     """
     if not isinstance(smoothing, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
-    call = BlackBoxCall(fn, vectorized, Inline() if evaluator is None else evaluator, value, on_nonfinite, head)
+    call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
     check_limits(tolerance, max_evaluations)
     _check_memory(head, memory, tolerance)
     x = checked_input(x).detach().clone()

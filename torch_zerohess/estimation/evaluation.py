@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -41,7 +41,7 @@ class BlackBoxCall:
 
     fn: Callable[..., Any]
     vectorized: bool = True
-    evaluator: Evaluator = field(default_factory=Inline)
+    evaluator: Evaluator | None = None
     value: ValueMode = "center"
     on_nonfinite: str | float = "raise"
     head: Head | None = None
@@ -49,6 +49,8 @@ class BlackBoxCall:
     def __post_init__(self) -> None:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
+        if self.evaluator is None:
+            object.__setattr__(self, "evaluator", Inline())
         checked_head(self.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
@@ -60,6 +62,7 @@ class BlackBoxCall:
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
         fn = self.fn if self.vectorized else Each(self.fn)
+        assert self.evaluator is not None
         values = checked_values(self.evaluator(fn, points, *aux), points, self.vectorized)
         return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
 
@@ -98,9 +101,9 @@ class Evaluations:
     Shapes: B batch, K perturbations, n parameters.
     """
 
-    everywhere: Tensor | None
+    all_points: Tensor | None
     """Points [B, E, n], in the dtype of x, if they are kept: the K perturbed ones, and x where it was evaluated."""
-    everything: Tensor
+    all_values: Tensor
     """Values there, [B, E, *out], as the black box returned them; zero where they were dropped."""
     share: Tensor
     """Weight of each row in a mean, [B, K, 1]: 1/K; where rows were dropped, zero for them and more for the others."""
@@ -113,13 +116,13 @@ class Evaluations:
     @property
     def values(self) -> Tensor:
         """Values at the perturbed points, [B, K, *out]."""
-        return self.everything[:, : self.share.shape[1]]
+        return self.all_values[:, : self.share.shape[1]]
 
     @property
     def center(self) -> Tensor | None:
         """f(x), [B, *out], where it was evaluated."""
         K = self.share.shape[1]
-        return self.everything[:, K] if self.everything.shape[1] > K else None
+        return self.all_values[:, K] if self.all_values.shape[1] > K else None
 
     @property
     def rest(self) -> Tensor:
@@ -130,8 +133,8 @@ class Evaluations:
     @property
     def points(self) -> Tensor:
         """Perturbed points [B, K, n], in the dtype of x: made again where they are not kept."""
-        if self.everywhere is not None:
-            return self.everywhere[:, : self.share.shape[1]]
+        if self.all_points is not None:
+            return self.all_points[:, : self.share.shape[1]]
         stein = self.expansion.stein
         assert isinstance(stein, LikelihoodRatio)
         assert isinstance(stein.u, Redrawn)
@@ -175,15 +178,15 @@ def evaluate(
     seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
     with_center = call.value == "center" or smoothing.baseline == "center"
     perturbations = perturb(x, smoothing, seed, keep, with_center)
-    everywhere, stein = perturbations.points, perturbations.stein
-    B, K, n = len(x), everywhere.shape[1] - with_center, x.shape[1]
+    points, stein = perturbations.points, perturbations.stein
+    B, K, n = len(x), points.shape[1] - with_center, x.shape[1]
     # Where perturbations are too many to be kept, so are two copies of the points.
     redrawn = stein.u if isinstance(stein, LikelihoodRatio) and isinstance(stein.u, Redrawn) else None
     spare = redrawn is not None and control is None
-    values, outputs = call.values(everywhere, control.references(aux) if control else aux, spare=spare)
+    values, outputs = call.values(points, control.references(aux) if control else aux, spare=spare)
     if spare and redrawn is not None and not math.isfinite(float(values.sum())):
-        everywhere = completed(redrawn.points(), x, with_center)  # as they were before fn
-    values, kept = finite_values(values, everywhere, call.on_nonfinite, K, smoothing, stein)
+        points = completed(redrawn.points(), x, with_center)  # as they were before fn
+    values, kept = finite_values(values, points, call.on_nonfinite, K, smoothing, stein)
     share = torch.full((B, K, 1), 1.0 / K, dtype=torch.float64, device=x.device)
     if kept is not None:
         share = (kept / kept.sum(1, keepdim=True).double())[..., None]
@@ -193,7 +196,7 @@ def evaluate(
         return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
 
     counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
-    explain = None if control is None else partial(control.explain, values, everywhere, outputs, aux, added, counted)
+    explain = None if control is None else partial(control.explain, values, points, outputs, aux, added, counted)
     remaining = _remaining(call, values, share, aux, control, explain, stein)
     baseline, coefficients = _coefficients(remaining.reshape(B, K + with_center, -1), share, smoothing, n)
     # The sum of finite numbers may be infinite, but that of others is never finite.
@@ -213,7 +216,7 @@ def evaluate(
         if entropy:
             base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
     expansion = Expansion(base, coefficients, perturbations.sigma, stein)
-    return Evaluations(None if spare else everywhere, values, share, remaining, baseline, expansion)
+    return Evaluations(None if spare else points, values, share, remaining, baseline, expansion)
 
 
 def _remaining(

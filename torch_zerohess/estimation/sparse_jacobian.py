@@ -12,7 +12,7 @@ from torch_zerohess.estimation.inputs import checked_input
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values
 from torch_zerohess.estimation.perturbations import perturb
-from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -84,7 +84,7 @@ def sparse_jacobian(
         )
     settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True)
     check_samples(smoothing.samples, keep)
-    call = BlackBoxCall(fn, vectorized, Inline() if evaluator is None else evaluator, "smoothed", on_nonfinite)
+    call = BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite)
     work = x if x.dtype == torch.float64 else x.float()
     u, changes, weights, shape, evaluations = _sampled(call, work, smoothing)
     check_samples(len(u), keep)

@@ -20,6 +20,7 @@ from typing import Any
 
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.payload import dumped, loaded_error
@@ -88,16 +89,15 @@ class ProcessPool(Ahead):
         recycle: int | None = None,
         memory_limit: int | None = None,
     ) -> None:
-        _check("workers", workers, 1)
-        _check("retries", retries, 0, none=False)
-        _check("recycle", recycle, 1)
+        self.workers = cores() if workers is None else checked_integer("workers", workers, 1)
+        retries = checked_integer("retries", retries, 0)
+        recycle = None if recycle is None else checked_integer("recycle", recycle, 1)
         if timeout is not None and not timeout > 0:
             raise ValueError(f"timeout must be seconds > 0 or None, got {timeout!r}")
         if memory_limit is not None and not memory_limit > 0:
             raise ValueError(f"memory_limit must be bytes > 0 or None, got {memory_limit!r}")
         if memory_limit is not None and sys.platform != "linux":
             raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
-        self.workers = workers or cores()
         self.timeout, self.retries, self.recycle, self.memory_limit = timeout, retries, recycle, memory_limit
         super().__init__()
         self._forget()
@@ -278,13 +278,6 @@ class ProcessPool(Ahead):
 def cores() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _check(name: str, value: int | None, least: int, *, none: bool = True) -> None:
-    if value is None and none:
-        return
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} must be an integer >= {least}{' or None' if none else ''}, got {value!r}")
 
 
 def _unmade(error: BaseException) -> BaseException:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch, Chunk
@@ -42,10 +43,9 @@ class Ray(Ahead):
     """
 
     def __init__(self, actors: int | None = None, *, retries: int = 2, **options: Any) -> None:
-        for name, value, least in (("actors", actors, 1), ("retries", retries, 0)):
-            given = isinstance(value, int) and not isinstance(value, bool) and value >= least
-            if not given and not (name == "actors" and value is None):
-                raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
+        if actors is not None:
+            actors = checked_integer("actors", actors, 1)
+        retries = checked_integer("retries", retries, 0)
         try:
             import ray
         except ModuleNotFoundError as error:

@@ -14,10 +14,12 @@ def as_tensor(result: Any) -> Tensor:
     images of bytes, a loss that is 0 on a plateau.
     """
     try:
-        if hasattr(result, "__array_interface__"):  # of NumPy, with strides and types that torch may not know
+        numpy = sys.modules.get("numpy")
+        if numpy is not None and hasattr(result, "__array_interface__"):  # of any strides, and types torch may not know
+            result = numpy.asarray(result)
             long = result.dtype.kind == "f" and result.dtype.itemsize > 8
             kind = float if long else result.dtype.newbyteorder("=")
-            result = sys.modules["numpy"].require(result, dtype=kind, requirements="CW")
+            result = numpy.require(result, dtype=kind, requirements="CW")
         leaf = result  # whatever the default dtype of torch
         while isinstance(leaf, (list, tuple)) and len(leaf):
             leaf = leaf[0]

@@ -6,10 +6,11 @@ from typing import Any
 
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.linalg.dual import clipped
 from torch_zerohess.linalg.steihaug import Step, steihaug
 from torch_zerohess.optim.newton_step import NewtonStep
-from torch_zerohess.optim.second_order import Model, check_count, check_not_negative, check_positive, check_radius
+from torch_zerohess.optim.second_order import Model, check_not_negative, check_positive, check_radius
 
 SOLVERS = ("steihaug", "clip", "dual")
 _FAR = 1e6
@@ -87,7 +88,6 @@ class NewtonCG(NewtonStep):
         check_radius(radius)
         check_positive(tolerance=tolerance, max_radius=max_radius)
         check_not_negative(damping=damping, noise=noise)
-        check_count(iterations=iterations)
         if solver not in SOLVERS:
             raise ValueError(f"solver must be one of {', '.join(map(repr, SOLVERS))}, got {solver!r}")
         if modification not in (None, "abs"):
@@ -102,7 +102,7 @@ class NewtonCG(NewtonStep):
             "curvature": curvature,
             "solver": solver,
             "modification": modification,
-            "iterations": iterations,
+            "iterations": checked_integer("iterations", iterations, 1),
             "tolerance": tolerance,
             "damping": damping,
             "adapt": adapt,

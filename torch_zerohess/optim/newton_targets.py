@@ -6,6 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.autograd.blocks import magnitudes
 
 _DENSE = 16
@@ -49,9 +50,8 @@ class NewtonTargets:
         for name, value in (("damping", damping), ("radius", radius)):
             if not value > 0.0:
                 raise ValueError(f"{name} must be positive, got {value}")
-        if not isinstance(iterations, int) or iterations < 1:
-            raise ValueError(f"iterations must be an integer of at least 1, got {iterations!r}")
-        self.damping, self.iterations, self.radius = damping, iterations, radius
+        self.damping, self.radius = damping, radius
+        self.iterations = checked_integer("iterations", iterations, 1)
         self.losses: Tensor | None = None
         """[B], of the last call."""
         self._factor: Tensor | None = None

@@ -7,12 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.optim.second_order import (
     TRIALS,
     Closure,
     Model,
     SecondOrder,
-    check_count,
     check_not_negative,
     check_radius,
 )
@@ -75,14 +75,13 @@ class NonlinearCG(SecondOrder):
     ) -> None:
         check_radius(radius)
         check_not_negative(line_search_tolerance=line_search_tolerance)
-        check_count(line_search_iterations=line_search_iterations, recompute=recompute)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'abs' or 'radius', got {modification!r}")
         defaults = {
             "radius": radius,
-            "line_search_iterations": line_search_iterations,
+            "line_search_iterations": checked_integer("line_search_iterations", line_search_iterations, 1),
             "line_search_tolerance": line_search_tolerance,
-            "recompute": recompute,
+            "recompute": checked_integer("recompute", recompute, 1),
             "curvature": curvature,
             "modification": modification,
         }

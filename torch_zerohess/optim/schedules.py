@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Iterable
-from numbers import Integral, Real
 from typing import Any
 
 from torch import nn
 
+from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.autograd.blackbox import BlackBox
 
 
@@ -42,12 +42,10 @@ class LinearSigma:
                     "parameters of the black box instead"
                 )
         for name, value in (("start", start), ("end", end)):
-            if not isinstance(value, Real) or not 0 < value < math.inf:
+            if not 0 < checked_number(name, value) < math.inf:
                 raise ValueError(f"{name} must be a positive sigma, got {value!r}")
-        for name, count, least in (("steps", steps, 1), ("hold", hold, 0)):
-            if not isinstance(count, Integral) or count < least:
-                raise ValueError(f"{name} must be an integer of at least {least}, got {count!r}")
-        self.start, self.end, self.steps, self.hold, self.count = float(start), float(end), steps, hold, 0
+        self.start, self.end, self.count = float(start), float(end), 0
+        self.steps, self.hold = checked_integer("steps", steps, 1), checked_integer("hold", hold, 0)
         self._apply()
 
     @property

@@ -201,12 +201,3 @@ def check_not_negative(**settings: float) -> None:
     for name, value in settings.items():
         if not 0.0 <= value < math.inf:
             raise ValueError(f"{name} must be finite and not negative, got {value}")
-
-
-def check_count(**settings: int) -> None:
-    """Raise for a setting that is not an integer of at least one."""
-    for name, value in settings.items():
-        if isinstance(value, bool) or not hasattr(value, "__index__"):
-            raise TypeError(f"{name} must be an integer, got {value!r}")
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")

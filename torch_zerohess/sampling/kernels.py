@@ -75,7 +75,7 @@ def _compiled(tensor: Tensor) -> bool:
     return extension.available and tensor.is_cpu
 
 
-def _drawn(tensor: Tensor) -> bool:
+def _draws_on(tensor: Tensor) -> bool:
     """Whether there is an operator that draws on this device."""
     return extension.available and (tensor.is_cpu or (tensor.is_cuda and _triton))
 
@@ -89,14 +89,14 @@ def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: 
 
 def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:
     """See `proposals.draw`."""
-    if _drawn(rows):
+    if _draws_on(rows):
         return torch.ops.torch_zerohess.draw(rows.contiguous(), n, single)
     return proposals.draw(rows, n, single)
 
 
 def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> Tensor:
     """See `philox.uniforms`; first is even."""
-    if _drawn(row):
+    if _draws_on(row):
         return torch.ops.torch_zerohess.uniforms(seed.contiguous(), row.contiguous(), first, count, stream)
     return philox.uniforms(seed, row, first, count, stream)
 
@@ -135,7 +135,7 @@ def sample(
     see `proposals.pick_rows`, `proposals.draw` and `proposals.place`. E = K + 1 with x as the last point where
     `center`, else K.
     """
-    if _drawn(x):
+    if _draws_on(x):
         return torch.ops.torch_zerohess.sample(seed, S, x.contiguous(), sigma, antithetic, proposal, center, keep)
     (B, n), single = x.shape, x.dtype == torch.float32
     rows = pick_rows(seed, 0, B * S, n, proposal, x.device)

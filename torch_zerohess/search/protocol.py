@@ -17,8 +17,8 @@ from typing import Any, Generic
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import check_callable, checked_integer, checked_number
 from torch_zerohess.estimation.inputs import short
-from torch_zerohess.search.arguments import check_callable, checked_integer, checked_number
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored

@@ -34,7 +34,7 @@ class LowRank:
 
         The draw depends on P alone, so that the same outputs give the same coordinates.
         """
-        flat = outputs.flatten(1)
+        flat = outputs.reshape(len(outputs), -1)
         mean = flat.mean(0)
         chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(0))[:rank]
         span = flat[chosen.to(flat.device)] - mean
@@ -45,18 +45,18 @@ class LowRank:
 
     def encode(self, outputs: Tensor) -> Tensor:
         """Coordinates [K, r] of outputs [K, *out]; what is outside of the span is left out."""
-        return (outputs.flatten(1) - self.mean) @ self.basis
+        return (outputs.reshape(len(outputs), -1) - self.mean) @ self.basis
 
     def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
         """Coordinates [K, r] of outputs [K, *out], and the mean square [K] of what is outside of the span."""
-        change = outputs.flatten(1) - self.mean
+        change = outputs.reshape(len(outputs), -1) - self.mean
         known = change @ self.basis
         return known, (change.square().mean(1) - known.square().sum(1)).clamp_min(0.0)
 
     def decode(self, coordinates: Tensor) -> Tensor:
         """Outputs [K, *out] of coordinates [K, r]."""
         flat = self.mean + len(self.mean) * coordinates.to(self.basis.dtype) @ self.basis.mT
-        return flat.unflatten(1, self.shape)
+        return flat.reshape(len(flat), *self.shape)
 
 
 class LowRankSurrogate:

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.surrogate import Surrogate
 
@@ -67,13 +68,9 @@ class Memory:
         order: int = 2,
         draws: int | None = None,
     ) -> None:
-        for name, number, least in (("capacity", capacity, 2), ("fresh", fresh, 0), ("draws", draws, 2)):
-            if number is None:  # of fresh and draws
-                continue
-            if isinstance(number, bool) or not hasattr(number, "__index__"):
-                raise TypeError(f"{name} must be an integer, got {number!r}")
-            if number < least:
-                raise ValueError(f"{name} must be at least {least}, got {number}")
+        capacity = checked_integer("capacity", capacity, 2)
+        fresh = None if fresh is None else checked_integer("fresh", fresh, 0)
+        draws = None if draws is None else checked_integer("draws", draws, 2)
         if surrogate is not None and not callable(surrogate):
             raise TypeError(f"surrogate must have fit(points, outputs) and __call__(z), got {surrogate!r}")
         if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):

@@ -160,6 +160,20 @@ def test_integers_and_truth_values_are_numbers(fn) -> None:
     assert torch.equal(one.gradient, expected.gradient)
 
 
+class Picture:
+    """Numbers by the array interface alone, as an image of Pillow has them."""
+
+    def __init__(self, array: np.ndarray) -> None:
+        self._array = array
+        self.__array_interface__ = array.__array_interface__
+
+
+def test_what_has_the_array_interface_is_an_array() -> None:
+    bytes_ = lambda z: (z.numpy() > 0.2).astype(np.uint8)  # noqa: E731
+    got = estimate(lambda z: Picture(bytes_(z)), X, S).gradient
+    assert torch.equal(got, estimate(bytes_, X, S).gradient)
+
+
 @pytest.mark.parametrize("make", [lambda a: a[:, ::-1], lambda a: np.broadcast_to(a[:, :1], a.shape)])
 def test_arrays_in_any_order_and_without_the_right_to_write(make, recwarn) -> None:
     got = estimate(lambda z: make(z.numpy()), X, S).gradient

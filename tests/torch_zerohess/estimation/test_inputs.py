@@ -59,8 +59,8 @@ SETTINGS = [
     ({"sampler": "orthogonal", "proposal": "fr22"}, ValueError, "proposal must be .*got 'fr22'"),
     ({"sampler": "sobol", "proposal": "optimal"}, ValueError, "sampler must be 'random', got 'sobol'"),
     ({"sampler": "sobol", "scrambles": 3}, ValueError, "scrambles must divide samples, got 3 of 8"),
-    ({"sampler": "sobol", "scrambles": 0}, ValueError, "scrambles must divide samples, got 0 of 8"),
-    ({"sampler": "sobol", "scrambles": True}, ValueError, "scrambles must divide samples, got True of 8"),
+    ({"sampler": "sobol", "scrambles": 0}, ValueError, "scrambles must be at least 1, got 0"),
+    ({"sampler": "sobol", "scrambles": True}, TypeError, "scrambles must be an integer, got True"),
     ({"scrambles": 2}, ValueError, "scrambles are those of sampler 'sobol', got 2 with 'random'"),
     ({"width": 1.0}, TypeError, "width"),
 ]

@@ -58,7 +58,7 @@ def test_errors(actors):
 
 
 def test_arguments_are_checked():
-    with pytest.raises(ValueError, match="actors must be an integer >= 1, got 0"):
+    with pytest.raises(ValueError, match="actors must be at least 1, got 0"):
         Ray(0)
-    with pytest.raises(ValueError, match="retries must be an integer >= 0, got -1"):
+    with pytest.raises(ValueError, match="retries must be at least 0, got -1"):
         Ray(retries=-1)

@@ -91,7 +91,7 @@ def test_a_network_learns_through_an_ill_conditioned_layer():
     [
         ({"damping": 0.0}, "damping must be positive, got 0.0"),
         ({"radius": -1.0}, "radius must be positive, got -1.0"),
-        ({"iterations": 0}, "iterations must be an integer of at least 1, got 0"),
+        ({"iterations": 0}, "iterations must be at least 1, got 0"),
     ],
 )
 def test_settings_are_checked(arguments, message):

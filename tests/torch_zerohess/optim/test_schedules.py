@@ -1,5 +1,6 @@
 """The sigma schedule: its values step by step, and resuming."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -19,23 +20,32 @@ def test_linear_sigma():
     other.load_state_dict(schedule.state_dict())
     assert layer.smoothing.sigma == pytest.approx(0.8)
     wrong = (
-        {"start": 0.0},
-        {"start": "a"},
-        {"end": -1.0},
-        {"end": float("inf")},
-        {"steps": 0},
-        {"steps": 2.5},
-        {"hold": -1},
+        ({"start": 0.0}, ValueError),
+        ({"start": "a"}, TypeError),
+        ({"end": -1.0}, ValueError),
+        ({"end": float("inf")}, ValueError),
+        ({"steps": 0}, ValueError),
+        ({"steps": 2.5}, TypeError),
+        ({"hold": -1}, ValueError),
     )
-    for settings in wrong:
+    for settings, error in wrong:
         arguments = {"start": 1.0, "end": 0.5, "steps": 2} | settings
-        with pytest.raises(ValueError, match=next(iter(settings))):
+        with pytest.raises(error, match=next(iter(settings))):
             zh.LinearSigma(layer, **arguments)
     with pytest.raises(TypeError, match="BlackBox"):
         zh.LinearSigma([lambda z: z], 1.0, 0.5, steps=2)
     for nothing in ([], 5, torch.nn.Linear(1, 1)):
         with pytest.raises(TypeError, match=r"module_or_modules must .*got"):
             zh.LinearSigma(nothing, 1.0, 0.5, steps=2)
+
+
+def test_numbers_of_every_kind():
+    layer = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0))
+    schedule = zh.LinearSigma(layer, torch.tensor(2.0), np.float32(1.0), steps=np.int64(2), hold=torch.tensor(1))
+    schedule.step()
+    schedule.step()
+    assert layer.smoothing.sigma == 1.5
+    assert {type(value) for value in schedule.state_dict().values()} <= {int, float}
 
 
 def test_layers_inside_of_modules():

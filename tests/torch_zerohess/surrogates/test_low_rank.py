@@ -84,6 +84,14 @@ def test_the_latest_points_are_kept_and_types_are_those_of_the_inputs():
     assert model(points).dtype == torch.float32
 
 
+def test_numbers_are_outputs_too():
+    points = normal(30, 2)
+    numbers = points @ torch.tensor([1.0, -2.0], dtype=points.dtype)
+    model = LowRankSurrogate(LinearSurrogate(), rank=8)
+    model.fit(points, numbers)
+    torch.testing.assert_close(model(points), numbers, atol=1e-4, rtol=0)
+
+
 def test_what_is_wrong_is_said():
     with pytest.raises(ValueError, match="rank must be at least 1, got 0"):
         LowRankSurrogate(LinearSurrogate(), rank=0)

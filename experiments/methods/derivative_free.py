@@ -45,7 +45,7 @@ class Best:
 def cma_es(trial: Trial, *, scale: float = 1.0, bounded: bool = False) -> None:
     """CMA-ES of pycma with its default population 4 + floor(3 ln n), and with bounds if `bounded`.
 
-    Where it stops by itself, as it does on a plateau, it starts again from the same point with twice the population
+    Where it stops by itself, as it does on a plateau, it starts again from a random point with twice the population
     (Auger and Hansen 2005, "A restart CMA evolution strategy with increasing population size"), until the evaluations
     are used up. pycma wants two parameters: a single one gets a second that changes nothing.
     """
@@ -61,9 +61,9 @@ def cma_es(trial: Trial, *, scale: float = 1.0, bounded: bool = False) -> None:
         lower, upper = (one.tolist() for one in trial.task.bounds)
         options["bounds"] = [lower + [-1.0] * len(more), upper + [1.0] * len(more)]
     best, population = Best(trial), 4 + int(3 * math.log(n))
-    while True:
+    for start in starts(trial):
         strategy = cma.CMAEvolutionStrategy(
-            trial.start.tolist() + more, scale * trial.task.sigma, {**options, "popsize": population}
+            start.tolist() + more, scale * trial.task.sigma, {**options, "popsize": population}
         )
         while not strategy.stop():
             drawn = np.array(strategy.ask())

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator
 
+import torch
 from torch import Tensor
 
 from experiments.runs.trial import Trial
@@ -12,10 +13,20 @@ _OTHERS = 1_000_000
 
 
 def starts(trial: Trial) -> Iterator[Tensor]:
-    """Yield the start [n] of a trial, then random ones of its task, until one has cost no evaluation."""
+    """Yield the start [n] of a trial, then random points, until one has cost no evaluation.
+
+    The random points are uniform within the bounds. Without finite bounds they are further starts of the task.
+    """
     yield trial.start
+    bounds = trial.task.bounds
+    within = bounds is not None and bool(torch.isfinite(torch.stack(bounds)).all())
     for again in itertools.count(1):
-        before = trial.evaluations
-        yield trial.task.start(_OTHERS * again + trial.run).double()
+        before, number = trial.evaluations, _OTHERS * again + trial.run
+        if within and bounds is not None:
+            lower, upper = bounds
+            drawn = torch.rand(trial.task.n, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
+            yield lower + (upper - lower) * drawn
+        else:
+            yield trial.task.start(number).double()
         if trial.evaluations == before:
             return

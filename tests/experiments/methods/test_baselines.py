@@ -107,6 +107,29 @@ def test_the_best_point_is_reported(name) -> None:
 
 
 @pytest.mark.parametrize("name", ["cma_es_bounded", "cobyqa", "dfo_ls", "lbfgs_fd"])
+def test_a_plateau_is_left_from_a_random_point_within_the_bounds(name) -> None:
+    """All starts of the task lie on the plateau, six wide, and steps are at most one long at first."""
+
+    def image(x):
+        change = x - 2.0
+        return torch.where(change.norm(dim=1, keepdim=True) < 2.0, change, 2.0)
+
+    both = torch.ones(2, dtype=torch.float64)
+    task = replace(
+        Line().task(2000),
+        n=2,
+        start=uniform(8 * both, 9 * both),
+        bounds=(0 * both, 10 * both),
+        output=least_squares(image, lambda one: one),
+        loss=lambda x: image(x).square().mean(1),
+        truth=Truth(lambda x: float(image(x[None]).square().mean()), lambda x: float((x - 2.0).square().mean())),
+    )
+    rows: list = []
+    attempt(task, name, 0, METHODS[name].solve, watch=rows.append)
+    assert rows[-1].image_error < 1e-3 * rows[0].image_error
+
+
+@pytest.mark.parametrize("name", ["cma_es_bounded", "cobyqa", "dfo_ls", "lbfgs_fd"])
 def test_bounds_are_kept(name) -> None:
     line = Line()
     task = line.task()

@@ -157,6 +157,14 @@ def test_named_files_exist(name, file):
     assert any(found), f"{name} names {file}"
 
 
+def test_code_that_mutations_change_is_there():
+    """A row of the list of constants quotes the code that it changes, with spaces for the ends of lines."""
+    quoted = re.findall(r"^\| `([^`]+)` \| .* \| `([^`]+)` -> ", TEXTS["tests/README.md"].replace(r"\|", "|"), re.M)
+    assert len(quoted) > 150
+    missing = [row for row in quoted if " ".join(row[1].split()) not in " ".join((ROOT / row[0]).read_text().split())]
+    assert not missing
+
+
 def test_tests_that_are_named_exist():
     """The list of constants names the test that notices each of them."""
     named = set(re.findall(r"`(test_\w+)`", TEXTS["tests/README.md"]))

@@ -33,7 +33,7 @@ _FEWEST, _FEW = 4, 8  # evaluations below which single points have no three draw
 _LOW = 3  # parameters up to which few Sobol points fill the space
 _DENSE, _CURVED = 16, 6  # evaluations per parameter from which Sobol points, and pairs, have the least error
 _PAIRS = 64  # evaluations of so many pairs of Sobol points that they can be cut into four scrambles
-_WIDEST = 1024  # parameters up to which directions are made orthogonal: its time is that of n products of samples
+_WIDEST = 1024  # parameters up to which directions are made orthogonal: the time grows with n times the samples
 _SCRAMBLES = 4  # fewer would have a smaller error, and an interval of no use
 _LEAST_SCRAMBLE = 8  # points
 

@@ -7,7 +7,7 @@ of this form is a head. A render then serves every reference, because the black 
     loss = layer(network(images), images).mean()
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,12 +26,17 @@ class SquaredError:
 
     def __call__(self, outputs: Tensor, references: Tensor) -> Tensor:
         """Return the mean squared differences [K]."""
-        if outputs.shape[1:] != references.shape[1:]:
+        self.check(outputs.shape[1:], references)
+        return (outputs - references).flatten(1).square().mean(1)
+
+    @staticmethod
+    def check(out: Sequence[int], references: Tensor) -> None:
+        """Raise ValueError for references that are not [K, *out]."""
+        if references.shape[1:] != tuple(out):
             raise ValueError(
-                f"references must be [K, *out] with out = {list(outputs.shape[1:])}, the shape of one output, "
+                f"references must be [K, *out] with out = {list(out)}, the shape of one output, "
                 f"got {list(references.shape)}"
             )
-        return (outputs - references).flatten(1).square().mean(1)
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ class LocalEntropy:
     scale, and vanishes with the loss. T is not differentiated. For a large temperature the local entropy is the mean.
 
     Args:
-        head: of which the losses are.
+        head: outputs [K, *out], *aux [K, ...] -> losses [K].
         temperature: T over the mean loss.
     """
 

@@ -77,7 +77,7 @@ def minimize(
             `scipy.optimize.Bounds`.
         max_evaluations: points that fn may be called with.
         engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
-            and, for an output of 20 parameters or more, by the first evaluations.
+            and, with `loss` and at least 20 parameters, by the first evaluations.
         batch: points that fn gets at once, where the search can use so many: fewer batches, more evaluations. Give the
             number of `workers`, or how many points fn takes at once. See `TrustRegion.ask`.
         vectorized: False for an fn of one point, [n] -> scalar or [*out].

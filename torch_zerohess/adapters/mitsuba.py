@@ -47,10 +47,10 @@ class MitsubaScene:
         description: what `mitsuba.load_dict` takes, a function that returns it for the `mitsuba` module (for what needs
             the variant, such as transforms and meshes), or the path of an XML file.
         parameters: what the columns of x change, in this order.
-        film: width and height in pixels; None for those of the scene.
-        spp: samples per pixel, at least 1; None for that of the scene.
-        depth: longest path, for the integrator `path` instead of that of the scene: 2 is direct light.
-        integrator: of `load_dict`, instead of that of the scene.
+        film: width and height in pixels; None keeps the film of the scene.
+        spp: samples per pixel, at least 1; None keeps the number of the scene.
+        depth: longest path, with the integrator `path` in place of the scene's integrator: 2 is direct light.
+        integrator: dictionary for `load_dict`, in place of the scene's integrator.
         seed: of the renders, at least 0.
         noise: "fixed" has the same seed always; "call" a new one for every call, shared by its points; "point" a new
             one for every point.

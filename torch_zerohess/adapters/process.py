@@ -13,6 +13,8 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.values import as_tensor
+
 _KEPT = 50
 """Lines of the standard error that are shown in an error."""
 
@@ -31,7 +33,7 @@ class Program:
     - "json": a request is the line `{"x": [[...], ...]}`, with `"aux": [...]` where there is aux. The answer is one
       line, the list of K values. Numbers are written so that float64 is read back exactly.
     - "npy": a request is the array x, then each aux, as `numpy.save` writes them. The answer is one array.
-    - a function of bytes: makes the value of what the program wrote; the request is that of "json".
+    - a function of bytes: turns the output of the program into the value. Requests are written as for "json".
 
     A server flushes its output after each answer, and writes messages to the standard error alone. It ends when its
     standard input does. A server that ended or took too long is started again by the next call.
@@ -164,12 +166,12 @@ class Program:
 
     def _values(self, output: bytes) -> Tensor:
         if callable(self.format):
-            return torch.as_tensor(self.format(output))
+            return as_tensor(self.format(output))
         try:
             if self.format == "npy":
                 import numpy as np
 
-                return torch.from_numpy(np.load(io.BytesIO(output), allow_pickle=False))
+                return as_tensor(np.load(io.BytesIO(output), allow_pickle=False))
             return torch.tensor(json.loads(output), dtype=torch.float64)
         except (ValueError, TypeError, EOFError, OSError) as error:
             shown = output[:200].decode(errors="replace")

@@ -1,4 +1,4 @@
-"""What every draw adds to the derivatives: on which the coefficient of a control variate is measured."""
+"""The share of every draw in the derivatives, from which the coefficient of a control variate is estimated."""
 
 from collections.abc import Sequence
 

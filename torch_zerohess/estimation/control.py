@@ -101,6 +101,7 @@ class Control:
         head = self.head.head if isinstance(self.head, LocalEntropy) else self.head
         space = getattr(surrogate, "space", None)
         if isinstance(head, SquaredError) and space is not None:
+            head.check(space.shape, aux[0])
             known, outside = space.split(aux[0])
             coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
             losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]

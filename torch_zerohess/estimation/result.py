@@ -120,10 +120,10 @@ class Estimate:
         12.7 for two draws (sampler "sobol" has two below 32 samples), 3.2 for four, 2.1 for 16, 1.96 for many. For
         "optimal" the draws are the samples of an element.
 
-        It is exact for normal draws. What draws are is kernel times f: near to normal for f that varies at random or in
-        waves, skewed for f of one sign of curvature, the more the wider the tails of the kernel are ("gaussian" more
-        than "aggregate" and "optimal", the Hessian more than the gradient). With few skewed draws it covers less: four
-        antithetic draws of the Hessian of a parabola 0.67 instead of 0.95.
+        It is exact for normal draws. A draw is a kernel times f. Draws are nearly normal if f varies at random or in
+        waves. They are skewed if the curvature of f has one sign, and more so the wider the tails of the kernel
+        ("gaussian" more than "aggregate" and "optimal", the Hessian more than the gradient). With few skewed draws the
+        interval covers less: four antithetic draws of the Hessian of a parabola 0.67 instead of 0.95.
 
         Args:
             quantity: as for `standard_error`; "value" is F(x), also where `value` is f(x).

@@ -29,7 +29,7 @@ class Newton(NewtonStep):
       beyond its own magnitude (Dauphin et al. 2014): the safer choice for sampled Hessians.
 
     Eigenvalues within rounding of zero count as zero, and so do components of the gradient along their eigenvectors.
-    With `adapt` the closure is called once more, without derivatives: a step that does not lower the loss is taken
+    With `adapt` the closure is called again, without derivatives: a step that does not lower the loss is taken
     back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Without
     `adapt` every step is taken.
 

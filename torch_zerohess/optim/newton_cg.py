@@ -28,11 +28,12 @@ class NewtonCG(NewtonStep):
     - "clip": conjugate gradients without a boundary; the step is shortened to the radius afterwards. The direction is
       Newton's, however short the step.
     - "dual": the same with an exact solution, by a system of as many equations as the network has outputs in the batch
-      (`linalg.dual.dual_step`). It costs one product J J^T: for batches of few outputs and many weights.
+      (`linalg.dual.dual_step`). It costs one product J J^T: for batches of few outputs and many weights. Where the
+      curvature over the outputs is indefinite, and not modified, the step is that of "clip".
 
-    With `adapt` the closure is called once more, without derivatives: a step that does not lower the
-    loss is taken back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright,
-    algorithm 4.1). Without it every step is taken, as suits a loss over small batches.
+    With `adapt` the closure is called again, without derivatives, up to ten times if the loss is not finite. A step
+    that does not lower the loss is taken back, and the radius follows the ratio of actual to predicted decrease
+    (Nocedal and Wright, algorithm 4.1). Without it every step is taken, as suits a loss over small batches.
 
     Noise. Sampled derivatives have an error, which exact steps amplify in flat directions. The closure may return
     several losses [R], independent estimates whose mean is the loss (`layer(x.expand(R, n))`, or one per image of a
@@ -118,8 +119,8 @@ class NewtonCG(NewtonStep):
 
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
         solver, damping = group["solver"], group["damping"]
-        if solver == "dual":
-            return model.dual_step(radius, damping)
+        if solver == "dual" and (exact := model.dual_step(radius, damping)) is not None:
+            return exact
 
         def product(v: Tensor) -> Tensor:
             return model.products(v) + damping * v

@@ -17,7 +17,7 @@ _ROUNDING = 10.0
 class NewtonStep(SecondOrder):
     """Steps to the minimum of a quadratic model inside |s| <= radius, with or without a test.
 
-    With `adapt` the closure is called once more, without derivatives: a step that does not lower the loss is taken
+    With `adapt` the closure is called again, without derivatives: a step that does not lower the loss is taken
     back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Where
     the predicted decrease is within the rounding of the loss no step is taken, and the radius stays.
     """

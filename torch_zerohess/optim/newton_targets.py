@@ -18,7 +18,7 @@ _PATIENCE = 100
 
 
 class NewtonTargets:
-    """Replaces the losses of a batch by squared distances to the ends of Newton steps (Petersen et al. 2024).
+    """Returns, for every element of a batch, the end of a Newton step on its loss (Petersen et al. 2024).
 
     For losses l of outputs y [B, n] with gradient g and Hessian H of every element,
 

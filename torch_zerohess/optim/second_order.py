@@ -22,6 +22,8 @@ Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
 _OUTSIDE = 1e-4
 """Part of a gradient that may come from elsewhere than the inputs of black boxes, for the dual solve: rounding."""
+_INDEFINITE = 1e-12
+"""Least eigenvalue of a curvature, over the largest one, that is negative by more than rounding."""
 TRIALS = 10
 """Evaluations of one step at most; it is shortened after each one at which the loss is not finite."""
 
@@ -81,8 +83,8 @@ class Model:
         ]
         return operator.pull(pushed).double()
 
-    def dual_step(self, radius: float, damping: float) -> Step:
-        """Return the step of `linalg.dual.dual_step` for the mean of the losses."""
+    def dual_step(self, radius: float, damping: float) -> Step | None:
+        """Return the step of `linalg.dual.dual_step` for the mean of the losses; None where A is indefinite."""
         A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
         slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
         g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
@@ -96,6 +98,10 @@ class Model:
                 "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone: "
                 "use solver 'steihaug' or 'clip'"
             )
+        if self._blocks is None:
+            values = torch.linalg.eigvalsh(A)
+            if float(values[0]) < -_INDEFINITE * float(values[-1].abs()):
+                return None
         return dual_step(J, A, g, radius, damping)
 
     def _dense(self, index: int) -> list[Tensor]:

@@ -27,7 +27,7 @@ class Descent(AskTell[Any]):
     point and around the best one with more samples per iteration.
 
     Settings are those of `AskTell`. Decreases below twice the `noise` do not count. By default the pool keeps three
-    times as many evaluations as the quadratic of a loss is fitted to; of an output 60 or 6 n.
+    times the evaluations that the quadratic of a loss is fitted to, and of an output max(60, 6 n).
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
     order; evaluations are re-used as in derivative-free least squares (Cartis et al. 2019) and COBYQA.

@@ -28,7 +28,7 @@ class OutputProcess(ProcessMethod[ProcessProgress]):
 
 
 class GaussianProcessSearch(AskTell[Any]):
-    """Search in a finite box by a Gaussian process, for one to about four parameters. It leaves local minima.
+    """Search in a finite box by a Gaussian process, for one to about four parameters. It escapes local minima.
 
     - With an output [K, *out] and a white-box `loss`, the process predicts the output anywhere in the box from all
       evaluations. The next point is the one where the loss of the prediction, with some optimism, is lowest; or where

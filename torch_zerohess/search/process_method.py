@@ -3,7 +3,7 @@
 The process predicts the output anywhere in the box from all evaluations. The next point is the one with the lowest loss
 among the outputs that lie within `_OPTIMISM` standard deviations of the prediction (Bayesian optimization of a
 composite function: Astudillo and Frazier 2019). Where that point is known already, the search evaluates the point that
-is known least, so it leaves local minima and plateaus.
+is known least, so it escapes local minima and plateaus.
 
 If the black box is noisy, the best point is the one whose *predicted* output has the lowest loss. Noise in outputs is
 detected by the evidence; noise in a plain loss is declared with `noise`.

@@ -23,7 +23,7 @@ ENGINES = ("auto", "gaussian_process", "descent", "local")
 class TrustRegion(AskTell[Any]):
     """A search that counts evaluations: `GaussianProcessSearch`, `Descent` or `LocalGaussNewton`. The caller evaluates.
 
-    - Up to four parameters in a finite box: a Gaussian process, which leaves plateaus and local minima.
+    - Up to four parameters in a finite box: a Gaussian process, which escapes plateaus and local minima.
     - 20 parameters or more, an output of many numbers and a `loss`: the first batch tells whether these numbers depend
       on few parameters each. If they do: Gauss-Newton on a sparse Jacobian.
     - Otherwise: descent by quadratic models in a trust region tied to sigma.

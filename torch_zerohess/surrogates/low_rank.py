@@ -45,13 +45,16 @@ class LowRank:
 
     def encode(self, outputs: Tensor) -> Tensor:
         """Coordinates [K, r] of outputs [K, *out]; what is outside of the span is left out."""
-        return (outputs.reshape(len(outputs), -1) - self.mean) @ self.basis
+        return self._change(outputs) @ self.basis
 
     def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
         """Coordinates [K, r] of outputs [K, *out], and the mean square [K] of what is outside of the span."""
-        change = outputs.reshape(len(outputs), -1) - self.mean
+        change = self._change(outputs)
         known = change @ self.basis
         return known, (change.square().mean(1) - known.square().sum(1)).clamp_min(0.0)
+
+    def _change(self, outputs: Tensor) -> Tensor:
+        return (outputs.reshape(len(outputs), -1) - self.mean).to(self.basis.dtype)
 
     def decode(self, coordinates: Tensor) -> Tensor:
         """Outputs [K, *out] of coordinates [K, r]."""

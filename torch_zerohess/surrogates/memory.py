@@ -17,6 +17,8 @@ _FEWEST = 8
 """Evaluations at the first fit."""
 _EXCESS = 1.05
 """Evaluations over the capacity at which they are thinned."""
+_BLOCK = 1024
+"""Points whose distances to others are held at once."""
 _FORGET = 0.8
 """Weight of what the coefficient knows, at every new call."""
 
@@ -70,7 +72,7 @@ class Memory:
     ) -> None:
         capacity = checked_integer("capacity", capacity, 2)
         fresh = None if fresh is None else checked_integer("fresh", fresh, 0)
-        draws = None if draws is None else checked_integer("draws", draws, 2)
+        draws = None if draws is None else checked_integer("draws", draws, 3)
         if surrogate is not None and not callable(surrogate):
             raise TypeError(f"surrogate must have fit(points, outputs) and __call__(z), got {surrogate!r}")
         if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):
@@ -213,13 +215,12 @@ class Memory:
 
     def _thin(self) -> None:
         """Drop points whose nearest neighbour among later ones is closest, until the capacity is kept."""
-        points, excess = self.points, self._size - self.capacity
-        scale = points.std(0).clamp_min(torch.finfo(points.dtype).tiny)
-        apart = torch.cdist(points / scale, points / scale, compute_mode="donot_use_mm_for_euclid_dist")
-        later = torch.ones_like(apart, dtype=torch.bool).triu(1)
-        nearest = apart.masked_fill(~later, float("inf")).min(1).values
-        kept = nearest.argsort()[excess:].sort().values
-        self._points, self._outputs = [points[kept]], [self.outputs[kept]]
+        first = max(self._size - 2 * self.capacity, 0)  # older ones go first, so that distances are few
+        points = self.points[first:]
+        scaled = points / points.std(0).clamp_min(torch.finfo(points.dtype).tiny)
+        nearest = torch.cat([_to_later(scaled, row) for row in range(0, len(scaled), _BLOCK)])
+        kept = first + nearest.argsort()[len(points) - self.capacity :].sort().values
+        self._points, self._outputs = [self.points[kept]], [self.outputs[kept]]
         self._size, self._rows = len(kept), int((kept < self._rows).sum())
 
     def state_dict(self) -> dict[str, Any]:
@@ -257,6 +258,14 @@ class Memory:
     def __repr__(self) -> str:
         kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"
         return f"Memory({type(self.surrogate).__name__}, {kept}, coefficient={self.coefficient:.2f})"
+
+
+def _to_later(points: Tensor, first: int) -> Tensor:
+    """Return the distances of a block of points [P, n] to the nearest of those after them; infinite for the last."""
+    block = points[first : first + _BLOCK]
+    apart = torch.cdist(block, points[first:], compute_mode="donot_use_mm_for_euclid_dist")
+    later = torch.ones_like(apart, dtype=torch.bool).triu(1)
+    return apart.masked_fill(~later, float("inf")).min(1).values
 
 
 def _is_number(value: float) -> bool:

@@ -109,4 +109,6 @@ def test_a_program_that_takes_arguments():
     fit = zh.minimize(program, torch.zeros(1, dtype=torch.float64), sigma=0.2, bounds=(-1, 1), seed=0, target=1e-6)
     assert abs(float(fit.x) - 0.25) < 1e-3
     assert fit.evaluations < 30
-    assert torch.equal(partial(program)(torch.tensor([[0.75]], dtype=torch.float64)), torch.tensor([0.25]))
+    assert torch.equal(
+        partial(program)(torch.tensor([[0.75]], dtype=torch.float64)), torch.tensor([0.25], dtype=torch.float64)
+    )

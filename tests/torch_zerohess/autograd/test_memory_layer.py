@@ -348,6 +348,26 @@ def test_wrong_arguments_say_so() -> None:
         zh.BlackBox(render, smoothing, head=zh.heads.SquaredError())(x, r[:, :2])
 
 
+def test_references_of_another_type_or_shape_than_the_images() -> None:
+    """With a surrogate in coordinates, as without one: types are promoted, shapes are not."""
+    waves = torch.linspace(1.0, 3.0, 100, dtype=torch.float64).view(10, 10)
+
+    def wide(z: Tensor) -> Tensor:
+        return torch.sin(z[:, :1, None].double() * waves).float()
+
+    memory = zh.Memory()
+    smoothing = zh.Smoothing(sigma=SIGMA, samples=4)
+    box = zh.BlackBox(wide, smoothing, head=zh.heads.SquaredError(), memory=memory, value="smoothed")
+    x, r = torch.rand(3, 2).double(), torch.rand(3, 10, 10).double()
+    for _ in range(4):
+        assert box(x, r).dtype == torch.float64
+    assert memory.surrogate.space is not None
+    memory.fresh = 0
+    box(x, r)
+    with pytest.raises(ValueError, match=r"references must be .* \[10, 10\].*got \[3, 100\]"):
+        box(x, r.flatten(1))
+
+
 class Column:
     """A surrogate of one number that keeps what it is given."""
 

@@ -81,12 +81,33 @@ def test_jacobians_agree() -> None:
         SampleJacobian(net, IMAGES)([torch.zeros(3)])
 
 
-def test_coupled_elements_are_refused() -> None:
+COUPLED = {
+    "all elements": lambda a, b: a.sum() ** 2,
+    "two elements": lambda a, b: a.square().sum() + 3.0 * (a[0] * a[2]).sum(),
+    "elements of the second tensor": lambda a, b: a.square().sum() + b.sum(0).square().sum(),
+    "elements of two tensors": lambda a, b: a.square().sum() + b.square().sum() + (a[1] * b[1]).sum(),
+}
+
+
+@pytest.mark.parametrize("loss", COUPLED.values(), ids=COUPLED.keys())
+def test_coupled_elements_are_refused(loss) -> None:
     net = network()
-    y = net(IMAGES)
-    operator = CurvatureOperator((y.sum() ** 2), list(net.parameters()), mode="gauss_newton", through=y)
+    a, b = net(IMAGES), net(2.0 * IMAGES)
+    operator = CurvatureOperator(loss(a, b), list(net.parameters()), mode="gauss_newton", through=[a, b])
     with pytest.raises(ValueError, match="couples its elements"):
         output_blocks(operator)
+
+
+@pytest.mark.parametrize("solver", ["dual", "clip"])
+def test_indefinite_curvature_is_descended(solver) -> None:
+    """On -|y|^2, which no step makes positive, a Newton step would go to the maximum."""
+    x = torch.tensor([[0.5, 1.0], [-1.0, 0.2]], dtype=torch.float64, requires_grad=True)
+    optimizer = zh.optim.NewtonCG([x], curvature="gauss_newton", solver=solver, damping=1e-3, adapt=False, radius=1.0)
+    seen = []
+    for _ in range(3):
+        y = 1.0 * x
+        seen.append(float(optimizer.step(lambda y=y: (-y.square().sum(), y)).detach()))
+    assert seen[0] > seen[1] > seen[2]
 
 
 def test_a_gradient_from_elsewhere_is_refused() -> None:

@@ -56,6 +56,23 @@ def test_thinning_drops_older_points_that_are_crowded() -> None:
     assert torch.equal(memory.points, memory.outputs)
 
 
+def test_thinning_compares_few_points_at_once(monkeypatch) -> None:
+    """However many are added, distances are those of a block of points to twice the capacity at most."""
+    apart, shapes = torch.cdist, []
+    monkeypatch.setattr(
+        torch, "cdist", lambda a, b, **options: shapes.append((len(a), len(b))) or apart(a, b, **options)
+    )
+    memory, z = Memory(capacity=1500), normal(20_000, 1)
+    memory.add(z, z)
+    assert len(memory) == 1500
+    assert max(block for block, _ in shapes) <= 1024
+    assert max(others for _, others in shapes) <= 3000
+    latest = z[-3000:]
+    gaps = torch.stack([(latest[k + 1 :] - latest[k]).abs().min() for k in range(2999)])
+    dropped = gaps.argsort()[:1500]
+    assert not torch.isin(latest[dropped], memory.points).any()
+
+
 def test_refresh_fits_only_after_growth() -> None:
     memory = Memory(Counting())
     fits = []
@@ -107,7 +124,7 @@ def test_a_module_without_fit_is_ready_and_never_fitted() -> None:
         ({"capacity": 2.5}, TypeError),
         ({"fresh": -1}, ValueError),
         ({"fresh": True}, TypeError),
-        ({"draws": 1}, ValueError),
+        ({"draws": 2}, ValueError),
         ({"order": 3}, ValueError),
         ({"surrogate": 3}, TypeError),
         ({"surrogate": torch.sin}, TypeError),

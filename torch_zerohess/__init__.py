@@ -10,7 +10,7 @@ Hessian-vector products of F are estimated from one batch of evaluations of f (S
     loss.backward()                                             # or torch.func, or zh.optim.NewtonCG
 """
 
-from torch_zerohess import adapters, evaluators, heads, losses, optim
+from torch_zerohess import adapters, evaluators, heads, losses, optim, surrogates
 from torch_zerohess.autograd.blackbox import BlackBox, smooth
 from torch_zerohess.autograd.curvature import CurvatureOperator, hvp
 from torch_zerohess.doctor import doctor
@@ -18,7 +18,7 @@ from torch_zerohess.estimation.estimate import estimate
 from torch_zerohess.estimation.finite_differences import finite_difference_hvp
 from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
-from torch_zerohess.minimize import Minimum, minimize
+from torch_zerohess.minimize import Iterate, Minimum, minimize
 from torch_zerohess.optim.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory
@@ -28,6 +28,7 @@ __all__ = [
     "BlackBox",
     "CurvatureOperator",
     "Estimate",
+    "Iterate",
     "LinearSigma",
     "Memory",
     "Minimum",
@@ -45,4 +46,5 @@ __all__ = [
     "optim",
     "smooth",
     "sparse_jacobian",
+    "surrogates",
 ]

@@ -30,7 +30,7 @@ def checked_integer(name: str, value: Any, least: int | None = None) -> int:
 def checked_number(name: str, value: Any, least: float = -math.inf) -> float:
     """Return a number. TypeError if it is none, ValueError if it is NaN or below `least`."""
     try:
-        number = None if isinstance(value, (str, bytes)) else float(value)
+        number = None if isinstance(value, (str, bytes, bool)) else float(value)
     except (TypeError, ValueError, RuntimeError):
         number = None
     if number is None:

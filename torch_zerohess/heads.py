@@ -13,6 +13,8 @@ from typing import Any
 
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_number
+
 __all__ = ["LocalEntropy", "SquaredError"]
 
 
@@ -59,7 +61,7 @@ class LocalEntropy:
     def __post_init__(self) -> None:
         if not callable(self.head):
             raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {self.head!r}")
-        if not 0.0 < self.temperature < float("inf"):
+        if not 0.0 < checked_number("temperature", self.temperature) < float("inf"):
             raise ValueError(f"temperature must be positive and finite, got {self.temperature}")
 
     def __call__(self, outputs: Tensor, *aux: Tensor) -> Tensor:

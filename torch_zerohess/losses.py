@@ -18,6 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torch_zerohess.arguments import checked_integer
+
 __all__ = ["ImageLoss", "mse", "multiscale_mse", "ssim"]
 
 
@@ -75,8 +77,7 @@ def multiscale_mse(target: Any, levels: int = 4) -> ImageLoss:
         0.5
     """
     target = _checked(target)
-    if levels < 1:
-        raise ValueError(f"levels must be at least 1, got {levels}")
+    levels = checked_integer("levels", levels, 1)
     _large_enough(target, 2 ** (levels - 1), f"{levels} levels")
     return ImageLoss("multiscale_mse", target, partial(_pyramid, levels=levels))
 

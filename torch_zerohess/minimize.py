@@ -113,7 +113,7 @@ def minimize(
         (True, True, 'solved')
     """
     _check_names(settings)
-    check_callable(callback=callback, evaluator=evaluator)
+    check_callable(callback=callback)
     max_evaluations = checked_integer("max_evaluations", max_evaluations)
     batch = checked_integer("batch", batch, 1)
     target = None if target is None else checked_number("target", target)

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from torch_zerohess.adapters.mitsuba_parameters import Parameter, Transform, Value
 from torch_zerohess.adapters.mitsuba_variants import select_variant
+from torch_zerohess.arguments import checked_integer
 
 __all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
 
@@ -233,8 +234,8 @@ def _check(
     if film is not None and (len(pair) != 2 or not all(isinstance(side, int) and side >= 1 for side in pair)):
         raise ValueError(f"film must be a pair (width, height) of pixels >= 1, got {film!r}")
     for name, value, least in (("spp", spp, 1), ("depth", depth, 1), ("seed", seed, 0)):
-        if value is not None and (not isinstance(value, int) or not least <= value < _MOST):
-            raise ValueError(f"{name} must be an integer from {least} to {_MOST - 1}, got {value!r}")
+        if value is not None and not least <= checked_integer(name, value) < _MOST:
+            raise ValueError(f"{name} must be from {least} to {_MOST - 1}, got {value!r}")
     if depth is not None and integrator is not None:
         raise ValueError("depth is that of the integrator `path`: give either depth or integrator, got both")
     for name, text, choices in (("noise", noise, ("fixed", "call", "point")), ("nan", nan, ("raise", "keep"))):

@@ -140,11 +140,17 @@ class CurvatureOperator:
 
 
 def hvp(
-    outputs: Tensor, inputs: Tensor | Sequence[Tensor], v: Tensor | Sequence[Tensor], *, mode: str = "exact"
+    outputs: Tensor,
+    inputs: Tensor | Sequence[Tensor],
+    v: Tensor | Sequence[Tensor],
+    *,
+    mode: str = "exact",
+    through: Tensor | Sequence[Tensor] | None = None,
 ) -> Tensor | list[Tensor]:
-    """Return the Hessian of a loss with respect to `inputs`, times v: see `CurvatureOperator`.
+    """Return the Hessian of a loss with respect to `inputs`, times v.
 
-    v has the shape of `inputs`, a tensor or a sequence of tensors, and so has the result. The graph is kept.
+    v has the shape of `inputs`, a tensor or a sequence of tensors, and so has the result. The graph is kept. `mode` and
+    `through` are those of `CurvatureOperator`.
 
     Example:
         >>> w = torch.tensor([1.0, 2.0], requires_grad=True)
@@ -157,7 +163,9 @@ def hvp(
             f"v must have the shapes of inputs, {[list(one.shape) for one in parts]}, "
             f"got {[list(one.shape) for one in vectors]}"
         )
-    product = CurvatureOperator(outputs, parts, mode=mode) @ torch.cat([one.reshape(-1) for one in vectors])
+    product = CurvatureOperator(outputs, parts, mode=mode, through=through) @ torch.cat(
+        [one.reshape(-1) for one in vectors]
+    )
     pieces = product.split([one.numel() for one in parts])
     result = [piece.view_as(one) for piece, one in zip(pieces, parts, strict=True)]
     return result[0] if isinstance(inputs, Tensor) else result

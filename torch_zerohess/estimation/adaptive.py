@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.estimation.batch import Batch
 from torch_zerohess.smoothing import Smoothing
 
@@ -70,9 +70,7 @@ def check_limits(tolerance: float | None, max_evaluations: int | None) -> None:
                 f"max_evaluations is the limit of a tolerance: give tolerance too, got {max_evaluations} alone"
             )
         return
-    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)):
-        raise TypeError(f"tolerance must be a positive number, got {tolerance!r}")
-    if not 0 < tolerance < math.inf:
+    if not 0 < checked_number("tolerance", tolerance) < math.inf:
         raise ValueError(f"tolerance must be positive and finite, a relative error such as 0.1, got {tolerance}")
     if max_evaluations is not None:
         checked_integer("max_evaluations", max_evaluations)

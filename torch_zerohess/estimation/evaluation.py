@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import check_callable
 from torch_zerohess.estimation import local_entropy
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
@@ -49,6 +50,7 @@ class BlackBoxCall:
     def __post_init__(self) -> None:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
+        check_callable(evaluator=self.evaluator)
         if self.evaluator is None:
             object.__setattr__(self, "evaluator", Inline())
         checked_head(self.head)

@@ -126,7 +126,7 @@ class SurrogateTerm:
         return self.hessian() if quantity == "hessian" else self._pairs(quantity, v).mean(1)
 
     def variance(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
-        """Return the variance of `mean`, from the spread of the pairs as if they were independent: usually too large."""
+        """Return the variance of `mean`, from the spread of the pairs as if independent: usually too large."""
         if quantity == "hessian":
             return torch.stack([self.variance("hvp", unit.expand_as(self.x)) for unit in self._units], 3)
         pairs = self._pairs(quantity, v)

@@ -8,6 +8,7 @@ represented by coordinates (`LowRank`).
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank
 from torch_zerohess.surrogates.process import ProcessSurrogate
@@ -34,8 +35,7 @@ class AutomaticSurrogate:
     """
 
     def __init__(self, *, rank: int = 128, capacity: int = 4000) -> None:
-        if rank < 1:
-            raise ValueError(f"rank must be at least 1, got {rank}")
+        rank = checked_integer("rank", rank, 1)
         self.rank, self.capacity = rank, capacity
         self.space: LowRank | None = None
         """The coordinates of the latest fit; None where outputs have few elements."""

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.surrogate import checked
 
 _RIDGE = 1e-9
@@ -26,8 +27,7 @@ class LinearSurrogate:
     """
 
     def __init__(self, *, capacity: int = 4000) -> None:
-        if capacity < 2:
-            raise ValueError(f"capacity must be at least 2, got {capacity}")
+        capacity = checked_integer("capacity", capacity, 2)
         self.capacity = capacity
         self._middle = self._mean = self._slope = torch.empty(0)
         self._shape = torch.Size()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.surrogate import Surrogate, checked
 
 _FLAT = 1e-7
@@ -72,8 +73,7 @@ class LowRankSurrogate:
     """
 
     def __init__(self, model: Surrogate, *, rank: int = 128, capacity: int = 4000) -> None:
-        if rank < 1:
-            raise ValueError(f"rank must be at least 1, got {rank}")
+        rank = checked_integer("rank", rank, 1)
         self.model, self.rank, self.capacity = model, rank, capacity
         self._space: LowRank | None = None
 

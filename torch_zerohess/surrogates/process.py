@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.inducing import InducedProcess
 from torch_zerohess.surrogates.lengths import most_likely
 from torch_zerohess.surrogates.surrogate import checked
@@ -32,8 +33,7 @@ class ProcessSurrogate:
     """
 
     def __init__(self, *, capacity: int = 4000) -> None:
-        if capacity < 2:
-            raise ValueError(f"capacity must be at least 2, got {capacity}")
+        capacity = checked_integer("capacity", capacity, 2)
         self.capacity = capacity
         self._process: InducedProcess | None = None
         self._lengths = torch.empty(0)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, spaced, thresholds
 
@@ -54,7 +55,7 @@ class SparseSettings:
     @classmethod
     def checked(cls, n: int, *, keep: int, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
         """Check what a caller gave for n parameters; ValueError for a setting out of range."""
-        if not 1 <= keep <= n:
+        if not 1 <= checked_integer("keep", keep) <= n:
             raise ValueError(f"keep must be between 1 and the number of parameters, {n}, got {keep}")
         if not 0.0 < rate < 1.0:
             raise ValueError(f"rate must be between 0 and 1, got {rate}")

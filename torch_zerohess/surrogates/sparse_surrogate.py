@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.low_rank import LowRank
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -40,10 +41,8 @@ class SparseSurrogate:
     def __init__(
         self, *, keep: int = 16, rate: float = 0.1, grid: Sequence[int] | None = None, capacity: int = 4000
     ) -> None:
-        if keep < 1:
-            raise ValueError(f"keep must be at least 1, got {keep}")
-        if capacity < 2:
-            raise ValueError(f"capacity must be at least 2, got {capacity}")
+        keep = checked_integer("keep", keep, 1)
+        capacity = checked_integer("capacity", capacity, 2)
         self.keep, self.rate, self.grid, self.capacity = keep, rate, grid, capacity
         self.jacobian: SparseJacobian | None = None
         """Of the latest fit. `explained` is the share of the change of held-out outputs that it predicts."""

@@ -85,6 +85,9 @@ def test_products_match_the_dense_matrix(case, mode):
     ]
     product = zh.hvp(loss, parameters, vectors, mode=mode)
     torch.testing.assert_close(torch.cat([one.flatten() for one in product]), dense @ block[:, 0])
+    if mode == "gauss_newton":
+        product = zh.hvp(loss, parameters, vectors, mode=mode, through=operator.through)
+        torch.testing.assert_close(torch.cat([one.flatten() for one in product]), dense @ block[:, 0])
 
 
 @pytest.mark.parametrize("mode", ["exact", "gauss_newton"])

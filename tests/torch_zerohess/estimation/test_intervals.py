@@ -222,7 +222,8 @@ def test_drawing_up_to_a_tolerance(proposal: str, sampler: str) -> None:
     assert bool(((got.hvp(V) - hessian @ V).abs() < 5 * got.standard_error("hvp", V)).all())
     torch.testing.assert_close(got.hessian_diagonal(), got.hessian().diagonal())
     # The first batch is that of the smoothing itself, and each later one as large as all before it.
-    assert torch.equal(got.points[: 8 * 2], estimate(SLOPE, X, smoothing).points[:16]) or proposal == "optimal"
+    if proposal != "optimal":  # whose points are those of one element after the other
+        assert torch.equal(got.points[: 8 * 2], estimate(SLOPE, X, smoothing).points[:16])
     assert [(one - 1) // (calls[0] - 1) for one in calls[:4]] == [1, 1, 2, 4]
 
 
@@ -259,7 +260,7 @@ LIMITS = [
     ({"max_evaluations": 100}, ValueError, "give tolerance too, got 100 alone"),
     ({"tolerance": 0.0}, ValueError, r"tolerance must be positive and finite, .*got 0\.0"),
     ({"tolerance": math.nan}, ValueError, "tolerance must be positive and finite"),
-    ({"tolerance": "1 %"}, TypeError, "tolerance must be a positive number, got '1 %'"),
+    ({"tolerance": "1 %"}, TypeError, "tolerance must be a number, got '1 %'"),
     ({"tolerance": 0.1, "max_evaluations": 30}, ValueError, "max_evaluations must be at least 33, .*got 30"),
     ({"tolerance": 0.1, "max_evaluations": 1e3}, TypeError, r"max_evaluations must be an integer, got 1000\.0"),
 ]

@@ -209,6 +209,10 @@ class Smoothing:
             ranges[-1][1] + (" beyond" if ranges[1:] else "")
         ]
 
+    def drawn_seed(self) -> int:
+        """Return the seed; from torch's global generator if it is None."""
+        return int(torch.randint(2**63 - 1, (), device="cpu")) if self.seed is None else self.seed
+
     def sigma_vector(self, n: int, device: torch.device) -> Tensor:
         """Return sigma as float64 [n]; ValueError for a tensor that has not n elements."""
         if isinstance(self.sigma, float):

@@ -165,7 +165,7 @@ class BlackBox(nn.Module):
             )
         self.control = Control.of(self.memory, self.call.head, learning=self.training)
         with transforms.outside(), transforms.random_numbers_allowed():
-            seed = int(torch.randint(2**62, ())) if self.smoothing.seed is None else self.smoothing.seed
+            seed = self.smoothing.drawn_seed()
         try:
             return control_variate.around(
                 self.control,

@@ -106,7 +106,7 @@ def estimate(
             control = Control.of(memory, head, learning=True)
             if control.active:  # before this call's evaluations, which it must not know
                 sigma = smoothing.sigma_vector(n, flat.device)
-                term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, _seed(smoothing), smoothing.order)
+                term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, smoothing.drawn_seed(), smoothing.order)
             return made([draw(smoothing)], alone)
     if tolerance is None:
         return made([draw(smoothing)], alone)
@@ -116,15 +116,11 @@ def estimate(
         _relative_error,
         smoothing,
         lambda own: B * own.evaluations(n, center=center),
-        _seed(smoothing),
+        smoothing.drawn_seed(),
         float(tolerance),
         MOST if max_evaluations is None else max_evaluations,
     )
     return made(batches, reason)
-
-
-def _seed(smoothing: Smoothing) -> int:
-    return int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
 
 
 def _check_memory(head: Head | None, memory: Memory | None, tolerance: float | None) -> None:

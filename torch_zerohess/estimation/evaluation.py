@@ -177,7 +177,7 @@ def evaluate(
         control: what is subtracted from the values before they become coefficients.
     """
     smoothing = smoothing.resolved(x.shape[1])
-    seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
+    seed = smoothing.drawn_seed()
     with_center = call.value == "center" or smoothing.baseline == "center"
     perturbations = perturb(x, smoothing, seed, keep, with_center)
     points, stein = perturbations.points, perturbations.stein

@@ -7,9 +7,6 @@ element. They travel with the samples as further elements of the output: (exp((m
 import torch
 from torch import Tensor
 
-ELEMENTS = 4
-"""Of a packed output."""
-
 
 def scales(losses: Tensor, mean: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
     """Return T = `temperature` times the mean loss [B], and m, the least of losses [B, K]: float64 [B] each."""

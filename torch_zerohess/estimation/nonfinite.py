@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.stein import Stein
+from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.smoothing import Smoothing
 
 
@@ -50,11 +51,11 @@ def replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -
     """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
     if isinstance(rule, str):
         point = points[tuple(where.tolist())]
-        text = ", ".join(f"{float(p):.6g}" for p in point[:8]) + (", ..." if len(point) > 8 else "")
         value = values[tuple(where.tolist())]
         wrong = float(value.flatten()[~torch.isfinite(value.flatten())][0])
         raise ValueError(
-            f"fn returned {wrong} at the point [{text}]; choose on_nonfinite='drop' or a number to go on without it"
+            f"fn returned {wrong} at the point [{numbers(point)}]; choose on_nonfinite='drop' or a number to go on "
+            "without it"
         )
     # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
     return torch.where(torch.isfinite(values), values.double(), float(rule))

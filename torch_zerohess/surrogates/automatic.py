@@ -45,7 +45,7 @@ class AutomaticSurrogate:
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
         points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
-        if self._is_sparse(points, outputs):
+        if self._takes_sparse(points, outputs):
             return
         self.space = LowRank.of(outputs, self._rank(points)) if outputs[0].numel() > _WIDE else None
         known = outputs if self.space is None else self.space.encode(outputs)
@@ -62,8 +62,8 @@ class AutomaticSurrogate:
         models[0].fit(points, known)
         self.model = models[0]
 
-    def _is_sparse(self, points: Tensor, outputs: Tensor) -> bool:
-        """Take a sparse map if it predicts held-out outputs better than the map of least norm."""
+    def _takes_sparse(self, points: Tensor, outputs: Tensor) -> bool:
+        """Fit a sparse map, and take it if it predicts held-out outputs better than the map of least norm."""
         (P, n), m = points.shape, outputs[0].numel()
         if n <= _PROCESS or m <= _WIDE or P < FEWEST_SAMPLES:
             return False

@@ -57,6 +57,10 @@ class BlackBox(nn.Module):
     randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
     "different" where neither x nor aux is mapped over.
 
+    Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process
+    (`torch._dynamo.config.recompile_limit`), layers that no longer live included. Layers of one model are one graph.
+    Beyond 8 models use `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it.
+
     `torch.export` raises RuntimeError: no file can hold the black box.
 
     Example:

@@ -40,6 +40,8 @@ class BlackBox(nn.Module):
             registered: its parameters are not trained through this layer.
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
             operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
+            Parameters and other tensors in it are constants: they must not require grad. A module given as head is not
+            registered. What is trained belongs behind a layer without a head.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
             are. Under `torch.no_grad` f(x) alone is evaluated, and not kept. Calls of several threads that share a
@@ -56,6 +58,10 @@ class BlackBox(nn.Module):
     Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch: that is
     randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
     "different" where neither x nor aux is mapped over.
+
+    Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
+    `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
+    `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it.
 
     `torch.export` raises RuntimeError: no file can hold the black box.
 

@@ -11,19 +11,23 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torch_zerohess.heads import LocalEntropy
+
 Head = Callable[..., Tensor]
 """(outputs [K, *out], *aux [K, ...]) -> [K], made of differentiable torch operations."""
+_ALONE = (
+    "but the layer is differentiated with respect to x alone: call requires_grad_(False) or detach() first, or put "
+    "what is trained behind a layer without a head"
+)
 
 
 def checked_head(head: Any) -> Head | None:
     """Return the head, or raise TypeError or ValueError if it cannot serve."""
     if head is not None and not callable(head):
         raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {head!r}")
-    if isinstance(head, nn.Module) and any(one.requires_grad for one in head.parameters()):
-        raise ValueError(
-            "head has parameters that require grad, but the layer is differentiated with respect to x alone: "
-            "call head.requires_grad_(False) first"
-        )
+    inner = head.head if isinstance(head, LocalEntropy) else head
+    if isinstance(inner, nn.Module) and any(one.requires_grad for one in inner.parameters()):
+        raise ValueError(f"head has parameters that require grad, {_ALONE}")
     return head
 
 
@@ -40,7 +44,13 @@ def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
 
 
 def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    losses = head(outputs, *aux)
+    if any(one.requires_grad for one in (outputs, *aux)):
+        losses = head(outputs, *aux)
+    else:
+        with torch.enable_grad():  # records nothing, unless the head has a tensor of its own that requires grad
+            losses = head(outputs, *aux)
+        if isinstance(losses, Tensor) and losses.requires_grad:
+            raise ValueError(f"head depends on a tensor that requires grad, {_ALONE}")
     if not isinstance(losses, Tensor) or not losses.is_floating_point():
         raise TypeError(f"head must return a real floating-point tensor, got {getattr(losses, 'dtype', type(losses))}")
     if losses.shape != outputs.shape[:1]:

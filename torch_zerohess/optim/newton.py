@@ -40,6 +40,8 @@ class Newton(NewtonStep):
         modification: "shift" or "abs".
         adapt: whether to test the step and adapt the radius.
         max_radius: the radius never grows beyond it.
+        lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change. With `adapt`
+            the radius does not grow while it is below 1.
 
     The closure of `step` returns a loss with a graph, as for `NewtonCG`; of several losses the mean is taken.
 
@@ -59,12 +61,14 @@ class Newton(NewtonStep):
         modification: str = "shift",
         adapt: bool = True,
         max_radius: float = math.inf,
+        lr: float = 1.0,
     ) -> None:
         check_radius(radius)
         check_positive(max_radius=max_radius)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'shift' or 'abs', got {modification!r}")
         defaults = {
+            "lr": lr,
             "radius": radius,
             "curvature": curvature,
             "modification": modification,

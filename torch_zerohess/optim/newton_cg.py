@@ -57,6 +57,8 @@ class NewtonCG(NewtonStep):
         max_radius: the radius never grows beyond it.
         noise: number of standard errors by which residual and curvature must differ from zero, if there are several
             losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact.
+        lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change. With `adapt`
+            the radius does not grow while it is below 1.
 
     The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
     pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them. For solver
@@ -85,6 +87,7 @@ class NewtonCG(NewtonStep):
         adapt: bool = True,
         max_radius: float = math.inf,
         noise: float = 2.0,
+        lr: float = 1.0,
     ) -> None:
         check_radius(radius)
         check_positive(tolerance=tolerance, max_radius=max_radius)
@@ -99,6 +102,7 @@ class NewtonCG(NewtonStep):
         if solver == "dual" and not damping > 0.0:
             raise ValueError(f"solver 'dual' needs a positive damping, got {damping}")
         defaults = {
+            "lr": lr,
             "radius": radius,
             "curvature": curvature,
             "solver": solver,

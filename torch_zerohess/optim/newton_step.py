@@ -19,7 +19,8 @@ class NewtonStep(SecondOrder):
 
     With `adapt` the closure is called again, without derivatives: a step that does not lower the loss is taken
     back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Where
-    the predicted decrease is within the rounding of the loss no step is taken, and the radius stays.
+    the predicted decrease is within the rounding of the loss no step is taken, and the radius stays. The length that is
+    compared with the radius is that of the step times `lr`.
     """
 
     exit: str | None = None
@@ -44,16 +45,17 @@ class NewtonStep(SecondOrder):
         s, decrease, self.exit = self._minimise(model, radius, group)
         if not math.isfinite(decrease) or not bool(torch.isfinite(s).all()):
             raise ValueError("the curvature of the loss is not finite; no step was taken")
+        lr = float(group["lr"])
         if not group["adapt"]:
-            self._add(s)
+            self._add(lr * s)
             return model.loss
-        if not decrease > _ROUNDING * torch.finfo(model.loss.dtype).eps * abs(float(model.loss)):
-            return model.loss  # converged: the test would compare rounding errors, and shrink the radius for good
         slope = float(model.gradient.dot(s))
         bend = -2.0 * (decrease + slope)  # s.Hs
         for trial in range(TRIALS):
-            scale = 0.25**trial
+            scale = lr * 0.25**trial
             predicted, length = -scale * (slope + 0.5 * scale * bend), scale * float(s.norm())
+            if not trial and not predicted > _ROUNDING * torch.finfo(model.loss.dtype).eps * abs(float(model.loss)):
+                return model.loss  # converged: the test would compare rounding errors, and shrink the radius for good
             actual = self._try(scale * s, closure, model.loss)
             if math.isfinite(actual):
                 group["radius"] = min(_next_radius(actual / predicted, length, radius), group["max_radius"])

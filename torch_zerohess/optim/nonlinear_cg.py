@@ -52,6 +52,7 @@ class NonlinearCG(SecondOrder):
         recompute: steps after which the directions start anew from the gradient.
         curvature: "exact", or "gauss_newton" for J^T H J of the black boxes behind a network.
         modification: "abs" or "radius", of curvature that is not positive.
+        lr: factor from 0 to 1 on every move, which the schedulers of `torch.optim.lr_scheduler` change.
 
     Example:
         >>> x = torch.tensor([3.0, -2.0], dtype=torch.float64, requires_grad=True)
@@ -72,12 +73,14 @@ class NonlinearCG(SecondOrder):
         recompute: int = 10,
         curvature: str = "exact",
         modification: str = "abs",
+        lr: float = 1.0,
     ) -> None:
         check_radius(radius)
         check_not_negative(line_search_tolerance=line_search_tolerance)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'abs' or 'radius', got {modification!r}")
         defaults = {
+            "lr": lr,
             "radius": radius,
             "line_search_iterations": checked_integer("line_search_iterations", line_search_iterations, 1),
             "line_search_tolerance": line_search_tolerance,
@@ -160,7 +163,7 @@ class NonlinearCG(SecondOrder):
             bend = -bend if group["modification"] == "abs" else 0.0
         radius = group["radius"]
         length = radius if abs(slope) >= radius * bend else abs(slope) / bend
-        return math.copysign(length, -slope) * d
+        return math.copysign(float(group["lr"]) * length, -slope) * d
 
     def _given(self, hvp: Product, d: Tensor) -> Tensor:
         result = hvp(d.to(self._parameters[0].dtype))

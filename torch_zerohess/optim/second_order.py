@@ -119,6 +119,8 @@ class SecondOrder(Optimizer):
     """An optimizer with one Hessian, hence one group of parameters."""
 
     def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any]) -> None:
+        if not 0.0 <= defaults["lr"] <= 1.0:
+            raise ValueError(f"lr must be a factor from 0 to 1, got {defaults['lr']}")
         if defaults["curvature"] not in CURVATURES:
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
         super().__init__(params, defaults)

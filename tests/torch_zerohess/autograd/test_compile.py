@@ -1,5 +1,7 @@
 """Compiled layers: the numbers of `estimate` with the same seed, or an error."""
 
+import inspect
+
 import pytest
 import torch
 from layers import AGGREGATE, BATCH, IMAGE, SCALAR, SETTINGS, close, counting, leaf, network
@@ -65,6 +67,20 @@ def test_compiled_inside_a_network(backend: str) -> None:
     torch.compile(model, fullgraph=True, backend=backend)(inputs).square().sum().backward()
     for p, gradient in zip(model.parameters(), expected, strict=True):
         close(p.grad, gradient)
+
+
+@pytest.mark.parametrize("way", ["isolated", "one model"])
+def test_more_layers_than_the_recompile_limit(way: str) -> None:
+    if way == "isolated" and "isolate_recompiles" not in inspect.signature(torch.compile).parameters:
+        pytest.skip("this torch has no isolate_recompiles")
+    layers, x = [BlackBox(SCALAR.f, AGGREGATE) for _ in range(2)], leaf(BATCH)
+    with torch._dynamo.config.patch(recompile_limit=1):
+        if way == "isolated":
+            for layer in layers:
+                torch.compile(layer, fullgraph=True, backend="eager", isolate_recompiles=True)(x).sum().backward()
+        else:
+            torch.compile(lambda x: layers[0](x) + layers[1](x), fullgraph=True, backend="eager")(x).sum().backward()
+    close(x.grad, 2 * estimate(SCALAR.f, BATCH, AGGREGATE).gradient)
 
 
 @pytest.mark.parametrize("by", ["backward", "grad"])

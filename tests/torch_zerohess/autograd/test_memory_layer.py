@@ -331,14 +331,33 @@ def test_first_order_leaves_the_curvature_to_the_surrogate() -> None:
     assert float((bends[2][1] - bends[3][1]).norm()) > 0.01
 
 
+@pytest.mark.parametrize("memory", [False, True])
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+@pytest.mark.parametrize("x_requires_grad", [False, True])
+def test_a_head_with_tensors_that_require_grad_is_refused(value: str, memory: bool, x_requires_grad: bool) -> None:
+    """They would get no gradient, and nobody would be told."""
+    w, settings = torch.ones((), requires_grad=True), zh.Smoothing(sigma=0.5, samples=2, seed=0)
+    kept = zh.Memory() if memory else None
+    box = zh.BlackBox(render, settings, value=value, memory=kept, head=lambda y, r: w * zh.heads.SquaredError()(y, r))
+    x, r = point()
+    x = x.clone().requires_grad_(x_requires_grad)
+    with pytest.raises(ValueError, match="head depends on a tensor that requires grad"):
+        box(x, r)
+    w.requires_grad_(False)
+    assert bool(box(x, r).isfinite().all())
+    with torch.no_grad():  # aux that requires grad is no matter where no derivative can be asked for
+        assert bool(box(x, r.clone().requires_grad_()).isfinite().all())
+
+
 def test_wrong_arguments_say_so() -> None:
     smoothing = zh.Smoothing(sigma=1.0)
     with pytest.raises(TypeError, match="memory must be a Memory"):
         zh.BlackBox(render, smoothing, memory=3)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="head must be callable"):
         zh.BlackBox(render, smoothing, head=3)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="head has parameters"):
-        zh.BlackBox(render, smoothing, head=nn.Linear(3, 1))
+    for head in (nn.Linear(3, 1), zh.heads.LocalEntropy(nn.Linear(3, 1))):
+        with pytest.raises(ValueError, match="head has parameters"):
+            zh.BlackBox(render, smoothing, head=head)
     x, r = point()
     with pytest.raises(ValueError, match="aux must be empty"):
         zh.BlackBox(render, smoothing, memory=zh.Memory())(x, r)

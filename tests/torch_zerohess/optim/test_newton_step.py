@@ -76,3 +76,11 @@ def test_a_decrease_within_rounding_is_not_tested(optimizer) -> None:
         steps.step(closure)
         assert len(called) == calls
         assert steps.param_groups[0]["radius"] == radius
+
+
+@BOTH
+def test_the_radius_does_not_grow_by_steps_that_lr_shortens(optimizer) -> None:
+    x = vector(0.0).requires_grad_()
+    steps = optimizer([x], radius=1.0, lr=0.5)
+    steps.step(lambda: -x.sum())
+    assert (float(x.detach()), steps.param_groups[0]["radius"]) == (0.5, 1.0)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.optim import lr_scheduler
 
 import torch_zerohess as zh
 from torch_zerohess.autograd.curvature import CurvatureOperator
@@ -57,3 +58,46 @@ def test_a_closure_that_calls_backward_is_told_not_to(kind: type) -> None:
         optimizer.step(closure)
     assert torch.equal(p.detach(), vector(1.0, 2.0))
     assert dict(optimizer.state) == {}
+
+
+SCHEDULED = {
+    "NewtonCG": (zh.optim.NewtonCG, {}),
+    "NewtonCG without a test": (zh.optim.NewtonCG, {"adapt": False}),
+    "Newton": (zh.optim.Newton, {}),
+    "NonlinearCG": (zh.optim.NonlinearCG, {"line_search_iterations": 1, "recompute": 1}),
+}
+
+
+@pytest.mark.parametrize(
+    ("schedule", "factors"),
+    [
+        (lambda one: lr_scheduler.StepLR(one, step_size=1, gamma=0.5), (0.5, 0.25, 0.125, 0.0625)),
+        (lambda one: lr_scheduler.CosineAnnealingLR(one, T_max=2), (0.5, 0.25, 0.0, 0.25)),
+    ],
+    ids=["StepLR", "CosineAnnealingLR"],
+)
+@pytest.mark.parametrize(("kind", "settings"), SCHEDULED.values(), ids=SCHEDULED.keys())
+def test_schedulers_of_torch_scale_the_step(kind: type, settings: dict, schedule, factors: tuple[float, ...]) -> None:
+    """A Newton step on half the squared distance to zero ends there: a part of it leaves the rest of the distance."""
+    x = vector(3.0, -2.0).requires_grad_()
+    optimizer = kind([x], radius=100.0, lr=0.5, **settings)
+    scheduler = schedule(optimizer)
+    for number, factor in enumerate(factors):
+        if number == 2:  # a new optimizer and schedule that go on where the ones before were saved
+            states = optimizer.state_dict(), scheduler.state_dict()
+            optimizer = kind([x], radius=1.0, **settings)
+            scheduler = schedule(optimizer)
+            optimizer.load_state_dict(states[0])
+            scheduler.load_state_dict(states[1])
+        expected = (1.0 - factor) * x.detach()
+        optimizer.step(lambda: 0.5 * x.square().sum())
+        torch.testing.assert_close(x.detach(), expected)
+        scheduler.step()
+    assert optimizer.param_groups[0]["radius"] == 100.0
+
+
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
+@pytest.mark.parametrize("lr", [-0.1, 1.5, float("nan")])
+def test_lr_is_a_factor_from_0_to_1(kind: type, lr: float) -> None:
+    with pytest.raises(ValueError, match="lr must be a factor from 0 to 1"):
+        kind([torch.ones(1, requires_grad=True)], lr=lr)

@@ -24,7 +24,7 @@ from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
-from torch_zerohess.surrogates.memory import Memory
+from torch_zerohess.surrogates.memory import Memory, check_memory
 
 
 class BlackBox(nn.Module):
@@ -85,8 +85,7 @@ class BlackBox(nn.Module):
         if not isinstance(smoothing, Smoothing):
             raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
         self.smoothing = smoothing
-        if memory is not None and not isinstance(memory, Memory):
-            raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
+        check_memory(memory)
         self.call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
         self.memory = memory
         self.control: Control | None = None

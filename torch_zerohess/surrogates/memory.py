@@ -24,6 +24,8 @@ _FORGET = 0.8
 class Memory:
     """Evaluations of a black box, and a surrogate g of it, as a control variate of `BlackBox` and `estimate`.
 
+    Several of them can share one memory, and `minimize` adds to it. All must call the same black box.
+
     With a head h after the black box f and a coefficient c,
 
         F(x, r) = c E h(g(x + sigma u), r)  +  E[ h(f(x + sigma u), r) - c h(g(x + sigma u), r) ].
@@ -257,6 +259,12 @@ class Memory:
     def __repr__(self) -> str:
         kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"
         return f"Memory({type(self.surrogate).__name__}, {kept}, coefficient={self.coefficient:.2f})"
+
+
+def check_memory(memory: Any) -> None:
+    """Raise TypeError for what is neither None nor a `Memory`."""
+    if memory is not None and not isinstance(memory, Memory):
+        raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
 
 
 def _is_number(value: float) -> bool:

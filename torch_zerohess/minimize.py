@@ -132,7 +132,7 @@ def minimize(
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
     start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
     rounds = max(max_evaluations, 0) if restarts is None else restarts
-    seed = int(torch.randint(2**63 - 1, ())) if seed is None else seed
+    seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else seed
 
     def make(noise: float) -> TrustRegion:
         given: dict[str, Any] = settings | {

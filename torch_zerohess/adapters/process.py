@@ -13,6 +13,8 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.values import as_tensor
+
 _KEPT = 50
 """Lines of the standard error that are shown in an error."""
 
@@ -164,13 +166,13 @@ class Program:
 
     def _values(self, output: bytes) -> Tensor:
         if callable(self.format):
-            return torch.as_tensor(self.format(output))
+            return as_tensor(self.format(output))
         try:
             if self.format == "npy":
                 import numpy as np
 
                 return torch.from_numpy(np.load(io.BytesIO(output), allow_pickle=False))
-            return torch.tensor(json.loads(output), dtype=torch.float64)
+            return torch.tensor(json.loads(output), dtype=torch.float64, device="cpu")
         except (ValueError, TypeError, EOFError, OSError) as error:
             shown = output[:200].decode(errors="replace")
             raise ValueError(

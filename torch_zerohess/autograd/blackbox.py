@@ -168,7 +168,7 @@ class BlackBox(nn.Module):
             )
         self.control = Control.of(self.memory, self.call.head, learning=self.training)
         with transforms.outside(), transforms.random_numbers_allowed():
-            seed = int(torch.randint(2**62, ())) if self.smoothing.seed is None else self.smoothing.seed
+            seed = int(torch.randint(2**62, (), device="cpu")) if self.smoothing.seed is None else self.smoothing.seed
         try:
             return control_variate.around(
                 self.control,

@@ -124,7 +124,7 @@ def estimate(
 
 
 def _seed(smoothing: Smoothing) -> int:
-    return int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
+    return int(torch.randint(2**63 - 1, (), device="cpu")) if smoothing.seed is None else smoothing.seed
 
 
 def _check_memory(head: Head | None, memory: Memory | None, tolerance: float | None) -> None:

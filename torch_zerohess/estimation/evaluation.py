@@ -83,7 +83,7 @@ class BlackBoxCall:
         values, lost = apply_head(self.head, outputs, aux), self._lost(flat)
         if lost:  # a head may make a number of NaN
             values = values.clone()
-            values[torch.tensor(lost) // E, torch.tensor(lost) % E] = torch.nan
+            values[[k // E for k in lost], [k % E for k in lost]] = torch.nan
         return values, outputs
 
     def _lost(self, points: Tensor) -> list[int]:
@@ -175,7 +175,7 @@ def evaluate(
         control: what is subtracted from the values before they become coefficients.
     """
     smoothing = smoothing.resolved(x.shape[1])
-    seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
+    seed = int(torch.randint(2**63 - 1, (), device="cpu")) if smoothing.seed is None else smoothing.seed
     with_center = call.value == "center" or smoothing.baseline == "center"
     perturbations = perturb(x, smoothing, seed, keep, with_center)
     points, stein = perturbations.points, perturbations.stein

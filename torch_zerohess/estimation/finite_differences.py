@@ -63,7 +63,7 @@ def finite_difference_hvp(
     norm = direction.norm(dim=-1, keepdim=True)
     length = size * norm
     offset = (step * sigma * direction / norm.clamp_min(1.0)).to(x.dtype)  # the norm is 0 or at least 1
-    seed = int(torch.randint(2**62, ())) if smoothing.seed is None else smoothing.seed
+    seed = int(torch.randint(2**62, (), device="cpu")) if smoothing.seed is None else smoothing.seed
     other = seed if common else seed ^ (1 << 61)
     forward, backward = (
         estimate(

@@ -96,7 +96,7 @@ def sparse_jacobian(
 
 def _sampled(call: BlackBoxCall, x: Tensor, smoothing: Smoothing) -> tuple[Tensor, Tensor, Tensor, torch.Size, int]:
     """Return perturbations [S, n] in units of sigma, changes [S, m], weights [S], the shape [*out], evaluations."""
-    seed = int(torch.randint(2**63 - 1, ())) if smoothing.seed is None else smoothing.seed
+    seed = int(torch.randint(2**63 - 1, (), device="cpu")) if smoothing.seed is None else smoothing.seed
     perturbations = perturb(x[None], smoothing, seed, keep=True)
     stein = perturbations.stein
     assert isinstance(stein, LikelihoodRatio)

@@ -29,7 +29,7 @@ class LinearSurrogate:
         if capacity < 2:
             raise ValueError(f"capacity must be at least 2, got {capacity}")
         self.capacity = capacity
-        self._middle = self._mean = self._slope = torch.empty(0)
+        self._middle = self._mean = self._slope = torch.empty(0, device="cpu")
         self._shape = torch.Size()
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:

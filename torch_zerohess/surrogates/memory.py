@@ -106,13 +106,13 @@ class Memory:
     def points(self) -> Tensor:
         """Points of the evaluations that are kept, [P, n]."""
         self._points = [torch.cat(self._points)] if len(self._points) > 1 else self._points
-        return self._points[0] if self._points else torch.empty(0, 0)
+        return self._points[0] if self._points else torch.empty(0, 0, device="cpu")
 
     @property
     def outputs(self) -> Tensor:
         """Outputs there, [P, *out]."""
         self._outputs = [torch.cat(self._outputs)] if len(self._outputs) > 1 else self._outputs
-        return self._outputs[0] if self._outputs else torch.empty(0)
+        return self._outputs[0] if self._outputs else torch.empty(0, device="cpu")
 
     @property
     def scalar(self) -> bool:

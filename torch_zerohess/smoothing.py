@@ -210,7 +210,7 @@ class Smoothing:
         ]
 
     def sigma_vector(self, n: int, device: torch.device) -> Tensor:
-        """Return sigma as float64 [n]; ValueError if its length is neither one nor n."""
+        """Return sigma as float64 [n]; ValueError for a tensor of another length, also of length 1 if n is not 1."""
         if isinstance(self.sigma, float):
             return torch.full((n,), self.sigma, dtype=torch.float64, device=device)
         if len(self.sigma) != n:

@@ -32,6 +32,14 @@ LAYERS = {
     ],
 }
 MOST_LINES = 320
+MAKERS = {
+    f"torch.{one}"
+    for one in (
+        *("arange", "as_tensor", "empty", "eye", "full", "linspace", "logspace", "ones", "rand", "randint", "randn"),
+        *("randperm", "scalar_tensor", "tensor", "tril_indices", "triu_indices", "zeros"),
+    )
+}
+DEFAULT_DEVICE = {"search.space": ["torch.as_tensor(x0, dtype=None if kept else torch.float64)"]}
 MODULES = {tree: sorted((ROOT / tree).rglob("*.py")) for tree in LAYERS}
 CASES = [pytest.param(tree, path, id=str(path.relative_to(ROOT))) for tree in LAYERS for path in MODULES[tree]]
 
@@ -60,6 +68,17 @@ def imported(tree: str, path: Path) -> set[str]:
                     tail = tail[:-1]
                 found.add(".".join(tail))
     return found
+
+
+@pytest.mark.parametrize(("tree", "path"), [one for one in CASES if one.values[0] == "torch_zerohess"])
+def test_every_tensor_is_made_on_a_device_that_is_named(tree: str, path: Path) -> None:
+    """The default device of torch may be another one. Only a start that is a list goes to it."""
+    unnamed = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        makes = isinstance(node, ast.Call) and ast.unparse(node.func) in MAKERS
+        if makes and "device" not in {one.arg for one in node.keywords}:
+            unnamed.append(ast.unparse(node))
+    assert unnamed == DEFAULT_DEVICE.get(name(tree, path), [])
 
 
 @pytest.mark.parametrize("tree", LAYERS)

@@ -140,7 +140,7 @@ def _channels_first(image: Tensor, ndim: int) -> Tensor:
 
 
 def _checked(target: Any) -> Tensor:
-    target = torch.as_tensor(target).detach().clone()
+    target = (target if isinstance(target, Tensor) else torch.as_tensor(target, device="cpu")).detach().clone()
     if target.ndim not in (2, 3) or 0 in target.shape:
         raise ValueError(f"target must be [h, w] or [h, w, c], got [{_listed(target)}]")
     if not target.is_floating_point():

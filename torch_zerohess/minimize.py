@@ -18,6 +18,7 @@ from torch_zerohess.search.minimum import Iterate, Minimum, Observation, Status
 from torch_zerohess.search.running import Running
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
+from torch_zerohess.surrogates.memory import Memory, check_memory
 
 __all__ = ["Iterate", "Minimum", "Observation", "minimize"]
 
@@ -62,6 +63,7 @@ def minimize(
     checkpoint: str | os.PathLike[str] | None = None,
     restarts: int | None = None,
     noise: float | None = None,
+    memory: Memory | None = None,
     **settings: Any,
 ) -> Minimum:
     """Minimise fn from x0 with `optim.TrustRegion`.
@@ -100,6 +102,10 @@ def minimize(
             six times more if the values differ. If fn is noisy, an eighth of `max_evaluations` (4 to 48) is kept for
             the end. The best candidates are then evaluated again, and x is the one with the lowest mean. `value` is
             that mean and `value_error` its standard error.
+        memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
+            `BlackBox` of the same fn; also those of a call that is interrupted or fails. Those made before a checkpoint
+            are not in it. The search does not read the memory: the result is the same as without one. The next
+            `estimate` finds out what a surrogate of them is worth, and those after it use it.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn,
@@ -114,6 +120,7 @@ def minimize(
     """
     _check_names(settings)
     check_callable(callback=callback)
+    check_memory(memory)
     max_evaluations = checked_integer("max_evaluations", max_evaluations)
     batch = checked_integer("batch", batch, 1)
     target = None if target is None else checked_number("target", target)
@@ -125,7 +132,7 @@ def minimize(
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
     start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
     rounds = max(max_evaluations, 0) if restarts is None else restarts
-    seed = int(torch.randint(2**63 - 1, ())) if seed is None else seed
+    seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else seed
 
     def make(noise: float) -> TrustRegion:
         given: dict[str, Any] = settings | {
@@ -147,12 +154,15 @@ def minimize(
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
 
     def evaluated(points: Tensor, aux: Sequence[Tensor]) -> Tensor:
-        values = call(points, aux)
+        values = call(points.clone(), aux)
         if loss is None and values.shape[1:] not in ((), (1,)):
             raise ValueError(
                 f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
                 f"{len(points)} points"
             )
+        if memory is not None:
+            with memory.lock:
+                memory.add(points, values)
         return values
 
     running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, verbose=verbose)

@@ -234,7 +234,8 @@ def _checked_sigma(sigma: Any) -> float | Tensor:
     if isinstance(sigma, Tensor) and sigma.requires_grad:
         raise ValueError("sigma must not require grad: pass sigma.detach()")
     try:
-        values = sigma if isinstance(sigma, Tensor) else torch.as_tensor(sigma, dtype=_PRECISE.get(type(sigma)))
+        kept = isinstance(sigma, Tensor)
+        values = sigma if kept else torch.as_tensor(sigma, dtype=_PRECISE.get(type(sigma)), device="cpu")
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"sigma must be a positive number or a tensor [n], got {sigma!r}") from error
     if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:

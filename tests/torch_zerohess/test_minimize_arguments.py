@@ -29,6 +29,7 @@ REFUSED = [
     ({"target": math.nan}, ValueError, "target must be a number, got nan"),
     ({"callback": 5}, TypeError, "callback must be callable, got 5"),
     ({"evaluator": 5}, TypeError, "evaluator must be callable, got 5"),
+    ({"memory": {}}, TypeError, "memory must be a Memory, got dict"),
     ({"loss": "mse"}, TypeError, "loss must be callable, got 'mse'"),
     ({"fn": 3}, TypeError, "fn must be callable, got 3"),
     ({"seed": "a"}, TypeError, "seed must be an integer, got 'a'"),

@@ -114,9 +114,9 @@ class MitsubaScene:
         self.labels = [label for one in self.parameters for label in one.labels]
         """Of the columns of x [n]."""
         lower, upper = zip(*(pair for one in self.parameters for pair in one.limits), strict=True)
-        self.bounds = torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
+        self.bounds = (torch.tensor(one, dtype=torch.float64, device="cpu") for one in (lower, upper))
         """Lower and upper [n], infinite where there are none; renders are of points clamped to them."""
-        start = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64)
+        start = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64, device="cpu")
         self.x0 = start.clamp(*self.bounds)
         """[n], the scene as it was loaded, or the nearest within the bounds."""
         self.values.keep([name for one in self.parameters for name in one.names])
@@ -146,7 +146,7 @@ class MitsubaScene:
         self._calls += self.noise == "call"
         images = [self._image(point) for point in points]
         if self.loss is None:
-            out = torch.stack(images) if images else torch.empty(0, dtype=torch.float32)
+            out = torch.stack(images) if images else torch.empty(0, dtype=torch.float32, device="cpu")
         else:
             with torch.no_grad():
                 losses = [self.loss(image) for image in images]
@@ -154,7 +154,7 @@ class MitsubaScene:
                 if not isinstance(one, Tensor) or one.numel() != 1:
                     got = f"shape {list(one.shape)}" if isinstance(one, Tensor) else f"{one!r}"
                     raise ValueError(f"loss must return a tensor with one number per image, got {got}")
-            out = torch.stack([one.reshape(()) for one in losses]) if losses else torch.empty(0)
+            out = torch.stack([one.reshape(()) for one in losses]) if losses else torch.empty(0, device="cpu")
             out = out.to(x.dtype)
         return out.to(x.device)
 

@@ -172,7 +172,7 @@ class Program:
                 import numpy as np
 
                 return as_tensor(np.load(io.BytesIO(output), allow_pickle=False))
-            return torch.tensor(json.loads(output), dtype=torch.float64)
+            return torch.tensor(json.loads(output), dtype=torch.float64, device="cpu")
         except (ValueError, TypeError, EOFError, OSError) as error:
             shown = output[:200].decode(errors="replace")
             raise ValueError(

@@ -16,7 +16,7 @@ from torch_zerohess.autograd.limit import limited
 from torch_zerohess.autograd.linear_map import project
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.control import Control
-from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate_center
+from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
@@ -24,7 +24,7 @@ from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
-from torch_zerohess.surrogates.memory import Memory
+from torch_zerohess.surrogates.memory import Memory, check_memory
 
 
 class BlackBox(nn.Module):
@@ -53,7 +53,9 @@ class BlackBox(nn.Module):
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
 
     Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For float16 and
-    bfloat16, as autocast makes them, fn gets float32.
+    bfloat16, as autocast makes them, fn gets float32. A batch without points, [0, n], gives an empty result, with zero
+    gradients upstream. fn is not called for it. Without a head the shape of one output must be known, from an earlier
+    call or the memory, else ValueError.
 
     Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch: that is
     randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
@@ -91,8 +93,7 @@ class BlackBox(nn.Module):
         if not isinstance(smoothing, Smoothing):
             raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
         self.smoothing = smoothing
-        if memory is not None and not isinstance(memory, Memory):
-            raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
+        check_memory(memory)
         self.call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
         self.memory = memory
         self.control: Control | None = None
@@ -103,21 +104,23 @@ class BlackBox(nn.Module):
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
         _before_compiling()
-        dtype, x = checked_input(x).dtype, working(x)
+        dtype, x = checked_input(x, empty=True).dtype, working(x)
         self._check_aux(aux)
         batch, n = x.shape[:-1], x.shape[-1]
-        center, others = x.detach().reshape(-1, n), folded_aux(_without_grad(aux), batch)
-        if self.call.value == "center" and not transforms.derivative_possible(x):
+        center, others = x.detach().reshape(batch.numel(), n), folded_aux(_without_grad(aux), batch)
+        if len(center) and self.call.value == "center" and not transforms.derivative_possible(x):
             result = self._center(center, others)
             return result.reshape((*batch, *result.shape[1:])).to(dtype)
         watched = transforms.watched(x)
         alone = self.memory is None and not isinstance(self.call.head, LocalEntropy)
-        if alone and not watched and not transforms.forward_mode_active():
+        if len(center) and alone and not watched and not transforms.forward_mode_active():
             expansion = self._evaluate(center, others)
             result = ClosedForm.apply(x, expansion, functools.partial(_general, expansion, center=center, zero=True))
             return result.to(dtype)
         if x.requires_grad and not watched and not transforms.has_tangent(x):
             x = Input.apply(x)
+        if not len(center):
+            return opaque.empty(self, x, others).to(dtype)
         if self.memory is None:
             result = self._around(center, others)(x.reshape(-1, n))
         else:
@@ -215,7 +218,7 @@ class BlackBox(nn.Module):
         if transforms.watched(x):
             result: Tensor = torch.ops.torch_zerohess.evaluate_center(self._handle, x, aux)
             return result
-        return evaluate_center(self.call, x, aux).to(x.dtype)
+        return opaque.expand_center(self, x, aux)
 
     @property
     def fn(self) -> Callable[..., Any]:

@@ -45,7 +45,7 @@ def around(
     fresh = B if memory.fresh is None else min(memory.fresh, B)
     with transforms.outside(), transforms.random_numbers_allowed():
         generator = torch.Generator().manual_seed(seed)
-        part = torch.randperm(B, generator=generator)[:fresh].sort().values.to(center.device)
+        part = torch.randperm(B, generator=generator, device="cpu")[:fresh].sort().values.to(center.device)
         u = nodes(seed, memory.draws, center.shape[1], B).to(center.device)
 
     def spread(change: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate, evaluat
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.stein import Layout
 from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.surrogates.memory import Memory
 
 
 class Owner(Protocol):
@@ -27,6 +28,7 @@ class Owner(Protocol):
 
     call: BlackBoxCall
     smoothing: Smoothing
+    memory: Memory | None
     control: Control | None
     output_shapes: dict[tuple[int | torch.Size, ...], torch.Size]
 
@@ -35,8 +37,34 @@ def expand(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Expans
     """Evaluate once around x [B, n], without autograd; `keep` stores the perturbations."""
     with torch.no_grad(), transforms.random_numbers_allowed():
         expansion = evaluate(owner.call, x, aux, owner.smoothing, keep, owner.control).expansion
-    owner.output_shapes[_signature(x, aux)] = expansion.base.shape[1:]
+    owner.output_shapes[_signature(x.shape[1], aux)] = expansion.base.shape[1:]
     return expansion
+
+
+def expand_center(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    """Return f(x), [B, *out], for x [B, n]."""
+    values = evaluate_center(owner.call, x, aux)
+    owner.output_shapes[_signature(x.shape[1], aux)] = values.shape[1:]
+    return values.to(x.dtype)
+
+
+def empty(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    """Return the values [*batch, *out] of a batch x [*batch, n] without points, differentiable in x; aux are [0, ...].
+
+    ValueError if the shape of one value is not known yet. A head returns numbers.
+    """
+    shape = owner.output_shapes.get(_signature(x.shape[-1], aux))
+    if owner.call.head is not None:
+        shape = torch.Size()
+    elif owner.memory is not None and len(owner.memory):
+        shape = owner.memory.outputs.shape[1:]
+    if shape is None:
+        raise ValueError(
+            f"x must have at least one point in the first call, got {list(x.shape)}: fn is not called without points, "
+            "so the shape of its output is not known yet"
+        )
+    nothing = x.sin().sum(-1)  # a graph with derivatives of every order
+    return nothing[(..., *[None] * len(shape))].expand(*nothing.shape, *shape)
 
 
 _owners: "weakref.WeakValueDictionary[int, Owner]" = weakref.WeakValueDictionary()
@@ -86,10 +114,7 @@ def _evaluate(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> 
 
 @torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=(), tags=_RANDOM)
 def _evaluate_center(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
-    owner = _owner(handle)
-    values = evaluate_center(owner.call, x, aux)
-    owner.output_shapes[_signature(x, aux)] = values.shape[1:]
-    return values.to(x.dtype)
+    return expand_center(_owner(handle), x, aux)
 
 
 def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Layout]:
@@ -108,14 +133,14 @@ def _(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
     return x.new_empty(len(x), *_output_shape(_owner(handle), x, aux))
 
 
-def _signature(x: Tensor, aux: Sequence[Tensor]) -> tuple[int | torch.Size, ...]:
+def _signature(n: int, aux: Sequence[Tensor]) -> tuple[int | torch.Size, ...]:
     """What the shape of one value may depend on."""
-    return (int(x.shape[1]), *(torch.Size(map(int, one.shape[1:])) for one in aux))
+    return (int(n), *(torch.Size(map(int, one.shape[1:])) for one in aux))
 
 
 def _output_shape(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> torch.Size:
     """Shape of one value: known from an earlier call, or from calling the black box once at zero."""
-    signature = _signature(x, aux)
+    signature = _signature(x.shape[1], aux)
     if signature not in owner.output_shapes:
         with transforms.real_tensors(), torch.no_grad():
             probe = torch.zeros(1, int(x.shape[1]), dtype=x.dtype, device=x.device)
@@ -132,6 +157,8 @@ def _output_shape(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> torch.Size:
 
 def _mapped(info: Any, in_dims: Any, x: Tensor, aux: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
     """Fold the dimension that vmap maps over into the batch."""
+    if not info.batch_size:
+        raise ValueError("x must have at least one point under vmap, got a mapped dimension of length 0")
 
     def fold(one: Tensor, dim: int | None) -> Tensor:
         one = one.expand(info.batch_size, *one.shape) if dim is None else one.movedim(dim, 0)

@@ -73,7 +73,7 @@ def combined(batches: Sequence[Batch], of: Callable[[Batch], Tensor]) -> Tensor:
 def combined_spread(batches: Sequence[Batch], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the standard error of the mean over independent batches, and its degrees of freedom (Satterthwaite)."""
     rows = [one.evaluations.share.shape[1] for one in batches]
-    error, inverse = torch.zeros(()), torch.zeros(())
+    error, inverse = torch.zeros((), device="cpu"), torch.zeros((), device="cpu")
     for one, count in zip(batches, rows, strict=True):
         share = count / sum(rows)
         own, degrees = one.spread(quantity, t)

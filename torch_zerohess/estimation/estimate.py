@@ -19,7 +19,7 @@ from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
-from torch_zerohess.surrogates.memory import Memory
+from torch_zerohess.surrogates.memory import Memory, check_memory
 
 _ONE_SIGMA = 0.6826894921370859  # probability within one standard deviation of a normal distribution
 
@@ -126,8 +126,7 @@ def estimate(
 def _check_memory(head: Head | None, memory: Memory | None, tolerance: float | None) -> None:
     if isinstance(head, LocalEntropy):
         raise ValueError("head LocalEntropy is no mean over samples, which an estimate is: use BlackBox with this head")
-    if memory is not None and not isinstance(memory, Memory):
-        raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
+    check_memory(memory)
     if memory is not None and tolerance is not None:
         raise ValueError(
             f"a memory serves one batch, a tolerance asks for several: give one of the two, got tolerance {tolerance}"

@@ -85,7 +85,7 @@ class BlackBoxCall:
         values, lost = apply_head(self.head, outputs, aux), self._lost(flat)
         if lost:  # a head may make a number of NaN
             values = values.clone()
-            values[torch.tensor(lost) // E, torch.tensor(lost) % E] = torch.nan
+            values[[k // E for k in lost], [k % E for k in lost]] = torch.nan
         return values, outputs
 
     def _lost(self, points: Tensor) -> list[int]:

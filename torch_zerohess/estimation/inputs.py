@@ -9,14 +9,18 @@ _SHOWN = 8  # numbers of a tensor that a text shows
 _HALF = (torch.float16, torch.bfloat16)
 
 
-def checked_input(x: Any) -> Tensor:
-    """Return x, or raise TypeError or ValueError if it is not a real floating tensor [*batch, n] with n > 0."""
+def checked_input(x: Any, *, empty: bool = False) -> Tensor:
+    """Return x, or raise TypeError or ValueError if it is not a real floating tensor [*batch, n] with n > 0.
+
+    empty: a batch may have no points.
+    """
     if not isinstance(x, Tensor):
         raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
     if x.dtype not in (torch.float32, torch.float64, *_HALF):
         raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
-    if x.dim() == 0 or x.numel() == 0:
-        raise ValueError(f"x must have shape [*batch, n] with n and every batch dimension > 0, got {list(x.shape)}")
+    if x.dim() == 0 or x.shape[-1] == 0 or (x.numel() == 0 and not empty):
+        wanted = "n > 0" if empty else "n and every batch dimension > 0"
+        raise ValueError(f"x must have shape [*batch, n] with {wanted}, got {list(x.shape)}")
     return x
 
 

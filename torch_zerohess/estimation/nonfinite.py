@@ -25,7 +25,7 @@ def finite_values(
     if on_nonfinite != "drop" or bool(bad[:, K:].any()):
         where = bad.nonzero()[0]
         if on_nonfinite == "drop":  # the center cannot be dropped
-            where = torch.tensor([int(bad[:, K].nonzero()[0]), K])
+            where = torch.tensor([int(bad[:, K].nonzero()[0]), K], device="cpu")
         rule = "raise" if on_nonfinite == "drop" else on_nonfinite
         return replaced(values, where, points, rule), None
     kept = ~bad[:, :K]

@@ -41,7 +41,7 @@ def _log_gamma_ratio(x: Tensor) -> Tensor:
 @lru_cache(maxsize=1)
 def _gauss_legendre() -> tuple[Tensor, Tensor]:
     """Nodes and weights on [0, 1] (Golub and Welsch 1969)."""
-    k = torch.arange(1.0, _NODES, dtype=torch.float64)
+    k = torch.arange(1.0, _NODES, dtype=torch.float64, device="cpu")
     off = k / (4 * k * k - 1).sqrt()
     nodes, vectors = torch.linalg.eigh(torch.diag(off, 1) + torch.diag(off, -1))
     return (nodes + 1) / 2, vectors[0] ** 2

@@ -60,9 +60,9 @@ def nodes(seed: int, count: int | None, n: int, batch: int) -> Tensor:
     half = (count + 1) // 2
     generator = torch.Generator().manual_seed(seed)
     if n > _SOBOL:
-        u = torch.randn(half, n, generator=generator, dtype=torch.float64)
+        u = torch.randn(half, n, generator=generator, dtype=torch.float64, device="cpu")
     else:
-        shifted = (_even(half, n) + torch.rand(n, generator=generator, dtype=torch.float64)) % 1.0
+        shifted = (_even(half, n) + torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")) % 1.0
         u = torch.special.ndtri(shifted.clamp(_EDGE, 1.0 - _EDGE))
     return torch.cat([u, -u])
 

@@ -120,7 +120,7 @@ class Batch:
         if not parts:
             if known is None:
                 raise self.loss()
-            return torch.full((len(self.points), *known[1]), torch.nan, dtype=known[0])
+            return torch.full((len(self.points), *known[1]), torch.nan, dtype=known[0], device="cpu")
         first = parts[0][1]
         for start, values in parts:
             if values.shape[1:] != first.shape[1:]:
@@ -131,7 +131,7 @@ class Batch:
         if not self.lost:
             return first if len(parts) == 1 else torch.cat([values for _, values in parts])
         dtype = torch.cat([values[:0] for _, values in parts]).dtype
-        result = torch.full((len(self.points), *first.shape[1:]), torch.nan, dtype=dtype)
+        result = torch.full((len(self.points), *first.shape[1:]), torch.nan, dtype=dtype, device=first.device)
         for start, values in parts:
             result[start : start + len(values)] = values
         return result

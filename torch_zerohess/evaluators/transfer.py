@@ -47,7 +47,7 @@ def read(where: Sequence[Spec], source: Any, start: int = 0) -> list[Tensor]:
     """Return copies of the tensors in a writable buffer."""
     result = []
     for dtype, shape, offset, size in where:
-        one = torch.empty(shape, dtype=dtype)
+        one = torch.empty(shape, dtype=dtype, device="cpu")
         if size:
             place = torch.frombuffer(source, dtype=dtype, count=one.numel(), offset=start + offset)
             one.reshape(-1).copy_(place)

@@ -13,6 +13,8 @@ def as_tensor(result: Any) -> Tensor:
     Numbers of Python are float64, alone and in lists, and so are integers and truth values of any kind: counts,
     images of bytes, a loss that is 0 on a plateau.
     """
+    if isinstance(result, Tensor):
+        return result if result.is_floating_point() or result.is_complex() else result.double()
     try:
         numpy = sys.modules.get("numpy")
         if numpy is not None and hasattr(result, "__array_interface__"):  # of any strides, and types torch may not know
@@ -23,12 +25,14 @@ def as_tensor(result: Any) -> Tensor:
         leaf = result  # whatever the default dtype of torch
         while isinstance(leaf, (list, tuple)) and len(leaf):
             leaf = leaf[0]
+        # Arrays that are on no GPU go to the CPU, whatever the default device of torch.
+        device = None if hasattr(result, "__cuda_array_interface__") else "cpu"
         if isinstance(leaf, float):
-            return torch.as_tensor(result, dtype=torch.float64)
-        tensor = torch.as_tensor(result)
+            return torch.as_tensor(result, dtype=torch.float64, device=device)
+        tensor = torch.as_tensor(result, device=device)
         mixed = isinstance(leaf, int) and tensor.is_floating_point()  # [1, 2.5]
         exact = not (tensor.is_floating_point() or tensor.is_complex())
-        return torch.as_tensor(result, dtype=torch.float64) if mixed or exact else tensor
+        return torch.as_tensor(result, dtype=torch.float64, device=device) if mixed or exact else tensor
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(
             f"fn must return a tensor or a NumPy array of numbers, got {type(result).__name__}: {error}"

@@ -41,7 +41,7 @@ _LOG_BOX = 1.383646559789373  # log(2 BOX_HALF_WIDTH / sqrt(2 pi))
 
 def pick_rows(seed: int, first: int, count: int, n: int, proposal: int) -> Tensor:
     """Return int64 [count, 5], how each row is made: seed, index, kind, and the dimensions i, j of its lobe."""
-    index = torch.arange(first, first + count)
+    index = torch.arange(first, first + count, device="cpu")
     seeds = torch.full_like(index, seed)
     return mixture_rows(seeds, index, uniforms(seeds, index, 0, 3, PICKS), n, proposal)
 
@@ -135,13 +135,13 @@ def density_ratio(l1: Tensor, l2: Tensor, hole: Tensor, n: int, proposal: int) -
 
 def element_rows(seed: int, first: int, samples: int, n: int, order: int) -> Tensor:
     """Rows of optimal sampling: `samples` for the value, for each gradient element and each Hessian element i <= j."""
-    i, j = torch.triu_indices(n, n) if order == 2 else torch.empty(2, 0, dtype=torch.int64)
-    each, value = torch.arange(n), torch.zeros(1, dtype=torch.int64)
+    i, j = torch.triu_indices(n if order == 2 else 0, n, device="cpu")
+    each, value = torch.arange(n, device="cpu"), torch.zeros(1, dtype=torch.int64, device="cpu")
     hessian = torch.where(i == j, DIAGONAL_LOBE, OFF_DIAGONAL_LOBE)
     kind = torch.cat([torch.full_like(value, NORMAL), torch.full_like(each, GRADIENT_LOBE), hessian])
     elements = torch.stack([kind, torch.cat([value, each, i]), torch.cat([value, each, j])], 1)
     elements = elements.repeat_interleave(samples, 0)
-    index = torch.arange(first, first + len(elements))
+    index = first + torch.arange(len(elements), device=elements.device)
     return torch.cat([torch.stack([torch.full_like(index, seed), index], 1), elements], 1)
 
 

@@ -46,7 +46,8 @@ def sobol(
         raise ValueError(f"sampler 'sobol' has {most} dimensions at most, but x has {n} parameters: use 'random'")
     size = draw_size(smoothing, n)
     scrambles = smoothing.samples // size
-    seeds = uniforms(torch.full((scrambles,), seed), torch.arange(scrambles), 0, 1, EXTRA)[:, 0]
+    each = torch.arange(scrambles, device="cpu")
+    seeds = uniforms(torch.full_like(each, seed), each, 0, 1, EXTRA)[:, 0]
     engines = [torch.quasirandom.SobolEngine(n + 3, scramble=True, seed=int(one * 2**62)) for one in seeds]
     points = torch.stack([engine.draw(size, dtype=torch.float64) for engine in engines]).to(device)
     index = torch.arange(batch * smoothing.samples, device=device)
@@ -70,7 +71,7 @@ def orthogonal(
     """
     rows = kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device)
     plain = rows.clone()
-    plain[:, 2:] = torch.tensor([NORMAL, 0, 0])
+    plain[:, 2], plain[:, 3:] = NORMAL, 0
     gaussian = kernels.draw(plain, n).view(batch, smoothing.samples, n)
     size = draw_size(smoothing, n)
     whole = smoothing.samples // size * size

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def pick_rows(seed: int, first: int, count: int, n: int, proposal: int) -> Tensor:
-    return torch.empty(count, 5, dtype=torch.int64)
+    return torch.empty(count, 5, dtype=torch.int64, device="cpu")
 
 
 def draw(rows: Tensor, n: int, single: bool = False) -> Tensor:

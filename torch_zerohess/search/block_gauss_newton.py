@@ -112,7 +112,7 @@ class BlockMethod(Method[BlockProgress]):
         """Ask for samples along the next directions, as many as are wanted and left of the basis."""
         n, unused = self.settings.n, known.unused
         if not len(unused):
-            basis = torch.linalg.qr(torch.randn(n, n, generator=generator))[0]
+            basis = torch.linalg.qr(torch.randn(n, n, generator=generator, device="cpu"))[0]
             unused = basis.to(known.center.device)
         steps = known.sigma * math.sqrt(n) * unused[: known.wanted].double()
         there, back = (self._within(known.center + sign * steps) for sign in (1.0, -1.0))
@@ -124,7 +124,7 @@ class BlockMethod(Method[BlockProgress]):
         """Correct the Jacobian along the samples, the first of which is the start at the beginning."""
         assert evaluated.outputs is not None
         if not len(known.output):
-            first, evaluated = evaluated.outputs[0].clone(), evaluated.those(torch.arange(1, len(evaluated)))
+            first, evaluated = evaluated.outputs[0].clone(), evaluated.those(slice(1, None))
             known = replace(
                 known,
                 best=replace(known.best, loss=float(self._loss(first, known.shape))),

@@ -6,12 +6,12 @@ from torch import Tensor
 
 def normal(generator: torch.Generator, like: Tensor, *shape: int) -> Tensor:
     """Standard normal numbers on the device of `like`."""
-    return torch.randn(*shape, generator=generator, dtype=torch.float64).to(like.device)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64, device="cpu").to(like.device)
 
 
 def uniform(generator: torch.Generator, lower: Tensor, upper: Tensor, count: int) -> Tensor:
     """Points [count, n] all over the box."""
-    unit = torch.rand(count, len(lower), generator=generator, dtype=torch.float64).to(lower.device)
+    unit = torch.rand(count, len(lower), generator=generator, dtype=torch.float64, device="cpu").to(lower.device)
     return lower + (upper - lower) * unit
 
 

@@ -146,7 +146,7 @@ class LocalMethod(Method[LocalProgress]):
         if known.jacobian is None or n > _FULL or not torch.equal(known.best.point, known.center):
             return None
         gradient, product = self._derivatives(known, known.jacobian)
-        hessian = torch.stack([product(one) for one in torch.eye(n).to(known.center)])
+        hessian = torch.stack([product(one) for one in torch.eye(n, dtype=torch.float64, device=known.center.device)])
         sigma, unknown = known.sigma, torch.full_like(known.center, math.inf)
         model = LocalModel(known.best.loss, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
         return model, sigma
@@ -168,7 +168,7 @@ class LocalMethod(Method[LocalProgress]):
                     "number: use engine='descent'"
                 )
             known = replace(known, output=output, best=replace(known.best, loss=float(evaluated.losses[0])))
-            evaluated = evaluated.those(torch.arange(1, len(evaluated)))
+            evaluated = evaluated.those(slice(1, None))
         told = evaluated.those(evaluated.finite)
         assert told.outputs is not None
         if len(told) < FEWEST_SAMPLES:

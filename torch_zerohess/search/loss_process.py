@@ -118,7 +118,7 @@ class LossProcess(ProcessMethod[LossProgress]):
         known = self.avoiding(known, evaluated.points[~finite])
         for k in finite.nonzero().flatten().tolist():  # what tells the process something new
             if float((known.pool.points - evaluated.points[k]).norm(dim=1).min()) > APART:
-                known = self.remembered(known, evaluated.those(torch.tensor([k])))
+                known = self.remembered(known, evaluated.those(slice(k, k + 1)))
         best = now.best if now.best.loss <= known.best.loss else known.best
         known = replace(
             known,

@@ -200,7 +200,7 @@ class MetricQuadratics(Method[MetricProgress]):
     def _started(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Ask for the start and a point along every axis, on the side where there is room."""
         center, upper = known.center, self.settings.upper
-        side = torch.where(torch.rand(self._n, generator=generator).to(center.device) < 0.5, -1.0, 1.0)
+        side = torch.where(torch.rand(self._n, generator=generator, device="cpu").to(center.device) < 0.5, -1.0, 1.0)
         side = torch.where(center + known.sigma > upper, -1.0, side)
         side = torch.where(center - known.sigma < self.settings.lower, 1.0, side).to(center)
         return known, torch.cat([center[None], self._inside(center + known.sigma * torch.diag(side))])
@@ -277,7 +277,7 @@ class MetricQuadratics(Method[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Ask for a point of the region in a direction u [n] or its opposite."""
         step = known.sigma * (known.root @ direction)
-        step = -step if float(torch.rand((), generator=generator)) < 0.5 else step
+        step = -step if float(torch.rand((), generator=generator, device="cpu")) < 0.5 else step
         x = self._inside((known.lowest.point + step)[None])
         step = x[0] - known.lowest.point
         expected = known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))

@@ -92,7 +92,7 @@ class Minimum:
             axes = pyplot.subplots()[1]
         values = self.values.detach().double().cpu()
         known = values.nan_to_num(nan=float("inf"))
-        counts = torch.arange(1, len(values) + 1)
+        counts = torch.arange(1, len(values) + 1, device="cpu")
         axes.plot(counts, values, ".", color="0.7", label="evaluations")
         axes.step(counts, known.cummin(0).values, where="post", label="lowest so far")
         if self.value_error:

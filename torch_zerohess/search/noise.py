@@ -54,8 +54,8 @@ def lowest_mean(
         evaluations: how many there may be.
         noise: standard deviation of a loss; what is measured counts where it is more.
     """
-    left, choosing = torch.arange(len(points)), evaluations // 2
-    losses = torch.zeros(len(points), 0, dtype=torch.float64)  # of those that are left
+    left, choosing = torch.arange(len(points), device="cpu"), evaluations // 2
+    losses = torch.zeros(len(points), 0, dtype=torch.float64, device="cpu")  # of those that are left
     rounds = math.ceil(math.log2(len(points)))
     for k in range(rounds):
         each = choosing // ((rounds - k) * len(left))

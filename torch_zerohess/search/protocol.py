@@ -68,7 +68,7 @@ class AskTell(ABC, Generic[P]):
         if not 0.0 < checked_number("tolerance", tolerance) < 1.0:
             raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
         pool = None if pool is None else checked_integer("pool", pool, 4)
-        seed = int(torch.randint(2**63 - 1, ())) if seed is None else checked_integer("seed", seed)
+        seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_integer("seed", seed)
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
         self._method = self._make(Settings(start, lower, upper, loss, restarts, tolerance, float(noise), pool))
@@ -81,7 +81,7 @@ class AskTell(ABC, Generic[P]):
         """Values of some of them, by number, that came before the others."""
         self._drawn: tuple[int, Tensor] | None = None
         """The batch that `ask` drew points for last, and these points, so that no model is fitted twice."""
-        self.told = torch.empty(0, dtype=torch.float64)
+        self.told = torch.empty(0, dtype=torch.float64, device=x0.device)
         """Losses [K] of the points told last."""
 
     @abstractmethod
@@ -295,16 +295,18 @@ class AskTell(ABC, Generic[P]):
             return points
         generator = torch.Generator()
         generator.set_state(self._state.random)
-        generator.manual_seed(int(torch.randint(2**63 - 1, (), generator=generator)))  # numbers of its own
+        generator.manual_seed(
+            int(torch.randint(2**63 - 1, (), generator=generator, device="cpu"))
+        )  # numbers of its own
         further = self._method.more(self._state.progress, points, batch - len(points), generator)
         return torch.cat([points, self._space.rounded(further)])
 
     def _converted(self, values: Any) -> Tensor:
         try:
-            values = torch.as_tensor(values, dtype=torch.float64)
+            values = torch.as_tensor(values, dtype=torch.float64, device=self.unit.device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}") from error
-        return values.detach().to(self.unit.device)
+        return values.detach()
 
     def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:
         """Return what was told about points [K, n], of which those beyond the search's own are from `Method.more`."""

@@ -118,7 +118,7 @@ class Running:
             return self._first(search.ask(max(self._batch - 1, 1)))
         points = search.ask(self._batch, limit=self.left)
         self.noise = self.noise or 0.0
-        search.tell(self._call(points.clone(), ()))
+        search.tell(self._call(points, ()))
         return self._noted(points, search.told)
 
     def ending(self, *, arrived: bool) -> Status:
@@ -261,7 +261,7 @@ class Running:
         """Return the losses [K] of points [K, n], which are not told to the search."""
         losses = []
         for part in points.split(max(self._batch, self._least - 1)):  # no more at once than in the first batch
-            losses.append(self.search.losses(self._call(part.clone(), ())))
+            losses.append(self.search.losses(self._call(part, ())))
             self._noted(part, losses[-1])
         return torch.cat(losses)
 

@@ -82,7 +82,7 @@ def _bounds(bounds: Bounds | None, x0: Tensor) -> tuple[Tensor, Tensor]:
         infinite = torch.full_like(x0.detach(), math.inf)
         return -infinite, infinite
     sides = zip(_sides(bounds, len(x0)), (-math.inf, math.inf), strict=True)
-    lower, upper = (_side(one, none).to(x0.device).detach() for one, none in sides)
+    lower, upper = (_side(one, none, x0.device).detach() for one, none in sides)
     for name, one in (("lower", lower), ("upper", upper)):
         if one.shape not in ((), x0.shape):
             raise ValueError(f"the {name} bound must be a number or [{len(x0)}], got shape {list(one.shape)}")
@@ -139,11 +139,11 @@ def _in_order(lower: Any, upper: Any) -> bool:
     return all(a is None or b is None or a < b for a, b in zip(lower, upper, strict=True))
 
 
-def _side(one: Any, none: float) -> Tensor:
+def _side(one: Any, none: float, device: torch.device) -> Tensor:
     """Return a bound as float64; `none` where there is none."""
     try:
         if isinstance(one, (tuple, list)):
             one = [none if each is None else float(each) for each in one]
-        return torch.as_tensor(none if one is None else one, dtype=torch.float64)
+        return torch.as_tensor(none if one is None else one, dtype=torch.float64, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"bounds must be numbers, tensors [n] or None, got {one!r}") from error

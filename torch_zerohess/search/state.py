@@ -111,10 +111,10 @@ class Evaluated:
         """Those from `Method.more`."""
         return self.those(torch.arange(len(self), device=self.points.device) >= len(self) - self.extra)
 
-    def those(self, which: Tensor) -> "Evaluated":
-        """The ones that `which` selects: bools [K], or indices."""
+    def those(self, which: Tensor | slice) -> "Evaluated":
+        """The ones that `which` selects: bools [K], indices, or a slice."""
         outputs = None if self.outputs is None else self.outputs[which]
-        extra = int((torch.arange(len(self), device=which.device)[which] >= len(self) - self.extra).sum())
+        extra = int((torch.arange(len(self), device=self.points.device)[which] >= len(self) - self.extra).sum())
         return Evaluated(self.points[which], self.losses[which], outputs, self.shape, extra)
 
 

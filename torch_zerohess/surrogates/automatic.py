@@ -51,7 +51,8 @@ class AutomaticSurrogate:
         known = outputs if self.space is None else self.space.encode(outputs)
         models = self._candidates(points)
         if len(models) > 1:
-            index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1)).to(points.device)
+            index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1), device="cpu")
+            index = index.to(points.device)
             part = max(1, len(points) // _HELD_OUT)
             held, rest = index[:part], index[part:]
             errors = []

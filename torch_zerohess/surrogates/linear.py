@@ -29,7 +29,7 @@ class LinearSurrogate:
     def __init__(self, *, capacity: int = 4000) -> None:
         capacity = checked_integer("capacity", capacity, 2)
         self.capacity = capacity
-        self._middle = self._mean = self._slope = torch.empty(0)
+        self._middle = self._mean = self._slope = torch.empty(0, device="cpu")
         self._shape = torch.Size()
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:

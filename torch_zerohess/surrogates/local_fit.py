@@ -54,14 +54,14 @@ def _least_squares(u: Tensor, values: Tensor) -> tuple[LocalModel, float] | None
     size = float((values - base).max())
     if size == 0.0:
         return None
-    row, column = torch.triu_indices(n, n).to(u.device)
+    row, column = torch.triu_indices(n, n, device=u.device)
     half = torch.where(row == column, 0.5, 1.0).to(u)
     design = torch.cat([u.new_ones(P, 1), u, half * u[:, row] * u[:, column]], 1)
     q, r = torch.linalg.qr(design)
     pivots = r.diagonal().abs()
     if float(pivots.min()) < _RANK * float(pivots.max()):
         return None
-    inverse = torch.linalg.solve_triangular(r, torch.eye(len(r)).to(r), upper=True)
+    inverse = torch.linalg.solve_triangular(r, torch.eye(len(r), dtype=r.dtype, device=r.device), upper=True)
     target = (values - base) / size
     solution = inverse @ (q.mT @ target)
     # What is not quadratic is no noise: it does not average out over the evaluations (Cauchy and Schwarz).

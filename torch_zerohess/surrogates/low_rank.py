@@ -37,7 +37,7 @@ class LowRank:
         """
         flat = outputs.reshape(len(outputs), -1)
         mean = flat.mean(0)
-        chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(0))[:rank]
+        chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(0), device="cpu")[:rank]
         span = flat[chosen.to(flat.device)] - mean
         values, vectors = torch.linalg.eigh((span @ span.mT).double())
         kept = values > max(_FLAT * float(values[-1]), math.ulp(0.0))

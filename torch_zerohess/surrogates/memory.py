@@ -26,6 +26,8 @@ _FORGET = 0.8
 class Memory:
     """Evaluations of a black box, and a surrogate g of it, as a control variate of `BlackBox` and `estimate`.
 
+    Several of them can share one memory, and `minimize` adds to it. All must call the same black box.
+
     With a head h after the black box f and a coefficient c,
 
         F(x, r) = c E h(g(x + sigma u), r)  +  E[ h(f(x + sigma u), r) - c h(g(x + sigma u), r) ].
@@ -106,13 +108,13 @@ class Memory:
     def points(self) -> Tensor:
         """Points of the evaluations that are kept, [P, n]."""
         self._points = [torch.cat(self._points)] if len(self._points) > 1 else self._points
-        return self._points[0] if self._points else torch.empty(0, 0)
+        return self._points[0] if self._points else torch.empty(0, 0, device="cpu")
 
     @property
     def outputs(self) -> Tensor:
         """Outputs there, [P, *out]."""
         self._outputs = [torch.cat(self._outputs)] if len(self._outputs) > 1 else self._outputs
-        return self._outputs[0] if self._outputs else torch.empty(0)
+        return self._outputs[0] if self._outputs else torch.empty(0, device="cpu")
 
     @property
     def scalar(self) -> bool:
@@ -266,6 +268,12 @@ def _to_later(points: Tensor, first: int) -> Tensor:
     apart = torch.cdist(block, points[first:], compute_mode="donot_use_mm_for_euclid_dist")
     later = torch.ones_like(apart, dtype=torch.bool).triu(1)
     return apart.masked_fill(~later, float("inf")).min(1).values
+
+
+def check_memory(memory: Any) -> None:
+    """Raise TypeError for what is neither None nor a `Memory`."""
+    if memory is not None and not isinstance(memory, Memory):
+        raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
 
 
 def _is_number(value: float) -> bool:

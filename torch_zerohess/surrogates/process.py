@@ -36,7 +36,7 @@ class ProcessSurrogate:
         capacity = checked_integer("capacity", capacity, 2)
         self.capacity = capacity
         self._process: InducedProcess | None = None
-        self._lengths = torch.empty(0)
+        self._lengths = torch.empty(0, device="cpu")
         self._shape = torch.Size()
 
     @property
@@ -59,7 +59,7 @@ class ProcessSurrogate:
         spread = z.std(0)
         spread = torch.where(spread > 0.0, spread, torch.ones_like(spread))
         u = z / spread
-        some = torch.randperm(len(u), generator=torch.Generator().manual_seed(0))[:_EVIDENCE].to(u.device)
+        some = torch.randperm(len(u), generator=torch.Generator().manual_seed(0), device="cpu")[:_EVIDENCE].to(u.device)
         choice = most_likely(u[some], y[some] - y[some].mean(0), anisotropic=u.shape[1] <= _MOST)
         self._lengths = spread * choice.lengths
         self._process = InducedProcess.condition(u / choice.lengths, y, choice.kernel, choice.noise)

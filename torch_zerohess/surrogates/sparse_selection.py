@@ -78,7 +78,7 @@ def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds
     """
     K, n = u.shape
     directions, decoys = _normalized(u), _normalized(u.roll(1, 0))
-    counts = [torch.zeros(_BINS, dtype=torch.float64) for _ in range(4)]
+    counts = [torch.zeros(_BINS, dtype=torch.float64, device="cpu") for _ in range(4)]
     blocks = list(_blocks(grids, n))
     energy = torch.stack([rest[:, first * grids.row : last * grids.row].square().sum() for first, last in blocks])
     step = max(1, round(grids.pixels[0] * grids.row * n / _COUNTED))
@@ -101,7 +101,7 @@ def spaced(energy: Tensor, count: int) -> list[int]:
     total = energy.double().cpu().cumsum(0)
     if count >= len(energy) or not float(total[-1]) > 0.0:
         return list(range(len(energy)))[:: max(1, len(energy) // max(1, count))]
-    aims = (torch.arange(count).double() + 0.5) / count * total[-1]
+    aims = (torch.arange(count, device="cpu").double() + 0.5) / count * total[-1]
     return torch.searchsorted(total, aims).unique().tolist()
 
 

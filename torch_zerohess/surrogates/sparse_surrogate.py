@@ -46,7 +46,7 @@ class SparseSurrogate:
         self.keep, self.rate, self.grid, self.capacity = keep, rate, grid, capacity
         self.jacobian: SparseJacobian | None = None
         """Of the latest fit. `explained` is the share of the change of held-out outputs that it predicts."""
-        self._middle = self._mean = torch.empty(0)
+        self._middle = self._mean = torch.empty(0, device="cpu")
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""

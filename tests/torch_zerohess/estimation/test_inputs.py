@@ -91,8 +91,8 @@ POINTS = [
     (torch.ones(2, dtype=torch.complex128), TypeError, r"x must be float32 or float64, got torch\.complex128"),
     (torch.ones(2, dtype=torch.int8), TypeError, r"x must be float32 or float64, got torch\.int8"),
     (torch.ones(2, dtype=torch.bool), TypeError, r"x must be float32 or float64, got torch\.bool"),
-    (torch.ones(0), ValueError, r"x must have shape \[\*batch, n\] with n and every batch dimension > 0, got \[0\]"),
-    (torch.ones(0, 3), ValueError, r"x must have shape \[\*batch, n\].*got \[0, 3\]"),
+    (torch.ones(0), ValueError, r"x must have shape \[\*batch, n\] with n.* > 0, got \[0\]"),
+    (torch.ones(0, 3), ValueError, r"x must have .*got \[0, 3\]"),
     (torch.tensor(1.0), ValueError, r"x must have shape \[\*batch, n\].*got \[\]"),
     ([0.1, 0.2], TypeError, r"x must be a torch tensor \[\*batch, n\], got list"),
     (np.ones(2), TypeError, r"x must be a torch tensor \[\*batch, n\], got ndarray"),
@@ -164,6 +164,7 @@ def test_the_function_cannot_change_its_input() -> None:
 
 OTHERS = [
     (lambda: estimate(f, X, S.replace(sigma=torch.ones(3))), ValueError, "sigma has 3 elements, but x has 2"),
+    (lambda: estimate(f, X, S.replace(sigma=torch.ones(1))), ValueError, "sigma has 1 elements, but x has 2"),
     (lambda: BlackBox(f, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
     (lambda: estimate(f, X, 0.5), TypeError, "smoothing must be a Smoothing, got float"),
     (lambda: BlackBox("f", S), TypeError, "fn must be callable, got 'f'"),

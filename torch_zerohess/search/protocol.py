@@ -256,12 +256,13 @@ class AskTell(ABC, Generic[P]):
         """
         alone = len(self._given) in (0, len(self._state.asked))  # nothing is out, or what the search itself asked for
         out = {"early": dict(self._early), "out": None if alone else self._given}
-        return {"search": self._kind, "unit": self.unit, **out, **plain(self._state)}
+        bounds = {"lower": self._space.lower, "upper": self._space.upper}
+        return {"search": self._kind, "unit": self.unit, **bounds, **out, **plain(self._state)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a `state_dict`; the settings and the loss stay those given here.
 
-        ValueError if these do not go with it: another search, other parameters or another sigma.
+        ValueError if these do not go with it: another search, other parameters, another sigma or other bounds.
         """
         unit, device = state["unit"].to(self.unit), self.unit.device
         if len(unit) != self._method.settings.n:
@@ -270,6 +271,11 @@ class AskTell(ABC, Generic[P]):
             raise ValueError(f"state must be of a search with sigma = {self.unit.tolist()}, got {unit.tolist()}")
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
+        for name, own in (("lower", self._space.lower), ("upper", self._space.upper)):
+            if not torch.equal(state[name].to(own), own):
+                raise ValueError(
+                    f"state must be of a search with {name} bounds {own.tolist()}, got {state[name].tolist()}"
+                )
         progress = restored(self._method.progress, state["progress"], device)
         early = {k: value.to(device) for k, value in state["early"].items()}
         out = None if state["out"] is None else state["out"].to(device)

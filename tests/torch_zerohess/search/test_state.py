@@ -110,6 +110,7 @@ def test_the_settings_stay_those_of_the_search_that_loads():
         (2, {"sigma": 2.0}, r"sigma = \[1.0, 1.0\], got \[2.0, 2.0\]"),
         (2, {"bounds": (-5.0, 5.0)}, "by descent of the loss, got one by gaussian_process of the loss"),
         (2, {"loss": torch.sum}, "by descent of the loss, got one by descent of the output"),
+        (2, {"bounds": (-9.0, None)}, r"lower bounds \[-inf, -inf\], got \[-9.0, -9.0\]"),
     ],
 )
 def test_a_state_of_another_search(n, changes, message):

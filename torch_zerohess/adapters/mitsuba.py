@@ -114,7 +114,8 @@ class MitsubaScene:
         self.labels = [label for one in self.parameters for label in one.labels]
         """Of the columns of x [n]."""
         lower, upper = zip(*(pair for one in self.parameters for pair in one.limits), strict=True)
-        self.bounds = (torch.tensor(one, dtype=torch.float64, device="cpu") for one in (lower, upper))
+        at_least, at_most = (torch.tensor(one, dtype=torch.float64, device="cpu") for one in (lower, upper))
+        self.bounds = (at_least, at_most)
         """Lower and upper [n], infinite where there are none; renders are of points clamped to them."""
         start = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64, device="cpu")
         self.x0 = start.clamp(*self.bounds)

@@ -140,13 +140,8 @@ class SurrogateTerm:
             degrees: its degrees of freedom; those of the sum are by Satterthwaite.
             quantity: which.
             v: [B, n], the vector of the "hvp".
-
-        Raises:
-            ValueError: the memory has fewer than 3 draws, which are fewer than two pairs.
         """
         own = len(self.u) // 2 - 1
-        if own < 1:
-            raise ValueError(f"a standard error needs a memory with draws of at least 3, got {len(self.u)}")
         mine = self.variance(quantity, v).sqrt()
         whole = torch.hypot(error, mine)
         unit = torch.where(whole > 0, whole, 1.0)

@@ -222,10 +222,8 @@ def test_what_cannot_serve_raises() -> None:
         estimated(Memory(), 0, tolerance=0.1)
     with pytest.raises(TypeError, match="memory must be a Memory, got dict"):
         estimated({}, 0)
-    memory = Whole(SURROGATES["good"], draws=2)
-    memory.pathwise = True
-    with pytest.raises(ValueError, match="draws of at least 3, got 2"):
-        estimated(memory, 0).standard_error("gradient")
+    with pytest.raises(ValueError, match="draws must be at least 3, got 2"):
+        Memory(draws=2)
 
 
 @pytest.mark.parametrize("fitted", [True, False])

@@ -259,7 +259,7 @@ def test_intervals_of_several_batches_contain_the_truth() -> None:
 LIMITS = [
     ({"max_evaluations": 100}, ValueError, "give tolerance too, got 100 alone"),
     ({"tolerance": 0.0}, ValueError, r"tolerance must be positive and finite, .*got 0\.0"),
-    ({"tolerance": math.nan}, ValueError, "tolerance must be positive and finite"),
+    ({"tolerance": math.nan}, ValueError, "tolerance must be a number, got nan"),
     ({"tolerance": "1 %"}, TypeError, "tolerance must be a number, got '1 %'"),
     ({"tolerance": 0.1, "max_evaluations": 30}, ValueError, "max_evaluations must be at least 33, .*got 30"),
     ({"tolerance": 0.1, "max_evaluations": 1e3}, TypeError, r"max_evaluations must be an integer, got 1000\.0"),

@@ -54,6 +54,13 @@ def test_too_few_evaluations(most):
     assert f.points == 0
 
 
+def test_results_are_compared_by_identity_and_have_a_hash():
+    """Their fields are tensors, which have no truth value together."""
+    one, other = (zh.minimize(lambda z: z.square().sum(1), zeros(2), sigma=1.0, seed=0, target=0.5) for _ in range(2))
+    assert one != other
+    assert len({one, other, one}) == 2
+
+
 def test_target():
     fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, target=0.6)
     assert fit.value <= 0.6

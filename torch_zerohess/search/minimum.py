@@ -22,7 +22,7 @@ class Observation(NamedTuple):
     value: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Iterate:
     """State after a batch of evaluations: how many there were, the best value so far, and where."""
 
@@ -35,7 +35,7 @@ class Iterate:
     """Their losses [K]."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Minimum:
     """The best point found, and the smoothed function around it.
 

@@ -25,6 +25,8 @@ def as_tensor(result: Any) -> Tensor:
         leaf = result  # whatever the default dtype of torch
         while isinstance(leaf, (list, tuple)) and len(leaf):
             leaf = leaf[0]
+        if numpy is not None and leaf is not result and isinstance(leaf, numpy.ndarray):  # torch takes them one by one
+            return as_tensor(numpy.asarray(result))
         # Arrays that are on no GPU go to the CPU, whatever the default device of torch.
         device = None if hasattr(result, "__cuda_array_interface__") else "cpu"
         if isinstance(leaf, float):

@@ -174,6 +174,12 @@ def test_what_has_the_array_interface_is_an_array() -> None:
     assert torch.equal(got, estimate(bytes_, X, S).gradient)
 
 
+def test_lists_of_arrays_are_one_array(recwarn) -> None:
+    got = estimate(lambda z: [np.sin(one) for one in z.numpy()], X, S).gradient
+    assert torch.equal(got, estimate(torch.sin, X, S).gradient)
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize("make", [lambda a: a[:, ::-1], lambda a: np.broadcast_to(a[:, :1], a.shape)])
 def test_arrays_in_any_order_and_without_the_right_to_write(make, recwarn) -> None:
     got = estimate(lambda z: make(z.numpy()), X, S).gradient

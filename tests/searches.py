@@ -100,3 +100,15 @@ def points_of(search, f, evaluations):
     asked = []
     run(search, lambda z: f(asked.append(z) or z), evaluations)
     return torch.cat(asked)
+
+
+def raising(fn, call, error=ZeroDivisionError):
+    """Return fn, which raises an error in the given call of it (from 0)."""
+    count = iter(range(call + 1))
+
+    def counting(argument):
+        if next(count) == call:
+            raise error
+        return fn(argument)
+
+    return counting

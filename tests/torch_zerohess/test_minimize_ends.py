@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from searches import TARGET, tilted, zeros
+from searches import TARGET, raising, tilted, zeros
 
 import torch_zerohess as zh
 
@@ -86,26 +86,14 @@ def test_callback():
     assert none.evaluations == 20
 
 
-def interrupted(fn, call):
-    """Return fn, with Ctrl-C in the given call of it (from 0)."""
-    count = iter(range(call + 1))
-
-    def counting(argument):
-        if next(count) == call:
-            raise KeyboardInterrupt
-        return fn(argument)
-
-    return counting
-
-
 @pytest.mark.parametrize("where", ["fn", "callback"])
 def test_interrupted(where):
     """Ctrl-C in the fifth call returns what was found until then."""
     seen = []
     if where == "fn":
-        fit = zh.minimize(interrupted(tilted, 4), zeros(2), sigma=2.0, seed=0, callback=seen.append)
+        fit = zh.minimize(raising(tilted, 4, KeyboardInterrupt), zeros(2), sigma=2.0, seed=0, callback=seen.append)
     else:
-        fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=interrupted(seen.append, 4))
+        fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=raising(seen.append, 4, KeyboardInterrupt))
     plain = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, callback=lambda one: one.evaluations == fit.evaluations)
     assert fit.message == "interrupted"
     assert len(seen) == 4
@@ -116,7 +104,7 @@ def test_interrupted(where):
 
 def test_interrupted_before_anything_was_evaluated():
     with pytest.raises(KeyboardInterrupt):
-        zh.minimize(interrupted(tilted, 0), zeros(2), sigma=1.0)
+        zh.minimize(raising(tilted, 0, KeyboardInterrupt), zeros(2), sigma=1.0)
 
 
 def test_an_exception_passes():
@@ -306,18 +294,6 @@ def test_a_checkpoint_goes_on_where_it_was(tmp_path):
     assert torch.equal(rest.x, whole.x)
     assert torch.equal(rest.points, whole.points)
     assert torch.equal(rest.values, whole.values)
-
-
-def raising(fn, call):
-    """Return fn that raises in the given call (from 0)."""
-    count = iter(range(call + 1))
-
-    def counting(z):
-        if next(count) == call:
-            raise ZeroDivisionError
-        return fn(z)
-
-    return counting
 
 
 def test_verbose_says_how_far_it_is(monkeypatch, capsys):

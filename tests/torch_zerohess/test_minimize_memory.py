@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from searches import tilted, zeros
+from searches import raising, tilted, zeros
 
 import torch_zerohess as zh
 from truths import vector
@@ -85,14 +85,14 @@ def test_what_was_evaluated_before_an_end_is_kept(tmp_path):
     fit = zh.minimize(raising(tilted, 3, KeyboardInterrupt), zeros(2), **settings)
     assert torch.equal(memory.points, fit.points)
     with pytest.raises(ZeroDivisionError) as caught:
-        zh.minimize(raising(tilted, 3, ZeroDivisionError), zeros(2), **settings)
+        zh.minimize(raising(tilted, 3), zeros(2), **settings)
     assert torch.equal(memory.points, caught.value.minimum.points)
     fit = zh.minimize(tilted, zeros(2), **settings)
     assert torch.equal(memory.points, fit.points)
     assert torch.equal(memory.outputs, fit.values)
     memory = zh.Memory()
     with pytest.raises(ZeroDivisionError):
-        zh.minimize(tilted, zeros(2), loss=raising(torch.sum, 0, ZeroDivisionError), memory=memory, **SETTINGS)
+        zh.minimize(tilted, zeros(2), loss=raising(torch.sum, 0), memory=memory, **SETTINGS)
     assert len(memory) > 0
 
 
@@ -118,15 +118,3 @@ def test_what_repeats_for_noise_is_kept_too():
     assert fit.noise > 0
     torch.testing.assert_close(memory.points, fit.points, rtol=0, atol=0)
     torch.testing.assert_close(memory.outputs, fit.values, rtol=0, atol=0)
-
-
-def raising(fn, call, error):
-    """Return fn that raises in the given call (from 0)."""
-    count = iter(range(call + 1))
-
-    def counting(z):
-        if next(count) == call:
-            raise error
-        return fn(z)
-
-    return counting

@@ -163,9 +163,8 @@ def hvp(
             f"v must have the shapes of inputs, {[list(one.shape) for one in parts]}, "
             f"got {[list(one.shape) for one in vectors]}"
         )
-    product = CurvatureOperator(outputs, parts, mode=mode, through=through) @ torch.cat(
-        [one.reshape(-1) for one in vectors]
-    )
+    operator = CurvatureOperator(outputs, parts, mode=mode, through=through)
+    product = operator @ torch.cat([one.reshape(-1) for one in vectors])
     pieces = product.split([one.numel() for one in parts])
     result = [piece.view_as(one) for piece, one in zip(pieces, parts, strict=True)]
     return result[0] if isinstance(inputs, Tensor) else result

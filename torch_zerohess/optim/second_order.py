@@ -22,8 +22,8 @@ Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
 _OUTSIDE = 1e-4
 """Part of a gradient that may come from elsewhere than the inputs of black boxes, for the dual solve: rounding."""
-_INDEFINITE = 1e-12
-"""Least eigenvalue of a curvature, over the largest one, that is negative by more than rounding."""
+_INDEFINITE = 100.0
+"""Negative eigenvalue of a curvature that is more than rounding, over the largest magnitude times the rounding."""
 TRIALS = 10
 """Evaluations of one step at most; it is shortened after each one at which the loss is not finite."""
 
@@ -100,7 +100,7 @@ class Model:
             )
         if self._blocks is None:
             values = torch.linalg.eigvalsh(A)
-            if float(values[0]) < -_INDEFINITE * float(values[-1].abs()):
+            if float(values[0]) < -_INDEFINITE * torch.finfo(self.loss.dtype).eps * float(values.abs().max()):
                 return None
         return dual_step(J, A, g, radius, damping)
 

@@ -301,9 +301,8 @@ class AskTell(ABC, Generic[P]):
             return points
         generator = torch.Generator()
         generator.set_state(self._state.random)
-        generator.manual_seed(
-            int(torch.randint(2**63 - 1, (), generator=generator, device="cpu"))
-        )  # numbers of its own
+        own = int(torch.randint(2**63 - 1, (), generator=generator, device="cpu"))
+        generator.manual_seed(own)
         further = self._method.more(self._state.progress, points, batch - len(points), generator)
         return torch.cat([points, self._space.rounded(further)])
 

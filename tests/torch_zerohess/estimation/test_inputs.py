@@ -38,6 +38,7 @@ SETTINGS = [
     ({"sigma": "wide"}, TypeError, r"sigma must be a positive number.*'wide'"),
     ({"sigma": None}, TypeError, r"sigma must be a positive number.*None"),
     ({"sigma": True}, TypeError, r"sigma must be a positive number.*True"),
+    ({"sigma": np.array([True, True])}, TypeError, r"sigma must be a positive number.*True"),
     ({"samples": 0}, ValueError, "samples must be at least 1, got 0"),
     ({"samples": -5}, ValueError, "samples must be at least 1, got -5"),
     ({"samples": 4.0}, TypeError, r"samples must be an integer, got 4\.0"),
@@ -72,6 +73,21 @@ def test_settings(changes: dict, error: type[Exception], message: str) -> None:
         Smoothing(**{"sigma": 0.5, **changes})
     with pytest.raises(error, match=message):
         Smoothing(sigma=0.5).replace(**changes)
+
+
+@pytest.mark.parametrize(
+    "sigma",
+    [
+        [0.5, 0.25],
+        (0.5, 0.25),
+        np.array([0.5, 0.25]),
+        np.array([0.25, 0.5])[::-1],
+        np.array([0.5, 0.25], dtype=">f4"),
+    ],
+    ids=["list", "tuple", "array", "reversed", "big-endian"],
+)
+def test_sigma_of_any_kind(sigma: object) -> None:
+    assert torch.equal(Smoothing(sigma=sigma).sigma, vector(0.5, 0.25))
 
 
 def test_settings_are_frozen_keyword_only_and_own_their_sigma() -> None:

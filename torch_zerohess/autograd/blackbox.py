@@ -63,7 +63,8 @@ class BlackBox(nn.Module):
 
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
-    `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it.
+    `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it. A layer with a memory
+    is called between the graphs of a compiled model: fullgraph=True is an error.
 
     `torch.export` raises RuntimeError: no file can hold the black box.
 
@@ -104,6 +105,10 @@ class BlackBox(nn.Module):
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
         _before_compiling()
+        if self.memory is not None and torch.compiler.is_compiling():
+            from torch_zerohess.autograd.in_graph import eager  # loaded late, as there
+
+            return eager(self, x, *aux)
         dtype, x = checked_input(x, empty=True).dtype, working(x)
         self._check_aux(aux)
         batch, n = x.shape[:-1], x.shape[-1]
@@ -167,11 +172,6 @@ class BlackBox(nn.Module):
         """
         if self.memory is None:
             return self._estimated(center, aux, zero)
-        if torch.compiler.is_compiling():
-            raise RuntimeError(
-                "a layer with a memory cannot be compiled, because its surrogate changes from call to call: "
-                "exclude the layer with torch.compiler.disable"
-            )
         self.control = Control.of(self.memory, self.call.head, learning=self.training)
         with transforms.outside(), transforms.random_numbers_allowed():
             seed = self.smoothing.drawn_seed()

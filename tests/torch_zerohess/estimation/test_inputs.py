@@ -227,6 +227,16 @@ OTHERS = [
 ]
 
 
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+def test_a_sigma_of_another_length_is_refused_without_gradients_too(value: str) -> None:
+    layer = BlackBox(f, S.replace(sigma=torch.ones(3)), value=value)
+    for x in (X, X.clone().requires_grad_()):
+        with pytest.raises(ValueError, match="sigma has 3 elements, but x has 2 parameters"):
+            layer(x)
+    with torch.no_grad(), pytest.raises(ValueError, match="sigma has 3 elements, but x has 2 parameters"):
+        layer(X.clone().requires_grad_())
+
+
 @pytest.mark.parametrize(("call", "error", "message"), OTHERS)
 def test_other_arguments(call, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):

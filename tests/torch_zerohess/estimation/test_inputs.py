@@ -1,6 +1,7 @@
 """Bad inputs: the error names the argument, the value received and what would be right."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -161,6 +162,43 @@ def test_errors_of_the_function_itself_arrive_as_they_are() -> None:
     for call in (lambda: estimate(fails, X, S), lambda: torch.func.hessian(smooth(fails, S))(X)):
         with pytest.raises(KeyError, match="my own"):
             call()
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+@pytest.mark.parametrize(
+    ("of_one_point", "error"),
+    [
+        (lambda z: float(z[0]) ** 2, ValueError),
+        (lambda z: z.sum().item() if z[0] > 0 else 0.0, RuntimeError),
+        (lambda z: math.sin(z.numpy()[0]), TypeError),
+        (lambda z: np.linspace(0.0, 1.0, 3)[z.int()[0, 0] + 7], IndexError),
+    ],
+)
+def test_an_error_of_the_first_batch_says_that_it_was_one(of_one_point, error: type[Exception]) -> None:
+    for call in (lambda: estimate(of_one_point, X, S), lambda: torch.func.grad(smooth(of_one_point, S))(X)):
+        with pytest.raises(error) as raised:
+            call()
+        note = "fn was called with a batch [7, 2]; if it takes one point, pass vectorized=False"
+        assert raised.value.__notes__ == [note]
+    with pytest.raises(error) as raised:
+        estimate(lambda z: of_one_point(z[None].expand(4, 2)), X, S, vectorized=False)
+    assert not hasattr(raised.value, "__notes__")
+
+
+def test_an_error_of_a_later_batch_has_no_note() -> None:
+    calls = []
+
+    def fn(z: Tensor) -> Tensor:
+        calls.append(z)
+        if len(calls) == 2:
+            raise ValueError("lost the scene")
+        return f(z)
+
+    layer = BlackBox(fn, S)
+    layer(X)
+    with pytest.raises(ValueError, match="lost the scene") as raised:
+        layer(X)
+    assert not hasattr(raised.value, "__notes__")
 
 
 def test_the_function_cannot_change_its_input() -> None:

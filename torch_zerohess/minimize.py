@@ -76,7 +76,7 @@ def minimize(
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
             there is one, give it: each evaluation then tells as many equations as the output has numbers.
         bounds: (lower, upper), numbers or [n] or None; n pairs (lower, upper), a list of tuples or an array [n, 2]; or
-            `scipy.optimize.Bounds`.
+            `scipy.optimize.Bounds`. ValueError for two rows of two numbers that can be read either way.
         max_evaluations: points that fn may be called with.
         engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
             and, with `loss` and at least 20 parameters, by the first evaluations.

@@ -226,16 +226,20 @@ def _sampling(proposal: str, sampler: str, antithetic: Signs, baseline: str, **_
     return f"{proposal}, {sampler}, {'pairs' if antithetic else 'single'}, {baseline}"
 
 
-# Numbers of Python are float64, whatever the default of torch.
-_PRECISE = {float: torch.float64, list: torch.float64, tuple: torch.float64}
+def _numbers(given: Any) -> Tensor:
+    """Return numbers of Python, or of an array of any strides and bytes, as a tensor; float64 if they are real."""
+    if hasattr(given, "tolist"):
+        given = given.tolist()
+    tensor = torch.as_tensor(given, device="cpu")
+    real = not (tensor.is_complex() or tensor.dtype == torch.bool)
+    return torch.as_tensor(given, dtype=torch.float64, device="cpu") if real else tensor
 
 
 def _checked_sigma(sigma: Any) -> float | Tensor:
     if isinstance(sigma, Tensor) and sigma.requires_grad:
         raise ValueError("sigma must not require grad: pass sigma.detach()")
     try:
-        kept = isinstance(sigma, Tensor)
-        values = sigma if kept else torch.as_tensor(sigma, dtype=_PRECISE.get(type(sigma)), device="cpu")
+        values = sigma if isinstance(sigma, Tensor) else _numbers(sigma)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"sigma must be a positive number or a tensor [n], got {sigma!r}") from error
     if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:

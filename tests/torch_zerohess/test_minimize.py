@@ -1,6 +1,8 @@
 """One call for a function and a start: results against closed forms, and every way to end."""
 
+import ast
 import math
+import re
 
 import numpy as np
 import pytest
@@ -267,6 +269,21 @@ def test_bounds_in_an_array_are_read_as_in_a_list(kind):
             assert one.upper.tolist() == [upper for _, upper in pairs]
     for rows in ([[-1.0, 2.0], [-3.0, 2.0]], [[-1.0, -3.0], [2.0, 2.0]]):  # of which one reading is in order
         assert Space.checked(zeros(2), 1.0, kind(rows)).lower.tolist() == [-1.0, -3.0]
+
+
+@pytest.mark.parametrize("kind", [tuple, list, np.array, torch.tensor])
+def test_bounds_that_mean_the_same_either_way(kind):
+    space = Space.checked(vector(0.5, 1.5), 1.0, kind([[0.0, 1.0], [1.0, 2.0]]))
+    assert space.lower.tolist() == [0.0, 1.0]
+    assert space.upper.tolist() == [1.0, 2.0]
+
+
+def test_bounds_that_can_be_read_in_two_ways_are_refused_with_both():
+    with pytest.raises(ValueError, match=r"write .* if each parameter has a pair, or .* if lower =") as raised:
+        Space.checked(vector(0.5, 12.0), 1.0, ([0, 10], [1, 20]))
+    pairs, sides = (ast.literal_eval(one) for one in re.findall(r"\[\(.*?\)\]", str(raised.value)))
+    assert Space.checked(vector(0.5, 12.0), 1.0, sides).lower.tolist() == [0.0, 10.0]
+    assert Space.checked(vector(5.0, 12.0), 1.0, pairs).lower.tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("bounds", [(None, 2.0), (None, vector(2.0, 9.0)), [(None, 2.0), (None, 9.0)]])

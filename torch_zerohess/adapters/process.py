@@ -1,25 +1,29 @@
 """An external program as a black box, over its standard input and output."""
 
 import contextlib
+import functools
 import io
 import json
+import os
 import shutil
 import subprocess
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.batch import numbers
+from torch_zerohess.evaluators.inline import Closing
 from torch_zerohess.evaluators.values import as_tensor
 
 _KEPT = 50
 """Lines of the standard error that are shown in an error."""
 
 
-class Program:
+class Program(Closing):
     """A program that reads points and writes values: x [K, n], *aux [K, ...] -> [K, *out].
 
     | command | what runs | input | output |
@@ -38,6 +42,11 @@ class Program:
     A server flushes its output after each answer, and writes messages to the standard error alone. It ends when its
     standard input does. A server that ended or took too long is started again by the next call.
 
+    A run fails if it ends with a code other than 0, takes too long, or writes what is no number. With on_failure="nan"
+    all points of the run have NaN as their values, in the shape of earlier outputs. Before the first output that is one
+    NaN per point: if outputs are tensors, call the program first where it works. What becomes of a NaN is said by
+    `on_nonfinite` of a layer; `minimize` avoids it.
+
     A `Program` can be pickled; a copy starts a program of its own.
 
     Args:
@@ -47,12 +56,13 @@ class Program:
         timeout: seconds per point; None for no limit.
         folder: where the program runs; here if None.
         environment: variables beside those of this process.
+        on_failure: "raise", or "nan" to go on without the values of a run that fails.
 
     Raises:
         FileNotFoundError: there is no such program.
         ValueError: an argument is wrong; or, from a call, the answer cannot be read.
         TimeoutError, RuntimeError: from a call, the program took too long, or ended with a code other than 0. The
-            message has what it wrote to the standard error.
+            message has the point, and what the program wrote to the standard error.
 
     Example:
         >>> import sys
@@ -70,6 +80,7 @@ class Program:
         timeout: float | None = None,
         folder: str | None = None,
         environment: Mapping[str, str] | None = None,
+        on_failure: Literal["raise", "nan"] = "raise",
     ) -> None:
         if isinstance(command, str) or (not callable(command) and not command):
             raise ValueError(f"command must be a list, the program and its arguments, or a function, got {command!r}")
@@ -79,7 +90,12 @@ class Program:
             raise ValueError("server=True needs a command that is a list, and format 'json' or 'npy'")
         if timeout is not None and not timeout > 0:
             raise ValueError(f"timeout must be seconds > 0 or None, got {timeout!r}")
+        if on_failure not in ("raise", "nan"):
+            raise ValueError(f"on_failure must be 'raise' or 'nan', got {on_failure!r}")
         self.command, self.server, self.format, self.timeout = command, server, format, timeout
+        self.on_failure, self._shape = on_failure, torch.Size()
+        self.last_failure: str | None = None
+        """Message of the last run that failed, with what it wrote to the standard error; in worker processes theirs."""
         self.folder, self.environment = folder, None if environment is None else dict(environment)
         if not callable(command):
             _found(command)
@@ -90,12 +106,6 @@ class Program:
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_server": None}
-
-    def __enter__(self) -> "Program":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the server, if there is one."""
@@ -110,17 +120,40 @@ class Program:
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...]."""
         if callable(self.command):
-            return torch.stack([self._values(self._output(_found(self.command(one)), b"", 1)) for one in x.detach()])
+            runs = [functools.partial(self._run, _found(self.command(one)), b"", 1) for one in x.detach()]
+            found = [self._unless_failed(run, one) for run, one in zip(runs, x, strict=True)]
+            self._shape = next((one.shape for one in found if one is not None), self._shape)
+            return torch.stack([_missing(self._shape) if one is None else one for one in found])
         request = self._request(x, aux)
-        if not self.server:
-            return self._values(self._output(self.command, request, len(x)))
+        answer = self._serve if self.server else functools.partial(self._run, self.command)
+        values = self._unless_failed(functools.partial(answer, request, len(x)), x)
+        if values is None:
+            return _missing((*x.shape[:-1], *self._shape))
+        self._shape = values.shape[x.dim() - 1 :]
+        return values
+
+    def _unless_failed(self, run: Callable[[], Tensor], x: Tensor) -> Tensor | None:
+        """Return the values of a run at x; None if it fails and that is no error. The message names the first point."""
+        try:
+            return run()
+        except (RuntimeError, TimeoutError, ValueError) as error:
+            points = x.reshape(-1, x.shape[-1])
+            more = f" and {len(points) - 1} more" if len(points) > 1 else ""
+            error.args = (f"at the point [{numbers(points[0])}]{more}: {error}",)
+            if self.on_failure == "raise":
+                raise
+            self.last_failure = str(error)
+            return None
+
+    def _serve(self, request: bytes, points: int) -> Tensor:
+        assert not callable(self.command)
         if self._server is not None and not self._server.alive:
             self.close()
         if self._server is None:
             self._server = _Server(self._start(self.command))
         try:
-            answer = self._server.ask(request, self.format == "npy", self._limit(len(x)))
-            return self._values(answer)
+            answer = self._server.ask(request, self.format == "npy", self._limit(points))
+            return self._values(answer, b"".join(self._server.errors))
         except BaseException:  # also Ctrl-C: an answer may be on its way
             self.close()
             raise
@@ -129,13 +162,11 @@ class Program:
         return None if self.timeout is None else self.timeout * max(1, points)
 
     def _start(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
-        import os
-
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         variables = None if self.environment is None else os.environ | self.environment
         return subprocess.Popen(list(command), cwd=self.folder, env=variables, **pipes)
 
-    def _output(self, command: Sequence[str], request: bytes, points: int) -> bytes:
+    def _run(self, command: Sequence[str], request: bytes, points: int) -> Tensor:
         limit = self._limit(points)
         with self._start(command) as process:
             try:
@@ -148,7 +179,7 @@ class Program:
                 raise
         if process.returncode:
             raise RuntimeError(_ended(command, process.returncode, errors))
-        return output
+        return self._values(output, errors)
 
     def _request(self, x: Tensor, aux: Sequence[Tensor]) -> bytes:
         tensors = [one.detach().cpu() for one in (x, *aux)]
@@ -164,20 +195,23 @@ class Program:
             content["aux"] = [one.tolist() for one in tensors[1:]]
         return (json.dumps(content) + "\n").encode()
 
-    def _values(self, output: bytes) -> Tensor:
-        if callable(self.format):
-            return as_tensor(self.format(output))
+    def _values(self, output: bytes, errors: bytes) -> Tensor:
         try:
+            if callable(self.format):
+                return as_tensor(self.format(output))
             if self.format == "npy":
                 import numpy as np
 
                 return as_tensor(np.load(io.BytesIO(output), allow_pickle=False))
+            if b"null" in output:
+                raise ValueError("it printed null where a number was expected")
             return torch.tensor(json.loads(output), dtype=torch.float64, device="cpu")
-        except (ValueError, TypeError, EOFError, OSError) as error:
+        except Exception as error:  # a function may raise any
             shown = output[:200].decode(errors="replace")
+            named = "what the function `format` reads" if callable(self.format) else f"values as {self.format}"
             raise ValueError(
-                f"the program must write values as {self.format} and nothing else to its standard output, got "
-                f"{shown!r} ({error}): let it print messages to its standard error"
+                f"the program must write {named} and nothing else to its standard output, got {shown!r} "
+                f"({type(error).__name__}: {error}): let it print messages to its standard error{_shown(errors)}"
             ) from error
 
 
@@ -186,7 +220,7 @@ class _Server:
 
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
         self.process = process
-        self._errors: deque[bytes] = deque(maxlen=_KEPT)
+        self.errors: deque[bytes] = deque(maxlen=_KEPT)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
@@ -214,13 +248,13 @@ class _Server:
             self.process.kill()
             thread.join()
             self._listener.join(1.0)
-            raise TimeoutError(_late(command, limit, b"".join(self._errors)))
+            raise TimeoutError(_late(command, limit, b"".join(self.errors)))
         if not answer or not answer[0]:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(2.0)
             self.process.kill()
             self._listener.join(1.0)
-            raise RuntimeError(_ended(command, self.process.wait(), b"".join(self._errors)))
+            raise RuntimeError(_ended(command, self.process.wait(), b"".join(self.errors)))
         return answer[0]
 
     def end(self) -> None:
@@ -241,7 +275,7 @@ class _Server:
     def _listen(self) -> None:
         assert self.process.stderr is not None
         with contextlib.suppress(OSError, ValueError):
-            self._errors.extend(self.process.stderr)
+            self.errors.extend(self.process.stderr)
 
 
 def _read_npy(file: IO[bytes]) -> bytes:
@@ -258,6 +292,10 @@ def _read_npy(file: IO[bytes]) -> bytes:
     read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(shown)
     return start + version + size + header + file.read(int(np.prod(shape)) * dtype.itemsize)
+
+
+def _missing(shape: Sequence[int]) -> Tensor:
+    return torch.full(tuple(shape), torch.nan, dtype=torch.float64, device="cpu")
 
 
 def _found(command: Sequence[str]) -> Sequence[str]:

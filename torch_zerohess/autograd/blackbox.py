@@ -52,20 +52,23 @@ class BlackBox(nn.Module):
         value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
 
-    Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For float16 and
-    bfloat16, as autocast makes them, fn gets float32. A batch without points, [0, n], gives an empty result, with zero
-    gradients upstream. fn is not called for it. Without a head the shape of one output must be known, from an earlier
-    call or the memory, else ValueError.
+    Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For x and aux in
+    float16 or bfloat16, as autocast makes them, fn and head get float32. A batch without points, [0, n], gives an empty
+    result, with zero gradients upstream. fn is not called for it. Without a head the shape of one output must be known,
+    from an earlier call or the memory, else ValueError.
 
     Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch: that is
     randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
     "different" where neither x nor aux is mapped over.
 
+    `state_dict` carries all settings of the smoothing, not sigma alone, and what the memory keeps. `load_state_dict`
+    puts them in the place of those that the layer was made with. Settings that are to differ are set after it:
+    `layer.smoothing = layer.smoothing.replace(samples=16)`.
+
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
-    `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it.
-
-    `torch.export` raises RuntimeError: no file can hold the black box.
+    `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it. A layer with a memory
+    is called between graphs: fullgraph=True is an error. `torch.export` raises RuntimeError: no file holds a black box.
 
     Example:
         >>> layer = BlackBox(lambda z: z.round().sum(1), Smoothing(sigma=1.0, samples=2000, seed=0))
@@ -104,6 +107,10 @@ class BlackBox(nn.Module):
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
         _before_compiling()
+        if self.memory is not None and torch.compiler.is_compiling():
+            from torch_zerohess.autograd.in_graph import eager  # loaded late, as there
+
+            return eager(self, x, *aux)
         dtype, x = checked_input(x, empty=True).dtype, working(x)
         self._check_aux(aux)
         batch, n = x.shape[:-1], x.shape[-1]
@@ -167,11 +174,6 @@ class BlackBox(nn.Module):
         """
         if self.memory is None:
             return self._estimated(center, aux, zero)
-        if torch.compiler.is_compiling():
-            raise RuntimeError(
-                "a layer with a memory cannot be compiled, because its surrogate changes from call to call: "
-                "exclude the layer with torch.compiler.disable"
-            )
         self.control = Control.of(self.memory, self.call.head, learning=self.training)
         with transforms.outside(), transforms.random_numbers_allowed():
             seed = self.smoothing.drawn_seed()

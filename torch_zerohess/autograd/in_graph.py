@@ -3,7 +3,10 @@
 Importing this module loads the compiler, which takes seconds: only code that is being compiled imports it.
 """
 
+from typing import Any
+
 import torch
+from torch import Tensor
 
 from torch_zerohess.autograd import limit, opaque
 
@@ -11,3 +14,12 @@ WHOLE = (limit.limited, opaque.noise_checked)
 
 for function in WHOLE:
     torch.compiler.allow_in_graph(function)
+
+
+def _called(layer: Any, x: Tensor, *aux: Tensor) -> Tensor:
+    result: Tensor = layer(x, *aux)
+    return result
+
+
+eager = torch.compiler.disable(_called, reason="the surrogate of a layer with a memory changes from call to call")
+"""Calls a layer between two graphs. With fullgraph=True torch raises an error, which has the reason."""

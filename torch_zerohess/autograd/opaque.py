@@ -42,7 +42,8 @@ def expand(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Expans
 
 
 def expand_center(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    """Return f(x), [B, *out], for x [B, n]."""
+    """Return f(x), [B, *out], for x [B, n]; ValueError for a sigma that is not [n], as where it is needed."""
+    owner.smoothing.sigma_vector(x.shape[1], x.device)
     values = evaluate_center(owner.call, x, aux)
     owner.output_shapes[_signature(x.shape[1], aux)] = values.shape[1:]
     return values.to(x.dtype)

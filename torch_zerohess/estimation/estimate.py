@@ -51,7 +51,7 @@ def estimate(
         x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came.
         smoothing: how to sample.
         *aux: further inputs of fn, [*batch, ...] each, repeated for every evaluation of their batch element; with a
-            head its inputs, which are not copied.
+            head its inputs, which are not copied. float16 and bfloat16 become float32.
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
             operations. F is then the smoothed loss.
         memory: keeps the evaluations, and subtracts what its surrogate explains from earlier ones, see `Memory`. The

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from torch_zerohess.estimation.stein import Stein, completed, total
 from torch_zerohess.evaluators.batch import loss_error
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.inline import Evaluator, Inline
+from torch_zerohess.evaluators.payload import RemoteTraceback
 from torch_zerohess.evaluators.values import checked_values
 from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.sampling.kernels import Redrawn
@@ -46,6 +47,8 @@ class BlackBoxCall:
     value: ValueMode = "center"
     on_nonfinite: str | float = "raise"
     head: Head | None = None
+    answered: bool = field(default=False, init=False, repr=False, compare=False)
+    """Whether a call has given values."""
 
     def __post_init__(self) -> None:
         if not callable(self.fn):
@@ -65,7 +68,16 @@ class BlackBoxCall:
         """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
         fn = self.fn if self.vectorized else Each(self.fn)
         assert self.evaluator is not None
-        values = checked_values(self.evaluator(fn, points, *aux), points, self.vectorized)
+        try:
+            result = self.evaluator(fn, points, *aux)
+        except (IndexError, RuntimeError, TypeError, ValueError) as error:
+            raised = isinstance(self.evaluator, Inline) or isinstance(error.__cause__, RemoteTraceback)
+            if raised and self.vectorized and not self.answered and hasattr(error, "add_note"):  # Python 3.11
+                size = list(points.shape)
+                error.add_note(f"fn was called with a batch {size}; if it takes one point, pass vectorized=False")
+            raise
+        values = checked_values(result, points, self.vectorized)
+        object.__setattr__(self, "answered", True)
         return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
 
     def values(self, points: Tensor, aux: Sequence[Tensor], *, spare: bool = False) -> tuple[Tensor, Tensor]:

@@ -1,12 +1,16 @@
 """Hessian-vector products by central differences of the smoothed gradient: the HVP of the literature."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.estimate import estimate
+from torch_zerohess.estimation.inputs import checked_input
+from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing
 
 
@@ -19,6 +23,8 @@ def finite_difference_hvp(
     common: bool = True,
     step: float = 1 / 3,
     vectorized: bool = True,
+    evaluator: Evaluator | None = None,
+    on_nonfinite: str | float = "raise",
 ) -> Tensor:
     """Return an estimate of the Hessian of F times v from two gradient estimates g.
 
@@ -38,6 +44,8 @@ def finite_difference_hvp(
             draws independent ones, as the source does.
         step: length of the difference in units of sigma.
         vectorized: False if fn takes one point [n] at a time.
+        evaluator: where evaluations run; in this process if None.
+        on_nonfinite: "raise", "drop", or a number that replaces NaN and infinities.
 
     Returns:
         [*batch, *out, n], of the dtype of x.
@@ -51,11 +59,13 @@ def finite_difference_hvp(
         >>> bool((product - torch.tensor([12.0, 0.0])).abs().max() < 1.0)
         True
     """
-    n = x.shape[-1] if isinstance(x, Tensor) and x.dim() else 0
+    if not isinstance(smoothing, Smoothing):
+        raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
+    n = checked_input(x).shape[-1]
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):
         raise ValueError(f"v must be a tensor of shape [{n}] or that of x, got {getattr(v, 'shape', v)}")
-    if not step > 0:
-        raise ValueError(f"step must be positive, in units of sigma, got {step}")
+    if not 0 < checked_number("step", step) < math.inf:
+        raise ValueError(f"step must be positive and finite, in units of sigma, got {step}")
     sigma = smoothing.sigma_vector(n, x.device)
     t = v.detach().double() / sigma
     size = t.abs().amax(-1, keepdim=True)  # the square of a large number is infinite
@@ -65,10 +75,9 @@ def finite_difference_hvp(
     offset = (step * sigma * direction / norm.clamp_min(1.0)).to(x.dtype)  # the norm is 0 or at least 1
     seed = smoothing.drawn_seed()
     other = seed if common else seed ^ (1 << 61)
+    how: dict[str, Any] = {"vectorized": vectorized, "evaluator": evaluator, "on_nonfinite": on_nonfinite}
     forward, backward = (
-        estimate(
-            fn, x + sign * offset, smoothing.replace(seed=s), *aux, vectorized=vectorized, value="smoothed"
-        ).gradient
+        estimate(fn, x + sign * offset, smoothing.replace(seed=s), *aux, value="smoothed", **how).gradient
         for sign, s in ((1.0, seed), (-1.0, other))
     )
     scale = length.reshape(*length.shape[:-1], *[1] * (forward.dim() - length.dim()), 1)

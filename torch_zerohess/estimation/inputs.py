@@ -30,7 +30,10 @@ def working(x: Tensor) -> Tensor:
 
 
 def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
-    """Return auxiliary inputs [*batch, ...] as [B, ...], detached, or raise TypeError or ValueError."""
+    """Return auxiliary inputs [*batch, ...] as [B, ...], detached, or raise TypeError or ValueError.
+
+    Those in float16 and bfloat16 become float32, as x does: NumPy knows no bfloat16, and no number is lost.
+    """
     for number, one in enumerate(aux):
         if not isinstance(one, Tensor):
             raise TypeError(f"aux[{number}] must be a tensor [*batch, ...], got {type(one).__name__}")
@@ -38,7 +41,7 @@ def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
             raise ValueError(
                 f"aux[{number}] must have the batch dimensions {list(batch)} of x first, got {list(one.shape)}"
             )
-    return [one.detach().reshape(batch.numel(), *one.shape[len(batch) :]) for one in aux]
+    return [working(one.detach()).reshape(batch.numel(), *one.shape[len(batch) :]) for one in aux]
 
 
 def short(tensor: Tensor) -> str:

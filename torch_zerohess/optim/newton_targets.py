@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.autograd.blocks import magnitudes
+from torch_zerohess.optim.second_order import check_positive
 
 _DENSE = 16
 """Outputs up to which the Hessian of every element is formed and solved."""
@@ -47,9 +48,7 @@ class NewtonTargets:
     """
 
     def __init__(self, *, damping: float = 1e-3, iterations: int = 16, radius: float = math.inf) -> None:
-        for name, value in (("damping", damping), ("radius", radius)):
-            if not value > 0.0:
-                raise ValueError(f"{name} must be positive, got {value}")
+        check_positive(damping=damping, radius=radius)
         self.damping, self.radius = damping, radius
         self.iterations = checked_integer("iterations", iterations, 1)
         self.losses: Tensor | None = None

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from torch_zerohess.arguments import checked_number
 from torch_zerohess.autograd.blocks import jacobian as white_box_jacobian
 from torch_zerohess.autograd.blocks import magnitudes, output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
@@ -119,7 +120,7 @@ class SecondOrder(Optimizer):
     """An optimizer with one Hessian, hence one group of parameters."""
 
     def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any]) -> None:
-        if not 0.0 <= defaults["lr"] <= 1.0:
+        if not 0.0 <= checked_number("lr", defaults["lr"]) <= 1.0:
             raise ValueError(f"lr must be a factor from 0 to 1, got {defaults['lr']}")
         if defaults["curvature"] not in CURVATURES:
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
@@ -192,20 +193,20 @@ def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, Ja
 
 
 def check_positive(**settings: float) -> None:
-    """Raise ValueError for a setting that is not a positive number."""
+    """Raise TypeError for a setting that is no number, ValueError for one that is not positive."""
     for name, value in settings.items():
-        if not value > 0.0:
+        if not checked_number(name, value) > 0.0:
             raise ValueError(f"{name} must be positive, got {value}")
 
 
 def check_radius(radius: float) -> None:
-    """Raise ValueError for a radius that is not positive or not finite."""
-    if not 0.0 < radius < math.inf:
+    """Raise TypeError for a radius that is no number, ValueError for one that is not positive or not finite."""
+    if not 0.0 < checked_number("radius", radius) < math.inf:
         raise ValueError(f"radius must be positive and finite, got {radius}")
 
 
 def check_not_negative(**settings: float) -> None:
-    """Raise ValueError for a setting that is negative or not finite."""
+    """Raise TypeError for a setting that is no number, ValueError for one that is negative or not finite."""
     for name, value in settings.items():
-        if not 0.0 <= value < math.inf:
+        if not 0.0 <= checked_number(name, value) < math.inf:
             raise ValueError(f"{name} must be finite and not negative, got {value}")

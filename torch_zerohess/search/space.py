@@ -108,7 +108,8 @@ def _bounds(bounds: Bounds | None, x0: Tensor) -> tuple[Tensor, Tensor]:
 def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
     """Return lower and upper of bounds in any form; ValueError if two forms are possible.
 
-    A list of tuples is a list of pairs. An array or tensor is read as the list of its rows.
+    A list of tuples is a list of pairs. An array or tensor is read as the list of its rows. Two rows of two numbers are
+    taken where only one reading has lower < upper, or both are the same.
     """
     if hasattr(bounds, "lb") and hasattr(bounds, "ub"):  # scipy.optimize.Bounds
         return bounds.lb, bounds.ub
@@ -122,12 +123,14 @@ def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
     columns = [list(one) for one in zip(*bounds, strict=True)] if pairs else []
     if pairs and isinstance(bounds, list) and all(isinstance(one, tuple) for one in bounds):
         return columns[0], columns[1]
-    if pairs and n == 2 and _in_order(*bounds) and _in_order(*columns):
+    rows = [list(one) for one in bounds] if pairs else []
+    if pairs and n == 2 and rows != columns and _in_order(*rows) and _in_order(*columns):
+        as_pairs, as_sides = ([tuple(one) for one in each] for each in (rows, columns))
         raise ValueError(
-            f"bounds of 2 parameters must be (lower, upper), each a tensor, or a list of tuples, got {bounds}, "
-            f"meaning lower = {columns[0]} or lower = {list(bounds[0])}"
+            f"bounds of 2 parameters can be read in two ways, got {bounds}: write {as_pairs} if each parameter has a "
+            f"pair, or {as_sides} if lower = {rows[0]} and upper = {rows[1]}"
         )
-    if pairs and (n != 2 or not _in_order(*bounds)):
+    if pairs and (n != 2 or not _in_order(*rows)):
         return columns[0], columns[1]
     if len(bounds) != 2:
         raise ValueError(f"bounds must be (lower, upper) or a list of {n} pairs, got {len(bounds)} entries")

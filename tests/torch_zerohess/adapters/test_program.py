@@ -85,6 +85,71 @@ def test_a_program_that_ends_or_hangs_says_why(server):
             python(wrong + "time.sleep(60)", server=one, timeout=0.5)(Z)
 
 
+SQUARE = "a = json.load(sys.stdin)['x']; print('seen', file=sys.stderr); x = a[0][0]; "
+FAILURES = {
+    "exit": ("sys.exit(3) if x > 1 else None; ", "ended with code 3"),
+    "late": ("time.sleep(60) if x > 1 else None; ", "gave no answer within timeout: 1 s"),
+    "text": ("print('oh' if x > 1 else '', end=''); ", "nothing else to its standard output, got 'oh"),
+    "null": ("x = 'null' if x > 1 else x; ", "it printed null where a number was expected"),
+}
+
+
+@pytest.mark.parametrize(("wrong", "message"), FAILURES.values(), ids=FAILURES)
+def test_a_run_that_fails_has_no_value_or_names_its_point(wrong, message):
+    """One image [2] per point, for one point: the run fails beyond 1."""
+    code = READ + SQUARE + "sys.stderr.flush(); " + wrong + "print(f'[[{x}, 7]]')"
+    good, bad = torch.tensor([[0.5, 0.25]]).double(), torch.tensor([[1.5, 0.25]]).double()
+    program = python(code, on_failure="nan")
+    assert program(good).tolist() == [[0.5, 7.0]]
+    assert program.last_failure is None
+    program.timeout = 1.0 if "timeout" in message else None
+    values = program(bad)
+    assert values.shape == (1, 2)
+    assert bool(values.isnan().all())
+    assert program.last_failure.startswith("at the point [1.5, 0.25]: the program")
+    assert message in program.last_failure
+    assert program.last_failure.endswith("it wrote to its standard error:\nseen")
+    program.timeout = None
+    assert program(good).tolist() == [[0.5, 7.0]]
+    if "timeout" not in message:
+        with pytest.raises((RuntimeError, ValueError), match=rf"point \[1.5, 0.25\] and 1 more: (.|\n)*{message}"):
+            python(code)(bad.expand(2, 2))
+
+
+def test_a_search_goes_on_after_a_run_that_failed():
+    def command(point: torch.Tensor) -> list[str]:
+        x = float(point[0])
+        return [
+            "awk",
+            f'BEGIN {{ if ({x!r} < 0.1) {{ print "below" > "/dev/stderr"; exit 1 }} print ({x!r} - 0.25)^2 }}',
+        ]
+
+    program = Program(command, format=float, on_failure="nan")
+    below = torch.tensor([[0.75], [0.0]], dtype=torch.float64)
+    assert program(below)[:1].tolist() == [0.25]
+    assert program(below).isnan().tolist() == [False, True]
+    start = torch.ones(1, dtype=torch.float64)
+    fit = zh.minimize(program, start, sigma=0.5, bounds=(-1, 1), seed=0, target=1e-6, max_evaluations=60)
+    assert fit.status == "target"
+    assert bool(torch.isnan(torch.tensor([one.value for one in fit.history])).any())
+    with pytest.raises(RuntimeError, match=r"at the point \[0\]: the program 'awk' ended with code 1(.|\n)*below"):
+        Program(command, format=float)(below)
+    with pytest.raises(ValueError, match=r"at the point \[0.75\]: the program must write what the function `format`"):
+        Program(command, format=bytes.hex)(below)
+    unknown = Program(command, format=float, on_failure="nan")
+    assert unknown(below[1:]).isnan().tolist() == [True]  # one number, as long as no output was seen
+    with pytest.raises(FileNotFoundError, match="no program 'no-such'"):
+        Program(lambda point: ["no-such"], on_failure="nan")(below)
+
+
+def test_a_server_that_failed_is_started_again():
+    code = SERVE + "x = a['x'][0][0]\n    if x > 1: sys.exit(3)\n    print([x], flush=True)\n"
+    with python(code, server=True, on_failure="nan") as program:
+        for x, lost in ((0.5, False), (1.5, True), (0.5, False)):
+            assert program(torch.tensor([[x]])).isnan().tolist() == [lost]
+    assert "ended with code 3" in program.last_failure
+
+
 def test_arguments_are_checked():
     with pytest.raises(FileNotFoundError, match="there is no program 'no-such-program'"):
         Program(["no-such-program", "-x"])
@@ -96,6 +161,8 @@ def test_arguments_are_checked():
         Program(list, server=True)
     with pytest.raises(ValueError, match="timeout must be seconds > 0 or None, got 0"):
         Program(["true"], timeout=0)
+    with pytest.raises(ValueError, match="on_failure must be 'raise' or 'nan', got 'drop'"):
+        Program(["true"], on_failure="drop")
 
 
 def quarter(point: torch.Tensor) -> list[str]:

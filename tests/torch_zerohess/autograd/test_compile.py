@@ -1,12 +1,14 @@
 """Compiled layers: the numbers of `estimate` with the same seed, or an error."""
 
 import inspect
+import warnings
 
 import pytest
 import torch
 from layers import AGGREGATE, BATCH, IMAGE, SCALAR, SETTINGS, close, counting, leaf, network
+from torch import Tensor
 
-from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess import BlackBox, Memory, Smoothing, estimate
 from torch_zerohess.estimation import perturbations
 
 COMPILED = {
@@ -67,6 +69,43 @@ def test_compiled_inside_a_network(backend: str) -> None:
     torch.compile(model, fullgraph=True, backend=backend)(inputs).square().sum().backward()
     for p, gradient in zip(model.parameters(), expected, strict=True):
         close(p.grad, gradient)
+
+
+class Between(torch.nn.Module):
+    """A layer with a memory between two operations of torch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = BlackBox(IMAGE.f, AGGREGATE, memory=Memory())
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = x.sin()
+        z = self.layer(y)
+        return z.square().sum()
+
+
+def test_a_layer_with_a_memory_is_one_graph_break_without_warnings() -> None:
+    graphs = []
+
+    def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> torch.fx.GraphModule:
+        graphs.append(graph)
+        return graph
+
+    plain, model = Between(), Between()
+    compiled = torch.compile(model, backend=backend)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")  # torch hides some of its own, but not where they are errors
+        for _ in range(2):
+            x, y = leaf(BATCH), leaf(BATCH)
+            plain(x).backward()
+            compiled(y).backward()
+            assert torch.equal(x.grad, y.grad)
+    assert [str(one.message) for one in caught] == []
+    assert len(graphs) == 2
+    assert model.layer.memory.evaluations == plain.layer.memory.evaluations > 0
+    torch.compiler.reset()
+    with pytest.raises(RuntimeError, match="the surrogate of a layer with a memory changes from call to call"):
+        torch.compile(model, fullgraph=True, backend="eager")(x)
 
 
 @pytest.mark.parametrize("way", ["isolated", "one model"])

@@ -109,6 +109,25 @@ def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
     assert set(seen) == {torch.float32}
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_auxiliary_inputs_in_half_precision_become_float32(dtype: torch.dtype) -> None:
+    seen: set[torch.dtype] = set()
+
+    def fn(z: Tensor, a: Tensor) -> Tensor:
+        seen.add(a.dtype)
+        return SCALAR.f(z) * torch.from_numpy(a.numpy())
+
+    a, whole = torch.linspace(0.1, 0.7, 4).to(dtype), torch.arange(4)
+    close(BlackBox(fn, AGGREGATE)(leaf(), a[0]).detach(), SCALAR.f(X[None])[0] * a[0].float())
+    close(BlackBox(fn, AGGREGATE)(BATCH, a), SCALAR.f(BATCH) * a.float())
+    assert estimate(fn, BATCH, AGGREGATE, a).value.dtype == torch.float64
+    assert seen == {torch.float32}
+    kept = BlackBox(lambda z, k: SCALAR.f(z) * (k.dtype == torch.int64), AGGREGATE)
+    close(kept(BATCH, whole), SCALAR.f(BATCH))  # other types stay as they are
+    head = BlackBox(lambda z: z, AGGREGATE, head=lambda y, a: y.sum(1) * float(a.dtype == torch.float32))
+    close(head(BATCH, a), BATCH.sum(1))
+
+
 def test_a_layer_behind_autocast() -> None:
     model, inputs = nn.Linear(2, N), spread(8, -1.0, 1.0).view(4, 2).float()
     with torch.autocast("cpu", torch.bfloat16):
@@ -154,6 +173,8 @@ def test_state_dict_resumes_the_settings() -> None:
             model(vector(0.3, 0.4)).backward()
             results.append(model[0].weight.grad)
         assert torch.equal(*results)
+    target[1].smoothing = target[1].smoothing.replace(samples=9)  # settings that are to differ are set after loading
+    assert target[1].smoothing == annealed.replace(samples=9)
 
 
 def test_copies_and_pickles_live_on_their_own() -> None:

@@ -71,9 +71,35 @@ def test_common_random_numbers_reduce_the_noise() -> None:
     assert bool((scatter(True) < scatter(False)).all())
 
 
+def test_evaluators_and_values_that_are_not_finite() -> None:
+    """Each side leaves out the pair in which the function has no value."""
+    calls = []
+
+    def evaluator(fn, points: Tensor) -> Tensor:
+        calls.append(len(points))
+        return fn(points)
+
+    def square(z: Tensor) -> Tensor:
+        return torch.where(z[:, 0] == z[:, 0].max(), torch.nan, z.square().sum(1))
+
+    smoothing = zh.Smoothing(sigma=0.5, samples=8, baseline="mean", proposal="gaussian", sampler="orthogonal", seed=0)
+    settings = {"evaluator": evaluator, "on_nonfinite": "drop"}
+    found = zh.finite_difference_hvp(square, vector(0.3, -0.2), vector(1.0, 2.0), smoothing, **settings)
+    assert calls == [16, 16]
+    assert bool(torch.isfinite(found).all())
+    with pytest.raises(ValueError, match="fn returned nan"):
+        zh.finite_difference_hvp(square, vector(0.3, -0.2), vector(1.0, 2.0), smoothing)
+
+
 def test_errors() -> None:
     smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
     with pytest.raises(ValueError, match=r"v must be a tensor of shape \[3\] or that of x, got torch.Size\(\[2\]\)"):
         zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(2), smoothing)
-    with pytest.raises(ValueError, match=r"step must be positive, in units of sigma, got 0\.0"):
+    with pytest.raises(ValueError, match=r"step must be positive and finite, in units of sigma, got 0\.0"):
         zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(3), smoothing, step=0.0)
+    with pytest.raises(TypeError, match="step must be a number, got True"):
+        zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(3), smoothing, step=True)
+    with pytest.raises(TypeError, match=r"x must be a torch tensor \[\*batch, n\], got list"):
+        zh.finite_difference_hvp(WAVE.f, [1.0, 1.0], torch.ones(2), smoothing)
+    with pytest.raises(TypeError, match="smoothing must be a Smoothing, got float"):
+        zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(3), 0.5)

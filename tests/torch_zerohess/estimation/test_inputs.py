@@ -1,6 +1,7 @@
 """Bad inputs: the error names the argument, the value received and what would be right."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -38,6 +39,7 @@ SETTINGS = [
     ({"sigma": "wide"}, TypeError, r"sigma must be a positive number.*'wide'"),
     ({"sigma": None}, TypeError, r"sigma must be a positive number.*None"),
     ({"sigma": True}, TypeError, r"sigma must be a positive number.*True"),
+    ({"sigma": np.array([True, True])}, TypeError, r"sigma must be a positive number.*True"),
     ({"samples": 0}, ValueError, "samples must be at least 1, got 0"),
     ({"samples": -5}, ValueError, "samples must be at least 1, got -5"),
     ({"samples": 4.0}, TypeError, r"samples must be an integer, got 4\.0"),
@@ -72,6 +74,21 @@ def test_settings(changes: dict, error: type[Exception], message: str) -> None:
         Smoothing(**{"sigma": 0.5, **changes})
     with pytest.raises(error, match=message):
         Smoothing(sigma=0.5).replace(**changes)
+
+
+@pytest.mark.parametrize(
+    "sigma",
+    [
+        [0.5, 0.25],
+        (0.5, 0.25),
+        np.array([0.5, 0.25]),
+        np.array([0.25, 0.5])[::-1],
+        np.array([0.5, 0.25], dtype=">f4"),
+    ],
+    ids=["list", "tuple", "array", "reversed", "big-endian"],
+)
+def test_sigma_of_any_kind(sigma: object) -> None:
+    assert torch.equal(Smoothing(sigma=sigma).sigma, vector(0.5, 0.25))
 
 
 def test_settings_are_frozen_keyword_only_and_own_their_sigma() -> None:
@@ -147,6 +164,43 @@ def test_errors_of_the_function_itself_arrive_as_they_are() -> None:
             call()
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+@pytest.mark.parametrize(
+    ("of_one_point", "error"),
+    [
+        (lambda z: float(z[0]) ** 2, ValueError),
+        (lambda z: z.sum().item() if z[0] > 0 else 0.0, RuntimeError),
+        (lambda z: math.sin(z.numpy()[0]), TypeError),
+        (lambda z: np.linspace(0.0, 1.0, 3)[z.int()[0, 0] + 7], IndexError),
+    ],
+)
+def test_an_error_of_the_first_batch_says_that_it_was_one(of_one_point, error: type[Exception]) -> None:
+    for call in (lambda: estimate(of_one_point, X, S), lambda: torch.func.grad(smooth(of_one_point, S))(X)):
+        with pytest.raises(error) as raised:
+            call()
+        note = "fn was called with a batch [7, 2]; if it takes one point, pass vectorized=False"
+        assert raised.value.__notes__ == [note]
+    with pytest.raises(error) as raised:
+        estimate(lambda z: of_one_point(z[None].expand(4, 2)), X, S, vectorized=False)
+    assert not hasattr(raised.value, "__notes__")
+
+
+def test_an_error_of_a_later_batch_has_no_note() -> None:
+    calls = []
+
+    def fn(z: Tensor) -> Tensor:
+        calls.append(z)
+        if len(calls) == 2:
+            raise ValueError("lost the scene")
+        return f(z)
+
+    layer = BlackBox(fn, S)
+    layer(X)
+    with pytest.raises(ValueError, match="lost the scene") as raised:
+        layer(X)
+    assert not hasattr(raised.value, "__notes__")
+
+
 def test_the_function_cannot_change_its_input() -> None:
     x = X.clone()
 
@@ -209,6 +263,16 @@ OTHERS = [
         "sampler 'sobol' has .* dimensions at most, but x has 30000 parameters: use 'random'",
     ),
 ]
+
+
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+def test_a_sigma_of_another_length_is_refused_without_gradients_too(value: str) -> None:
+    layer = BlackBox(f, S.replace(sigma=torch.ones(3)), value=value)
+    for x in (X, X.clone().requires_grad_()):
+        with pytest.raises(ValueError, match="sigma has 3 elements, but x has 2 parameters"):
+            layer(x)
+    with torch.no_grad(), pytest.raises(ValueError, match="sigma has 3 elements, but x has 2 parameters"):
+        layer(X.clone().requires_grad_())
 
 
 @pytest.mark.parametrize(("call", "error", "message"), OTHERS)

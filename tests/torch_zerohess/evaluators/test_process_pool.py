@@ -133,6 +133,39 @@ def test_what_cannot_be_pickled_is_named(pool):
             pool(fn, z)
 
 
+@pytest.mark.parametrize(
+    ("file", "what"),
+    [
+        ("script.py", "put the main part of the script under `if"),
+        ("<stdin>", "in no file, .*: write it into one, its main"),
+    ],
+)
+def test_a_main_program_that_workers_cannot_import(file, what, tmp_path, monkeypatch, capfd):
+    (tmp_path / "script.py").write_text("raise SystemExit(1)")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(tmp_path / file), raising=False)
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
+    with ProcessPool(1) as alone, pytest.raises(RuntimeError, match=f"exit code 1 at its start, .*{what}"):
+        alone(black_boxes.waves, points(1))
+
+
+def test_a_function_that_workers_do_not_have_in_their_main_program(pool, monkeypatch):
+    def only_here(z):
+        return z.sum(1)
+
+    only_here.__module__, only_here.__qualname__ = "__main__", "only_here"
+    monkeypatch.setattr(sys.modules["__main__"], "only_here", only_here, raising=False)
+    with pytest.raises(RuntimeError, match=r"fn could not be loaded .*only_here.*: put it into a module") as raised:
+        zh.estimate(only_here, vector(0.1, 0.2), S, evaluator=pool)
+    assert not hasattr(raised.value, "__notes__")
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+def test_an_error_of_the_first_batch_in_a_worker_has_a_note(pool):
+    with pytest.raises(ValueError, match="only one element tensors") as raised:
+        zh.estimate(black_boxes.of_one, vector(0.1, 0.2), S, evaluator=pool)
+    assert "if it takes one point, pass vectorized=False" in raised.value.__notes__[0]
+
+
 def test_points_that_end_the_process_are_lost_and_only_they(pool):
     z = torch.tensor([[0.1, 0.2], [0.7, 0.0], [0.3, 0.4]])
     values = pool(black_boxes.aborting, z)

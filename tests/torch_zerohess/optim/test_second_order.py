@@ -99,5 +99,21 @@ def test_schedulers_of_torch_scale_the_step(kind: type, settings: dict, schedule
 @pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
 @pytest.mark.parametrize("lr", [-0.1, 1.5, float("nan")])
 def test_lr_is_a_factor_from_0_to_1(kind: type, lr: float) -> None:
-    with pytest.raises(ValueError, match="lr must be a factor from 0 to 1"):
+    with pytest.raises(ValueError, match=r"lr must be a (factor from 0 to 1|number), got"):
         kind([torch.ones(1, requires_grad=True)], lr=lr)
+
+
+@pytest.mark.parametrize(
+    ("make", "names"),
+    [
+        (zh.optim.NewtonCG, ("lr", "radius", "tolerance", "max_radius", "damping", "noise")),
+        (zh.optim.Newton, ("lr", "radius", "max_radius")),
+        (zh.optim.NonlinearCG, ("lr", "radius", "line_search_tolerance")),
+        (lambda _, **settings: zh.optim.NewtonTargets(**settings), ("radius", "damping")),
+    ],
+)
+def test_truth_values_and_texts_are_no_numbers(make, names: tuple[str, ...]) -> None:
+    for name in names:
+        for value in (True, "1"):
+            with pytest.raises(TypeError, match=f"{name} must be a number, got {value!r}"):
+                make([torch.ones(1, requires_grad=True)], **{name: value})

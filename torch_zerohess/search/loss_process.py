@@ -103,10 +103,13 @@ class LossProcess(ProcessMethod[LossProgress]):
         nothing, n = evaluated.points[:0], self.settings.n
         new = float((known.best.point - known.finished).norm()) > APART
         turn = known.steps >= _STEPS or known.waited >= self._patience or known.searched >= _TURN * (n + 1)
-        if not turn or not new or known.noisy or known.done:
+        if not turn or known.noisy or known.done:
             return known, nothing
-        begun = self._finish.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
-        quadratics, points = self._finish.plan(begun, generator)
+        if new:
+            begun = self._finish.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
+            quadratics, points = self._finish.plan(begun, generator)
+        else:
+            quadratics, points = self._finish.elsewhere(generator)
         return replace(known, quadratics=quadratics, finishing=True, steps=0, waited=0, searched=0), points
 
     def _after_quadratics(

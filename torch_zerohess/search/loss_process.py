@@ -2,7 +2,8 @@
 
 The process finds the way over plateaus and out of local minima (`ProcessMethod`), quadratics end it
 (`MetricQuadratics`): a process that is to hold all over the box leaves a millionth of the loss unexplained, a quadratic
-around a smooth minimum next to nothing.
+around a smooth minimum next to nothing. Where a function has more minima than the process can tell apart, it finds
+nothing better; then quadratics begin at a random point of the box.
 """
 
 import math
@@ -91,7 +92,7 @@ class LossProcess(ProcessMethod[LossProgress]):
     def _after_process(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
-        """Let quadratics finish where the process has found a new basin, or finds nothing better for long."""
+        """Let quadratics finish a new basin; where the process finds none, let them begin elsewhere in the box."""
         before, count = known.best.loss, len(evaluated.needed)
         known = self.take(known, evaluated)
         known = replace(
@@ -103,10 +104,13 @@ class LossProcess(ProcessMethod[LossProgress]):
         nothing, n = evaluated.points[:0], self.settings.n
         new = float((known.best.point - known.finished).norm()) > APART
         turn = known.steps >= _STEPS or known.waited >= self._patience or known.searched >= _TURN * (n + 1)
-        if not turn or not new or known.noisy or known.done:
+        if not turn or known.noisy or known.done:
             return known, nothing
-        begun = self._finish.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
-        quadratics, points = self._finish.plan(begun, generator)
+        if new:
+            begun = self._finish.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
+            quadratics, points = self._finish.plan(begun, generator)
+        else:
+            quadratics, points = self._finish.elsewhere(generator)
         return replace(known, quadratics=quadratics, finishing=True, steps=0, waited=0, searched=0), points
 
     def _after_quadratics(
@@ -135,7 +139,9 @@ class LossProcess(ProcessMethod[LossProgress]):
         patient = known.waited < _QUADRATIC_PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
-        converged = now.done and not now.lost
-        solved = best.point if converged else torch.full_like(best.point, math.inf)
-        known = replace(known, finishing=False, finished=best.point, solved=solved, waited=0)
+        if best is now.best:
+            converged = now.done and not now.lost
+            solved = best.point if converged else torch.full_like(best.point, math.inf)
+            known = replace(known, finished=best.point, solved=solved)
+        known = replace(known, finishing=False, waited=0)
         return self.arrived(known, "quadratics have arrived or found nothing better for a while"), points

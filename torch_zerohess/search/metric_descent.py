@@ -93,6 +93,11 @@ class MetricQuadratics(Method[MetricProgress]):
         known = replace(self._begun(best), points=points, values=values, lowest=best, sigma=sigma)
         return replace(known, phase="geometry")
 
+    def elsewhere(self, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
+        """Return a round that begins at a random point of the box, and its first points."""
+        center = uniform(generator, self.settings.lower, self.settings.upper, 1)[0]
+        return self._started(self._begun(Best(center)), generator)
+
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[MetricProgress, Tensor]:

@@ -31,6 +31,7 @@ from experiments.reports.progress import progress
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
 from experiments.runs.trial import Trial
+from torch_zerohess.optim import TrustRegion
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search, output=False))
 RIVALS = ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded")
@@ -58,7 +59,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Reached:
-    """Evaluations until each of `bbob.TARGETS` was reached, as far as they were, and the seconds of the run."""
+    """Evaluations until each of `bbob.TARGETS` was reached, as far as they were, and seconds of the processor."""
 
     evaluations: tuple[int, ...]
     seconds: float
@@ -126,9 +127,9 @@ def reached(task: Task, method: Method, run: int, limit: float = 600.0) -> Reach
         return values
 
     counted = replace(task, loss=loss)
-    begun = time.perf_counter()
+    begun = time.process_time()
     attempt(counted, method.name, run, lambda trial: _again(trial, method), limit=limit)
-    return Reached(tuple(hits), time.perf_counter() - begun)
+    return Reached(tuple(hits), time.process_time() - begun)
 
 
 def _again(trial: Trial, method: Method) -> None:
@@ -172,6 +173,13 @@ def report(done: Mapping[Job, Reached]) -> str:
     return table(headers, list(_rows(groups)))
 
 
+def _named(n: int, method: str) -> str:
+    """Name of a method in the table; ours with the engine that it chooses."""
+    if method != OURS.name:
+        return method
+    return f"{method}: {TrustRegion(torch.zeros(n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
+
+
 def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[str]]:
     for (n, method), group in groups.items():
         shares = [sum(one.share(min(budget, job.budget) * n) for job, one in group) / len(group) for budget in BUDGETS]
@@ -180,4 +188,4 @@ def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> It
             one.evaluations[-1] if len(one.evaluations) == len(bbob.TARGETS) else job.budget * n for job, one in group
         )
         milliseconds = 1e3 * sum(one.seconds for _, one in group) / used
-        yield [str(n), method, *(f"{share:.3f}" for share in shares), f"{milliseconds:.2f}", str(len(group))]
+        yield [str(n), _named(n, method), *(f"{share:.3f}" for share in shares), f"{milliseconds:.2f}", str(len(group))]

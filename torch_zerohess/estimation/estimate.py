@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.adaptive import MOST, check_limits, draw_until
-from torch_zerohess.estimation.batch import Batch, combined, combined_spread
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate
 from torch_zerohess.estimation.head import Head
@@ -15,6 +14,7 @@ from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.estimation.student import student_factor
+from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing
@@ -85,10 +85,10 @@ def estimate(
 
     control, term = None, None
 
-    def draw(own: Smoothing) -> Batch:
-        return Batch(evaluate(call, flat, aux_rows, own, stored(own, B, n), control), own)
+    def draw(own: Smoothing) -> Sums:
+        return Sums(evaluate(call, flat, aux_rows, own, stored(own, B, n), control), own)
 
-    def made(batches: list[Batch], reason: str) -> Estimate:
+    def made(batches: list[Sums], reason: str) -> Estimate:
         first, *more = batches
         return Estimate(
             *(first.evaluations, batch, x, first.smoothing),
@@ -132,7 +132,7 @@ def _check_memory(call: BlackBoxCall, memory: Memory | None, tolerance: float | 
         )
 
 
-def _relative_error(batches: list[Batch]) -> float:
+def _relative_error(batches: list[Sums]) -> float:
     """Largest |e| / |g| over the elements of a batch, e the half widths of intervals of one standard deviation."""
     g = combined(batches, lambda one: one.stein.gradient(one.a)).flatten(1)
     error, degrees = combined_spread(batches, "gradient", None)

@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.krylov import krylov_steps
-from torch_zerohess.search.draws import normal, reflect
 from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, check_share
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
+from torch_zerohess.search.random_points import normal, reflect
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.loss_curvature import loss_curvature

@@ -95,13 +95,6 @@ def fit_sparse(
     return replace(found, explained=explained, explained_dense=dense)
 
 
-def explained_by(jacobian: SparseJacobian, u: Tensor, changes: Tensor) -> float:
-    """Return the share of the changes [K, m] along u [K, n], less their mean, that a Jacobian predicts."""
-    u, d = _centered(u, changes, None)
-    rest = d - _predicted(jacobian.index, jacobian.values, u)
-    return 1.0 - float(rest.square().sum()) / max(float(d.square().sum()), torch.finfo(torch.float32).tiny)
-
-
 def _validated(
     u: Tensor,
     changes: Tensor,

@@ -6,7 +6,7 @@ Random tests have fixed seeds. Limits of shares are from binomial errors or stat
 import pytest
 import torch
 
-from torch_zerohess.surrogates.sparse_fit import SparseSettings, explained_by, fit_sparse
+from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, largest, spaced, thresholds
 
@@ -21,6 +21,12 @@ def sparse_map(m, n, s, seed=0):
     places = torch.stack([torch.randperm(n, generator=generator)[:s] for _ in range(m)])
     sizes = (1 + torch.rand(m, s, generator=generator).double()) * torch.randn(m, s, generator=generator).sign()
     return torch.zeros(m, n).double().scatter_(1, places, sizes)
+
+
+def explained_by(J, u, changes):
+    """Share of the changes [K, m] along u [K, n], less their mean, that a Jacobian predicts."""
+    u, changes = u - u.mean(0), changes - changes.mean(0)
+    return 1.0 - float((changes - u @ J.dense().mT).square().sum() / changes.square().sum())
 
 
 def random_jacobian():

@@ -10,8 +10,8 @@ from typing import Any
 import matplotlib as mpl
 import torch
 
-from experiments.studies.estimators import ALONE, ESTIMATORS, FIRST_ORDER, OURS, Estimator
 from experiments.studies.estimator_problems import QUANTITIES, Problem
+from experiments.studies.estimators import ALONE, ESTIMATORS, FIRST_ORDER, OURS, Estimator
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt

@@ -35,8 +35,8 @@ from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_choice import SIZES, compare, summary
 from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
-from experiments.studies.estimators import ALONE, ESTIMATORS, NAMES, OURS, Estimator
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
+from experiments.studies.estimators import ALONE, ESTIMATORS, NAMES, OURS, Estimator
 
 _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest budget
 

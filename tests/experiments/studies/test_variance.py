@@ -17,8 +17,8 @@ from experiments.studies.estimator_choice import (
     rival_gradients,
     summary,
 )
-from experiments.studies.estimators import ESTIMATORS, OURS, PAPER
 from experiments.studies.estimator_problems import looked_up, quadrature
+from experiments.studies.estimators import ESTIMATORS, OURS, PAPER
 from experiments.studies.variance import VarianceReport, variance
 
 SOBOL = "aggregate + center, sobol"

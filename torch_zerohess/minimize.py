@@ -12,6 +12,7 @@ from torch import Tensor
 from torch_zerohess.arguments import check_callable, checked_file, checked_integer, checked_number
 from torch_zerohess.estimation.evaluation import BlackBoxCall
 from torch_zerohess.estimation.inputs import working
+from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.search.minimum import Iterate, Minimum, Observation, Status
@@ -153,24 +154,30 @@ def minimize(
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
 
-    def evaluated(points: Tensor, aux: Sequence[Tensor]) -> Tensor:
-        values = call(points.clone(), aux)
-        if loss is None and values.shape[1:] not in ((), (1,)):
-            raise ValueError(
+    def evaluated(points: Tensor) -> tuple[list[int], Tensor, BaseException | None]:
+        given, failure = points.clone(), None
+        numbers = list(range(len(points)))
+        try:
+            values = call(given, ())
+        except BaseException as error:  # Ctrl-C, too: what is known already is kept
+            failure = error
+            numbers, values = finished_values(error, given)
+        if loss is None and numbers and values.shape[1:] not in ((), (1,)):
+            raise failure or ValueError(
                 f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
                 f"{len(points)} points"
             )
-        if memory is not None:
+        if memory is not None and numbers:
             with memory.lock:
-                memory.add(points, values)
-        return values
+                memory.add(points[numbers], values)
+        return numbers, values, failure
 
     running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, verbose=verbose)
 
     def ended() -> tuple[Status, str] | None:
         search = running.search
-        if not running.evaluations:
-            return None
+        if not running.begun:
+            return ("budget", running.budget) if running.spent else None
         if search.done:
             return running.ending(arrived=search.solved), search.message
         if target is not None and running.reaches(target):
@@ -183,8 +190,8 @@ def minimize(
             return running.ending(arrived=True), "the search has arrived at x, within xtol and ftol"
         if restarts is None and not running.noise and search.agreed >= _AGREED:
             return "solved", f"{search.agreed} rounds in a row have arrived at x"
-        if running.left < 1:
-            return "budget", f"max_evaluations ({max_evaluations}) used up"
+        if running.spent:
+            return "budget", running.budget
         if time_limit is not None and running.seconds > time_limit:
             return "time", f"time_limit ({time_limit} s) used up"
         return None
@@ -196,9 +203,9 @@ def minimize(
         while True:
             reached = ended() or asked
             if reached is None:
-                iterate = running.step()
+                running.step()
                 blamed = "callback"
-                if callback is not None and _is_true(callback(iterate)):
+                if callback is not None and _is_true(callback(running.iterate)):
                     asked = "callback", "the callback asked to end"
                 blamed = black_box
                 continue

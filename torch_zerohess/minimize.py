@@ -94,13 +94,18 @@ def minimize(
         target: the search ends when the value is at most this.
         xtol: the search ends when its region is within this of the best point in every parameter.
         ftol: the search ends when its model, where it holds, promises a decrease of at most this.
-        time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean.
+        time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but what all
+            evaluations say.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
-            from it: the function and all settings must be the same. ValueError if it is no such file.
+            from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
+            file.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up or three rounds in a row have arrived at the same point.
         noise: standard deviation of repeated losses at one point. If None it is measured: x0 is evaluated twice, and
-            six times more if the values differ. If fn is noisy, an eighth of `max_evaluations` (4 to 48) is kept for
+            six times more if the values differ. So fn counts as exact if it is so at x0, as on a plateau: give `noise`
+            then, its size where the minimum may be. Noise is taken to be the same everywhere. If it grows towards the
+            minimum, `value_error` is too small until the evaluations there outweigh those at x0; the mean at the end
+            has the noise at x. If fn is noisy, an eighth of `max_evaluations` (4 to 48) is kept for
             the end. The best candidates are then evaluated again, and x is the one with the lowest mean. `value` is
             that mean and `value_error` its standard error.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
@@ -110,8 +115,9 @@ def minimize(
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn,
-    loss or callback passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the
-    message says so.
+    loss or callback passes, with the `Minimum` so far as its attribute `minimum`. Either keeps, also in the checkpoint,
+    the points of an interrupted batch whose values are known: with `vectorized=False`, or from an evaluator. Where all
+    values are equal the message says so.
 
     Example:
         >>> import torch

@@ -84,11 +84,6 @@ class Running:
         return self._record.complete > 0
 
     @property
-    def told(self) -> tuple[Tensor, Tensor]:
-        """All points [evaluations, n] and their losses [evaluations], in order."""
-        return self._record.told
-
-    @property
     def evaluations(self) -> int:
         """Values so far, those that measure noise and those of an interrupted batch included."""
         return self._record.evaluations
@@ -117,7 +112,7 @@ class Running:
     @property
     def flat(self) -> bool:
         """Whether all values are equal."""
-        losses = self.told[1]
+        losses = self._record.told[1]
         return bool((losses == losses[0]).all())
 
     @property
@@ -158,7 +153,7 @@ class Running:
             return self._last.value <= target
         value, decided = self.search.value, self._decided
         if decided is not None:
-            value = float(self.told[1][decided.evaluations :].nan_to_num(nan=torch.inf).min())
+            value = float(self._record.told[1][decided.evaluations :].nan_to_num(nan=torch.inf).min())
         return value <= target - _LUCK * (self.noise or 0.0)
 
     def decide(self) -> None:
@@ -173,7 +168,7 @@ class Running:
         if allowed < 1:
             return
         self._deciding = before, allowed
-        points, losses = self.told
+        points, losses = self._record.told
         likely = [self._believed(before).x, self.search.center]
         found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise)
         if found is not None:
@@ -194,7 +189,7 @@ class Running:
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""
         search = self.search
-        (x, value, error), (points, losses) = self._best(), self.told
+        (x, value, error), (points, losses) = self._best(), self._record.told
         found = self._model(x)
         gradient = hessian = errors = None
         unit = search.unit
@@ -253,24 +248,29 @@ class Running:
             return self._believed(self.evaluations)
         if search.evaluations and self._record.requested is None:
             return Belief(search.x, search.value, 0.0)
-        points, losses = self.told  # those of the interrupted batch, too, which the search does not know
+        points, losses = self._record.told  # those of the interrupted batch, too, which the search does not know
         k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
         return Belief(points[k], float(losses[k]), 0.0)
 
     def _believed(self, count: int) -> Belief:
         """Return what the first evaluations say together in noise."""
         assert self.noise
-        points, losses = self.told
+        points, losses = self._record.told
         return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise)
 
     def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
-        """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better."""
+        """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better.
+
+        In noise the latter is better if there is one: its errors are those of the noise.
+        """
         found = self.search.model_at_best(x)
-        if self.noise or len(x) > _FITTED:
+        if len(x) > _FITTED:
             return found
-        unit, (points, losses) = self.search.unit, self.told
-        around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit))
-        return found if around is None or (found is not None and around[2] > _EXACT) else around[:2]
+        unit, (points, losses), noise = self.search.unit, self._record.told, self.noise or 0.0
+        around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
+        if around is None or (found is not None and not noise and around[2] > _EXACT):
+            return found
+        return around[:2]
 
     def _first(self, points: Tensor) -> None:
         """Evaluate the first points [K, n], and the start again; where its values differ, as often as noise needs."""
@@ -279,10 +279,10 @@ class Running:
         known = record.known - len(every)  # of a measurement that was interrupted
         values = record.values(every)
         if not differs(values[0], values[-1]):
-            self.noise = 0.0
+            again = self.search.losses(values[-1:])  # it may raise: the search is not told before
             self.search.tell(values[:-1])
-            losses = torch.cat([self.search.told, self.search.losses(values[-1:])])
-            self._noted(every, losses)
+            self.noise = 0.0
+            self._noted(every, torch.cat([self.search.told, again]))
             return
         count = max(min(REPEATED - 2, self._most - len(every) - self._least), known, 0)
         every = torch.cat([every, start.repeat(count, 1)])

@@ -1,5 +1,6 @@
 """Values that were known when a call failed: the exception carries them to whoever made the call."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,7 +20,8 @@ class Finished:
 
 def keep_finished(error: BaseException, points: Tensor, values: Mapping[int, Tensor]) -> None:
     """Let an exception of the call with `points` [K, n] carry the values [*out] that are known, by number."""
-    error.finished = Finished(points, values)  # type: ignore[attr-defined]
+    with contextlib.suppress(Exception):  # a frozen dataclass takes no attributes
+        error.finished = Finished(points, values)  # type: ignore[attr-defined]
 
 
 def finished_values(error: BaseException, points: Tensor) -> tuple[list[int], Tensor]:

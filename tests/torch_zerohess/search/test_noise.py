@@ -142,17 +142,20 @@ def test_few_evaluations_go_to_the_search_first():
     assert distinct_points(fit) == 6 + 5 + 1  # to measure noise, and samples and a step of the search in noise
 
 
-@pytest.mark.parametrize(("settings", "after"), [({"bounds": (-2, 2)}, 10), ({"bounds": (-2, 2)}, 12), ({}, 30)])
-def test_an_interrupted_search_returns_what_its_evaluations_support(settings, after):
+@pytest.mark.parametrize(("n", "bounds", "spread", "after"), [(2, (-2, 2), 0.1, 12), (5, None, 0.3, 45)])
+def test_an_interrupted_search_returns_what_its_evaluations_support(n, bounds, spread, after):
     """Over 10 seeds (value - truth) / error has mean 0 within 1, and is rarely above 3."""
     scores = []
     for seed in range(10):
-        f = noisy(seed, 0.1, lambda z: (z - 0.3).square().sum(1))
+        f = Counted(noisy(seed, spread, lambda z: (z - 0.3).square().sum(1)))
 
-        def end(one):
-            return one.evaluations >= after
+        def fn(z, f=f):
+            if sum(map(len, f.points)) >= after:
+                raise KeyboardInterrupt
+            return f(z)
 
-        fit = zh.minimize(f, [1.0, 1.0], sigma=1.0, seed=seed, max_evaluations=60, callback=end, **settings)
+        fit = zh.minimize(fn, [1.0] * n, sigma=1.0, seed=seed, bounds=bounds, max_evaluations=60)
+        assert fit.status == "interrupted"
         assert bool((fit.points == fit.x).all(1).any())
         scores.append((fit.value - float((fit.x - 0.3).square().sum())) / fit.value_error)
     scores = vector(*scores)

@@ -89,7 +89,7 @@ def test_every_module_has_a_layer(tree: str) -> None:
 
 @pytest.mark.parametrize("tree", LAYERS)
 def test_the_map_for_readers_has_the_same_order(tree: str) -> None:
-    """The table of folders in the tree's README. `results` has no code; `experiments` leaves out the files at its top."""
+    """The table in the tree's README; that of `experiments` has no files, but a folder without code."""
     rows = re.findall(r"^\| ((?:`\w+(?:/|\.py)`(?:, )?)+) \|", (ROOT / tree / "README.md").read_text(), re.MULTILINE)
     listed = [one for row in rows for one in re.findall(r"`(\w+)", row) if one != "results"]
     assert listed == [one for one in LAYERS[tree] if (ROOT / tree / one).is_dir() or tree == "torch_zerohess"]

@@ -51,10 +51,11 @@ class Estimate:
         value: ValueMode = "center",
         term: SurrogateTerm | None = None,
         chosen: str = "",
+        joint: bool = False,
     ) -> None:
         self._batches = [Sums(evaluations, smoothing), *more]
         self._batch, self._x, self._smoothing, self.reason = batch, x, smoothing, reason
-        self._value_mode, self._term, self._chosen = value, term, chosen
+        self._value_mode, self._term, self._chosen, self._joint = value, term, chosen, joint
         self._sigma = evaluations.expansion.sigma
         self._out = evaluations.expansion.base.shape[1:]
 
@@ -151,9 +152,10 @@ class Estimate:
 
     @property
     def evaluations(self) -> int:
-        """How often the black box was evaluated, f(x) included."""
+        """How often the black box was evaluated, f(x) included; a joint evaluation counts once."""
         found = [one.evaluations for one in self._batches]
-        return sum(one.share.numel() + len(one.share) * (one.center is not None) for one in found)
+        each = sum(one.share.shape[1] + (one.center is not None) for one in found)
+        return each if self._joint else each * self._batch.numel()
 
     @cached_property
     def points(self) -> Tensor:

@@ -1,7 +1,7 @@
 """Ask and tell, the same for every search: the checks, the values told, and the state that is saved.
 
 A search is a `Method`, and `AskTell` puts the public classes around it. `tell` computes the whole next `State` and
-assigns it at the end, so the search is unchanged if anything raises; `ask` only reads the state.
+assigns it at the end, so a search is as it was if anything raises; `ask` only reads the state.
 
 To add a search: a subclass of `Progress` with its fields, a subclass of `Method` with its step, and a subclass of
 `AskTell` that makes the method.

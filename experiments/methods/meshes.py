@@ -1,4 +1,4 @@
-"""Methods for the vertices of a mesh: smoothed derivatives, with what is known about meshes and cameras around them.
+"""Methods for the vertices of a mesh: smoothed derivatives, with knowledge of meshes and cameras around them.
 
 | method | perturbed | derivatives of | step |
 |---|---|---|---|
@@ -68,9 +68,9 @@ def handles(
     Args:
         trial: the run.
         credit: whether a handle answers for all pixels or for those that it can change.
-        newton: on so many of the levels, from the first, steps are those of Newton with blocks of the Hessian, which
-            needs credit "local"; on the others those of Adam. The finer the level, the fewer pixels a handle has, and
-            the more of its sampled curvature is noise.
+        newton: number of levels, from the first, with Newton steps by blocks of the Hessian, which needs credit
+            "local"; the other levels have Adam steps. The finer the level, the fewer pixels a handle has, and the more
+            of its sampled curvature is noise.
         levels: of the handles; one may come again.
         steps: on each level.
         samples: antithetic pairs; a step costs twice as many evaluations.

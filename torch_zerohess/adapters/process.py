@@ -42,10 +42,10 @@ class Program(Closing):
     A server flushes its output after each answer, and writes messages to the standard error alone. It ends when its
     standard input does. A server that ended or took too long is started again by the next call.
 
-    A run fails if it ends with a code other than 0, takes too long, or writes what is no number. With on_failure="nan"
-    all points of the run have NaN as their values, in the shape of earlier outputs. Before the first output that is one
-    NaN per point: if outputs are tensors, call the program first where it works. What becomes of a NaN is said by
-    `on_nonfinite` of a layer; `minimize` avoids it.
+    A run fails if it ends with a code other than 0, takes too long, or writes no number. With on_failure="nan" all
+    points of the run have NaN as their values, in the shape of earlier outputs. Before the first output that is one
+    NaN per point: if outputs are tensors, call the program first where it works. `on_nonfinite` of a layer says how it
+    treats a NaN; `minimize` avoids the point.
 
     A `Program` can be pickled; a copy starts a program of its own.
 
@@ -55,7 +55,7 @@ class Program(Closing):
         format: see above.
         timeout: seconds per point; None for no limit.
         folder: where the program runs; here if None.
-        environment: variables beside those of this process.
+        environment: variables added to the environment of this process.
         on_failure: "raise", or "nan" to go on without the values of a run that fails.
 
     Raises:

@@ -60,8 +60,8 @@ class BlackBox(nn.Module):
     randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
     "different" where neither x nor aux is mapped over.
 
-    `state_dict` carries all settings of the smoothing, not sigma alone, and what the memory keeps. `load_state_dict`
-    puts them in the place of those that the layer was made with. Settings that are to differ are set after it:
+    `state_dict` has all settings of the smoothing, not sigma alone, and the contents of the memory. `load_state_dict`
+    replaces the settings that the layer was made with. To change a setting, set it after loading:
     `layer.smoothing = layer.smoothing.replace(samples=16)`.
 
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
@@ -142,8 +142,8 @@ class BlackBox(nn.Module):
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order. Those of proposals "optimal" (with order=2) and "fr22"
-        end at the second and first, and higher ones raise ValueError. It makes no further evaluation.
+        smoothed black box and has derivatives of every order, but for proposals "optimal" (with order=2) and "fr22":
+        they have two and one, and higher ones raise ValueError. The function makes no further evaluation.
         """
         _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]

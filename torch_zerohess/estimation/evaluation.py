@@ -66,7 +66,7 @@ class BlackBoxCall:
 
     @property
     def outer(self) -> Outer:
-        """What stands around the expectation of the values."""
+        """The function outside of the expectation of the values."""
         return outer_of(self.head)
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -159,7 +159,7 @@ class Evaluations:
 
     @property
     def rest(self) -> Tensor:
-        """What is smoothed at the perturbed points, [B, K, P]."""
+        """The values at the perturbed points that are smoothed, [B, K, P]."""
         B, K, _ = self.share.shape
         return self.remaining[:, :K].reshape(B, K, -1)
 
@@ -205,7 +205,7 @@ def evaluate(
         aux: [B, ...] each, for every point of its batch element.
         smoothing: how to sample.
         keep: see `perturb`.
-        control: what is subtracted from the values before they become coefficients.
+        control: control variate, subtracted from the values before they become coefficients.
     """
     smoothing = smoothing.resolved(x.shape[1])
     seed = smoothing.drawn_seed()
@@ -244,7 +244,7 @@ def evaluate(
         if predicted is not None:
             remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
     baseline, coefficients = _coefficients(remaining.reshape(B, K + with_center, -1), share, smoothing, n)
-    # The sum of finite numbers may be infinite, but that of others is never finite.
+    # A sum is finite only if all terms are; a sum of finite terms may overflow.
     if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
         raise ValueError(
             f"fn returned values up to {float(values[:, :K].abs().max()):.3g}, whose differences are not finite in "

@@ -63,7 +63,7 @@ def finite_difference_hvp(
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
     n = checked_input(x).shape[-1]
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):
-        raise ValueError(f"v must be a tensor of shape [{n}] or that of x, got {getattr(v, 'shape', v)}")
+        raise ValueError(f"v must be a tensor of shape [{n}] or of the shape of x, got {getattr(v, 'shape', v)}")
     if not 0 < checked_number("step", step) < math.inf:
         raise ValueError(f"step must be positive and finite, in units of sigma, got {step}")
     sigma = smoothing.sigma_vector(n, x.device)

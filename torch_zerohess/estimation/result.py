@@ -1,4 +1,4 @@
-"""What an estimate says: the value and derivatives, and how far each of them may be from the truth."""
+"""The result of an estimate: the value and derivatives, and the error of each."""
 
 import math
 from collections.abc import Sequence
@@ -98,8 +98,8 @@ class Estimate:
         """Standard error of an estimate, in the shape of the estimate, from the spread of its independent draws.
 
         An antithetic pair is one draw. So are a whole scramble of sampler "sobol" and a block of "orthogonal". Few
-        draws tell their spread badly: for an interval take `confidence_interval`, not a fixed number of standard
-        errors. With baseline "mean" the draws depend on each other, and the error is that of the jackknife.
+        draws give a poor estimate of their spread: for an interval take `confidence_interval`, not a fixed number of
+        standard errors. With baseline "mean" the draws depend on each other, and the error is by the jackknife.
 
         Args:
             quantity: "value" (of the smoothed value), "gradient", "hessian_diagonal", "hessian" or "hvp".
@@ -214,7 +214,7 @@ class Estimate:
     def _shaped(self, flat: Tensor, what: str) -> Tensor:
         """Return [B, P, ...] as [*batch, *out, ...] in the dtype of x; ValueError if it is not finite there."""
         result = flat.reshape((*self._batch, *self._out, *flat.shape[2:])).to(self._x.dtype)
-        # The sum of finite numbers may be infinite, but that of others is never finite.
+        # A sum is finite only if all terms are; a sum of finite terms may overflow.
         if not math.isfinite(float(result.sum())) and not bool(torch.isfinite(result).all()):
             largest = max(float(one.evaluations.values.abs().max()) for one in self._batches)
             raise ValueError(

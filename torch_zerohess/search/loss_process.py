@@ -1,9 +1,9 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
-The process finds the way over plateaus and out of local minima (`ProcessMethod`), quadratics end it
-(`MetricQuadratics`): a process that is to hold all over the box leaves a millionth of the loss unexplained, a quadratic
-around a smooth minimum next to nothing. Where a function has more minima than the process can tell apart, it finds
-nothing better; then quadratics begin at a random point of the box.
+The process crosses plateaus and leaves local minima (`ProcessMethod`). Quadratics finish (`MetricQuadratics`): a
+process of the whole box leaves a millionth of the loss unexplained, a quadratic around a smooth minimum next to
+nothing. If a function has more minima than the process can tell apart, the process finds nothing better. Then
+quadratics begin at a random point of the box.
 """
 
 import math

@@ -93,7 +93,7 @@ def test_evaluators_and_values_that_are_not_finite() -> None:
 
 def test_errors() -> None:
     smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
-    with pytest.raises(ValueError, match=r"v must be a tensor of shape \[3\] or that of x, got torch.Size\(\[2\]\)"):
+    with pytest.raises(ValueError, match=r"shape \[3\] or of the shape of x, got torch.Size\(\[2\]\)"):
         zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(2), smoothing)
     with pytest.raises(ValueError, match=r"step must be positive and finite, in units of sigma, got 0\.0"):
         zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(3), smoothing, step=0.0)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.batch import numbers
+from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
 from torch_zerohess.evaluators.values import as_tensor
 
@@ -120,10 +121,16 @@ class Program(Closing):
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...]."""
         if callable(self.command):
-            runs = [functools.partial(self._run, _found(self.command(one)), b"", 1) for one in x.detach()]
-            found = [self._unless_failed(run, one) for run, one in zip(runs, x, strict=True)]
-            self._shape = next((one.shape for one in found if one is not None), self._shape)
-            return torch.stack([_missing(self._shape) if one is None else one for one in found])
+            found: dict[int, Tensor | None] = {}
+            try:
+                for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
+                    run = functools.partial(self._run, _found(self.command(one)), b"", 1)
+                    found[k] = self._unless_failed(run, one)
+            except BaseException as error:  # Ctrl-C, too
+                keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
+                raise
+            self._shape = next((one.shape for one in found.values() if one is not None), self._shape)
+            return torch.stack([_missing(self._shape) if one is None else one for one in found.values()])
         request = self._request(x, aux)
         answer = self._serve if self.server else functools.partial(self._run, self.command)
         values = self._unless_failed(functools.partial(answer, request, len(x)), x)
@@ -209,9 +216,10 @@ class Program(Closing):
         except Exception as error:  # a function may raise any
             shown = output[:200].decode(errors="replace")
             named = "what the function `format` reads" if callable(self.format) else f"values as {self.format}"
+            advice = "" if output.strip() == b"null" else ": let it print messages to its standard error"
             raise ValueError(
                 f"the program must write {named} and nothing else to its standard output, got {shown!r} "
-                f"({type(error).__name__}: {error}): let it print messages to its standard error{_shown(errors)}"
+                f"({type(error).__name__}: {error}){advice}{_shown(errors)}"
             ) from error
 
 

@@ -67,7 +67,8 @@ class BlackBox(nn.Module):
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
     `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it. A layer with a memory
-    is called between graphs: fullgraph=True is an error. `torch.export` raises RuntimeError: no file holds a black box.
+    is called between graphs: fullgraph=True is an error, and so is `torch.func.grad` inside of compiled code.
+    `torch.export` raises RuntimeError: no file holds a black box.
 
     Example:
         >>> layer = BlackBox(lambda z: z.round().sum(1), Smoothing(sigma=1.0, samples=2000, seed=0))

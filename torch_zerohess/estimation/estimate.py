@@ -63,10 +63,10 @@ def estimate(
         value: "center" returns f(x) as the value, "smoothed" an estimate of F(x).
         on_nonfinite: "raise", "drop", or a number that replaces NaN and infinities.
         joint: whether one evaluation takes a point of every batch element, for x [B, n]: fn is [K, B, n],
-            *aux [K, B, ...] -> [K, B, *out]. Use it where each of B parts of a scene changes a loss of its own, such as
-            the pixels near it: K evaluations then tell the derivatives of B small functions. Each function is smoothed
-            over the perturbations of the other parts, too. These have the density of the samples, which is the Gaussian
-            with proposal "gaussian".
+            *aux [K, B, ...] -> [K, B, *out], or [B, n] -> [B, *out] where not `vectorized`. Use it where each of B
+            parts of a scene changes a loss of its own, such as the pixels near it: K evaluations then tell the
+            derivatives of B small functions. Each function is smoothed over the perturbations of the other parts, too.
+            These have the density of the samples, which is the Gaussian with proposal "gaussian".
         tolerance: relative error of the gradient at which to stop; None for one batch.
         max_evaluations: of fn, over all of x, f(x) in every batch included: where to stop in any case; 100 000 if None.
 

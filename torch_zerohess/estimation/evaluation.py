@@ -116,7 +116,7 @@ class BlackBoxCall:
                 f"fn must return one value per batch element, [{E}, {B}, *out] for points {list(points.shape)}, "
                 f"got {list(values.shape)}"
             )
-        self._lost(points)
+        self._lost(points.flatten(1))
         return values.transpose(0, 1)
 
     def _lost(self, points: Tensor) -> list[int]:

@@ -87,6 +87,14 @@ def test_every_module_has_a_layer(tree: str) -> None:
     assert layers == set(LAYERS[tree]), "a folder or module has no layer, or a layer has no module"
 
 
+@pytest.mark.parametrize("tree", LAYERS)
+def test_the_map_for_readers_has_the_same_order(tree: str) -> None:
+    """The table in the tree's README; that of `experiments` has no files, but a folder without code."""
+    rows = re.findall(r"^\| ((?:`\w+(?:/|\.py)`(?:, )?)+) \|", (ROOT / tree / "README.md").read_text(), re.MULTILINE)
+    listed = [one for row in rows for one in re.findall(r"`(\w+)", row) if one != "results"]
+    assert listed == [one for one in LAYERS[tree] if (ROOT / tree / one).is_dir() or tree == "torch_zerohess"]
+
+
 @pytest.mark.parametrize(("tree", "path"), CASES)
 def test_imports_go_one_way(tree: str, path: Path) -> None:
     own = name(tree, path)

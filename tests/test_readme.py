@@ -66,7 +66,14 @@ def test_code_runs(name, tmp_path, monkeypatch):
         assert (names["fitted"].x - torch.tensor([0.6, 0.3])).abs().max() < 0.01
 
 
+def searches(path: Path) -> list[str]:
+    """The commands in comments of a file of settings, with lines that end in a backslash joined, cut at `;`."""
+    text = re.sub(r"\\\n *# *", "", path.read_text())
+    return [line.partition(";")[0] for line in re.findall(r"# (tune .*)", text)]
+
+
 CALLS = {name: [match[1] for line in commands(text) if (match := COMMAND.match(line))] for name, text in TEXTS.items()}
+CALLS |= {one.name: searches(one) for one in sorted((ROOT / "experiments/methods/settings").glob("*.py"))}
 
 
 @pytest.mark.parametrize(("name", "line"), params(CALLS))
@@ -84,6 +91,9 @@ def test_commands_can_be_called(name, line):
     call(command, instead, arguments)
     if given.get("methods") not in (None, "all"):
         chosen("methods", given["methods"].split(","), list(METHODS))
+    if command == "tune":
+        chosen("method", [given["method"]], list(METHODS))
+        chosen("task", [given["tasks"] or given["task"]], list(TASKS))
     if given["tasks"] and isinstance(given["tasks"], tuple):
         chosen("tasks", given["tasks"], list(TASKS))
 

@@ -60,9 +60,13 @@ def chosen_signs(n: int, evaluations: int, order: int, sampler: str) -> bool:
     return sampler == "orthogonal" and evaluations >= _CURVED * n
 
 
-def chosen_scrambles(samples: int) -> int:
-    """Return how many independent scrambles so many Sobol points are cut into."""
-    return next(r for r in (_SCRAMBLES, 2, 1) if samples % r == 0 and (r <= 2 or samples >= r * _LEAST_SCRAMBLE))
+def scrambles_of(samples: int, most: int = _SCRAMBLES) -> int:
+    """Return how many independent scrambles, 1, 2, 4 or 8, so many Sobol points are cut into.
+
+    There are more than two only if each is long enough for its points to be even.
+    """
+    cuts = (r for r in (8, 4, 2, 1) if r <= most and samples % r == 0)
+    return next(r for r in cuts if r <= 2 or samples >= r * _LEAST_SCRAMBLE)
 
 
 def chosen_baseline(antithetic: bool, draws: int) -> Literal["center", "mean"]:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch_zerohess.arguments import check_callable, checked_file, checked_integer, checked_number
 from torch_zerohess.estimation.evaluation import BlackBoxCall
 from torch_zerohess.estimation.inputs import working
+from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.search.minimum import Iterate, Minimum, Observation, Status
@@ -93,13 +94,18 @@ def minimize(
         target: the search ends when the value is at most this.
         xtol: the search ends when its region is within this of the best point in every parameter.
         ftol: the search ends when its model, where it holds, promises a decrease of at most this.
-        time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean.
+        time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but what all
+            evaluations say.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
-            from it: the function and all settings must be the same. ValueError if it is no such file.
+            from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
+            file.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up or three rounds in a row have arrived at the same point.
         noise: standard deviation of repeated losses at one point. If None it is measured: x0 is evaluated twice, and
-            six times more if the values differ. If fn is noisy, an eighth of `max_evaluations` (4 to 48) is kept for
+            six times more if the values differ. So fn counts as exact if it is so at x0, as on a plateau: give `noise`
+            then, its size where the minimum may be. Noise is taken to be the same everywhere. If it grows towards the
+            minimum, `value_error` is too small until the evaluations there outweigh those at x0; the mean at the end
+            has the noise at x. If fn is noisy, an eighth of `max_evaluations` (4 to 48) is kept for
             the end. The best candidates are then evaluated again, and x is the one with the lowest mean. `value` is
             that mean and `value_error` its standard error.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
@@ -109,8 +115,9 @@ def minimize(
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn,
-    loss or callback passes, with the `Minimum` so far as its attribute `minimum`. Where all values are equal the
-    message says so.
+    loss or callback passes, with the `Minimum` so far as its attribute `minimum`. Either keeps, also in the checkpoint,
+    the points of an interrupted batch whose values are known: with `vectorized=False`, or from an evaluator. Where all
+    values are equal the message says so.
 
     Example:
         >>> import torch
@@ -153,24 +160,30 @@ def minimize(
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
 
-    def evaluated(points: Tensor, aux: Sequence[Tensor]) -> Tensor:
-        values = call(points.clone(), aux)
-        if loss is None and values.shape[1:] not in ((), (1,)):
-            raise ValueError(
+    def evaluated(points: Tensor) -> tuple[list[int], Tensor, BaseException | None]:
+        given, failure = points.clone(), None
+        numbers = list(range(len(points)))
+        try:
+            values = call(given, ())
+        except BaseException as error:  # Ctrl-C, too: what is known already is kept
+            failure = error
+            numbers, values = finished_values(error, given)
+        if loss is None and numbers and values.shape[1:] not in ((), (1,)):
+            raise failure or ValueError(
                 f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
                 f"{len(points)} points"
             )
-        if memory is not None:
+        if memory is not None and numbers:
             with memory.lock:
-                memory.add(points, values)
-        return values
+                memory.add(points[numbers], values)
+        return numbers, values, failure
 
     running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, verbose=verbose)
 
     def ended() -> tuple[Status, str] | None:
         search = running.search
-        if not running.evaluations:
-            return None
+        if not running.begun:
+            return ("budget", running.budget) if running.spent else None
         if search.done:
             return running.ending(arrived=search.solved), search.message
         if target is not None and running.reaches(target):
@@ -183,8 +196,8 @@ def minimize(
             return running.ending(arrived=True), "the search has arrived at x, within xtol and ftol"
         if restarts is None and not running.noise and search.agreed >= _AGREED:
             return "solved", f"{search.agreed} rounds in a row have arrived at x"
-        if running.left < 1:
-            return "budget", f"max_evaluations ({max_evaluations}) used up"
+        if running.spent:
+            return "budget", running.budget
         if time_limit is not None and running.seconds > time_limit:
             return "time", f"time_limit ({time_limit} s) used up"
         return None
@@ -196,9 +209,9 @@ def minimize(
         while True:
             reached = ended() or asked
             if reached is None:
-                iterate = running.step()
+                running.step()
                 blamed = "callback"
-                if callback is not None and _is_true(callback(iterate)):
+                if callback is not None and _is_true(callback(running.iterate)):
                     asked = "callback", "the callback asked to end"
                 blamed = black_box
                 continue

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.choice import chosen_baseline, chosen_sampler, chosen_scrambles, chosen_signs
+from torch_zerohess.choice import chosen_baseline, chosen_sampler, chosen_signs, scrambles_of
 
 Proposal = Literal["aggregate", "gaussian", "optimal", "uniform", "fr22", "auto"]
 Baseline = Literal["center", "mean", "none", "auto"]
@@ -172,7 +172,7 @@ class Smoothing:
         samples = self.samples if signs or self.antithetic is False else evaluations
         if sampler == "sobol" and self.sampler == "auto" and samples % 2:  # one scramble has no standard error
             sampler = "orthogonal"
-        scrambles = chosen_scrambles(samples) if sampler == "sobol" and self.scrambles is None else self.scrambles
+        scrambles = scrambles_of(samples) if sampler == "sobol" and self.scrambles is None else self.scrambles
         if proposal == "auto":
             proposal = "gaussian" if self.order == 1 and sampler == "orthogonal" else "aggregate"
         if baseline == "auto":

@@ -15,7 +15,7 @@ from experiments.reports.speed_ups import CASE, with_ratios
 
 NAME = "source_table_2"
 REFERENCE = "our_hvpa"
-METHODS = {
+NAMES_IN_TABLE_2 = {
     "Mitsuba": ("mitsuba", "mitsuba_path"),
     "FR22": ("fr22",),
     "CMA-ES": ("cma_es", "cma_es_bounded"),
@@ -53,7 +53,7 @@ def side_by_side(medians: pd.DataFrame, tasks: Sequence[str] = ()) -> pd.DataFra
         source = source[source["task"].isin(tasks)]
     there = set(medians[["task", "method"]].itertuples(index=False, name=None))
     ours = [
-        next((name for name in METHODS[one.method] if (one.task, name) in there), "")
+        next((name for name in NAMES_IN_TABLE_2[one.method] if (one.task, name) in there), "")
         for one in source.itertuples(index=False)
     ]
     ratios = with_ratios(medians, REFERENCE).set_index([*CASE, "method"])[["ratio_seconds", "ratio_evaluations"]]

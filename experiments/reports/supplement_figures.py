@@ -14,10 +14,15 @@ import matplotlib as mpl
 import torch
 from torch import Tensor
 
+from experiments.problems.rendered import shown
+from experiments.problems.scenes.bunny import IN_MIRRORS, in_mirrors
+from experiments.problems.scenes.caustic import COEFFICIENTS, basis
+from experiments.problems.scenes.meshes import rgb
 from experiments.reports.animation import Look, Trace, pixels
 from experiments.reports.error_curves import AXES, band, plain_ticks
 from experiments.reports.results import Run
 from experiments.runs.trial import LEVELS
+from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -161,10 +166,6 @@ def mirrors(found: Trace, seen: Look, experiment: Tensor, path: Path) -> None:
 
 def mirrors_from_outside(variant: str, film: tuple[int, int] = (240, 180), spp: int = 64) -> Tensor:
     """Render the scene of MIRROR from above, with a line from the eye by both mirrors to the bunny: sRGB [h, w, 3]."""
-    from experiments.problems.rendered import shown
-    from experiments.problems.scenes.bunny import IN_MIRRORS, in_mirrors
-    from experiments.problems.scenes.meshes import rgb
-    from torch_zerohess.adapters.mitsuba import MitsubaScene
 
     def scene(mi: Any) -> dict[str, Any]:
         found = in_mirrors(mi)
@@ -221,7 +222,5 @@ def _errors(axis: Any, runs: Sequence[Trace]) -> None:
 
 def _surface(x: Tensor) -> Tensor:
     """Heights of the slab of CAUSTIC on a fine grid, in the units of its coefficients x [1024]."""
-    from experiments.problems.scenes.caustic import COEFFICIENTS, basis
-
     splines = basis(torch.linspace(0, 1, 128, dtype=torch.float64))
     return splines @ x.reshape(COEFFICIENTS, COEFFICIENTS) @ splines.mT

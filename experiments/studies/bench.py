@@ -45,7 +45,7 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class Memory:
+class Footprint:
     """MiB above what the process holds before: what a graph keeps, and the peak of forward, backward and an HVP."""
 
     perturbations: str
@@ -60,7 +60,7 @@ class BenchReport:
     """Everything `bench` measured."""
 
     timings: list[Timing]
-    memory: list[Memory]
+    memory: list[Footprint]
     ratios: list[Ratio]
 
 
@@ -190,7 +190,7 @@ def _seconds(operation: Callable[[], object], number: int) -> float:
     return (time.perf_counter() - start) / number
 
 
-def _memory(name: str, n: int, samples: int) -> Memory:
+def _memory(name: str, n: int, samples: int) -> Footprint:
     """Measure in a new process, whose peak is its own."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -199,7 +199,7 @@ def _memory(name: str, n: int, samples: int) -> Memory:
     sender.close()
     kept, peak = receiver.recv()
     process.join()
-    return Memory(name, n, samples, kept, peak)
+    return Footprint(name, n, samples, kept, peak)
 
 
 def _measure_memory(sender: Connection, stored: bool, n: int, samples: int) -> None:

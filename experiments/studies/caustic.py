@@ -15,8 +15,10 @@ import tyro
 from torch import Tensor
 
 from experiments.problems.scenes.caustic import COEFFICIENTS, INDEX, basis
+from experiments.problems.scenes.meshes import grid, mi_mesh
 from experiments.problems.tasks import caustic
 from experiments.runs.records import Files, read_outcome
+from torch_zerohess.adapters.mitsuba_variants import select_variant
 
 Array = npt.NDArray[np.float64]
 
@@ -70,8 +72,6 @@ def check(x: Tensor, side: int = 64, spp: int = 1000, variant: str = "auto", see
 
     In units of the incoming light, as the photon splat: divided by the transmission at a right angle.
     """
-    from torch_zerohess.adapters.mitsuba_variants import select_variant
-
     mi = select_variant(variant, threads=1)
     scene = mi.load_dict(description(mi, x, side), optimize=False)
     image = np.array(mi.render(scene, seed=seed, spp=spp))[:, :, 0]
@@ -80,8 +80,6 @@ def check(x: Tensor, side: int = 64, spp: int = 1000, variant: str = "auto", see
 
 def description(mi: Any, x: Tensor, side: int) -> dict[str, Any]:
     """Return the scene: x and y from 0 to 1, light along z from below the surface, the screen at z = DISTANCE."""
-    from experiments.problems.scenes.meshes import mi_mesh
-
     place, glass = mi.ScalarTransform4f, {"type": "dielectric", "int_ior": INDEX, "ext_ior": 1.0}
     beneath = -2 * caustic.UNIT * caustic.LARGEST
     middle, above = [0.5, 0.5, caustic.DISTANCE], [0.5, 0.5, caustic.DISTANCE - 1]
@@ -121,8 +119,6 @@ def surface(x: Tensor, patches: int = 8) -> tuple[Array, Array, npt.NDArray[np.u
 
     Every patch of the spline is cut into `patches`^2 squares.
     """
-    from experiments.problems.scenes.meshes import grid
-
     places = torch.linspace(0, 1, patches * (COEFFICIENTS - 3) + 1, dtype=torch.float64)
     value, slope = basis(places), basis(places, derivative=1)
     c = caustic.UNIT * x.double().view(COEFFICIENTS, COEFFICIENTS)

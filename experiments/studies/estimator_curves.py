@@ -10,8 +10,8 @@ from typing import Any
 import matplotlib as mpl
 import torch
 
-from experiments.studies.estimator_methods import ALONE, FIRST_ORDER, METHODS, OURS, Method
 from experiments.studies.estimator_problems import QUANTITIES, Problem
+from experiments.studies.estimators import ALONE, ESTIMATORS, FIRST_ORDER, OURS, Estimator
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -56,7 +56,7 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
     return float(a @ b / (a @ a))
 
 
-def _style(method: Method) -> dict[str, Any]:
+def _style(method: Estimator) -> dict[str, Any]:
     """Colour says where points come from, the line what is subtracted, the marker how points depend on each other."""
     colors = {
         "auto": "#7a9a01",
@@ -89,7 +89,7 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
     figure, axes = plt.subplots(len(problems), 4, figsize=(22, 6.2 * len(problems)), squeeze=False)
     for row, problem in zip(axes, problems, strict=True):
         for axis, quantity in zip(row, QUANTITIES, strict=True):
-            for method in (*METHODS, *ALONE):
+            for method in (*ESTIMATORS, *ALONE):
                 x, y = curve(measurements, problem.name, method.name, quantity, against)
                 if x:
                     fitted = slope(x, y)

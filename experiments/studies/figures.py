@@ -37,7 +37,7 @@ from experiments.reports.tables import table
 from experiments.runs.trial import LEVELS
 from experiments.studies import lobes
 from experiments.studies.estimator_curves import draw_operators, orders
-from experiments.studies.estimator_methods import FIRST_ORDER, OPERATORS
+from experiments.studies.estimators import FIRST_ORDER, OPERATORS
 from experiments.studies.gallery import gallery, trace
 from experiments.studies.robustness import robustness
 from experiments.studies.variance import variance

@@ -8,17 +8,18 @@ ends by itself starts again from a random point of the box.
 Instances 11 to 15 are for tuning, 1 to 5 for tables.
 """
 
-import csv
 import itertools
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from experiments.ensembles.kept_parts import KeptParts
 from experiments.methods import METHODS
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
@@ -28,14 +29,17 @@ from experiments.problems import bbob
 from experiments.problems.catalogue import chosen
 from experiments.problems.task import Task
 from experiments.reports.progress import progress
+from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
 from experiments.runs.trial import Trial
+from torch_zerohess.optim import TrustRegion
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search, output=False))
 RIVALS = ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded")
 BUDGETS = (10, 30, 100)
 """Evaluations over n after which the table counts."""
+HEADERS = ("n", "method", *(f"{budget} n" for budget in BUDGETS), "ms per evaluation", "runs")
 
 
 @dataclass(frozen=True)
@@ -50,17 +54,12 @@ class Job:
     budget: int
     """Evaluations over n."""
 
-    @property
-    def row(self) -> list[str]:
-        """The first cells of its row."""
-        return [str(one) for one in (self.n, self.function, self.instance, self.run, self.method, self.budget)]
-
 
 @dataclass(frozen=True)
 class Reached:
-    """Evaluations until each of `bbob.TARGETS` was reached, as far as they were, and the seconds of the run."""
+    """Evaluations until each of `bbob.TARGETS` was reached, as far as they were, and seconds of the processor."""
 
-    evaluations: tuple[int, ...]
+    evaluations: Sequence[int]
     seconds: float
 
     def share(self, most: int) -> float:
@@ -77,7 +76,8 @@ def optimizers(
     runs: int = 1,
     budget: int = BUDGETS[-1],
     limit: float = 600.0,
-    out: Path = Path("results/optimizers.csv"),
+    out: Path = Path("results/optimizers"),
+    store: str | None = None,
 ) -> None:
     """Print shares of (function, precision) pairs reached; called again it goes on where it was.
 
@@ -90,8 +90,11 @@ def optimizers(
         runs: starts for every function.
         budget: evaluations over n that a run may use.
         limit: seconds that a run may take.
-        out: CSV file with a row per run; rows that are there are not run again.
+        out: folder; runs that the same code has made there are not made again.
+        store: name under which the table is kept for the documents, as experiments/results/NAME.csv.
     """
+    if store is not None:
+        may_keep(store)
     torch.set_num_threads(1)
     known = {OURS.name: OURS, **METHODS}
     names = (OURS.name, *RIVALS)
@@ -100,15 +103,20 @@ def optimizers(
         if known[name].missing():
             raise SystemExit(f"{name} needs pip install {' '.join(known[name].missing())}")
     jobs = [Job(*one, budget) for one in itertools.product(n, functions, instances, range(runs), wanted)]
-    done = read(out)
-    for job in progress([one for one in jobs if one not in done], "runs"):
-        try:
-            task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
-        except (ImportError, ValueError) as error:
-            raise SystemExit(str(error)) from error
-        done[job] = reached(task, known[job.method], job.run, limit)
-        append(out, job, done[job])
-    print(report({job: done[job] for job in jobs}))
+    parts, done = KeptParts(out), dict[Job, Reached]()
+    for job in progress(jobs, "runs"):
+        (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, known[job.method], limit))
+    print(report(done))
+    if store is not None:
+        print(keep(HEADERS, rows(done), store))
+
+
+def _run(job: Job, method: Method, limit: float) -> list[Reached]:
+    try:
+        task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
+    except (ImportError, ValueError) as error:
+        raise SystemExit(str(error)) from error
+    return [reached(task, method, job.run, limit)]
 
 
 def reached(task: Task, method: Method, run: int, limit: float = 600.0) -> Reached:
@@ -126,9 +134,9 @@ def reached(task: Task, method: Method, run: int, limit: float = 600.0) -> Reach
         return values
 
     counted = replace(task, loss=loss)
-    begun = time.perf_counter()
+    begun = time.process_time()
     attempt(counted, method.name, run, lambda trial: _again(trial, method), limit=limit)
-    return Reached(tuple(hits), time.perf_counter() - begun)
+    return Reached(tuple(hits), time.process_time() - begun)
 
 
 def _again(trial: Trial, method: Method) -> None:
@@ -138,46 +146,31 @@ def _again(trial: Trial, method: Method) -> None:
         method(trial, None)
 
 
-def read(path: Path) -> dict[Job, Reached]:
-    """Return the rows of a file, none if there is no file."""
-    if not path.exists():
-        return {}
-    with path.open(newline="") as file:
-        return {
-            Job(int(row[0]), int(row[1]), int(row[2]), int(row[3]), row[4], int(row[5])): Reached(
-                tuple(map(int, row[7].split())), float(row[6])
-            )
-            for row in csv.reader(file)
-            if row[0] != "n"
-        }
-
-
-def append(path: Path, job: Job, result: Reached) -> None:
-    """Write a row."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    header = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if header:
-            writer.writerow(["n", "function", "instance", "run", "method", "budget", "seconds", "evaluations"])
-        writer.writerow([*job.row, f"{result.seconds:.3f}", " ".join(map(str, result.evaluations))])
-
-
 def report(done: Mapping[Job, Reached]) -> str:
-    """Return the table of shares."""
+    """Return the table of shares as text."""
+    return table(HEADERS, [[one if isinstance(one, str) else f"{one:.3g}" for one in row] for row in rows(done)])
+
+
+def rows(done: Mapping[Job, Reached]) -> list[list[object]]:
+    """Return the rows of the table of shares, a row per number of parameters and method."""
     groups: dict[tuple[int, str], list[tuple[Job, Reached]]] = defaultdict(list)
     for job, result in done.items():
         groups[job.n, job.method].append((job, result))
-    headers = ["n", "method", *(f"{budget} n" for budget in BUDGETS), "ms per evaluation", "runs"]
-    return table(headers, list(_rows(groups)))
+    return list(_rows(groups))
 
 
-def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[str]]:
+def _named(n: int, method: str) -> str:
+    """Name of a method in the table; ours with the engine that it chooses."""
+    if method != OURS.name:
+        return method
+    return f"{method}: {TrustRegion(torch.zeros(n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
+
+
+def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[object]]:
     for (n, method), group in groups.items():
         shares = [sum(one.share(min(budget, job.budget) * n) for job, one in group) / len(group) for budget in BUDGETS]
         # A run that has reached the finest target has ended there.
         used = sum(
             one.evaluations[-1] if len(one.evaluations) == len(bbob.TARGETS) else job.budget * n for job, one in group
         )
-        milliseconds = 1e3 * sum(one.seconds for _, one in group) / used
-        yield [str(n), method, *(f"{share:.3f}" for share in shares), f"{milliseconds:.2f}", str(len(group))]
+        yield [n, _named(n, method), *shares, 1e3 * sum(one.seconds for _, one in group) / used, len(group)]

@@ -35,8 +35,8 @@ from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_choice import SIZES, compare, summary
 from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
-from experiments.studies.estimator_methods import ALONE, METHODS, NAMES, OURS, Method
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
+from experiments.studies.estimators import ALONE, ESTIMATORS, NAMES, OURS, Estimator
 
 _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest budget
 
@@ -113,7 +113,7 @@ def variance(
     if store is not None:
         may_keep(store)
     names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
-    known = {method.name: method for method in (*METHODS, *ALONE)}
+    known = {method.name: method for method in (*ESTIMATORS, *ALONE)}
     picked = chosen("methods", methods, list(known))
     compared = [method for name, method in known.items() if name in picked]
     made = [made_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in progress(names, "truth")]
@@ -146,7 +146,7 @@ def variance(
 class _Tally:
     """Squared errors, seconds and evaluations of one method on one problem at one budget, run by run."""
 
-    def __init__(self, problem: Problem, method: Method, budget: int) -> None:
+    def __init__(self, problem: Problem, method: Estimator, budget: int) -> None:
         self.problem, self.method, self.budget = problem, method, budget
         self.squares: dict[str, list[float]] = {}
         self.seconds: list[float] = []

@@ -300,3 +300,16 @@ def test_verbose_says_how_far_it_is(monkeypatch, capsys):
     monkeypatch.setattr("torch_zerohess.search.running._PAUSE", 0.0)
     zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=10, verbose=True)
     assert "10 evaluations, value " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("resumed", [7, 12, 20])
+def test_fewer_evaluations_than_were_spent(resumed, tmp_path):
+    settings = {"sigma": 2.0, "seed": 0, "checkpoint": tmp_path / "search.pt"}
+    first = zh.minimize(tilted, zeros(2), max_evaluations=12, **settings)
+    f = Counted(tilted)
+    fit = zh.minimize(f, zeros(2), max_evaluations=resumed, **settings)
+    assert fit.evaluations == len(fit.history) == max(12, resumed) == 12 + f.points
+    assert fit.status == "budget"
+    said = "allows no more than the 12 so far" if resumed < 12 else "used up"
+    assert f"max_evaluations ({resumed}) {said}" in fit.message
+    assert fit.value <= first.value

@@ -22,7 +22,6 @@ from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
@@ -119,7 +118,7 @@ class BlackBox(nn.Module):
             result = self._center(center, others)
             return result.reshape((*batch, *result.shape[1:])).to(dtype)
         watched = transforms.watched(x)
-        alone = self.memory is None and not isinstance(self.call.head, LocalEntropy)
+        alone = self.memory is None and self.call.outer.linear
         if len(center) and alone and not watched and not transforms.forward_mode_active():
             expansion = self._evaluate(center, others)
             result = ClosedForm.apply(x, expansion, functools.partial(_general, expansion, center=center, zero=True))
@@ -173,8 +172,9 @@ class BlackBox(nn.Module):
         zero: promises that x equals the center in value, and that the function is called before the surrogate changes.
         """
         if self.memory is None:
-            return self._estimated(center, aux, zero)
-        self.control = Control.of(self.memory, self.call.head, learning=self.training)
+            estimated, constants = self._estimated(center, aux, zero)
+            return lambda x: self.call.outer.value(estimated(x), constants, self.call.value)
+        self.control = Control.of(self.memory, self.call.outer, learning=self.training)
         with transforms.outside(), transforms.random_numbers_allowed():
             seed = self.smoothing.drawn_seed()
         try:
@@ -192,19 +192,13 @@ class BlackBox(nn.Module):
         finally:
             self.control = None
 
-    def _estimated(self, center: Tensor, aux: list[Tensor], zero: bool) -> Callable[[Tensor], Tensor]:
-        """Return the part of the estimate that comes from new evaluations, as `_around` does."""
+    def _estimated(self, center: Tensor, aux: list[Tensor], zero: bool) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+        """Return the expectation that new evaluations tell, as `_around` does, and its constants."""
         expansion = self._evaluate(center, aux)
         active = self.control is not None and self.control.active
-        entropy = isinstance(self.call.head, LocalEntropy) and not active
         if active and self.memory is not None and self.memory.order == 1:
-            return lambda x: _tangent(expansion, x, center)
-
-        def estimated(x: Tensor) -> Tensor:
-            result = _general(expansion, x, center=center, zero=zero)
-            return control_variate.local_entropy_value(result, self.call.value) if entropy else result
-
-        return estimated
+            return functools.partial(_tangent, expansion, center=center), expansion.constants
+        return functools.partial(_general, expansion, center=center, zero=zero), expansion.constants
 
     def _evaluate(self, x: Tensor, aux: list[Tensor]) -> Expansion:
         B, n = x.shape

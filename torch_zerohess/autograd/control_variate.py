@@ -7,10 +7,8 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
-from torch_zerohess.estimation import local_entropy
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.surrogate_term import STEIN, nodes, prefers_pathwise, smoothed
-from torch_zerohess.heads import LocalEntropy
 
 Part = Callable[[Tensor], Tensor]
 """x [B, n] -> [B, *out], differentiable."""
@@ -24,7 +22,7 @@ def around(
     sigma: Tensor,
     seed: int,
     order: int,
-    estimated: Callable[[Tensor, list[Tensor]], Part],
+    estimated: Callable[[Tensor, list[Tensor]], tuple[Part, Tensor]],
     *,
     value: str,
 ) -> Part:
@@ -38,10 +36,11 @@ def around(
         sigma: float64 [n].
         seed: of the points of the surrogate's term and of the choice of fresh elements.
         order: highest derivative that is wanted.
-        estimated: evaluates around a part of the batch, with its aux, and returns the estimate of the residual.
+        estimated: evaluates around a part of the batch, with its aux, and returns the estimate of the residual, and
+            its constants, see `Outer.kept`.
         value: "center" or "smoothed", see `BlackBox`.
     """
-    B, memory = len(center), control.memory
+    B, memory, outer = len(center), control.memory, control.outer
     fresh = B if memory.fresh is None else min(memory.fresh, B)
     with transforms.outside(), transforms.random_numbers_allowed():
         generator = torch.Generator().manual_seed(seed)
@@ -56,47 +55,31 @@ def around(
         return control.predict(surrogate, z, aux)
 
     if not control.active:
-        alone = estimated(center[part], [one[part] for one in aux])
-        return lambda x: spread(alone(x[part]))
+        alone, constants = estimated(center[part], [one[part] for one in aux])
+        return lambda x: spread(outer.value(alone(x[part]), constants, value))
     if memory.pathwise is None and not transforms.watched(center):
         memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
     pathwise = len(sigma) > STEIN if memory.pathwise is None else memory.pathwise
-    entropy = control.head if isinstance(control.head, LocalEntropy) else None
-    scales: list[Tensor] = []
     with torch.no_grad():
         at_center = control.coefficient * predicted(center[:, None])[:, 0] if value == "center" else center[:, 0]
-        if entropy:
-            losses = predicted((center[:, None] + sigma * u).to(center.dtype))
-            scales = list(local_entropy.scales(losses, losses.mean(1), entropy.temperature))
-    rest = estimated(center[part], [one[part] for one in (*aux, *scales)]) if fresh else None
+        scales = outer.scales(
+            lambda: predicted((center[:, None] + sigma * u).to(center.dtype)), lambda losses: losses.mean(1)
+        )
+    whole_aux = aux if scales is None else [*aux, scales]
+    rest = estimated(center[part], [one[part] for one in whole_aux]) if fresh else None
 
     def values(z: Tensor) -> Tensor:
-        if entropy:
-            return local_entropy.tempered(predicted(z), *scales)
-        return control.coefficient * predicted(z)
+        return control.coefficient * outer.inner(predicted(z), scales)
 
     def whole(x: Tensor) -> Tensor:
         term = smoothed(values, x, center, sigma, u, pathwise=pathwise)
-        new = None if rest is None else rest(x[part])
-        if entropy:
-            T, m = (one.to(x.dtype) for one in scales)
-            result = m - T * term.log() - (0.0 if new is None else T * spread(new[:, 0]) / term)
-            new = None if new is None else new[:, 3]  # the loss at the center
-        elif value == "center":
-            result = term if new is None else term + spread(new)
-        else:
-            return term if new is None else term + spread(new)
+        new = None if rest is None else rest[0](x[part])
+        result = outer.corrected(term, None if new is None else spread(new), scales)
         if value == "smoothed":
             return result
-        at = at_center if new is None else at_center + spread(new.detach() - at_center[part])
+        at = at_center
+        if rest is not None and new is not None:
+            at = at + spread(outer.value(new, rest[1], value).detach() - at[part])
         return result - result.detach() + at.to(x.dtype)
 
     return whole
-
-
-def local_entropy_value(packed: Tensor, value: str) -> Tensor:
-    """Return m - T log Z [B] of packed outputs [B, 4]; with "center" its value is the loss at the center."""
-    Z, T, m, center = packed.unbind(1)
-    T, m = T.detach(), m.detach()
-    result = m - T * Z.clamp_min(torch.finfo(Z.dtype).tiny).log()
-    return result if value == "smoothed" else result - result.detach() + center.detach()

@@ -121,7 +121,8 @@ def _evaluate_center(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
 def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Layout]:
     owner = _owner(handle)
     smoothing = owner.smoothing if keep else owner.smoothing.resolved(int(x.shape[1]))
-    return Expansion.layout(smoothing, x.shape[0], K, x.shape[1], _output_shape(owner, x, aux), keep)
+    out, constants = _output_shape(owner, x, aux), owner.call.outer.constants
+    return Expansion.layout(smoothing, x.shape[0], K, x.shape[1], out, constants, keep)
 
 
 @_evaluate.register_fake

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 from torch_zerohess.arguments import checked_integer, checked_number
-from torch_zerohess.estimation.batch import Batch
+from torch_zerohess.estimation.sums import Sums
 from torch_zerohess.smoothing import Smoothing
 
 MOST = 100_000
@@ -13,14 +13,14 @@ _STEP = 0x9E3779B97F4A7C15  # from the seed of a batch to that of the next
 
 
 def draw_until(
-    draw: Callable[[Smoothing], Batch],
-    error: Callable[[list[Batch]], float],
+    draw: Callable[[Smoothing], Sums],
+    error: Callable[[list[Sums]], float],
     smoothing: Smoothing,
     cost: Callable[[Smoothing], int],
     seed: int,
     tolerance: float,
     max_evaluations: int,
-) -> tuple[list[Batch], str]:
+) -> tuple[list[Sums], str]:
     """Draw batches, each as large as all before it together, until `error` of them is at most the tolerance.
 
     Args:
@@ -38,7 +38,7 @@ def draw_until(
     Raises:
         ValueError: the limit does not allow for one batch.
     """
-    batches: list[Batch] = []
+    batches: list[Sums] = []
     used, multiple = 0, 0
     while True:
         following = max(1, multiple)

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.head import Head, apply_head
-from torch_zerohess.heads import LocalEntropy, SquaredError
+from torch_zerohess.estimation.head import apply_head
+from torch_zerohess.estimation.outer import Outer
+from torch_zerohess.heads import SquaredError
 from torch_zerohess.surrogates.memory import Memory
 
 
@@ -20,7 +21,7 @@ class Control:
     """The memory of a layer during one call."""
 
     memory: Memory
-    head: Head | None
+    outer: Outer
     active: bool
     """Whether the surrogate is subtracted; if not, evaluations are only kept."""
     coefficient: float
@@ -29,28 +30,18 @@ class Control:
     """Whether evaluations are kept."""
 
     @classmethod
-    def of(cls, memory: Memory, head: Head | None, *, learning: bool) -> "Control":
+    def of(cls, memory: Memory, outer: Outer, *, learning: bool) -> "Control":
         """Return the control variate for a call that begins: the surrogate is fitted if that is due."""
         if learning:
             memory.refresh()
-        c = memory.coefficient if memory.ready else 0.0
-        if isinstance(head, LocalEntropy):  # its outer function is not linear: all of the surrogate, or none
-            c = 1.0 if c >= 0.5 else 0.0
+        c = outer.share(memory.coefficient if memory.ready else 0.0)
         if memory.fresh == 0 and not memory.ready:
             raise ValueError("memory with fresh=0 has no surrogate yet: add evaluations and call memory.fit()")
-        return cls(memory, head, c > 0.0, c, learning)
+        return cls(memory, outer, c > 0.0, c, learning)
 
-    def references(self, aux: Sequence[Tensor]) -> list[Tensor]:
-        """The auxiliary inputs of the head, without the scales of a local entropy."""
-        return list(aux[:-2] if self._scaled else aux)
-
-    def scales(self, aux: Sequence[Tensor]) -> tuple[Tensor, Tensor] | None:
-        """T and m of a local entropy [B] each, which the surrogate gives; None where it is not used."""
-        return (aux[-2], aux[-1]) if self._scaled else None
-
-    @property
-    def _scaled(self) -> bool:
-        return self.active and isinstance(self.head, LocalEntropy)
+    def parted(self, aux: Sequence[Tensor]) -> tuple[Sequence[Tensor], Tensor | None]:
+        """Return the auxiliary inputs of the head, and the scales [B, 2] after them where the surrogate gave some."""
+        return (aux[:-1], aux[-1]) if self.active and not self.outer.linear else (aux, None)
 
     def explain(
         self,
@@ -67,14 +58,14 @@ class Control:
             values: [B, E, *out].
             points: [B, E, n].
             outputs: of the black box [B, E, *outputs].
-            aux: of the batch elements [B, ...].
+            aux: of the head [B, ...].
             added: what values [B, E, *out] add to the derivatives of the estimate, by order.
             kept: which values were not left out [B, E]; all of them if None.
         """
         predicted = None
         if self.memory.ready:
             with torch.no_grad():  # a module has parameters that require grad
-                predicted = self.predict(self.memory.surrogate, points, self.references(aux)).double()
+                predicted = self.predict(self.memory.surrogate, points, aux).double()
             if predicted.shape != values.shape:
                 raise ValueError(
                     f"the surrogate of the memory must return [K, {_listed(outputs.shape[2:])}] like the black box, "
@@ -98,7 +89,7 @@ class Control:
             aux: r, [B, ...] each.
         """
         B, E = z.shape[:2]
-        head = self.head.head if isinstance(self.head, LocalEntropy) else self.head
+        head = self.outer.head
         space = getattr(surrogate, "space", None)
         if isinstance(head, SquaredError) and space is not None:
             head.check(space.shape, aux[0])

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.adaptive import MOST, check_limits, draw_until
-from torch_zerohess.estimation.batch import Batch, combined, combined_spread
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate
 from torch_zerohess.estimation.head import Head
@@ -15,9 +14,9 @@ from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.estimation.student import student_factor
+from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
@@ -77,7 +76,7 @@ def estimate(
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
     call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
     check_limits(tolerance, max_evaluations)
-    _check_memory(head, memory, tolerance)
+    _check_memory(call, memory, tolerance)
     x = checked_input(x).detach().clone()
     batch, flat, aux_rows = x.shape[:-1], working(x).reshape(-1, x.shape[-1]), folded_aux(aux, x.shape[:-1])
     B, n = flat.shape
@@ -86,10 +85,10 @@ def estimate(
 
     control, term = None, None
 
-    def draw(own: Smoothing) -> Batch:
-        return Batch(evaluate(call, flat, aux_rows, own, stored(own, B, n), control), own)
+    def draw(own: Smoothing) -> Sums:
+        return Sums(evaluate(call, flat, aux_rows, own, stored(own, B, n), control), own)
 
-    def made(batches: list[Batch], reason: str) -> Estimate:
+    def made(batches: list[Sums], reason: str) -> Estimate:
         first, *more = batches
         return Estimate(
             *(first.evaluations, batch, x, first.smoothing),
@@ -103,7 +102,7 @@ def estimate(
     alone = "one batch: no tolerance was given"
     if memory is not None:
         with memory.lock:
-            control = Control.of(memory, head, learning=True)
+            control = Control.of(memory, call.outer, learning=True)
             if control.active:  # before this call's evaluations, which it must not know
                 sigma = smoothing.sigma_vector(n, flat.device)
                 term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, smoothing.drawn_seed(), smoothing.order)
@@ -123,8 +122,8 @@ def estimate(
     return made(batches, reason)
 
 
-def _check_memory(head: Head | None, memory: Memory | None, tolerance: float | None) -> None:
-    if isinstance(head, LocalEntropy):
+def _check_memory(call: BlackBoxCall, memory: Memory | None, tolerance: float | None) -> None:
+    if not call.outer.linear:
         raise ValueError("head LocalEntropy is no mean over samples, which an estimate is: use BlackBox with this head")
     check_memory(memory)
     if memory is not None and tolerance is not None:
@@ -133,7 +132,7 @@ def _check_memory(head: Head | None, memory: Memory | None, tolerance: float | N
         )
 
 
-def _relative_error(batches: list[Batch]) -> float:
+def _relative_error(batches: list[Sums]) -> float:
     """Largest |e| / |g| over the elements of a batch, e the half widths of intervals of one standard deviation."""
     g = combined(batches, lambda one: one.stein.gradient(one.a)).flatten(1)
     error, degrees = combined_spread(batches, "gradient", None)

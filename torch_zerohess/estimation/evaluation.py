@@ -3,28 +3,26 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_callable
-from torch_zerohess.estimation import local_entropy
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
+from torch_zerohess.estimation.outer import Outer, outer_of
 from torch_zerohess.estimation.perturbations import draws, perturb
-from torch_zerohess.estimation.stein import Stein, completed, total
+from torch_zerohess.estimation.stein import completed, total
 from torch_zerohess.evaluators.batch import loss_error
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.evaluators.payload import RemoteTraceback
 from torch_zerohess.evaluators.values import checked_values
-from torch_zerohess.heads import LocalEntropy
 from torch_zerohess.sampling.kernels import Redrawn
 from torch_zerohess.smoothing import Smoothing
 
@@ -56,13 +54,18 @@ class BlackBoxCall:
         check_callable(evaluator=self.evaluator)
         if self.evaluator is None:
             object.__setattr__(self, "evaluator", Inline())
-        checked_head(self.head)
+        checked_head(self.outer.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
         rule = self.on_nonfinite
         number = isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
         if not number and rule not in ("raise", "drop"):
             raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
+
+    @property
+    def outer(self) -> Outer:
+        """What stands around the expectation of the values."""
+        return outer_of(self.head)
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
@@ -197,7 +200,8 @@ def evaluate(
     # Where perturbations are too many to be kept, so are two copies of the points.
     redrawn = stein.u if isinstance(stein, LikelihoodRatio) and isinstance(stein.u, Redrawn) else None
     spare = redrawn is not None and control is None
-    values, outputs = call.values(points, control.references(aux) if control else aux, spare=spare)
+    references, scales = control.parted(aux) if control else (aux, None)
+    values, outputs = call.values(points, references, spare=spare)
     if spare and redrawn is not None and not math.isfinite(float(values.sum())):
         points = completed(redrawn.points(), x, with_center)  # as they were before fn
     values, kept = finite_values(values, points, call.on_nonfinite, K, smoothing, stein)
@@ -209,9 +213,20 @@ def evaluate(
         a = _coefficients(all_values.reshape(*all_values.shape[:2], -1), share, smoothing, n)[1]
         return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
 
-    counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
-    explain = None if control is None else partial(control.explain, values, points, outputs, aux, added, counted)
-    remaining = _remaining(call, values, share, aux, control, explain, stein)
+    def mean(losses: Tensor) -> Tensor:
+        return (stein.value(losses[:, None] * share.mT) / stein.value(share.mT))[:, 0]
+
+    outer, counted = (
+        call.outer,
+        None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True),
+    )
+    if scales is None:
+        scales = outer.scales(lambda: values[:, :K].double(), mean)
+    remaining = outer.inner(values, scales)
+    if control is not None:
+        predicted = control.explain(values, points, outputs, references, added, counted)
+        if predicted is not None:
+            remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
     baseline, coefficients = _coefficients(remaining.reshape(B, K + with_center, -1), share, smoothing, n)
     # The sum of finite numbers may be infinite, but that of others is never finite.
     if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
@@ -219,49 +234,13 @@ def evaluate(
             f"fn returned values up to {float(values[:, :K].abs().max()):.3g}, whose differences are not finite in "
             "float64: scale what fn returns"
         )
-    entropy = isinstance(call.head, LocalEntropy)
-    if entropy:
-        coefficients[..., 1:] = 0.0  # of constants
-    if call.value == "center" and not entropy:
+    if call.value == "center" and outer.linear:
         base = values[:, K].double()
     else:
         rest = remaining[:, :K]
         base = stein.smoothed(rest.reshape(B, K, -1), baseline[:, 0], coefficients.mT).reshape((B, *rest.shape[2:]))
-        if entropy:
-            base = torch.cat([base[:, :1], rest[:, 0, 1:]], 1)
-    expansion = Expansion(base, coefficients, perturbations.sigma, stein)
+    expansion = Expansion(base, coefficients, perturbations.sigma, outer.kept(scales, values[:, K:]), stein)
     return Evaluations(None if spare else points, values, share, remaining, baseline, expansion)
-
-
-def _remaining(
-    call: BlackBoxCall,
-    values: Tensor,
-    share: Tensor,
-    aux: Sequence[Tensor],
-    control: Control | None,
-    explain: Callable[[], Tensor | None] | None,
-    stein: Stein,
-) -> Tensor:
-    """Return what is to be smoothed, [B, E, *out], for values [B, E, *out], the one at the center last.
-
-    These are the values, less what the control variate explains; for a local entropy the packed values.
-    """
-    if isinstance(call.head, LocalEntropy):
-        K, own = share.shape[1], share.mT
-        losses = values[:, :K].double()
-        mean = (stein.value(losses[:, None] * own) / stein.value(own))[:, 0]
-        T, m = local_entropy.scales(losses, mean, call.head.temperature)
-        if control is not None:
-            T, m = control.scales(aux) or (T, m)
-        rows = local_entropy.packed(values, K, T, m)
-        predicted = None if explain is None else explain()
-        if predicted is not None:
-            rows[..., 0] -= local_entropy.tempered(predicted, T, m)
-        return rows
-    predicted = None if explain is None else explain()
-    if control is None or predicted is None:
-        return values
-    return values.double() - control.coefficient * predicted
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:

@@ -25,6 +25,8 @@ class Expansion:
     """c = (f_k - baseline) / K, float64 [B, K, P] for P outputs"""
     sigma: Tensor
     """float64 [n]"""
+    constants: Tensor
+    """What the function around the expectation needs, float64 [B, c], see `Outer.kept`; it gets F as Z."""
     stein: Stein
 
     def tensors(self) -> list[Tensor]:
@@ -32,16 +34,19 @@ class Expansion:
 
         Those two may share memory with values or settings, which outputs of an operator of torch must not.
         """
-        return [self.base.clone(), self.coefficients, self.sigma.clone(), *self.stein.tensors()]
+        return [self.base.clone(), self.coefficients, self.sigma.clone(), self.constants, *self.stein.tensors()]
 
     @classmethod
     def rebuild(cls, tensors: Sequence[Tensor], x: Tensor, smoothing: Smoothing, keep: bool) -> "Expansion":
         """Return the expansion around x [B, n] that `tensors` were taken from; keep: see `perturb`."""
-        base, coefficients, sigma, *rest = tensors
-        return cls(base, coefficients, sigma, family(smoothing).rebuild(rest, x, sigma, smoothing, keep))
+        base, coefficients, sigma, constants, *rest = tensors
+        return cls(base, coefficients, sigma, constants, family(smoothing).rebuild(rest, x, sigma, smoothing, keep))
 
     @staticmethod
-    def layout(smoothing: Smoothing, B: int, K: int, n: int, out: Sequence[int], keep: bool) -> list[Layout]:
+    def layout(
+        smoothing: Smoothing, B: int, K: int, n: int, out: Sequence[int], constants: int, keep: bool
+    ) -> list[Layout]:
         """Return what `tensors` of a batch will look like, for outputs of shape `out`."""
         own = family(smoothing).layout(smoothing, B, K, n, keep)
-        return [Layout((B, *out)), Layout((B, K, math.prod(out))), Layout((n,), batched=False), *own]
+        sums = [Layout((B, *out)), Layout((B, K, math.prod(out)))]
+        return [*sums, Layout((n,), batched=False), Layout((B, constants)), *own]

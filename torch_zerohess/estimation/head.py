@@ -11,8 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.heads import LocalEntropy
-
 Head = Callable[..., Tensor]
 """(outputs [K, *out], *aux [K, ...]) -> [K], made of differentiable torch operations."""
 _ALONE = (
@@ -25,8 +23,7 @@ def checked_head(head: Any) -> Head | None:
     """Return the head, or raise TypeError or ValueError if it cannot serve."""
     if head is not None and not callable(head):
         raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {head!r}")
-    inner = head.head if isinstance(head, LocalEntropy) else head
-    if isinstance(inner, nn.Module) and any(one.requires_grad for one in inner.parameters()):
+    if isinstance(head, nn.Module) and any(one.requires_grad for one in head.parameters()):
         raise ValueError(f"head has parameters that require grad, {_ALONE}")
     return head
 

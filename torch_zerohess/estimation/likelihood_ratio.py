@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, completed, total
+from torch_zerohess.estimation.standard_error import Divisible
+from torch_zerohess.estimation.stein import Layout, Projection, completed, total
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.sampling.kernels import Redrawn, Samples
 from torch_zerohess.smoothing import Smoothing
 
 
 @dataclass(frozen=True)
-class LikelihoodRatio(Stein):
+class LikelihoodRatio(Divisible):
     """Proposals "aggregate", "gaussian" and "uniform"."""
 
     u: Samples
@@ -99,17 +99,6 @@ class LikelihoodRatio(Stein):
             u = self.u._replace(rows=rows, x=self.u.x.repeat_interleave(len(index), 0))
             return LikelihoodRatio(u, self.weight[:, index].flatten(0, 1))
         return LikelihoodRatio(self.u[:, index].flatten(0, 1), self.weight[:, index].flatten(0, 1))
-
-    def variance(
-        self,
-        quantity: Quantity,
-        a: Tensor,
-        share: Tensor,
-        draws: Sequence[Tensor],
-        v: Tensor | None,
-        pooled: Tensor | None = None,
-    ) -> Spread:
-        return variance_of_draws(self, quantity, a, share, draws, v, pooled)
 
 
 def _kept(smoothing: Smoothing, keep: bool) -> bool:

@@ -8,11 +8,11 @@ from typing import NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.batch import Batch, combined, combined_spread
 from torch_zerohess.estimation.evaluation import Evaluations, ValueMode
 from torch_zerohess.estimation.inputs import short
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
+from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.smoothing import Smoothing
 
@@ -46,13 +46,13 @@ class Estimate:
         x: Tensor,
         smoothing: Smoothing,
         *,
-        more: Sequence[Batch] = (),
+        more: Sequence[Sums] = (),
         reason: str = "one batch: no tolerance was given",
         value: ValueMode = "center",
         term: SurrogateTerm | None = None,
         chosen: str = "",
     ) -> None:
-        self._batches = [Batch(evaluations, smoothing), *more]
+        self._batches = [Sums(evaluations, smoothing), *more]
         self._batch, self._x, self._smoothing, self.reason = batch, x, smoothing, reason
         self._value_mode, self._term, self._chosen = value, term, chosen
         self._sigma = evaluations.expansion.sigma

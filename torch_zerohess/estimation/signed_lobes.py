@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.standard_error import variance_of_draws
-from torch_zerohess.estimation.stein import Layout, Projection, Quantity, Spread, Stein, completed
+from torch_zerohess.estimation.standard_error import Divisible
+from torch_zerohess.estimation.stein import Layout, Projection, completed
 from torch_zerohess.sampling import kernels, proposals, samplers
 from torch_zerohess.smoothing import Smoothing
 
 
 @dataclass(frozen=True)
-class SignedLobes(Stein):
+class SignedLobes(Divisible):
     """Proposal "fr22": every dimension is drawn from the gradient lobe. First order only.
 
     The gradient is biased for n > 1: it smooths the other dimensions with the gradient's lobe instead of the Gaussian.
@@ -65,14 +65,3 @@ class SignedLobes(Stein):
     def subset(self, index: Tensor) -> "SignedLobes":
         """Return the draws index [D, r], of r rows each, as a batch of B * D estimates."""
         return SignedLobes(self.kernel[:, index].flatten(0, 1))
-
-    def variance(
-        self,
-        quantity: Quantity,
-        a: Tensor,
-        share: Tensor,
-        draws: Sequence[Tensor],
-        v: Tensor | None,
-        pooled: Tensor | None = None,
-    ) -> Spread:
-        return variance_of_draws(self, quantity, a, share, draws, v, pooled)

@@ -1,8 +1,8 @@
 """Variance of Stein sums from the spread of their independent draws."""
 
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -12,14 +12,23 @@ from torch_zerohess.estimation.stein import Quantity, Spread, Stein
 _CHUNK = 1 << 22  # numbers held at a time
 
 
-class Divisible(Protocol):
+class Divisible(Stein):
     """A family whose rows can be split into draws, each of which estimates everything."""
 
-    def sums(self, quantity: Quantity, a: Tensor, v: Tensor | None) -> Tensor:
-        """See `Stein.sums`."""
-
+    @abstractmethod
     def subset(self, index: Tensor) -> Stein:
         """Return the draws index [D, r], of r rows each, as a batch of B * D estimates."""
+
+    def variance(
+        self,
+        quantity: Quantity,
+        a: Tensor,
+        share: Tensor,
+        draws: Sequence[Tensor],
+        v: Tensor | None,
+        pooled: Tensor | None = None,
+    ) -> Spread:
+        return variance_of_draws(self, quantity, a, share, draws, v, pooled)
 
 
 def variance_of_draws(

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.factory import same
+from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation
 from torch_zerohess.evaluators.values import checked_values
 
@@ -101,16 +102,20 @@ class Ahead(Closing, ABC):
             raise RuntimeError(f"a callback of a future may submit to the {type(self).__name__}, but not wait for it")
         job = self._job(fn, points, aux)
         job.begin()
-        if self._serving.acquire(blocking=False):
-            try:
-                self._serve_alone(job)
-            finally:
-                self._serving.release()
-        else:  # another thread has a call, too
-            self._queue(job)
-        self._await(job)
-        self._calls.lost = job.batch.lost
-        return job.future.result()
+        try:
+            if self._serving.acquire(blocking=False):
+                try:
+                    self._serve_alone(job)
+                finally:
+                    self._serving.release()
+            else:  # another thread has a call, too
+                self._queue(job)
+            self._await(job)
+            self._calls.lost = job.batch.lost
+            return job.future.result()
+        except BaseException as error:  # of the black box, or Ctrl-C
+            keep_finished(error, points, job.batch.known)
+            raise
 
     def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
         """Return a `concurrent.futures.Future` of what a call with these arguments returns.

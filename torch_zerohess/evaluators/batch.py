@@ -74,6 +74,11 @@ class Batch:
         assert self._error is not None
         return [start for start in self.busy if start < self._error[0]]
 
+    @property
+    def known(self) -> dict[int, Tensor]:
+        """Values [*out] that have come, by the number of their point."""
+        return {start + k: one for start, values in list(self._values.items()) for k, one in enumerate(values)}
+
     def take(self) -> Chunk:
         """Return the next chunk, which is busy from now on."""
         chunk = self.waiting.popleft()

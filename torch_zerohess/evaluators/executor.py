@@ -12,6 +12,7 @@ from torch import Tensor
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
+from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation
 from torch_zerohess.evaluators.values import checked_values
 
@@ -67,6 +68,9 @@ class Executor(Closing):
         batch, tasks = self._tasks(fn, points, aux)
         try:
             return _joined(batch, tasks).to(points.device)
+        except BaseException as error:  # of the black box, or Ctrl-C
+            keep_finished(error, points, _known(tasks))
+            raise
         finally:
             for _, task in tasks:
                 task.cancel()
@@ -111,6 +115,13 @@ def _joined(batch: Batch, tasks: Tasks) -> Tensor:
     for chunk, task in tasks:  # in order, so that the first error is that of the first point
         batch.came(chunk, transfer.unpacked(task.result())[0])
     return batch.result()
+
+
+def _known(tasks: Tasks) -> dict[int, Tensor]:
+    """Return the values of the tasks that have succeeded, by the number of their point."""
+    done = [(chunk, task) for chunk, task in tasks if task.done() and not task.cancelled() and not task.exception()]
+    values = [(chunk, transfer.unpacked(task.result())[0]) for chunk, task in done]
+    return {chunk.start + k: one for chunk, rows in values for k, one in enumerate(rows)}
 
 
 def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[[], object]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.values import as_tensor
 
 
@@ -70,7 +71,15 @@ class Each:
     fn: Callable[..., Any]
 
     def __call__(self, points: Tensor, *aux: Tensor) -> Tensor:
-        return torch.stack([as_tensor(self.fn(*one)) for one in zip(points, *aux, strict=True)])
+        values: list[Tensor] = []
+        try:
+            for one in zip(points, *aux, strict=True):
+                value = as_tensor(self.fn(*one))
+                values.append(value.clone())  # fn may go on writing to what it returned
+        except BaseException as error:  # Ctrl-C, too
+            keep_finished(error, points, dict(enumerate(values)))
+            raise
+        return torch.stack(values)
 
 
 def built(fn: Callable[..., Any]) -> None:

@@ -18,7 +18,8 @@ class Evaluator(Protocol):
 
     An evaluator that gives up points, whose values are then NaN, says so in an attribute `lost`: the numbers of these
     points in the last call, and why. One that can begin further calls before the first has ended has
-    `submit(fn, points, *aux)`, which returns a `concurrent.futures.Future` of the values.
+    `submit(fn, points, *aux)`, which returns a `concurrent.futures.Future` of the values. Where a call fails whose
+    first values are known, its exception carries them, see `evaluators.finished`.
     """
 
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Any:

@@ -87,7 +87,7 @@ class Process:
     def _enlarge(self, size: int) -> None:
         if self.messages.memory is not None:
             self.messages.memory.close()
-        self.messages.memory = transfer.Memory(size + size // 4)
+        self.messages.memory = transfer.SharedMemory(size + size // 4)
         self.messages.send(ROOM, self.messages.memory.size)
         self.messages.memory.send(self.connection, self.process.pid or 0)
 

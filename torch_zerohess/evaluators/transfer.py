@@ -78,7 +78,7 @@ def can_share() -> bool:
     return bool(getattr(reduction, "HAVE_SEND_HANDLE", False)) and os.name == "posix"
 
 
-class Memory:
+class SharedMemory:
     """A piece of memory that two processes map."""
 
     def __init__(self, size: int, file: int | None = None) -> None:
@@ -93,7 +93,7 @@ class Memory:
         reduction.send_handle(connection, self.file, pid)
 
     @classmethod
-    def receive(cls, connection: "Connection[Any, Any]", size: int) -> "Memory":
+    def receive(cls, connection: "Connection[Any, Any]", size: int) -> "SharedMemory":
         """Map what `send` sent."""
         return cls(size, reduction.recv_handle(connection))
 

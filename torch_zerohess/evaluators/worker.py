@@ -39,7 +39,7 @@ class Messages:
 
     def __init__(self, connection: "Connection[Any, Any]") -> None:
         self.connection = connection
-        self.memory: transfer.Memory | None = None
+        self.memory: transfer.SharedMemory | None = None
 
     def send(self, kind: int, header: Any = None, tensors: tuple[Tensor, ...] = (), *, shared: bool = False) -> None:
         """Send a message; `shared` puts its tensors into the memory."""
@@ -124,7 +124,7 @@ def _answer(messages: Messages, values: Tensor | None) -> None:
 def _map(messages: Messages, size: int) -> None:
     if messages.memory is not None:
         messages.memory.close()
-    messages.memory = transfer.Memory.receive(messages.connection, size)
+    messages.memory = transfer.SharedMemory.receive(messages.connection, size)
 
 
 def _data(one: Tensor) -> memoryview:

@@ -7,6 +7,7 @@ other. Rows that depend on each other form one independent draw of `draw_size` c
 import torch
 from torch import Tensor
 
+from torch_zerohess.choice import scrambles_of
 from torch_zerohess.sampling import kernels
 from torch_zerohess.sampling.kernels import shape, uniforms, with_lobes
 from torch_zerohess.sampling.philox import EXTRA
@@ -26,8 +27,7 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
     if smoothing.scrambles is not None:
         return samples // smoothing.scrambles
     if smoothing.sampler == "sobol":
-        # Enough independent scrambles for a standard error, each long enough for its points to be even.
-        return samples // next(r for r in (8, 4, 2, 1) if samples % r == 0 and (r <= 2 or samples >= 8 * r))
+        return samples // scrambles_of(samples, 8)
     # Two blocks have a standard error; with a mean of the others it takes three.
     return min(n, max(1, samples // 3) if smoothing.baseline == "mean" else (samples + 1) // 2)
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.draws import normal, uniform
+from torch_zerohess.search.random_points import normal, uniform
 from torch_zerohess.surrogates.gaussian_process import GaussianProcess
 
 _SCALES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)

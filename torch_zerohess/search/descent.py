@@ -8,10 +8,10 @@ from torch import Tensor
 
 from torch_zerohess.linalg.subproblem import ball_step, box_step
 from torch_zerohess.search.descent_progress import BATCH, DescentProgress
-from torch_zerohess.search.draws import normal, reflect, uniform
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
+from torch_zerohess.search.random_points import normal, reflect, uniform
 from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values

@@ -33,8 +33,8 @@ class GaussianProcessSearch(AskTell[Any]):
     - With an output [K, *out] and a white-box `loss`, the process predicts the output anywhere in the box from all
       evaluations. The next point is the one where the loss of the prediction, with some optimism, is lowest; or where
       the process knows least, if that point is known already.
-    - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds. Where
-      the process finds nothing better, quadratics begin at a random point of the box.
+    - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds.
+      Where the process finds nothing better, quadratics begin at a random point of the box.
 
     One evaluation follows another, unless `ask` gets a batch. The search has arrived when three steps in a row are
     shorter than `tolerance`, or when quadratics have ended; these go on to a thousandth of the tolerance. After each of

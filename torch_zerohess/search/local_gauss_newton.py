@@ -3,10 +3,10 @@
 The start and a few dozen samples of all parameters at once tell a sparse Jacobian of the smoothed output, row by row
 (`surrogates.sparse_fit`). It takes about s log n samples for s parameters per row, where a dense Jacobian takes n.
 
-An iteration fits the Jacobian J to new samples, with the old J as the prior, and evaluates steps of several lengths.
-Each minimises the model g J s + s J^T H J s / 2 within its length, where g and H are gradient and Hessian of the loss
-after the output, by conjugate gradients. The best of them is taken if it lowers the loss; its length is the next
-radius. Where the output of that step was predicted well, the next steps use the same J. Sigma is a share of the radius.
+An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths then minimise
+the model g J s + s J^T H J s / 2 by conjugate gradients, where g and H are gradient and Hessian of the loss after the
+output; see `gauss_newton`. Where the output of the step that is taken was predicted well, the next steps use the same
+J. Sigma is a share of the radius.
 """
 
 import math
@@ -18,21 +18,16 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.krylov import krylov_steps
-from torch_zerohess.search.draws import normal, reflect
-from torch_zerohess.search.jacobian_progress import JacobianProgress
-from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, check_share
+from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
+from torch_zerohess.search.random_points import normal, reflect
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
-from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
-LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
-"""Of the steps that are tried, in units of the radius."""
-_REFUSED = 0.4
-"""Factor of the radius where no step lowers the loss."""
 _TRUSTED = 0.9
 """Share of the held-out change from which on the first radius is that of the samples, 1."""
 _FAITHFUL = 0.1
@@ -70,9 +65,7 @@ class LocalSettings:
             )
         result = cls(SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid), **own)
         for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
-            value = getattr(result, name)
-            if not 0.0 < value <= most or value == math.inf:
-                raise ValueError(f"{name} must be above 0 and at most {most}, got {value}")
+            check_share(name, getattr(result, name), most)
         check_samples(result.samples, result.sparse.keep)
         return result
 
@@ -87,7 +80,7 @@ class LocalProgress(JacobianProgress):
     """Of the next batch."""
 
 
-class LocalMethod(Method[LocalProgress]):
+class LocalMethod(GaussNewton[LocalProgress]):
     """The search of `LocalGaussNewton`, in units of its sigma."""
 
     engine = "local"
@@ -95,84 +88,42 @@ class LocalMethod(Method[LocalProgress]):
 
     def __init__(self, settings: Settings, own: LocalSettings) -> None:
         super().__init__(settings)
-        self.own = own
-
-    def first(self, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
-        """Ask for the start and samples around it."""
-        known = self.begun()
-        start = self.settings.start
-        return known, torch.cat([start[None], self._samples(known, generator)])
+        self.own, self.radius = own, own.radius
 
     def begun(self) -> LocalProgress:
-        """Return what is known before the first values."""
         start = self.settings.start
         return LocalProgress(
             best=Best(start),
             center=start,
-            radius=self.own.radius,
+            radius=self.radius,
             output=start.new_empty(0),
             samples=self.own.samples,
         )
-
-    def next(
-        self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
-    ) -> tuple[LocalProgress, Tensor]:
-        """Fit the Jacobian to samples, or take the best step; then ask for what follows."""
-        known = known.counted(evaluated)
-        if known.done:
-            return known, known.center[None][:0]
-        if known.phase == "sample":
-            known = self._fitted(known, evaluated)
-        else:
-            known = self._taken(known, evaluated.those(evaluated.finite))
-        if known.done:
-            return known, known.center[None][:0]
-        return self.step(known) if known.phase == "trial" else (known, self._samples(known, generator))
 
     def started(self, evaluated: Evaluated) -> LocalProgress | None:
         """Return what the start and samples around it at sigma tell; None if that is too little."""
         if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
             return None
         known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated))
-        known = self._fitted(known, evaluated)
+        known = self.sampled(known, evaluated)
         return known if known.phase == "trial" else None
 
-    def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
-        """The model of the latest Jacobian, which is one at the center, without standard errors.
-
-        None around another point, and for more than a thousand parameters.
-        """
-        n = self.settings.n
-        if known.jacobian is None or n > _FULL or not torch.equal(known.best.point, known.center):
-            return None
-        gradient, product = self._derivatives(known, known.jacobian)
-        hessian = torch.stack([product(one) for one in torch.eye(n, dtype=torch.float64, device=known.center.device)])
-        sigma, unknown = known.sigma, torch.full_like(known.center, math.inf)
-        model = LocalModel(known.best.loss, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
-        return model, sigma
-
-    def _samples(self, known: LocalProgress, generator: torch.Generator) -> Tensor:
+    def samples(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
         """Draw samples from N(center, sigma^2), mirrored into the bounds."""
         u = normal(generator, known.center, known.samples, self.settings.n)
-        return reflect(known.center + known.sigma * u, self.settings.lower, self.settings.upper)
+        return known, reflect(known.center + known.sigma * u, self.settings.lower, self.settings.upper)
 
-    def _fitted(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
-        """Fit the Jacobian to samples, the first of which is the start at the beginning."""
-        assert evaluated.outputs is not None
-        first = not len(known.output)
-        if first:
-            output = evaluated.outputs[0].clone()
-            if len(output) == 1:
-                raise ValueError(
-                    "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
-                    "number: use engine='descent'"
-                )
-            known = replace(known, output=output, best=replace(known.best, loss=float(evaluated.losses[0])))
-            evaluated = evaluated.those(slice(1, None))
-        told = evaluated.those(evaluated.finite)
+    def renewed(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Fit the Jacobian to samples; too few of them are drawn again."""
+        if len(known.output) == 1:
+            raise ValueError(
+                "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
+                "number: use engine='descent'"
+            )
+        first, told = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
         assert told.outputs is not None
         if len(told) < FEWEST_SAMPLES:
-            return known  # ask again
+            return known
         u = ((told.points - known.center) / known.sigma).float()
         changes = ((told.outputs - known.output) / known.sigma).float()
         jacobian = fit_sparse(u, changes, known.shape, self.own.sparse, known.jacobian)
@@ -180,55 +131,49 @@ class LocalMethod(Method[LocalProgress]):
             known = replace(known, radius=max(1.0, known.radius))
         return replace(known, jacobian=jacobian, phase="trial")
 
-    def step(self, known: LocalProgress) -> tuple[LocalProgress, Tensor]:
-        """Ask for steps of all lengths."""
-        assert known.jacobian is not None
-        gradient, product = self._derivatives(known, known.jacobian)
+    def steps(self, known: LocalProgress, radii: Tensor) -> Tensor:
+        """Solve the model by conjugate gradients, over the parameters that no bound holds."""
+        gradient, product = self._derivatives(known)
         lower, upper, x = self.settings.lower, self.settings.upper, known.center
         held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
         free = (~held).to(gradient)
-        radii = gradient.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
-        steps = krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
-        return replace(known, phase="trial"), (x + steps).clamp(lower, upper)
+        return krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
 
-    def _taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
-        """Go to the best of the steps with finite values if it lowers the loss."""
-        jacobian = known.jacobian
-        assert jacobian is not None
-        known = replace(known, iterations=known.iterations + 1, phase="sample")
-        k = int(evaluated.losses.argmin()) if len(evaluated) else -1
-        before = known.best.loss
-        if k >= 0 and float(evaluated.losses[k]) < known.best.loss:
-            assert evaluated.outputs is not None
-            point, output = evaluated.points[k].clone(), evaluated.outputs[k].clone()
-            step, change = point - known.center, output - known.output
-            radius = float(step.norm()) / math.sqrt(self.settings.n)
-            miss = change - jacobian.matvec(step).flatten()
-            faithful = float(miss.square().sum()) <= _FAITHFUL * float(change.square().sum())
-            best = Best(point, float(evaluated.losses[k]), known.sigma)
-            known = replace(known, best=best, center=point, radius=radius, output=output)
-            known = replace(known, phase="trial" if faithful else "sample")
-        else:
-            known = replace(known, radius=_REFUSED * known.radius)
-        gain = before - known.best.loss
+    def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Twice the samples follow a small gain, and half of them a large one."""
+        after = super().taken(known, evaluated)
+        before, gain = known.best.loss, known.best.loss - after.best.loss
         count = known.samples * (2 if gain < _SLOW * abs(before) else 1) // (2 if gain > _FAST * abs(before) else 1)
-        known = replace(known, samples=min(max(count, self.own.samples), _MOST * self.own.samples))
-        if known.radius < self.settings.tolerance:
-            known = self._arrived(known)
-        return replace(known, sigma=min(1.0, max(self.own.share * known.radius, self.own.least_sigma)))
+        return replace(after, samples=min(max(count, self.own.samples), _MOST * self.own.samples))
 
-    def _arrived(self, known: LocalProgress) -> LocalProgress:
-        """Start again with the first radius and sigma, or end."""
-        rounds = known.rounds + 1
+    def moved(self, known: LocalProgress, step: Tensor, change: Tensor) -> LocalProgress:
+        """The Jacobian needs no samples where it predicted the change of the output."""
+        assert known.jacobian is not None
+        miss = change - known.jacobian.matvec(step).flatten()
+        faithful = float(miss.square().sum()) <= _FAITHFUL * float(change.square().sum())
+        return replace(known, phase="trial" if faithful else "sample")
+
+    def arrived(self, known: LocalProgress) -> LocalProgress:
         if known.jacobian is not None and known.jacobian.explained > _PREDICTED:
             known = agreeing(known, known.center, self.settings.tolerance)
-        if rounds > self.settings.restarts:
-            message = f"steps were below {self.settings.tolerance} of sigma, {rounds} times"
-            return replace(known, rounds=rounds, done=True, message=message)
-        return replace(known, rounds=rounds, radius=self.own.radius, phase="sample")
+        return super().arrived(known)
 
-    def _derivatives(self, known: LocalProgress, jacobian: SparseJacobian) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    def distance(self, radius: float) -> float:
+        return min(1.0, max(self.own.share * radius, self.own.least_sigma))
+
+    def derivatives_at_center(self, known: LocalProgress) -> tuple[Tensor, Tensor] | None:
+        """None before the first Jacobian, and for more than a thousand parameters."""
+        n = self.settings.n
+        if known.jacobian is None or n > _FULL:
+            return None
+        gradient, product = self._derivatives(known)
+        eye = torch.eye(n, dtype=torch.float64, device=known.center.device)
+        return gradient, torch.stack([product(one) for one in eye])
+
+    def _derivatives(self, known: LocalProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
+        jacobian = known.jacobian
+        assert jacobian is not None
         assert self.settings.loss is not None
         loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
         gradient = jacobian.rmatvec(loss.slope)

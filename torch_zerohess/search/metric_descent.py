@@ -17,9 +17,9 @@ from torch import Tensor
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
-from torch_zerohess.search.draws import normal, reflect, uniform
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_progress import MetricProgress
+from torch_zerohess.search.random_points import normal, reflect, uniform
 from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool

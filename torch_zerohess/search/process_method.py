@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.candidates import farthest, is_known, least_known, lowest
-from torch_zerohess.search.draws import normal, reflect
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.process_progress import ProcessProgress
+from torch_zerohess.search.random_points import normal, reflect
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.pool import Pool
@@ -278,14 +278,16 @@ class ProcessMethod(Method[Q]):
             values = values.clamp(max=least + _PROPORTION * (middle - least))
         spread = float(values.max()) - least or 1.0
         values = (values - least) / spread  # their squares do not overflow
-        known, process = self._fitted(known, values[:, None])
+        known, process = self._fitted(known, values[:, None], self.settings.noise / spread)
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]
             known = self._judged(known, values * spread + least)
         return known, LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
 
-    def _fitted(self, known: Q, outputs: Tensor) -> tuple[Q, GaussianProcess]:
+    def _fitted(self, known: Q, outputs: Tensor, deviation: float = 0.0) -> tuple[Q, GaussianProcess]:
         """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again.
+
+        deviation: of repeated outputs at one point; 0 if it is not known.
 
         Where an output was not finite it is taken to be as the one with the highest loss. A loss alone says too little
         to tell noise from ripples: it is noisy if `noise` says so.
@@ -296,7 +298,8 @@ class ProcessMethod(Method[Q]):
         outputs = torch.cat([outputs, worst.expand(len(known.holes), -1)])
         declared = self.settings.noise > 0.0
         detects = self.settings.loss is not None and len(pool) >= min(_TELLING * (n + 1), self.capacity)
-        process = GaussianProcess.fit(points, outputs, NOISES + HIGH_NOISES if declared or detects else NOISES)
+        noises = NOISES + HIGH_NOISES if declared or detects else NOISES
+        process = GaussianProcess.fit(points, outputs, noises, deviation or None)
         noisy = declared or process.noise >= HIGH_NOISES[0]
         best = known.record if known.noisy and not noisy else known.best
         return replace(known, noisy=noisy, best=best), process

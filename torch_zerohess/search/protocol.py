@@ -1,7 +1,8 @@
 """Ask and tell, the same for every search: what is checked, what is told, what is saved.
 
 A search is a `Method`, and `AskTell` puts the public classes around it. `tell` computes the whole next `State` and
-assigns it at the end, so a search is as it was if anything raises; `ask` only reads the state.
+assigns it at the end, so a search is as it was if anything raises. `ask` reads the state, and notes which points it has
+given out.
 
 To add a search: a subclass of `Progress` with its fields, a subclass of `Method` with its step, and a subclass of
 `AskTell` that makes the method.

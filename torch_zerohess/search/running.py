@@ -1,26 +1,25 @@
 """A search that goes on: its evaluations, noise, history, file, and what it returns."""
 
-import math
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.belief import Belief, believed
+from torch_zerohess.search.decision import Decision, decide
 from torch_zerohess.search.minimum import Iterate, Minimum, Status
-from torch_zerohess.search.noise import REPEATED, deviation, differs, distinct, lowest_mean, reserved
+from torch_zerohess.search.noise import REPEATED, deviation, differs, reserved
+from torch_zerohess.search.record import Call, Record
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 _PAUSE = 1.0
 """Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
-_OTHERS = 2
-"""Points with low values, besides the best one and where the search is, that may be best in noise."""
 _LUCK = 2.0
 """Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
 _FITTED = 40
@@ -29,23 +28,12 @@ _EXACT = 1e-3
 """Relative standard error of its Hessian, below which it takes the place of the model that the search has."""
 
 
-@dataclass(frozen=True)
-class Decision:
-    """Which of the best points in noise has the lowest mean, its mean, and the standard error of that."""
-
-    x: Tensor
-    value: float
-    error: float
-    evaluations: int
-    """With those for the decision."""
-
-
 class Running:
     """A search with all that was evaluated, and the file that it is written to.
 
     Args:
         make: the search for a standard deviation of repeated losses.
-        call: outputs or losses of points [K, n].
+        call: outputs or losses of points [K, n], as far as they are known if it is interrupted.
         noise: that standard deviation; measured at the start if None.
         batch: points that are evaluated at once.
         least: evaluations that the search needs for one step.
@@ -57,7 +45,7 @@ class Running:
     def __init__(
         self,
         make: Callable[[float], TrustRegion],
-        call: Callable[[Tensor, Sequence[Tensor]], Tensor],
+        call: Call,
         noise: float | None,
         batch: int,
         least: int,
@@ -66,17 +54,17 @@ class Running:
         *,
         verbose: bool,
     ) -> None:
-        self.evaluations = 0
-        """Values so far, those that measure noise included."""
         self.noise = noise
         """Standard deviation of repeated losses; None before it is known."""
-        self._make, self._call, self._batch, self._least, self._most = make, call, batch, least, most
+        self._make, self._batch, self._least, self._most = make, batch, least, most
         self._path, self._verbose = path, verbose
-        self._batches = list[tuple[Tensor, Tensor]]()
         self._begun = self._written = self._said = time.monotonic()
         self._decided: Decision | None = None
+        self._deciding: tuple[int, int] | None = None
+        """Evaluations before the decision that is being made, and those that it gets."""
+        self.search = make(self.noise or 0.0)
+        self._record = Record(call, lambda values: self.search.losses(values), self.search.x)
         if path is None or not path.exists():
-            self.search = make(self.noise or 0.0)
             return
         try:
             self._resume(torch.load(path, map_location="cpu", weights_only=True))
@@ -91,12 +79,19 @@ class Running:
         return time.monotonic() - self._begun
 
     @property
-    def told(self) -> tuple[Tensor, Tensor]:
-        """All points [evaluations, n] and their losses [evaluations], in order; there must be some."""
-        if len(self._batches) > 1:
-            points, losses = zip(*self._batches, strict=True)
-            self._batches = [(torch.cat(points), torch.cat(losses))]
-        return self._batches[0]
+    def begun(self) -> bool:
+        """Whether the first batch has been evaluated."""
+        return self._record.complete > 0
+
+    @property
+    def evaluations(self) -> int:
+        """Values so far, those that measure noise and those of an interrupted batch included."""
+        return self._record.evaluations
+
+    @property
+    def spent(self) -> bool:
+        """Whether the evaluations that are left are too few for a step, or for the rest of an interrupted batch."""
+        return self.left < max(self._record.due, 1)
 
     @property
     def left(self) -> int:
@@ -106,20 +101,44 @@ class Running:
         return rest - (min(reserved(self._most), max(rest - needed, 0)) if self.noise else 0)
 
     @property
+    def budget(self) -> str:
+        """Why there is no further step where the evaluations are `spent`."""
+        given, count = f"max_evaluations ({self._most})", self.evaluations
+        if count > self._most:
+            return f"{given} allows no more than the {count} so far"
+        rest = count < self._most and (self._record.due or self._last is not None)  # a decision uses up the others
+        return f"{given} allows no step after the {count} so far" if rest else f"{given} used up"
+
+    @property
     def flat(self) -> bool:
         """Whether all values are equal."""
-        losses = self.told[1]
+        losses = self._record.told[1]
         return bool((losses == losses[0]).all())
 
-    def step(self) -> Iterate:
-        """Evaluate what the search asks for next; in the first batch the start twice, if noise is to be measured."""
-        search = self.search
-        if self.noise is None and self.left > max(len(search.ask()), self._batch) + 1:
-            return self._first(search.ask(max(self._batch - 1, 1)))
-        points = search.ask(self._batch, limit=self.left)
+    @property
+    def iterate(self) -> Iterate:
+        """What is known after the latest batch."""
+        x, value, _ = self._best()
+        points, losses = self._record.last
+        return Iterate(self.evaluations, value, x, points.clone(), losses.clone())
+
+    def step(self) -> None:
+        """Evaluate what the search asks for next; in the first batch the start twice, if noise is to be measured.
+
+        A step that was interrupted is completed.
+        """
+        search, points, self._deciding = self.search, self._record.requested, None
+        if points is None:
+            measured = self.noise is None and self.left > max(len(search.ask()), self._batch) + 1
+            points = search.ask(max(self._batch - 1, 1)) if measured else search.ask(self._batch, limit=self.left)
+        else:
+            measured, points = self.noise is None, points[: len(search.missing)]
+        if measured:
+            self._first(points)
+            return
         self.noise = self.noise or 0.0
-        search.tell(self._call(points, ()))
-        return self._noted(points, search.told)
+        search.tell(self._record.values(points))
+        self._noted(points, search.told)
 
     def ending(self, *, arrived: bool) -> Status:
         """Return what an end is where the search has `arrived`: in noise a small region is no evidence of a minimum."""
@@ -134,39 +153,43 @@ class Running:
             return self._last.value <= target
         value, decided = self.search.value, self._decided
         if decided is not None:
-            value = float(self.told[1][decided.evaluations :].nan_to_num(nan=math.inf).min())
+            value = float(self._record.told[1][decided.evaluations :].nan_to_num(nan=torch.inf).min())
         return value <= target - _LUCK * (self.noise or 0.0)
 
     def decide(self) -> None:
         """In noise, find out which of the best points has the lowest mean, with the evaluations kept for that."""
-        search = self.search
-        if not self.noise or not self.evaluations or self._most <= self.evaluations or self._last is not None:
+        if not self.noise or not self.begun or self._last is not None:
             return
-        points, losses = self.told
-        lowest = torch.where(torch.isfinite(losses), losses, torch.inf).argsort()[:_OTHERS]
-        candidates = distinct([search.x, search.center, *points[lowest]])
-        most = min(reserved(self._most), self._most - self.evaluations)
-        found = lowest_mean(self._evaluated, candidates, most, self.noise)
+        self._record.note_known()
+        before, most = self._deciding or (self.evaluations, 0)
+        allowed = min(reserved(self._most), self._most - before)
+        if most != allowed:  # there is none to go on with
+            before, allowed = self.evaluations, min(reserved(self._most), self._most - self.evaluations)
+        if allowed < 1:
+            return
+        self._deciding = before, allowed
+        points, losses = self._record.told
+        likely = [self._believed(before).x, self.search.center]
+        found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise)
         if found is not None:
-            k, value, error = found
-            self._decided = Decision(candidates[k], value, error, self.evaluations)
+            self._decided = Decision(*found, self.evaluations)
+        self._deciding = None
 
     def write(self) -> None:
         """Write the file; it is never half written."""
-        if self._path is None or not self.evaluations:
+        if self._path is None or (self._record.requested is None and not self.begun):
             return
         self._written = time.monotonic()
         draft = self._path.with_name(f"{self._path.name}.part")
         decided = None if self._decided is None else vars(self._decided)
-        points, losses = self.told
-        saved = {"points": points, "values": losses, "noise": self.noise, "decided": decided}
+        saved = {"noise": self.noise, "decided": decided, "deciding": self._deciding, **self._record.state_dict()}
         torch.save(saved | {"search": self.search.state_dict()}, draft)
         draft.replace(self._path)
 
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""
         search = self.search
-        (x, value, error), (points, losses) = self._best(), self.told
+        (x, value, error), (points, losses) = self._best(), self._record.told
         found = self._model(x)
         gradient = hessian = errors = None
         unit = search.unit
@@ -204,11 +227,9 @@ class Running:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
         self.noise = saved["noise"]
         self.search = self._make(self.noise or 0.0)
-        x, points, losses = self.search.x, saved["points"], saved["values"]
-        if points.dtype != x.dtype:
-            raise ValueError(f"x0 must be {points.dtype} as there, got {x.dtype}")
+        self._record.load_state_dict(saved, x := self.search.x)
         self.search.load_state_dict(saved["search"])
-        self._batches, self.evaluations = [(points.to(x.device), losses.to(x.device))], len(points)
+        self._deciding = saved["deciding"]
         if saved["decided"] is not None:
             self._decided = Decision(**saved["decided"] | {"x": saved["decided"]["x"].to(x)})
 
@@ -218,63 +239,81 @@ class Running:
         decided = self._decided
         return decided if decided is not None and decided.evaluations == self.evaluations else None
 
-    def _best(self) -> tuple[Tensor, float, float]:
-        """Return the best point, its value and the error of that; of the start until the search was told values."""
+    def _best(self) -> Belief:
+        """Return the best point, its value and the error of that; in noise what all evaluations say."""
         if self._last is not None:
-            return self._last.x, self._last.value, self._last.error
-        search, noise = self.search, self.noise or 0.0
-        if search.evaluations:
-            return search.x, search.value, noise
-        points, losses = self.told
-        losses = losses[(points == search.x).all(1) & torch.isfinite(losses)]
-        return search.x, float(losses.mean()), noise / math.sqrt(len(losses))
+            return Belief(self._last.x, self._last.value, self._last.error)
+        search = self.search
+        if self.noise:
+            return self._believed(self.evaluations)
+        if search.evaluations and self._record.requested is None:
+            return Belief(search.x, search.value, 0.0)
+        points, losses = self._record.told  # those of the interrupted batch, too, which the search does not know
+        k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
+        return Belief(points[k], float(losses[k]), 0.0)
+
+    def _believed(self, count: int) -> Belief:
+        """Return what the first evaluations say together in noise."""
+        assert self.noise
+        points, losses = self._record.told
+        return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise)
 
     def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
-        """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better."""
-        found = self.search.model_at_best(x)
-        if self.noise or len(x) > _FITTED:
-            return found
-        unit, (points, losses) = self.search.unit, self.told
-        around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit))
-        return found if around is None or (found is not None and around[2] > _EXACT) else around[:2]
+        """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better.
 
-    def _first(self, points: Tensor) -> Iterate:
+        In noise the latter is better if there is one: its errors are those of the noise.
+        """
+        found = self.search.model_at_best(x)
+        if len(x) > _FITTED:
+            return found
+        unit, (points, losses), noise = self.search.unit, self._record.told, self.noise or 0.0
+        around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
+        if around is None or (found is not None and not noise and around[2] > _EXACT):
+            return found
+        return around[:2]
+
+    def _first(self, points: Tensor) -> None:
         """Evaluate the first points [K, n], and the start again; where its values differ, as often as noise needs."""
-        start = points[:1]
-        values = self._call(torch.cat([points, start]), ())
+        start, record = points[:1], self._record
+        every = torch.cat([points, start])
+        known = record.known - len(every)  # of a measurement that was interrupted
+        values = record.values(every)
         if not differs(values[0], values[-1]):
-            self.noise = 0.0
+            again = self.search.losses(values[-1:])  # it may raise: the search is not told before
             self.search.tell(values[:-1])
-            losses = torch.cat([self.search.told, self.search.losses(values[-1:])])
-            return self._noted(torch.cat([points, start]), losses)
-        count = min(REPEATED - 2, max(self._most - len(values) - self._least, 0))
-        again = self._call(start.repeat(count, 1), ()) if count else values[:0]
-        losses = self.search.losses(torch.cat([values, again]))
+            self.noise = 0.0
+            self._noted(every, torch.cat([self.search.told, again]))
+            return
+        count = max(min(REPEATED - 2, self._most - len(every) - self._least), known, 0)
+        every = torch.cat([every, start.repeat(count, 1)])
+        values = record.values(every)
+        losses = self.search.losses(values)
         at_start = torch.cat([losses[:1], losses[len(points) :]])
         self.noise = deviation(at_start[torch.isfinite(at_start)])
         self.search = self._make(self.noise)
         if torch.equal(self.search.ask(max(self._batch - 1, 1)), points):
             self.search.tell(values[: len(points)])
-        return self._noted(torch.cat([points, start.repeat(1 + count, 1)]), losses)
+        self._noted(every, losses)
 
     def _evaluated(self, points: Tensor) -> Tensor:
         """Return the losses [K] of points [K, n], which are not told to the search."""
         losses = []
         for part in points.split(max(self._batch, self._least - 1)):  # no more at once than in the first batch
-            losses.append(self.search.losses(self._call(part, ())))
+            try:
+                losses.append(self.search.losses(self._record.values(part)))
+            except BaseException:  # Ctrl-C, too
+                self._record.note_known()
+                raise
             self._noted(part, losses[-1])
         return torch.cat(losses)
 
-    def _noted(self, points: Tensor, losses: Tensor) -> Iterate:
-        """Return what is known after a batch at points [K, n] with losses [K], and write it where it is due."""
-        self._batches.append((points, losses))
-        self.evaluations += len(points)
-        x, value, _ = self._best()
+    def _noted(self, points: Tensor, losses: Tensor) -> None:
+        """Add a batch at points [K, n] with losses [K] to the record, and write it where it is due."""
+        self._record.note(points, losses)
         now = time.monotonic()
         if self._verbose and now - self._said >= _PAUSE:
             self._said = now
-            said = f"{self.evaluations} evaluations, value {value:.6g}, sigma {self.search.sigma:.3g}"
+            said = f"{self.evaluations} evaluations, value {self._best().value:.6g}, sigma {self.search.sigma:.3g}"
             print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)
         if now - self._written >= _PAUSE:
             self.write()
-        return Iterate(self.evaluations, value, x, points.clone(), losses.clone())

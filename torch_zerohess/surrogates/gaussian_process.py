@@ -25,6 +25,8 @@ CONSTANT = 1.0
 """Variance of the constant part of the kernel."""
 _SPREAD = 1.5
 """Standard deviation of the prior over the log of a length."""
+_TOLD = 7
+"""Degrees of freedom of a deviation that the caller knows: that of eight values at one point."""
 _FLAT = 1e-14
 """Change of outputs, relative to their size, that is rounding."""
 _ZERO = 1e-16
@@ -66,19 +68,24 @@ class GaussianProcess:
     """Cholesky factor of the covariance of the points [P, P], with the noise."""
 
     @classmethod
-    def fit(cls, points: Tensor, outputs: Tensor, noises: Sequence[float] = NOISES) -> "GaussianProcess":
+    def fit(
+        cls, points: Tensor, outputs: Tensor, noises: Sequence[float] = NOISES, deviation: float | None = None
+    ) -> "GaussianProcess":
         """Choose kernel, length and noise from their lists by the evidence, and condition on P >= 2 outputs.
 
         Args:
             points: [P, n], float64.
             outputs: [P, m], float64.
             noises: levels to choose from.
+            deviation: standard deviation of repeated outputs at one point, if it is known.
         """
         mean = outputs.mean(0)
         change = outputs - mean
         scale = float(change.abs().max())
         flat = scale <= _FLAT * float(mean.abs().max())
-        evidence, variances = grid_evidence(points, torch.zeros_like(change) if flat else change / scale, noises)
+        relative = None if deviation is None or flat else deviation / scale
+        target = torch.zeros_like(change) if flat else change / scale
+        evidence, variances = grid_evidence(points, target, noises, relative)
         best = int(evidence.argmax())
         shape, level = divmod(best, len(noises))
         kernel, length, noise = KERNELS[shape // len(LENGTHS)], LENGTHS[shape % len(LENGTHS)], noises[level]
@@ -138,16 +145,20 @@ class GaussianProcess:
         return self.variance * (1.0 + CONSTANT - known).clamp_min(0.0)
 
 
-def grid_evidence(points: Tensor, change: Tensor, noises: Sequence[float]) -> tuple[Tensor, Tensor]:
+def grid_evidence(
+    points: Tensor, change: Tensor, noises: Sequence[float], deviation: float | None = None
+) -> tuple[Tensor, Tensor]:
     """Log evidence for every kernel, length and noise of the lists, and the most likely variance for each of them.
 
     The evidence is 2/m times the log likelihood without its constants, plus 2 times the log prior of the length. (An
-    output counts as one observation: its elements are not independent.)
+    output counts as one observation: its elements are not independent.) A known deviation enters as `_TOLD` squares of
+    that size, each of noise alone.
 
     Args:
         points: [P, n].
         change: outputs [P, m] less their mean, at most 1.
         noises: levels [N].
+        deviation: of repeated outputs at one point, in the units of `change`; None if it is not known.
 
     Returns:
         Two tensors [kernels * lengths, N].
@@ -158,8 +169,11 @@ def grid_evidence(points: Tensor, change: Tensor, noises: Sequence[float]) -> tu
     values, vectors = torch.linalg.eigh(torch.cat([kernel(scaled) for kernel in KERNELS]) + CONSTANT)
     power = (vectors * (change @ change.mT @ vectors)).sum(1).clamp_min(0.0)
     spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [kernels x lengths, N, P]
-    variances = (power[:, None] / spectrum).sum(2) / (P * m) + math.ulp(0.0)
-    evidence = -P * variances.log() - spectrum.log().sum(2)
+    squares, logs, count = (power[:, None] / spectrum).sum(2) / m, spectrum.log().sum(2), P
+    if deviation is not None:
+        squares, logs, count = squares + _TOLD * deviation**2 / levels, logs + _TOLD * levels.log(), P + _TOLD
+    variances = squares / count + math.ulp(0.0)
+    evidence = -count * variances.log() - logs
     evidence -= improbability(lengths).repeat(len(KERNELS))[:, None]
     return evidence, variances
 

@@ -12,23 +12,33 @@ _SPARE = 5
 _WIDER = 1.3
 """Factor between the numbers of evaluations that are tried."""
 _MOST = 3
-"""Evaluations that are tried at most, over the coefficients."""
+"""Evaluations without noise that are tried at most, over the coefficients."""
+_TOLD = 7
+"""Degrees of freedom of a known deviation: that of eight values at one point."""
+_CHANCE = 2.0
+"""Standard deviations by which the residuals may exceed the noise before the rest is no quadratic."""
+_APART = 3.0
+"""Standard errors by which a wider quadratic in noise may differ from a narrower one."""
 _REACH = 2.0
 """Distance of the farthest evaluation, in units of the width."""
 _RANK = 1e-9
 """Smallest pivot of the design, relative to the largest, with which the evaluations tell all coefficients."""
 
 
-def quadratic_around(x: Tensor, points: Tensor, values: Tensor) -> tuple[LocalModel, float, float] | None:
+def quadratic_around(
+    x: Tensor, points: Tensor, values: Tensor, noise: float = 0.0
+) -> tuple[LocalModel, float, float] | None:
     """Return the least-squares quadratic around x [n], its width, and the relative standard error of its Hessian.
 
     Args:
         x: its centre.
         points: evaluations [P, n], float64.
-        values: their losses [P], without noise; points whose loss is not finite are left out.
+        values: their losses [P]; points whose loss is not finite are left out.
+        noise: standard deviation of repeated losses at one point.
 
-    Of the nearest evaluations, as many are taken as make that error smallest. A quadratic is found exactly. None if
-    the evaluations do not tell one.
+    Of the nearest evaluations, as many are taken as make that error smallest. A quadratic is found exactly, but for the
+    noise. None if the evaluations do not tell one. In noise the widest quadratic is the most precise one, but not of
+    the function at x: the first one that contradicts a narrower one ends the widening (Lepski 1991).
     """
     finite = torch.isfinite(values)
     points, values = points[finite], values[finite]
@@ -36,18 +46,33 @@ def quadratic_around(x: Tensor, points: Tensor, values: Tensor) -> tuple[LocalMo
     coefficients = (n + 1) * (n + 2) // 2
     distance, order = (points - x).norm(dim=1).sort()
     best, least = None, math.inf
+    narrower: list[tuple[Tensor, Tensor]] = []
     count = coefficients + max(_SPARE, n)
-    while count <= min(len(order), _MOST * coefficients + _SPARE + n):
+    most = len(order) if noise else min(len(order), _MOST * coefficients + _SPARE + n)
+    while count <= most:
         sigma = float(distance[count - 1]) / _REACH
         near = order[:count]
-        fitted = _least_squares((points[near] - x) / sigma, values[near]) if sigma > 0.0 else None
+        fitted = _least_squares((points[near] - x) / sigma, values[near], noise) if sigma > 0.0 else None
+        if fitted is not None and noise:
+            found, error = _derivatives(fitted[0], sigma)
+            if any(bool(((found - one).abs() > _APART * width).any()) for one, width in narrower):
+                break
+            narrower.append((found, error))
         if fitted is not None and fitted[1] < least:
             best, least = (fitted[0], sigma, fitted[1]), fitted[1]
-        count = math.ceil(_WIDER * count)
+        wider = math.ceil(_WIDER * count)
+        count = most if noise and count < most < wider else wider
     return best
 
 
-def _least_squares(u: Tensor, values: Tensor) -> tuple[LocalModel, float] | None:
+def _derivatives(model: LocalModel, sigma: float) -> tuple[Tensor, Tensor]:
+    """Return gradient and Hessian diagonal [2n] in units of the points, and their standard errors."""
+    scale = torch.cat([torch.full_like(model.gradient, sigma), torch.full_like(model.gradient, sigma**2)])
+    found = torch.cat([model.gradient, model.hessian.diagonal()])
+    return found / scale, torch.cat([model.gradient_error, model.curvature_error]) / scale
+
+
+def _least_squares(u: Tensor, values: Tensor, noise: float) -> tuple[LocalModel, float] | None:
     """Return a quadratic fitted to values [P] at u [P, n], and the relative standard error of its Hessian."""
     P, n = u.shape
     base = values.min()
@@ -64,9 +89,15 @@ def _least_squares(u: Tensor, values: Tensor) -> tuple[LocalModel, float] | None
     inverse = torch.linalg.solve_triangular(r, torch.eye(len(r), dtype=r.dtype, device=r.device), upper=True)
     target = (values - base) / size
     solution = inverse @ (q.mT @ target)
+    spare = P - design.shape[1]
+    missed = float((target - design @ solution).norm()) * math.sqrt(P / spare)
+    averaged = 0.0
+    if noise:
+        variance = missed**2 / P
+        averaged = (_TOLD * (noise / size) ** 2 + spare * variance) / (_TOLD + spare)
+        missed = math.sqrt(P * max(variance - averaged * (1.0 + _CHANCE * math.sqrt(2.0 / spare)), 0.0))
     # What is not quadratic is no noise: it does not average out over the evaluations (Cauchy and Schwarz).
-    missed = float((target - design @ solution).norm()) * math.sqrt(P / (P - design.shape[1]))
-    error = missed * inverse.norm(dim=1)
+    error = math.hypot(missed, math.sqrt(averaged)) * inverse.norm(dim=1)
     gradient, bend = solution[1 : n + 1], solution[n + 1 :]
     hessian = u.new_zeros(n, n)
     hessian[row, column] = bend

@@ -1,5 +1,6 @@
 """Evaluations that are kept, and the surrogate fitted to them: a control variate for later estimates."""
 
+import math
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -205,7 +206,7 @@ class Memory:
         a, b = ((one - (weight * one).sum(dim, keepdim=True) / count) * weight for one in (a, b))
         pairs = [(a, b), *derivatives]
         new = [[float((one * other).sum()), float(other.square().sum())] for one, other in pairs]
-        if not all(_is_number(one) for moments in new for one in moments):  # the surrogate predicts nonsense
+        if not all(math.isfinite(one) for moments in new for one in moments):  # the surrogate predicts nonsense
             self._moments = []
             return
         if len(self._moments) != len(new):
@@ -274,7 +275,3 @@ def check_memory(memory: Any) -> None:
     """Raise TypeError for what is neither None nor a `Memory`."""
     if memory is not None and not isinstance(memory, Memory):
         raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")
-
-
-def _is_number(value: float) -> bool:
-    return value == value and abs(value) != float("inf")

@@ -14,8 +14,7 @@ from typing import Any
 
 from experiments.methods.settings import ours, paper, rivals
 from experiments.methods.settings.spaces import SPACES, space
-from experiments.methods.settings.table_3 import METHODS as SOURCE
-from experiments.methods.settings.table_3 import TABLE_3, table_3
+from experiments.methods.settings.table_3 import IN_TABLE_3, TABLE_3, table_3
 
 CHANGES: tuple[Mapping[str, Mapping[str, Mapping[str, Any]]], ...] = (
     *(paper.CHOSEN, paper.RETUNED, ours.SEARCH, ours.LOCAL, rivals.TUNED),
@@ -31,7 +30,7 @@ def settings(method: str, task: str) -> dict[str, Any]:
     NAME_source is a method of the source with the settings of Table 3, and with what that leaves open.
     """
     base, _, variant = method.rpartition("_")
-    if variant == "source" and base in SOURCE:
+    if variant == "source" and base in IN_TABLE_3:
         return table_3(base, task) | paper.CHOSEN.get(task, {}).get(base, {})
     found = table_3(method, task)
     for changes in CHANGES:

@@ -5,8 +5,8 @@ from typing import Any
 SEARCHES = ("gaussian_process", "gaussian_process_loss", "descent", "descent_loss")
 """Methods of `experiments.methods.ours`."""
 _SIGMAS: dict[str, dict[str, Any]] = {
-    # tune brdf --method trust_region --runs 100 --over sigma=0.2,0.25,0.36,0.5 and the like, on runs from 1000 upward,
-    # when `trust_region` chose the engine by n: `descent` on BOX10 and BRDF, `gaussian_process` on NONPSD.
+    # tune brdf --method descent --runs 100 --over sigma=0.2,0.25,0.36,0.5
+    # The same for descent on BOX10 and gaussian_process on NONPSD; the values that were tried there were not kept.
     "box10": {"sigma": 0.24},
     "brdf": {"sigma": 0.5},
     "nonpsd": {"sigma": 0.7},

@@ -53,7 +53,7 @@ TABLE_3 = {
         4, 0.5, 0.05, 0.1, Search(10, 0.1, 5, 1e-3, 30), Search(10, 0.1, 5, 1e-3, 30), Search(10, 0.1, 5, 1e-3, 30)
     ),
 }
-METHODS = ("fr22", "our_g", "our_h", "our_hvp", "our_hvpa")
+IN_TABLE_3 = ("fr22", "our_g", "our_h", "our_hvp", "our_hvpa")
 UNITS = {"box2": 1 / 500, "box10": 1 / 500}
 """Length of 1 in Table 3, in the units of our task; 1 where it is not named."""
 
@@ -61,7 +61,7 @@ UNITS = {"box2": 1 / 500, "box10": 1 / 500}
 def table_3(method: str, task: str) -> dict[str, Any]:
     """Return what Table 3 says, in the units of our task; empty where it says nothing."""
     column, unit = TABLE_3.get(task), UNITS.get(task, 1.0)
-    if column is None or method not in METHODS:
+    if column is None or method not in IN_TABLE_3:
         return {}
     if method in ("fr22", "our_g"):
         return {

@@ -18,7 +18,7 @@ from experiments.runs.attempt import attempt
 from experiments.runs.trial import Trial
 
 BASELINES = [
-    *("cma_es", "cma_es_bounded", "cobyqa", "dfo_ls", "bfgs_fd", "lbfgs_fd", "analytic_1", "analytic_2"),
+    *("cma_es", "cma_es_bounded", "cobyqa", "py_bobyqa", "dfo_ls", "bfgs_fd", "lbfgs_fd", "analytic_1", "analytic_2"),
     *("bfgs", "bfgs_wolfe", "lbfgs", "bfgs_damped", "bfgs_adaptive_fd"),
     *("bfgs_frozen", "bfgs_wolfe_frozen", "lbfgs_frozen", "bfgs_damped_frozen", "bfgs_adaptive_fd_frozen"),
 ]
@@ -98,7 +98,7 @@ def test_runs_repeat(name) -> None:
     assert rows() == rows()
 
 
-@pytest.mark.parametrize("name", ["cma_es", "cma_es_bounded", "cobyqa", "dfo_ls"])
+@pytest.mark.parametrize("name", ["cma_es", "cma_es_bounded", "cobyqa", "py_bobyqa", "dfo_ls"])
 def test_the_best_point_is_reported(name) -> None:
     _, rows, _ = run(name)
     losses = [row.loss for row in rows[1:]]
@@ -106,7 +106,7 @@ def test_the_best_point_is_reported(name) -> None:
     assert rows[-1].loss == pytest.approx(rows[-1].image_error)
 
 
-@pytest.mark.parametrize("name", ["cma_es_bounded", "cobyqa", "dfo_ls", "lbfgs_fd"])
+@pytest.mark.parametrize("name", ["cma_es_bounded", "cobyqa", "py_bobyqa", "dfo_ls", "lbfgs_fd"])
 def test_a_plateau_is_left_from_a_random_point_within_the_bounds(name) -> None:
     """All starts of the task lie on the plateau, six wide, and steps are at most one long at first."""
 
@@ -129,7 +129,7 @@ def test_a_plateau_is_left_from_a_random_point_within_the_bounds(name) -> None:
     assert rows[-1].image_error < 1e-3 * rows[0].image_error
 
 
-@pytest.mark.parametrize("name", ["cma_es_bounded", "cobyqa", "dfo_ls", "lbfgs_fd"])
+@pytest.mark.parametrize("name", ["cma_es_bounded", "cobyqa", "py_bobyqa", "dfo_ls", "lbfgs_fd"])
 def test_bounds_are_kept(name) -> None:
     line = Line()
     task = line.task()

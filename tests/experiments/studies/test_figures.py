@@ -12,7 +12,7 @@ from experiments.reports import supplement_figures
 from experiments.reports.animation import Trace
 from experiments.runs.records import Outcome, Record
 from experiments.studies.estimator_curves import Measurement, draw_operators, orders
-from experiments.studies.estimator_methods import ALONE, OPERATORS
+from experiments.studies.estimators import ALONE, OPERATORS
 from experiments.studies.figures import FIGURES, GROUPS, arrivals, figures
 from experiments.studies.gallery import trace
 from experiments.studies.lobes import LOBES, distance, draw, inverse

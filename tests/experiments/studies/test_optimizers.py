@@ -7,7 +7,7 @@ import torch
 
 from experiments.methods import METHODS
 from experiments.problems import bbob
-from experiments.studies.optimizers import OURS, Job, Reached, optimizers, reached, read, report
+from experiments.studies.optimizers import OURS, Job, Reached, optimizers, reached, report, rows
 
 
 @pytest.mark.parametrize("function", [1, 10, 24])
@@ -47,23 +47,24 @@ def test_a_method_that_ends_starts_again():
 
 
 def test_the_command_goes_on_where_it_was(tmp_path, capsys):
-    out = tmp_path / "optimizers.csv"
+    out, parts = tmp_path, tmp_path / "parts.jsonl"
     settings = {"n": (2,), "functions": (1,), "instances": (11,), "budget": 10, "out": out}
     optimizers(methods="ours", **settings)
-    before = out.read_text()
+    before = parts.read_text()
     optimizers(methods="ours,lbfgs_fd", **settings)
-    assert out.read_text().startswith(before)
-    assert len(read(out)) == 2
+    assert parts.read_text().startswith(before)
+    assert len(parts.read_text().splitlines()) == 2
     assert "lbfgs_fd" in capsys.readouterr().out
 
 
 def test_the_table_has_shares():
     jobs = {Job(2, f, 11, 0, "ours", 100): Reached((5,) * count, 1.0) for f, count in ((1, 51), (2, 0))}
-    assert "0.500" in report(jobs)
+    assert rows(jobs) == [[2, "ours: gaussian_process", 0.5, 0.5, 0.5, pytest.approx(1e3 * 2 / 205), 2]]
+    assert "0.5 " in report(jobs)
 
 
 def test_what_is_not_on_the_platform_is_said(tmp_path):
     with pytest.raises(SystemExit, match="n must be one of"):
-        optimizers(n=(4,), functions=(1,), methods="ours", out=tmp_path / "o.csv")
+        optimizers(n=(4,), functions=(1,), methods="ours", out=tmp_path)
     with pytest.raises(SystemExit, match="function must be from 1 to 24, got 25"):
-        optimizers(n=(2,), functions=(25,), methods="ours", out=tmp_path / "o.csv")
+        optimizers(n=(2,), functions=(25,), methods="ours", out=tmp_path)

@@ -17,8 +17,8 @@ from experiments.studies.estimator_choice import (
     rival_gradients,
     summary,
 )
-from experiments.studies.estimator_methods import METHODS, OURS, PAPER
 from experiments.studies.estimator_problems import looked_up, quadrature
+from experiments.studies.estimators import ESTIMATORS, OURS, PAPER
 from experiments.studies.variance import VarianceReport, variance
 
 SOBOL = "aggregate + center, sobol"
@@ -65,7 +65,7 @@ def test_shared_samples_beat_a_sample_set_per_element(report) -> None:
 
 
 def test_budgets_are_kept_and_nearly_used(tmp_path, no_figures) -> None:
-    alone = tuple(method.name for method in METHODS if not method.memory)
+    alone = tuple(method.name for method in ESTIMATORS if not method.memory)
     problems = ("WAVE2", "WAVE10")
     report = variance(runs=2, budgets=(32, 512), problems=problems, methods=alone, out=tmp_path, rivals=0)
     assert len({(m.problem, m.method, m.budget) for m in report.measurements}) == 4 * len(alone)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
-from torch_zerohess.estimation import local_entropy
+from torch_zerohess.estimation.outer import Entropy
 
 
 def identity(z: Tensor) -> Tensor:
@@ -89,7 +89,14 @@ def test_wrong_arguments_say_so() -> None:
 
 
 def test_tempered_losses_never_overflow() -> None:
-    T, m = torch.tensor([1e-30], dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64)
-    assert bool(
-        torch.isfinite(local_entropy.tempered(torch.tensor([[0.0, 1.0, 1e9]], dtype=torch.float64), T, m)).all()
-    )
+    losses, scales = (torch.tensor([row], dtype=torch.float64) for row in ([0.0, 1.0, 1e9], [1e-30, 1.0]))
+    assert bool(torch.isfinite(Entropy(square, 0.1).inner(losses, scales)).all())
+
+
+def test_a_layer_may_be_compiled_before_its_first_call() -> None:
+    smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=1)
+    eager, compiled = (zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(square)) for _ in range(2))
+    x = torch.tensor([[0.7], [1.5]], dtype=torch.float64, requires_grad=True)
+    call = torch.compile(compiled, fullgraph=True, backend="aot_eager")
+    slopes = [torch.autograd.grad(box(x).sum(), x)[0] for box in (call, eager)]
+    torch.testing.assert_close(*slopes)

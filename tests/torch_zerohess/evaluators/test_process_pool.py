@@ -22,6 +22,7 @@ from black_boxes import points
 import torch_zerohess as zh
 from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
 from torch_zerohess.evaluators.batch import MOST, Batch, cut
+from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.process_pool import cores
 from truths import Exponential, PlaneWave, deviation, vector
 
@@ -106,6 +107,9 @@ def test_an_error_comes_with_the_traceback_of_the_worker(pool):
         pool(black_boxes.failing, z)
     assert "black_boxes.py" in str(raised.value.__cause__)
     assert "in failing" in str(raised.value.__cause__)
+    numbers, values = finished_values(raised.value, z)
+    assert numbers[:2] == [0, 1]
+    assert torch.equal(values, z[numbers, 0])
     with pytest.raises(SystemExit, match="done"):
         pool(black_boxes.leaving, z)
     with pytest.raises(OSError, match="the scene is not there"):

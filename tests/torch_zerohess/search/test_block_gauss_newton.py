@@ -9,7 +9,8 @@ import torch
 from searches import run
 
 import torch_zerohess as zh
-from torch_zerohess.search.block_gauss_newton import LENGTHS, damped_steps, renewed
+from torch_zerohess.search.block_gauss_newton import damped_steps, renewed
+from torch_zerohess.search.gauss_newton import LENGTHS
 from truths import vector
 
 

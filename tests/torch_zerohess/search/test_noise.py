@@ -7,6 +7,7 @@ import torch
 from searches import TARGET, bowl, zeros
 
 import torch_zerohess as zh
+from torch_zerohess.search.belief import believed
 from torch_zerohess.search.noise import differs, distinct, lowest_mean, reserved
 from truths import vector
 
@@ -141,6 +142,75 @@ def test_few_evaluations_go_to_the_search_first():
     assert distinct_points(fit) == 6 + 5 + 1  # to measure noise, and samples and a step of the search in noise
 
 
+@pytest.mark.parametrize(("n", "bounds", "spread", "after"), [(2, (-2, 2), 0.1, 12), (5, None, 0.3, 45)])
+def test_an_interrupted_search_returns_what_its_evaluations_support(n, bounds, spread, after):
+    """Over 10 seeds (value - truth) / error has mean 0 within 1, and is rarely above 3."""
+    scores = []
+    for seed in range(10):
+        f = Counted(noisy(seed, spread, lambda z: (z - 0.3).square().sum(1)))
+
+        def fn(z, f=f):
+            if sum(map(len, f.points)) >= after:
+                raise KeyboardInterrupt
+            return f(z)
+
+        fit = zh.minimize(fn, [1.0] * n, sigma=1.0, seed=seed, bounds=bounds, max_evaluations=60)
+        assert fit.status == "interrupted"
+        assert bool((fit.points == fit.x).all(1).any())
+        scores.append((fit.value - float((fit.x - 0.3).square().sum())) / fit.value_error)
+    scores = vector(*scores)
+    assert int((scores.abs() > 3).sum()) <= 1
+    assert abs(float(scores.mean())) < 1.0
+
+
+def test_the_search_by_a_process_believes_few_evaluations():
+    """Four losses that differ by far more than the declared noise: none is taken for noise of a constant."""
+    search = zh.optim.GaussianProcessSearch([1.0, 1.0], sigma=1.0, bounds=(-2, 2), noise=0.1, seed=0)
+    assert len(search.ask()) == 3
+    search.tell([0.993, 2.389, 4.752])
+    next_one = search.ask()
+    search.tell([-0.002])
+    assert torch.equal(search.x, next_one[0])
+    assert search.value == pytest.approx(-0.002, abs=0.2)
+
+
+def test_a_belief_is_of_a_point_that_was_evaluated_and_not_of_the_luckiest_draw():
+    """Over 40 seeds (value - truth) / error has a mean above -1 and a size below 2; the lowest draw lies 1 below."""
+    generator, scores, lowest = torch.Generator().manual_seed(0), [], []
+    for _ in range(40):
+        points = torch.randn(50, 2, generator=generator, dtype=torch.float64)
+        losses = points.square().sum(1) + 0.5 * torch.randn(50, generator=generator, dtype=torch.float64)
+        x, value, error = believed(points, losses, points[int(losses.argmin())], torch.ones(2), 0.5)
+        assert bool((points == x).all(1).any())
+        scores.append((value - float(x.square().sum())) / error)
+        lowest.append(float(losses.min() - points[int(losses.argmin())].square().sum()))
+    assert abs(float(vector(*scores).mean())) < 1.0
+    assert float(vector(*scores).square().mean().sqrt()) < 2.0
+    assert float(vector(*lowest).mean()) < -1.0 * 0.5
+
+
+def test_what_one_point_or_equal_losses_say_is_their_mean():
+    losses = vector(1.0, 3.0, math.nan)
+    x, value, error = believed(TARGET.expand(3, -1), losses, zeros(2), torch.ones(2), 0.4)
+    assert (value, error) == (2.0, pytest.approx(0.4 / math.sqrt(2)))
+    assert torch.equal(x, TARGET)
+    points = torch.stack([TARGET, -TARGET, zeros(2)])
+    assert believed(points, torch.ones(3).double(), zeros(2), torch.ones(2), 0.4)[1:] == (1.0, 0.4 / math.sqrt(3))
+
+
+def test_derivatives_in_noise_and_their_errors():
+    """Over 12 runs (derivative - truth) / error has size 1, and the Hessian is known to a part of it."""
+    scores, errors = [], []
+    for seed in range(12):
+        f = noisy(seed, 0.1, lambda z: (z - 0.3).square().sum(1))
+        fit = zh.minimize(f, [1.0, 1.0], sigma=1.0, seed=seed, max_evaluations=60, noise=0.1)
+        scores.append((fit.gradient - 2 * (fit.x - 0.3)) / fit.standard_errors["gradient"])
+        scores.append((fit.hessian.diagonal() - 2.0) / fit.standard_errors["hessian_diagonal"])
+        errors.append(fit.standard_errors["hessian_diagonal"])
+    assert float(torch.cat(scores).square().mean().sqrt()) == pytest.approx(1.0, abs=5 / math.sqrt(2 * 48))
+    assert float(torch.cat(errors).median()) < 0.3
+
+
 def test_before_the_search_knows_anything_the_value_is_the_mean_at_the_start():
     """Noise was measured with the loss alone: the search that is for noise has other first points."""
     seen = []
@@ -153,8 +223,9 @@ def test_before_the_search_knows_anything_the_value_is_the_mean_at_the_start():
     fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, callback=callback)
     points, values = fit.points, fit.values
     mean = float(values[(points == 0).all(1)].mean())
-    assert seen[0].value == fit.value == mean == pytest.approx(float(bowl(zeros(2)[None])[0]), abs=0.6)
-    assert fit.value_error == fit.noise / math.sqrt(8)
+    assert seen[0].value == fit.value == pytest.approx(mean, abs=0.1)
+    assert mean == pytest.approx(float(bowl(zeros(2)[None])[0]), abs=0.6)
+    assert fit.value_error == pytest.approx(fit.noise / math.sqrt(8), rel=0.2)
     assert torch.equal(fit.x, zeros(2))
 
 
@@ -211,7 +282,8 @@ def test_a_target_that_the_mean_refutes_does_not_end_the_search(target, status):
 
 def test_a_time_limit_holds_in_noise():
     fit = zh.minimize(noisy(0), zeros(2), sigma=2.0, seed=0, max_evaluations=60, time_limit=0.0, noise=0.3)
-    assert (fit.status, fit.evaluations, fit.value_error) == ("time", 3, 0.3)
+    assert (fit.status, fit.evaluations) == ("time", 3)
+    assert 0.1 < fit.value_error < 0.4
 
 
 @pytest.mark.parametrize("batch", [1, 2, 5])

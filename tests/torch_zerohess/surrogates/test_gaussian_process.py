@@ -117,6 +117,24 @@ def test_the_evidence_is_the_likelihood_and_the_prior_of_the_length():
                 assert float(same) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
+def test_a_known_deviation_counts_as_seven_values_of_noise_alone():
+    points, noises, deviation = 1.5 * normal(9, 2), NOISES + HIGH_NOISES, 0.3
+    change = normal(9, 1, seed=3)
+    change = change / change.abs().max()
+    evidence, variances = grid_evidence(points, change, noises, deviation)
+    every = torch.cat([change[:, 0], torch.full((7,), deviation, dtype=torch.float64)])
+    for k, kernel in enumerate(KERNELS):
+        for i, length in enumerate(LENGTHS):
+            for j, noise in enumerate(noises):
+                K = noise * torch.eye(16, dtype=torch.float64)
+                K[:9, :9] += by_hand(kernel, points / length, points / length)
+                variance = float(every @ torch.linalg.solve(K, every)) / 16
+                likelihood = MultivariateNormal(torch.zeros(16).double(), variance * K).log_prob(every)
+                expected = 2 * float(likelihood) + 16 * (math.log(2 * math.pi) + 1) - (math.log(length) / 1.5) ** 2
+                assert float(evidence[len(LENGTHS) * k + i, j]) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+                assert float(variances[len(LENGTHS) * k + i, j]) == pytest.approx(variance, rel=1e-6)
+
+
 def test_the_evidence_of_one_length_per_parameter():
     points, each, noise = normal(9, 3), vector(0.5, 1.0, 3.0), torch.tensor(0.01).double()
     change = waves(points) - waves(points).mean(0)

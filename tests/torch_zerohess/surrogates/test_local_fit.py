@@ -102,3 +102,31 @@ def test_more_evaluations_are_taken_where_the_nearest_tell_nothing():
     model, sigma, error = quadratic_around(x, points, 1e4 + f(points))
     assert float((model.full_hessian() / sigma**2 - hessian).norm()) < 1e-6 * float(hessian.norm())
     assert error < 1e-6
+
+
+def scores_in_noise(third, runs=60, count=80):
+    """(derivative - truth) / error of |z|^2 + third z^3 with noise 0.1 at 0, and the errors of the Hessian."""
+    generator, scores, errors = torch.Generator().manual_seed(0), [], []
+    for _ in range(runs):
+        lengths = torch.rand(count, 1, generator=generator, dtype=torch.float64)
+        points = lengths * torch.randn(count, 2, generator=generator, dtype=torch.float64)
+        values = points.square().sum(1) + third * points.pow(3).sum(1)
+        values += 0.1 * torch.randn(count, generator=generator, dtype=torch.float64)
+        model, sigma, _ = quadratic_around(points.new_zeros(2), points, values, 0.1)
+        slope, bend = model.full_errors()
+        scores.append(torch.cat([model.gradient / slope, (model.hessian.diagonal() - 2 * sigma**2) / bend]))
+        errors.append(bend / sigma**2)
+    return torch.stack(scores), torch.cat(errors)
+
+
+def test_standard_errors_in_noise_are_true_of_a_quadratic():
+    """The size of 240 scores is 1, within 5 standard errors, and the evaluations are used."""
+    scores, errors = scores_in_noise(0.0)
+    assert float(scores.square().mean().sqrt()) == pytest.approx(1.0, abs=5 / math.sqrt(2 * scores.numel()))
+    assert float(errors.median()) < 0.1
+
+
+def test_a_third_derivative_in_noise_narrows_the_quadratic():
+    """Of all 80 evaluations the error would be 6 standard errors."""
+    scores, _ = scores_in_noise(0.3)
+    assert float(scores.square().mean().sqrt()) < 3.0

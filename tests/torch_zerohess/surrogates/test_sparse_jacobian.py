@@ -23,6 +23,12 @@ def sparse_map(m, n, s, seed=0):
     return torch.zeros(m, n).double().scatter_(1, places, sizes)
 
 
+def explained_by(J, u, changes):
+    """Share of the changes [K, m] along u [K, n], less their mean, that a Jacobian predicts."""
+    u, changes = u - u.mean(0), changes - changes.mean(0)
+    return 1.0 - float((changes - u @ J.dense().mT).square().sum() / changes.square().sum())
+
+
 def random_jacobian():
     """A Jacobian of outputs [2, 3] of 7 parameters with 3 entries per row, and the same as a matrix [6, 7]."""
     index, used = largest(torch.arange(6).repeat_interleave(3), torch.arange(18) % 7, torch.ones(18), 6, 4)

@@ -16,7 +16,7 @@ _EARLIER = 4
 
 
 @dataclass(frozen=True)
-class Method:
+class Estimator:
     """One way to estimate; `difference` takes the HVP by finite differences of gradients instead."""
 
     name: str
@@ -121,32 +121,32 @@ class _Untrained(torch.nn.Module):
         return out
 
 
-METHODS = (
-    Method(OURS, "aggregate", "center"),
-    Method("auto", "auto", "auto", sampler="auto", antithetic="auto"),
-    Method("aggregate + center, sobol", "aggregate", "center", sampler="sobol"),
-    Method("aggregate + center, orthogonal", "aggregate", "center", sampler="orthogonal"),
-    Method("aggregate + center, memory", "aggregate", "center", memory="process"),
-    Method("aggregate + center, untrained network", "aggregate", "center", memory="untrained"),
-    Method("aggregate + mean", "aggregate", "mean"),
-    Method("aggregate + none", "aggregate", "none"),
-    Method("gaussian + center", "gaussian", "center"),
-    Method("gaussian + center, sobol", "gaussian", "center", sampler="sobol"),
-    Method("gaussian + center, orthogonal", "gaussian", "center", sampler="orthogonal"),
-    Method("gaussian + none", "gaussian", "none"),
-    Method(PAPER, "optimal", "none"),
-    Method("per-element + none, unpaired", "optimal", "none", antithetic=False),
-    Method("per-element + center", "optimal", "center"),
-    Method("uniform + none", "uniform", "none"),
-    Method("uniform + center", "uniform", "center"),
-    Method("differences, independent", "aggregate", "center", difference="independent"),
-    Method("differences, common", "aggregate", "center", difference="common"),
+ESTIMATORS = (
+    Estimator(OURS, "aggregate", "center"),
+    Estimator("auto", "auto", "auto", sampler="auto", antithetic="auto"),
+    Estimator("aggregate + center, sobol", "aggregate", "center", sampler="sobol"),
+    Estimator("aggregate + center, orthogonal", "aggregate", "center", sampler="orthogonal"),
+    Estimator("aggregate + center, memory", "aggregate", "center", memory="process"),
+    Estimator("aggregate + center, untrained network", "aggregate", "center", memory="untrained"),
+    Estimator("aggregate + mean", "aggregate", "mean"),
+    Estimator("aggregate + none", "aggregate", "none"),
+    Estimator("gaussian + center", "gaussian", "center"),
+    Estimator("gaussian + center, sobol", "gaussian", "center", sampler="sobol"),
+    Estimator("gaussian + center, orthogonal", "gaussian", "center", sampler="orthogonal"),
+    Estimator("gaussian + none", "gaussian", "none"),
+    Estimator(PAPER, "optimal", "none"),
+    Estimator("per-element + none, unpaired", "optimal", "none", antithetic=False),
+    Estimator("per-element + center", "optimal", "center"),
+    Estimator("uniform + none", "uniform", "none"),
+    Estimator("uniform + center", "uniform", "center"),
+    Estimator("differences, independent", "aggregate", "center", difference="independent"),
+    Estimator("differences, common", "aggregate", "center", difference="common"),
 )
-NAMES = tuple(method.name for method in METHODS)
+NAMES = tuple(method.name for method in ESTIMATORS)
 OPERATORS = tuple(
     f"{kind} + {baseline}" for kind in ("uniform", "aggregate", "per-element") for baseline in ("none", "center")
 )
 """Ways to estimate in figure 11."""
 FIRST_ORDER = ", first order"
 """Ends the names of those that estimate the gradient alone."""
-ALONE = tuple(replace(one, name=one.name + FIRST_ORDER, order=1) for one in METHODS if one.name in OPERATORS)
+ALONE = tuple(replace(one, name=one.name + FIRST_ORDER, order=1) for one in ESTIMATORS if one.name in OPERATORS)

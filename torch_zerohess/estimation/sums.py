@@ -14,7 +14,7 @@ from torch_zerohess.smoothing import Smoothing
 
 
 @dataclass(frozen=True)
-class Batch:
+class Sums:
     """Evaluations, and the settings that they were drawn with. All results are float64 and in units of sigma."""
 
     evaluations: Evaluations
@@ -62,7 +62,7 @@ class Batch:
         return (((f - origin) - ((f - origin) * share).sum(1, keepdim=True)) * share).mT.contiguous()
 
 
-def combined(batches: Sequence[Batch], of: Callable[[Batch], Tensor]) -> Tensor:
+def combined(batches: Sequence[Sums], of: Callable[[Sums], Tensor]) -> Tensor:
     """Return the mean of a sum over independent batches, each weighted by its number of rows."""
     if len(batches) == 1:
         return of(batches[0])
@@ -70,7 +70,7 @@ def combined(batches: Sequence[Batch], of: Callable[[Batch], Tensor]) -> Tensor:
     return torch.stack([of(one) * (count / sum(rows)) for one, count in zip(batches, rows, strict=True)]).sum(0)
 
 
-def combined_spread(batches: Sequence[Batch], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
+def combined_spread(batches: Sequence[Sums], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the standard error of the mean over independent batches, and its degrees of freedom (Satterthwaite)."""
     rows = [one.evaluations.share.shape[1] for one in batches]
     error, inverse = torch.zeros((), device="cpu"), torch.zeros((), device="cpu")

@@ -1,0 +1,137 @@
+"""What an interruption inside a batch of `minimize` keeps: every value that is known, in the result and in the file."""
+
+import concurrent.futures
+
+import pytest
+import torch
+from searches import raising, tilted, zeros
+
+import torch_zerohess as zh
+from torch_zerohess.evaluators import Executor
+from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.factory import Each
+from torch_zerohess.evaluators.finished import finished_values, keep_finished
+
+SETTINGS = {"sigma": 2.0, "seed": 0, "vectorized": False, "max_evaluations": 20}
+
+
+class Point:
+    """A function of one point, with noise if any; the given call of it (from 0) raises before it draws."""
+
+    def __init__(self, call=-1, error=KeyboardInterrupt, noise=0.0):
+        self.call, self.error, self.noise, self.calls, self.values = call, error, noise, 0, []
+        self.generator = torch.Generator().manual_seed(0)
+
+    def __call__(self, x):
+        self.calls += 1
+        if self.calls - 1 == self.call:
+            raise self.error
+        draw = torch.randn((), generator=self.generator, dtype=torch.float64)
+        self.values.append(float(tilted(x[None])[0] + self.noise * draw))
+        return self.values[-1]
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_every_value_that_is_known_is_kept_and_paid_once(noise, bounds, tmp_path):
+    """Wherever it is interrupted, a search goes on to the bits that it would have had, also to those of the noise."""
+    whole = zh.minimize(Point(noise=noise), zeros(2), bounds=bounds, **SETTINGS)
+    for k in range(1, 20, 2 if bounds is None else 5):
+        path, memory = tmp_path / f"{k}.pt", zh.Memory()
+        f = Point(k, noise=noise)
+        part = zh.minimize(f, zeros(2), bounds=bounds, checkpoint=path, memory=memory, **SETTINGS)
+        assert (part.status, part.evaluations, part.values.tolist()) == ("interrupted", k, f.values)
+        assert torch.equal(memory.points, part.points)
+        assert torch.equal(part.points, whole.points[:k])
+        assert noise or part.value == min(f.values)
+        rest = zh.minimize(f, zeros(2), bounds=bounds, checkpoint=path, memory=memory, **SETTINGS)
+        assert f.calls == 1 + whole.evaluations
+        assert torch.equal(rest.points, whole.points)
+        assert torch.equal(rest.values, whole.values)
+        assert torch.equal(memory.points, whole.points)
+        assert (rest.value, rest.value_error, rest.message) == (whole.value, whole.value_error, whole.message)
+        assert torch.equal(rest.x, whole.x)
+
+
+def test_an_exception_keeps_them_too(tmp_path):
+    f = Point(2, ZeroDivisionError)
+    with pytest.raises(ZeroDivisionError) as caught:
+        zh.minimize(f, zeros(2), checkpoint=tmp_path / "search.pt", **SETTINGS)
+    found = caught.value.minimum
+    assert (found.status, found.evaluations, found.value) == ("failed", 2, min(f.values))
+    assert found.gradient is None
+    zh.minimize(f, zeros(2), checkpoint=tmp_path / "search.pt", **SETTINGS)
+    assert f.calls == 1 + 20
+
+
+def test_outputs_are_kept_where_the_loss_raises(tmp_path):
+    """Their losses are not known: the file has them, the result has not."""
+    calls = []
+
+    def output(x):
+        calls.append(x)
+        return torch.stack([x.sum() - 1.0, x.prod(), x[0]])
+
+    for call in (0, 4):
+        calls.clear()
+        settings = {**SETTINGS, "checkpoint": tmp_path / f"{call}.pt", "max_evaluations": 15}
+        with pytest.raises(ZeroDivisionError) as caught:
+            zh.minimize(output, zeros(2), loss=raising(lambda y: y.square().sum(), call), **settings)
+        assert hasattr(caught.value, "minimum") == (call > 0)
+        fit = zh.minimize(output, zeros(2), loss=lambda y: y.square().sum(), **settings)
+        assert len(calls) == fit.evaluations == 15
+
+
+def test_an_interrupted_batch_that_is_larger_than_what_is_left(tmp_path):
+    f, path = Point(4), tmp_path / "search.pt"
+    zh.minimize(f, zeros(2), batch=8, checkpoint=path, **SETTINGS)
+    fit = zh.minimize(f, zeros(2), batch=8, checkpoint=path, **{**SETTINGS, "max_evaluations": 5})
+    assert (fit.status, fit.evaluations, f.calls) == ("budget", 4, 5)
+    assert fit.message.startswith("max_evaluations (5) allows no step after the 4 so far")
+
+
+def test_evaluators_keep_them_by_number():
+    """A pool of threads, and what a pool of processes knows of a call."""
+
+    def fn(z):
+        if float(z[0, 0]) == 2.0:
+            raise ZeroDivisionError
+        return z.sum(1)
+
+    points = torch.arange(4.0)[:, None]
+    with concurrent.futures.ThreadPoolExecutor(1) as threads:
+        with pytest.raises(ZeroDivisionError) as caught:
+            Executor(threads)(fn, points)
+        numbers, values = finished_values(caught.value, points)
+    assert numbers[:2] == [0, 1]
+    assert values.tolist() == [float(k) for k in numbers]
+    batch = Batch(points, 0, most=2)
+    batch.came(batch.take(), vector_of(0, 1))
+    assert {k: float(one) for k, one in batch.known.items()} == {0: 0.0, 1: 1.0}
+
+
+def vector_of(*numbers):
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def test_only_the_values_of_the_own_call_are_taken():
+    """A black box may make calls itself, whose exceptions carry their values."""
+    points, error = torch.zeros(3, 2), ZeroDivisionError()
+    keep_finished(error, points, {1: torch.tensor(2.0), 0: torch.tensor(1.0)})
+    numbers, values = finished_values(error, points)
+    assert (numbers, values.tolist()) == ([0, 1], [1.0, 2.0])
+    assert finished_values(error, points.clone())[0] == []
+    keep_finished(error, points, {0: torch.zeros(2), 1: torch.zeros(3)})
+    assert finished_values(error, points)[0] == []
+    assert finished_values(ValueError(), points)[0] == []
+
+
+def test_a_function_may_return_one_buffer_for_every_point():
+    buffer = torch.zeros(2)
+
+    def fn(x):
+        buffer.copy_(x)
+        return buffer
+
+    points = torch.arange(6.0).view(3, 2)
+    assert torch.equal(Each(fn)(points), points)

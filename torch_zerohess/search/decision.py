@@ -1,0 +1,60 @@
+"""Which of the best points in noise has the lowest mean."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.noise import distinct, lowest_mean
+
+_OTHERS = 2
+"""Points with low values, besides the best one and where the search is, that may be best in noise."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Which of the best points in noise has the lowest mean, its mean, and the standard error of that."""
+
+    x: Tensor
+    value: float
+    error: float
+    evaluations: int
+    """With those for the decision."""
+
+
+def decide(
+    evaluate: Callable[[Tensor], Tensor],
+    points: Tensor,
+    losses: Tensor,
+    likely: list[Tensor],
+    before: int,
+    most: int,
+    noise: float,
+) -> tuple[Tensor, float, float] | None:
+    """Evaluate the best points again; return the one with the lowest mean, that, and its standard error.
+
+    Args:
+        evaluate: points [K, n] -> losses [K].
+        points: all evaluations [P, n], in order.
+        losses: [P].
+        likely: points [n] that may be best.
+        before: evaluations before the decision. Those after it are of a decision that was interrupted: where they are
+            of the same points they are not made again.
+        most: evaluations that the decision gets.
+        noise: standard deviation of a loss.
+    """
+    lowest = torch.where(torch.isfinite(losses), losses, torch.inf)[:before].argsort()[:_OTHERS]
+    candidates = distinct([*likely, *points[lowest]])
+    there, values = points[before:], losses[before:]
+
+    def again(asked: Tensor) -> Tensor:
+        nonlocal there, values
+        count = min(len(asked), len(there))
+        while not torch.equal(asked[:count], there[:count]):
+            count -= 1
+        known, there, values = values[:count], there[count:], values[count:]
+        return torch.cat([known, evaluate(asked[count:])]) if count < len(asked) else known
+
+    found = lowest_mean(again, candidates, most, noise)
+    return None if found is None else (candidates[found[0]], *found[1:])

@@ -1,0 +1,158 @@
+"""What searches by Gauss-Newton have in common: samples tell the Jacobian of an output, then steps are tried.
+
+Steps of several lengths are evaluated together. The best of them is taken if it lowers the loss, and its length is the
+radius of the next ones; otherwise the radius shrinks. A search says how the Jacobian is sampled, kept and solved.
+"""
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.method import Method
+from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.surrogates.quadratic import LocalModel
+
+LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
+"""Of the steps that are tried, in units of the radius."""
+_REFUSED = 0.4
+"""Factor of the radius where no step lowers the loss."""
+_ENDLESS = 10
+"""Batches in a row with values that are not finite, after which the search ends."""
+
+Q = TypeVar("Q", bound="JacobianProgress")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JacobianProgress(Progress):
+    """An output, and what is asked for to go on. A search adds the Jacobian there."""
+
+    phase: Literal["sample", "trial"] = "sample"
+    """What is asked for: samples, after the start itself at first, or steps."""
+    radius: float
+    """Root mean square over the parameters."""
+    output: Tensor
+    """At the center [m], float64; empty before the first values."""
+    refused: int = 0
+    """Batches in a row without a finite value."""
+
+    def counted(self: Q, evaluated: Evaluated) -> Q:
+        """Return what is known with a batch counted; it is done after too many batches without a finite value."""
+        refused = 0 if bool(evaluated.finite.any()) else self.refused + 1
+        known = replace(self, shape=evaluated.shape, evaluations=self.evaluations + len(evaluated), refused=refused)
+        if refused < _ENDLESS:
+            return known
+        return replace(known, done=True, message=f"{_ENDLESS} batches in a row had no finite value")
+
+
+class GaussNewton(Method[Q]):
+    """A search that samples the Jacobian of an output and tries steps, in units of its sigma."""
+
+    radius: float
+    """The first one."""
+
+    @abstractmethod
+    def begun(self) -> Q:
+        """Return what is known before the first values."""
+
+    @abstractmethod
+    def samples(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
+        """Ask for samples [K, n] around the center."""
+
+    @abstractmethod
+    def renewed(self, known: Q, evaluated: Evaluated) -> Q:
+        """Renew the Jacobian by samples with finite values, and say in `phase` what follows."""
+
+    @abstractmethod
+    def steps(self, known: Q, radii: Tensor) -> Tensor:
+        """Return a step [k, n] within each of the radii [k]."""
+
+    @abstractmethod
+    def moved(self, known: Q, step: Tensor, change: Tensor) -> Q:
+        """Return what is known after a step [n] that changed the output by [m], with the old Jacobian until now."""
+
+    @abstractmethod
+    def distance(self, radius: float) -> float:
+        """Return the sigma of the samples that go with a radius."""
+
+    @abstractmethod
+    def derivatives_at_center(self, known: Q) -> tuple[Tensor, Tensor] | None:
+        """Return gradient [n] and Hessian [n, n] of the loss; None where they are not known, or too large."""
+
+    def first(self, generator: torch.Generator) -> tuple[Q, Tensor]:
+        """Ask for the start and samples around it."""
+        known, points = self.samples(self.begun(), generator)
+        return known, torch.cat([known.center[None], points])
+
+    def next(self, known: Q, evaluated: Evaluated, generator: torch.Generator) -> tuple[Q, Tensor]:
+        """Renew the Jacobian by samples, or take the best step; then ask for what follows."""
+        known = known.counted(evaluated)
+        if not known.done and known.phase == "sample":
+            known = self.sampled(known, evaluated)
+        elif not known.done:
+            known = self.taken(known, evaluated.those(evaluated.finite))
+        if known.done:
+            return known, known.center[None][:0]
+        return self.step(known) if known.phase == "trial" else self.samples(known, generator)
+
+    def sampled(self, known: Q, evaluated: Evaluated) -> Q:
+        """Renew the Jacobian by samples, the first of which is the start at the beginning."""
+        assert evaluated.outputs is not None
+        if not len(known.output):
+            best = replace(known.best, loss=float(evaluated.losses[0]))
+            known = replace(known, output=evaluated.outputs[0].clone(), best=best)
+            evaluated = evaluated.those(slice(1, None))
+        return self.renewed(known, evaluated)
+
+    def step(self, known: Q) -> tuple[Q, Tensor]:
+        """Ask for steps of all lengths."""
+        radii = known.center.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
+        points = known.center + self.steps(known, radii)
+        return known, points.clamp(self.settings.lower, self.settings.upper)
+
+    def taken(self, known: Q, evaluated: Evaluated) -> Q:
+        """Go to the best of the steps with finite values if it lowers the loss."""
+        known = replace(known, iterations=known.iterations + 1, phase="sample")
+        k = int(evaluated.losses.argmin()) if len(evaluated) else -1
+        if k >= 0 and float(evaluated.losses[k]) < known.best.loss:
+            assert evaluated.outputs is not None
+            point, output = evaluated.points[k].clone(), evaluated.outputs[k].clone()
+            step, change = point - known.center, output - known.output
+            best = Best(point, float(evaluated.losses[k]), known.sigma)
+            radius = float(step.norm()) / math.sqrt(self.settings.n)
+            known = self.moved(replace(known, best=best, center=point, radius=radius, output=output), step, change)
+        else:
+            known = replace(known, radius=_REFUSED * known.radius)
+        if known.radius < self.settings.tolerance:
+            known = self.arrived(known)
+        return replace(known, sigma=self.distance(known.radius))
+
+    def arrived(self, known: Q) -> Q:
+        """Start again with the first radius, or end."""
+        rounds = known.rounds + 1
+        if rounds > self.settings.restarts:
+            message = f"steps were below {self.settings.tolerance} of sigma, {rounds} times"
+            return replace(known, rounds=rounds, done=True, message=message)
+        return replace(known, rounds=rounds, radius=self.radius, phase="sample")
+
+    def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
+        """The model of the latest Jacobian, which is one at the center, without standard errors.
+
+        None around another point, and where the derivatives are not known there.
+        """
+        derivatives = self.derivatives_at_center(known) if torch.equal(known.best.point, known.center) else None
+        if derivatives is None:
+            return None
+        gradient, hessian = derivatives
+        sigma, unknown = known.sigma, torch.full_like(known.center, math.inf)
+        model = LocalModel(known.best.loss, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
+        return model, sigma
+
+
+def check_share(name: str, value: float, most: float) -> None:
+    """Raise ValueError for a value that is not above 0, finite and at most `most`."""
+    if not 0.0 < value <= most or value == math.inf:
+        raise ValueError(f"{name} must be above 0 and at most {most}, got {value}")

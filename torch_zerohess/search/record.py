@@ -1,0 +1,119 @@
+"""Every evaluation of a search in order, and the values that an interrupted request has left."""
+
+import contextlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Call = Callable[[Tensor], tuple[list[int], Tensor, BaseException | None]]
+"""Evaluate points [K, n]: the numbers of those that have a value, these values [k, *out], and what was raised."""
+
+
+class Record:
+    """Evaluations in batches, each of one request.
+
+    Args:
+        call: evaluates points.
+        losses: of values [K, *out], [K].
+        x0: [n], whose type and device points have.
+    """
+
+    def __init__(self, call: Call, losses: Callable[[Tensor], Tensor], x0: Tensor) -> None:
+        self._call, self._losses = call, losses
+        self.requested: Tensor | None = None
+        """Points [K, n] that are being evaluated; None between two requests."""
+        self._numbers, self._values = list[int](), x0.new_empty(0)
+        self._batches = [(x0[None][:0], x0.new_empty(0, dtype=torch.float64))]
+        self._open: tuple[Tensor, Tensor] | None = None
+        self.last = self._batches[0]
+        """Points [K, n] and losses [K] of the last complete request."""
+        self.complete = 0
+        """Evaluations of complete requests."""
+
+    @property
+    def known(self) -> int:
+        """How far the request has got: the number after the last point that has a value."""
+        return max(self._numbers, default=-1) + 1
+
+    @property
+    def due(self) -> int:
+        """Points of the request that have no value yet."""
+        return 0 if self.requested is None else len(self.requested) - len(self._numbers)
+
+    @property
+    def told(self) -> tuple[Tensor, Tensor]:
+        """All points [evaluations, n] and their losses [evaluations], those of an interrupted request at the end."""
+        if len(self._batches) > 1:
+            self._batches = [_joined(self._batches)]
+        return _joined([*self._batches, self._interrupted]) if self._numbers else self._batches[0]
+
+    @property
+    def evaluations(self) -> int:
+        """How many there are, with those of an interrupted request."""
+        return self.complete + (len(self._interrupted[1]) if self._numbers else 0)
+
+    @property
+    def _interrupted(self) -> tuple[Tensor, Tensor]:
+        """Points [k, n] and losses [k] of the request, as far as they are known; none if the loss raises."""
+        if self._open is None:
+            assert self.requested is not None
+            self._open = self.requested[:0], self._batches[0][1][:0]
+            with contextlib.suppress(Exception):  # it is in the file, without losses
+                self._open = self.requested[sorted(self._numbers)], self._losses(self._sorted())
+        return self._open
+
+    def values(self, points: Tensor) -> Tensor:
+        """Return the values [K, *out] of points [K, n]; what is known of the request is not evaluated again.
+
+        The request stays open until `note`. Further points may be added to it.
+        """
+        self.requested, self._open = points, None
+        missing = [k for k in range(len(points)) if k not in self._numbers]
+        if missing:
+            numbers, values, error = self._call(points[missing])
+            if numbers:
+                self._values = torch.cat([self._values, values]) if self._numbers else values
+                self._numbers += [missing[k] for k in numbers]
+            if error is not None:
+                raise error
+        return self._sorted()[: len(points)]
+
+    def note(self, points: Tensor, losses: Tensor) -> None:
+        """Add points [K, n] and losses [K] to the record, and close the request."""
+        self.last = points, losses
+        self._batches.append(self.last)
+        self.complete += len(points)
+        self.requested, self._numbers, self._values = None, [], self._values[:0]
+
+    def note_known(self) -> None:
+        """Add what is known of the request, and close it."""
+        if self.requested is not None:
+            self.note(*self._interrupted)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything, for `load_state_dict`."""
+        points, losses = _joined(self._batches)
+        request = None if self.requested is None else (self.requested, list(self._numbers), self._values)
+        return {"points": points, "values": losses, "request": request}
+
+    def load_state_dict(self, state: dict[str, Any], like: Tensor) -> None:
+        """Go on from a state, on the device of x `like` [n]. ValueError if its points have another type."""
+        points, losses = state["points"], state["values"]
+        if points.dtype != like.dtype:
+            raise ValueError(f"x0 must be {points.dtype} as there, got {like.dtype}")
+        self._batches, self.complete = [(points.to(like.device), losses.to(like.device))], len(points)
+        if state["request"] is not None:
+            requested, self._numbers, values = state["request"]
+            self.requested, self._values = requested.to(like.device), values.to(like.device)
+
+    def _sorted(self) -> Tensor:
+        """The values that are known [k, *out], in the order of their points."""
+        order = sorted(range(len(self._numbers)), key=self._numbers.__getitem__)
+        return self._values if order == list(range(len(order))) else self._values[order]
+
+
+def _joined(batches: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    points, losses = zip(*batches, strict=True)
+    return torch.cat(points), torch.cat(losses)

@@ -29,8 +29,6 @@ _WIDTH = 0.3
 _PATIENCE, _QUADRATIC_PATIENCE = 3, 5
 """Evaluations over n + 1 in which the process, and the quadratics, must find something better: a curved valley refuses
 several steps in a row."""
-_TURN = 16
-"""Evaluations over n + 1 after which it is the turn of the quadratics although the process finds better points."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,8 +45,6 @@ class LossProgress(ProcessProgress):
     """Short steps of the process in a row."""
     waited: int = 0
     """Evaluations since something better was found."""
-    searched: int = 0
-    """Evaluations of the process in a row."""
 
     def is_minimum(self, tolerance: float) -> bool:
         return torch.equal(self.solved, self.best.point) and ProcessProgress.is_minimum(self, tolerance)
@@ -99,11 +95,10 @@ class LossProcess(ProcessMethod[LossProgress]):
             known,
             steps=known.steps + 1 if known.moved < _NEAR else 0,
             waited=0 if known.best.loss < before else known.waited + count,
-            searched=known.searched + count,
         )
-        nothing, n = evaluated.points[:0], self.settings.n
+        nothing = evaluated.points[:0]
         new = float((known.best.point - known.finished).norm()) > APART
-        turn = known.steps >= _STEPS or known.waited >= self._patience or known.searched >= _TURN * (n + 1)
+        turn = known.steps >= _STEPS or known.waited >= self._patience
         if not turn or known.noisy or known.done:
             return known, nothing
         if new:
@@ -111,7 +106,7 @@ class LossProcess(ProcessMethod[LossProgress]):
             quadratics, points = self._finish.plan(begun, generator)
         else:
             quadratics, points = self._finish.elsewhere(generator)
-        return replace(known, quadratics=quadratics, finishing=True, steps=0, waited=0, searched=0), points
+        return replace(known, quadratics=quadratics, finishing=True, steps=0, waited=0), points
 
     def _after_quadratics(
         self, known: LossProgress, before: MetricProgress, evaluated: Evaluated, generator: torch.Generator

@@ -7,10 +7,6 @@ from torch import Tensor
 
 from torch_zerohess.search.descent_progress import WIDEST, DescentProgress
 
-_DECREASE = 1e-3
-"""Part of the loss by which it must fall for a move; or less,"""
-_PROMISED = 0.1
-"""this part of the decrease that the model promises, as the loss may have a large offset."""
 _SLACK = 2.0
 """Standard deviations of the noise within which a decrease does not count."""
 _LONG, _GOOD, _GROWTH = 0.9, 0.5, 1.2
@@ -30,9 +26,8 @@ def after_loss(known: DescentProgress, point: Tensor, loss: float, noise: float)
     slack = _SLACK * noise
     promised = model.decrease(known.step)
     ratio = (known.value - loss + slack) / (promised + slack) if promised + slack > 0.0 else -math.inf
-    least = min(_DECREASE * abs(known.value), _PROMISED * max(promised, 0.0))
     lowest = known.lowest.loss
-    if min(loss, lowest) < known.value - max(least, slack):
+    if min(loss, lowest) < known.value - slack:
         sigma = known.sigma
         if loss <= lowest and known.length > _LONG and ratio > _GOOD:
             sigma *= _GROWTH

@@ -1,6 +1,7 @@
 """Local Gauss-Newton, and the choice by evidence, on problems whose solution is known in closed form."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from searches import run
 
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
+from torch_zerohess.search.gauss_newton import LENGTHS
 
 SIDE = 12
 N = SIDE**2
@@ -42,6 +44,31 @@ def test_texels_are_found_after_one_batch_of_samples():
     assert search.value < 1e-4
     assert search.jacobian.explained > 0.99
     torch.testing.assert_close(search.jacobian.dense().view(N, N), torch.eye(N), atol=1e-2, rtol=0)
+
+
+def rough(x):
+    """A ripple in every pixel that is as large as the texel, and that samples do not resolve."""
+    return image(x) + torch.sin(40 * image(x))
+
+
+@pytest.mark.parametrize(("f", "radius", "asked"), [(image, 1.0, 6), (rough, 0.5, 32)])
+def test_a_jacobian_that_predicts_well_is_trusted_in_long_steps_and_kept(f, radius, asked):
+    """Its first steps are twice as long, and further steps follow them; otherwise samples do."""
+    search = search_for(f, 3 * normal(N))
+    search.tell(f(search.ask()))
+    points = search.ask()
+    lengths = (points - search.x).norm(dim=1) / math.sqrt(N)
+    assert lengths.tolist() == pytest.approx([radius * one for one in LENGTHS])
+    search.tell(f(points))
+    assert len(search.ask()) == asked
+
+
+@pytest.mark.parametrize(("explained", "agreed"), [(0.4, 0), (0.6, 1)])
+def test_the_end_of_a_round_is_a_minimum_where_the_jacobian_predicts(explained, agreed):
+    search = run(search_for(image, normal(N)), image, 39)
+    known = search._state.progress
+    known = replace(known, jacobian=replace(known.jacobian, explained=explained))
+    assert search._method.arrived(known).agreed == agreed
 
 
 def test_overlapping_footprints():

@@ -88,3 +88,26 @@ def test_rounds_that_arrive_at_one_point_agree():
     run(two, lambda z: (z[:, 0].square() - 4).square() + z[:, 0], 10_000)  # minima at -2.03 and 1.97
     assert two.agreed < 3
     assert float(two.x) == pytest.approx(-2.0305, abs=1e-3)
+
+
+def test_a_batch_has_ends_of_shorter_and_longer_steps():
+    """Of a linear function every step ends on the edge of its region: these are 1, 2, 1/2, 4 and 1/4 as wide."""
+    search = Descent(zeros(3), sigma=0.5, seed=0)
+    search.tell(search.ask() @ vector(1.0, 2.0, 3.0))
+    search.tell(search.ask() @ vector(1.0, 2.0, 3.0))
+    progress = search.state_dict()["progress"]
+    assert progress["phase"] == "trial"
+    steps = (search.ask(8)[:5] - search.x) / 0.5
+    lengths = torch.linalg.solve(progress["root"], steps.mT).norm(dim=0) / progress["sigma"]
+    torch.testing.assert_close(lengths, vector(1.0, 2.0, 0.5, 4.0, 0.25), rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_derivatives_do_not_come_from_evaluations_that_lie_too_close(seed):
+    """The last of them, at the minimum to the last digits, differ by rounding only."""
+    f = ellipsoid(1e4, 2, seed)
+    search = run(Descent(zeros(2), sigma=1.0, seed=seed, restarts=0), f, 400)
+    assert search.done
+    model, sigma = search.model_at_best()
+    truth = torch.func.hessian(lambda z: f(z[None])[0])(search.x)
+    assert float((model.full_hessian() / sigma**2 - truth).norm()) < 1e-2 * float(truth.norm())

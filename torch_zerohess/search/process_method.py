@@ -39,7 +39,7 @@ _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
 _FLOOR = 1e-2
 """Least sigma, over the tolerance."""
-_ROUND = 2
+ROUND = 2
 """Steps after an arrival, over n, that are more optimistic."""
 _REFUSED = 10
 """Batches in a row with values that are not finite, after which the search ends."""
@@ -177,8 +177,7 @@ class ProcessMethod(Method[Q]):
 
     def arrived(self, known: Q, reason: str) -> Q:
         """End, or explore."""
-        known = replace(known, settled=0, exploring=_ROUND * self.settings.n, rounds=known.rounds + 1)
-        known = replace(known, arrived=min(known.arrived, known.best.loss))
+        known = replace(known, settled=0, exploring=ROUND * self.settings.n, rounds=known.rounds + 1)
         known = known.agreeing(self.settings.tolerance)
         if known.rounds > self.settings.restarts:
             return replace(known, done=True, message=f"{reason}, {known.rounds} times")

@@ -56,6 +56,8 @@ class ProcessProgress(Progress):
         It agrees with earlier arrivals if the search has since evaluated elsewhere as often as it had evaluated until
         then: beside a minimum that was hard to find there may be a lower one that is as hard to find.
         """
+        if not self.pool.ties(self.best.point, self.best.loss, tolerance):  # a plateau is no minimum
+            self = replace(self, arrived=min(self.arrived, self.best.loss))
         if not self.is_minimum(tolerance):
             return self
         looked, least = self.evaluations - self.counted, _LOOKING * (len(self.center) + 1)

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess import Smoothing, estimate, heads
+from torch_zerohess.evaluators import LostEvaluationError
 from truths import vector
 
 B, SIGMA = 5, 0.4
@@ -72,6 +73,17 @@ def test_auxiliary_inputs_single_points_and_evaluators_that_divide_the_batch():
     for one in alike:
         assert torch.allclose(one.gradient, whole.gradient, rtol=1e-12)
         assert torch.allclose(one.hessian(), whole.hessian(), rtol=1e-12)
+
+
+def test_a_lost_evaluation_names_the_points_of_all_elements():
+    def evaluator(fn, points):
+        evaluator.lost = {3: "its worker ended"}
+        return fn(points)
+
+    with pytest.raises(
+        LostEvaluationError, match=r"its worker ended, at the point \[-?[\d.]+, .*, \.\.\.\], number 3 of 9"
+    ):
+        estimate(chain, X, Smoothing(sigma=SIGMA, samples=4, seed=0), joint=True, evaluator=evaluator)
 
 
 def test_what_cannot_be_joint_is_refused():

@@ -1,5 +1,6 @@
 """Minimise a plain function from a start, without a torch model: `TrustRegion` with its evaluations done for you."""
 
+import contextlib
 import difflib
 import inspect
 import os
@@ -226,7 +227,8 @@ def minimize(
         end = "interrupted", "interrupted"
     except Exception as error:
         if running.evaluations:
-            error.minimum = running.minimum("failed", f"{blamed} raised {error!r}")  # type: ignore[attr-defined]
+            with contextlib.suppress(Exception):  # nothing takes the place of the caller's own error
+                error.minimum = running.minimum("failed", f"{blamed} raised {error!r}")  # type: ignore[attr-defined]
         raise
     finally:
         running.write()

@@ -1,6 +1,8 @@
 """What an interruption inside a batch of `minimize` keeps: every value that is known, in the result and in the file."""
 
 import concurrent.futures
+import math
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -11,6 +13,8 @@ from torch_zerohess.evaluators import Executor
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.finished import finished_values, keep_finished
+from torch_zerohess.search.noise import reserved
+from torch_zerohess.search.protocol import AskTell
 
 SETTINGS = {"sigma": 2.0, "seed": 0, "vectorized": False, "max_evaluations": 20}
 
@@ -62,6 +66,82 @@ def test_an_exception_keeps_them_too(tmp_path):
     assert found.gradient is None
     zh.minimize(f, zeros(2), checkpoint=tmp_path / "search.pt", **SETTINGS)
     assert f.calls == 1 + 20
+
+
+def tilted_at(x):
+    return tilted(x[None])[0]
+
+
+@dataclass(frozen=True)
+class Frozen(Exception):
+    """An error that takes no attributes."""
+
+    why: str
+
+
+def test_nothing_takes_the_place_of_the_own_error():
+    """Where no loss is finite, and where the error cannot carry the result of complete batches."""
+    with pytest.raises(ValueError, match="not finite at the start x0: nan"):
+        zh.minimize(lambda x: torch.full((len(x),), math.nan), zeros(2), sigma=1.0, noise=0.1, seed=0)
+    for noise in (None, 0.1):
+        fn = raising(lambda x: math.nan, 1, OSError("licence server gone"))
+        with pytest.raises(OSError, match="licence server gone") as caught:
+            zh.minimize(fn, zeros(2), noise=noise, **SETTINGS)
+        found = caught.value.minimum
+        assert (found.evaluations, math.isnan(found.value), found.x.tolist()) == (1, True, [0.0, 0.0])
+    with pytest.raises(Frozen, match="broken"):
+        zh.minimize(raising(tilted_at, 10, Frozen("broken")), zeros(2), **SETTINGS)
+
+
+def test_a_file_without_values_does_not_bind_a_smaller_budget(tmp_path):
+    """Nor does one with outputs whose losses are not known."""
+    path, settings = tmp_path / "search.pt", {"sigma": 1.0, "seed": 0, "batch": 50, "vectorized": False}
+    with pytest.raises(KeyboardInterrupt):
+        zh.minimize(Point(0), zeros(2), checkpoint=path, **settings)
+    assert not path.exists()
+    assert zh.minimize(Point(), zeros(2), checkpoint=path, max_evaluations=20, **settings).evaluations == 20
+    path.unlink()
+    settings |= {"loss": lambda y: 1 / 0, "checkpoint": path}
+    with pytest.raises(KeyboardInterrupt):
+        zh.minimize(raising(lambda x: x, 4, KeyboardInterrupt), zeros(2), **settings)
+    fit = zh.minimize(lambda x: x, zeros(2), max_evaluations=20, **settings)
+    assert (fit.status, fit.evaluations, len(fit.points), math.isnan(fit.value)) == ("budget", 0, 0, True)
+
+
+def test_measured_noise_is_paid_once_if_the_first_model_is_interrupted(tmp_path, monkeypatch):
+    settings = {**SETTINGS, "bounds": (-5.0, 5.0), "checkpoint": tmp_path / "search.pt"}
+    f = Point(noise=0.3)
+    with monkeypatch.context() as patch:
+        interrupted = raising(None, 0, KeyboardInterrupt)
+        patch.setattr(AskTell, "tell", lambda search, values: interrupted(values))
+        part = zh.minimize(f, zeros(2), **settings)
+    assert (part.status, part.evaluations) == ("interrupted", f.calls)
+    fit = zh.minimize(f, zeros(2), **settings)
+    assert fit.evaluations == f.calls == 20
+    assert fit.values.tolist() == f.values
+    whole = zh.minimize(Point(noise=0.3), zeros(2), **{**settings, "checkpoint": None})
+    assert torch.equal(fit.values, whole.values)
+
+
+def test_a_decision_that_is_interrupted_with_gaps_is_paid_once(tmp_path):
+    """Workers finish in any order: of the first batch of the decision only every other value is known."""
+    settings = {**SETTINGS, "batch": 8, "noise": 0.3, "max_evaluations": 128, "checkpoint": tmp_path / "search.pt"}
+    f, asked = Point(noise=0.3), []
+
+    def with_gaps(fn, points):
+        if len(asked) or f.calls < 128 - reserved(128):
+            return fn(points)
+        asked.append(points)
+        error, numbers = KeyboardInterrupt(), [1, 3]
+        keep_finished(error, points, dict(zip(numbers, fn(points[numbers]), strict=True)))
+        raise error
+
+    part = zh.minimize(f, zeros(2), evaluator=with_gaps, **settings)
+    assert part.status == "interrupted"
+    assert len(torch.unique(asked[0], dim=0)) >= 4
+    fit = zh.minimize(f, zeros(2), evaluator=with_gaps, **settings)
+    assert fit.evaluations == f.calls == 128
+    assert torch.equal(fit.points[: part.evaluations], part.points)
 
 
 def test_outputs_are_kept_where_the_loss_raises(tmp_path):

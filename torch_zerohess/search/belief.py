@@ -22,6 +22,20 @@ class Belief(NamedTuple):
     error: float
 
 
+def lowest(points: Tensor, losses: Tensor, start: Tensor) -> Belief:
+    """Return the evaluation with the lowest finite loss; the first one if none is finite, the start if there is none.
+
+    Args:
+        points: evaluations [P, n].
+        losses: [P].
+        start: [n], whose value is not known: NaN.
+    """
+    if not len(losses):
+        return Belief(start, math.nan, 0.0)
+    k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
+    return Belief(points[k], float(losses[k]), 0.0)
+
+
 def believed(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise: float) -> Belief:
     """Return the evaluated point with the lowest expected loss, by a Gaussian process of the evaluations.
 

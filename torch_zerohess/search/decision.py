@@ -46,15 +46,20 @@ def decide(
     """
     lowest = torch.where(torch.isfinite(losses), losses, torch.inf)[:before].argsort()[:_OTHERS]
     candidates = distinct([*likely, *points[lowest]])
-    there, values = points[before:], losses[before:]
+    unused = list(range(before, len(points)))
 
     def again(asked: Tensor) -> Tensor:
-        nonlocal there, values
-        count = min(len(asked), len(there))
-        while not torch.equal(asked[:count], there[:count]):
-            count -= 1
-        known, there, values = values[:count], there[count:], values[count:]
-        return torch.cat([known, evaluate(asked[count:])]) if count < len(asked) else known
+        told, missing = losses.new_empty(len(asked)), list[int]()
+        for k, one in enumerate(asked):
+            known = next((j for j in unused if torch.equal(points[j], one)), None)
+            if known is None:
+                missing.append(k)
+            else:  # in any order: evaluations that ran at once may have left gaps
+                unused.remove(known)
+                told[k] = losses[known]
+        if missing:
+            told[missing] = evaluate(asked[missing])
+        return told
 
     found = lowest_mean(again, candidates, most, noise)
     return None if found is None else (candidates[found[0]], *found[1:])

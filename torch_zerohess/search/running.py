@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.belief import Belief, believed
+from torch_zerohess.search.belief import Belief, believed, lowest
 from torch_zerohess.search.decision import Decision, decide
 from torch_zerohess.search.minimum import Iterate, Minimum, Status
 from torch_zerohess.search.noise import REPEATED, deviation, differs, reserved
@@ -113,7 +113,7 @@ class Running:
     def flat(self) -> bool:
         """Whether all values are equal."""
         losses = self._record.told[1]
-        return bool((losses == losses[0]).all())
+        return bool((losses == losses[:1]).all())
 
     @property
     def iterate(self) -> Iterate:
@@ -177,7 +177,7 @@ class Running:
 
     def write(self) -> None:
         """Write the file; it is never half written."""
-        if self._path is None or (self._record.requested is None and not self.begun):
+        if self._path is None or not (self.begun or self._record.known):  # there is nothing to go on with
             return
         self._written = time.monotonic()
         draft = self._path.with_name(f"{self._path.name}.part")
@@ -244,13 +244,12 @@ class Running:
         if self._last is not None:
             return Belief(self._last.x, self._last.value, self._last.error)
         search = self.search
-        if self.noise:
-            return self._believed(self.evaluations)
-        if search.evaluations and self._record.requested is None:
+        if not self.noise and search.evaluations and self._record.requested is None:
             return Belief(search.x, search.value, 0.0)
         points, losses = self._record.told  # with the interrupted batch, which was not told to the search
-        k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
-        return Belief(points[k], float(losses[k]), 0.0)
+        if self.noise and bool(torch.isfinite(losses).any()):
+            return self._believed(self.evaluations)
+        return lowest(points, losses, search.x)
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
@@ -289,10 +288,11 @@ class Running:
         values = record.values(every)
         losses = self.search.losses(values)
         at_start = torch.cat([losses[:1], losses[len(points) :]])
-        self.noise = deviation(at_start[torch.isfinite(at_start)])
-        self.search = self._make(self.noise)
-        if torch.equal(self.search.ask(max(self._batch - 1, 1)), points):
-            self.search.tell(values[: len(points)])
+        noise = deviation(at_start[torch.isfinite(at_start)])
+        search = self._make(noise)
+        if torch.equal(search.ask(max(self._batch - 1, 1)), points):
+            search.tell(values[: len(points)])
+        self.noise, self.search = noise, search  # not before: an interrupted measurement is made again
         self._noted(every, losses)
 
     def _evaluated(self, points: Tensor) -> Tensor:

@@ -68,7 +68,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command that the arguments name, by default those of the process."""
+    """Run the command that the arguments name; by default the arguments of the process."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
         if name in ("-h", "--help"):
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             _run(_named(name), rest)
         sys.stdout.flush()
-    except BrokenPipeError:  # `| head` has read enough; what is left to flush goes nowhere
+    except BrokenPipeError:  # `| head` has read enough; the rest of the output goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except ImportError as error:

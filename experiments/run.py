@@ -46,7 +46,7 @@ def run(
         jobs: processes, one thread each but for `threads`; the results do not depend on it.
         seed: number of the first run.
         limit: seconds that a run may take; 600, for networks any, if not given.
-        evaluations: that a run may use; those of the task if not given.
+        evaluations: of a run, at most; the number of the task if not given.
         variant: of Mitsuba; auto takes a just-in-time one only where it is known to work.
         threads: render threads of networks; all cores if not given. Other tasks have one per process.
         workers: processes that evaluate the black box of each run. The process of the run waits meanwhile. Each has

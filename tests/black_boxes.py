@@ -135,7 +135,7 @@ def aborting_at_every_third(z):
 
 
 class Meeting:
-    """Waves, but an evaluation ends only when those of all points 0 to `count` - 1 have begun."""
+    """Waves, but an evaluation ends only when the evaluations of all points 0 to `count` - 1 have begun."""
 
     def __init__(self, folder: Path, count: int) -> None:
         self.folder, self.count = folder, count

@@ -158,7 +158,7 @@ MADE = {"errors.png", "predictions.png", "report.html", "index.html"}
 
 @pytest.mark.parametrize(("name", "file"), params(NAMED))
 def test_named_files_exist(name, file):
-    """A path is from the root or from the document; a bare name is that of a file anywhere in the tree."""
+    """A path is from the root or from the document; a bare name is the name of a file anywhere in the tree."""
     if file in MADE or "NAME" in file:
         return
     found = [(ROOT / file).exists(), ((ROOT / name).parent / file).exists()]

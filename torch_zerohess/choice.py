@@ -70,5 +70,5 @@ def scrambles_of(samples: int, most: int = _SCRAMBLES) -> int:
 
 
 def chosen_baseline(antithetic: bool, draws: int) -> Literal["center", "mean"]:
-    """Return what is subtracted."""
+    """Return the baseline: f(x), or the mean of the other draws."""
     return "mean" if draws >= (2 if antithetic else 3) else "center"

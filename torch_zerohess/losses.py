@@ -64,8 +64,8 @@ def multiscale_mse(target: Any, levels: int = 4) -> ImageLoss:
     """Mean of the mean squared differences at `levels` resolutions, all with the weight 1 / levels.
 
     Level l averages the difference over cells of 2^l x 2^l pixels, from l = 0, the image itself, to levels - 1; cells
-    that the edge cuts average the pixels they have. Differences in fine structure count at the fine levels only, a
-    constant one at all of them: for image = target + d the loss is d^2, as that of `mse`.
+    that the edge cuts average the pixels they have. Differences in fine structure count at the fine levels only. A
+    constant difference counts at all levels: for image = target + d the loss is d^2, as with `mse`.
 
     Args:
         target: [h, w] or [h, w, c], a floating-point tensor or what torch.as_tensor takes.

@@ -94,8 +94,8 @@ def minimize(
         target: the search ends when the value is at most this.
         xtol: the search ends when its region is within this of the best point in every parameter.
         ftol: the search ends when its model, where it holds, promises a decrease of at most this.
-        time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but what all
-            evaluations say.
+        time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but a
+            prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
             from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
             file.
@@ -109,9 +109,9 @@ def minimize(
             the end. The best candidates are then evaluated again, and x is the one with the lowest mean. `value` is
             that mean and `value_error` its standard error.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
-            `BlackBox` of the same fn; also those of a call that is interrupted or fails. Those made before a checkpoint
-            are not in it. The search does not read the memory: the result is the same as without one. The next
-            `estimate` finds out what a surrogate of them is worth, and those after it use it.
+            `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
+            in it. The search does not read the memory: the result is the same as without one. The next `estimate`
+            measures how well a surrogate of the evaluations predicts, and later ones use the surrogate.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn,
@@ -165,7 +165,7 @@ def minimize(
         numbers = list(range(len(points)))
         try:
             values = call(given, ())
-        except BaseException as error:  # Ctrl-C, too: what is known already is kept
+        except BaseException as error:  # Ctrl-C, too: the values known so far are kept
             failure = error
             numbers, values = finished_values(error, given)
         if loss is None and numbers and values.shape[1:] not in ((), (1,)):

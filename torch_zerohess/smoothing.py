@@ -24,7 +24,7 @@ class Smoothing:
 
     `Smoothing.auto(sigma=...)` is what we recommend: proposal, sampler, baseline and antithetic are then "auto". They
     are chosen for the least error by the number of parameters, the number of evaluations and the order, see `choice`.
-    The repr says what is chosen for how many parameters, and `resolved(n)` returns it.
+    The repr lists the choice for every range of n parameters, and `resolved(n)` returns the chosen settings.
 
     Args:
         sigma: standard deviation of the Gaussian, in units of x: a positive number, or a tensor [n] of them, one per
@@ -40,8 +40,8 @@ class Smoothing:
             smoothed value for every n: in one dimension the smoothed value of x^2 is x^2 + 2 sigma^2 instead of
             x^2 + sigma^2.
         antithetic: use every perturbation with both signs.
-        baseline: what is subtracted from f. "center" is f(x); "mean" the mean of all other draws, which costs no
-            evaluation; "none" nothing. It changes the variance, by orders of magnitude, and not the expectation.
+        baseline: subtracted from f. "center" is f(x); "mean" the mean of all other draws, which costs no evaluation;
+            "none" nothing. It changes the variance, by orders of magnitude, and not the expectation.
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
@@ -95,7 +95,7 @@ class Smoothing:
         if self.scrambles is not None and self.samples % self.scrambles:
             raise ValueError(f"scrambles must divide samples, got {self.scrambles} of {self.samples}")
         if self.scrambles is not None and self.sampler != "sobol":
-            raise ValueError(f"scrambles are those of sampler 'sobol', got {self.scrambles} with {self.sampler!r}")
+            raise ValueError(f"scrambles need sampler 'sobol', got {self.scrambles} with sampler {self.sampler!r}")
         if self.sampler == "orthogonal" and self.proposal not in ("aggregate", "gaussian", "auto"):
             raise ValueError(
                 f"sampler 'orthogonal' makes normal directions: proposal must be 'aggregate' or 'gaussian', "
@@ -198,7 +198,7 @@ class Smoothing:
         return _sampling(self.proposal, self.sampler, self.antithetic, self.baseline)
 
     def _chosen_ranges(self) -> list[str]:
-        """Return what is chosen for which numbers of parameters, as text."""
+        """Return the choice for every range of numbers of parameters, as text."""
         ranges: list[tuple[int, str]] = []
         for n in range(1, _SHOWN + 1):
             text = _sampling(**self._choice(n))

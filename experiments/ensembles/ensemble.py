@@ -41,7 +41,7 @@ class Ensemble:
     threads: int | None = None
     """That render the images of a network task; all cores if None. A fitting task has one per process."""
     evaluations: int | None = None
-    """That a run may use; those of the task if None."""
+    """Most evaluations of a run; the number of the task if None."""
     workers: int | None = None
     """Processes for the black box of each run, besides its own; none if None."""
 
@@ -63,8 +63,8 @@ class Ensemble:
     ) -> list[Job]:
         """Return all jobs in the order of `ordered`.
 
-        methods: None takes all that apply. One that does not apply to a task, or lacks a package, is left out with a
-        line that says so. Settings that differ from those of earlier runs in the folder are refused.
+        methods: None takes all that apply. A method that does not apply to a task, or lacks a package, is left out with
+        a line that says so. Settings that differ from earlier runs in the folder are refused.
         """
         jobs = [job for task in tasks for job in self._jobs(task, methods)]
         if not jobs:

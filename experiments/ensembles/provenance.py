@@ -24,7 +24,7 @@ SHARED = ("preset", "variant", "threads", "workers")
 
 
 def read_command(folder: Path) -> dict[str, Any]:
-    """Return what is known about a folder: `commands` and `settings` (task -> method -> name -> value)."""
+    """Return the `commands` and the `settings` (task -> method -> name -> value) of a folder."""
     path = folder / NAME
     known: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"commands": [], "settings": {}}
     return known
@@ -68,7 +68,7 @@ def this_command() -> dict[str, Any]:
 
 
 def code() -> dict[str, Any]:
-    """Return the git `commit` of the code, and whether the code is `clean`: that of the commit; None outside of git."""
+    """Return the git `commit`, and whether the code is `clean`, equal to the commit; None for both outside of git."""
     commit = _git("rev-parse", "HEAD")
     changes = None if commit is None else _git("status", "--porcelain", "--", *_CODE)
     return {"commit": commit, "clean": None if changes is None else not changes}

@@ -50,7 +50,7 @@ class Job:
     threads: int | None = None
     """That render the images of a network task; all cores if None."""
     workers: int | None = None
-    """Further processes, in which the black box is evaluated; it is in that of the job if None."""
+    """Further processes, in which the black box is evaluated; if None, it is evaluated in the process of the job."""
 
     @property
     def task_name(self) -> str:
@@ -203,7 +203,7 @@ _carriers: dict[tuple[Any, ...], tuple[ProcessPool, Factory]] = {}
 
 
 def _carrier(workers: int, *source: Any) -> tuple[ProcessPool, Factory]:
-    """Return the processes for `BlackBoxOf(*source)`, and what makes it there once; those of another one end."""
+    """Return the processes for `BlackBoxOf(*source)`, and its factory; the processes of another source end."""
     key = workers, *source
     if key not in _carriers:
         while _carriers:

@@ -39,9 +39,9 @@ _FLAT = 1e-8
 """Variance of the first principal component below which residuals count as constant, over their mean square."""
 
 Black = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""A point [1, n] -> what is modelled [1, m] and the loss [1], for one evaluation."""
+"""A point [1, n] -> the modelled outputs [1, m] and the loss [1], for one evaluation."""
 Propose = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Points [N, n] in the cube, what is modelled [N, m] and losses [N] -> the next point [1, n] in the cube."""
+"""Points [N, n] in the cube, modelled outputs [N, m] and losses [N] -> the next point [1, n] in the cube."""
 
 
 class Cube:

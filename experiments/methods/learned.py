@@ -74,8 +74,8 @@ def zerograds(
         pairs: antithetic pairs per iteration.
         sigma: of the samples around x, at the start and at the end, over `Task.sigma`.
         steps: from start to end.
-        inner: sigma of the kernel that smooths the loss, over that of the samples: f is called beside the point that
-            its value is attributed to.
+        inner: sigma of the kernel that smooths the loss / sigma of the samples: f is called beside the point that its
+            value is attributed to.
         rate: learning rate of x, over `Task.sigma`.
         fit_rate: learning rate of the network.
         fits: steps of the network per iteration.
@@ -135,7 +135,7 @@ def relax(
         f = black.loss(w + current * u)
         gradients = lax(f, h, w, u, current)
         tuned.zero_grad()
-        # The mean gradient does not depend on h, so the gradient of the variance is that of the second moment.
+        # The mean gradient does not depend on h: variance and second moment have the same gradient in h.
         (current**2 * gradients.square().sum(1).mean()).backward()
         w.grad = gradients.detach().mean(0)
         tuned.step()

@@ -7,9 +7,9 @@ encoder to its weights, which Adam moves. Neither paper has an encoder with a bl
 network by taking its 35 000 weights for the parameters of the black box; here these would be 268 000, and the encoder,
 which is a white box, would be sampled as well.
 
-Both methods see the losses and the training images, but no render, no bounds, no derivative of the black box. Sigma is
-that of the task. Sigma and the learning rate of the encoder go down linearly over nine tenths of the evaluations, as
-for the source's methods.
+Both methods see the losses and the training images, but no render, no bounds, no derivative of the black box. The first
+sigma is the sigma of the task. Sigma and the learning rate of the encoder go down linearly over nine tenths of the
+evaluations, as for the source's methods.
 """
 
 from collections import deque
@@ -71,7 +71,7 @@ def zerograds(
         batch: images of a step.
         pairs: antithetic pairs per image.
         rate: first and last learning rate of the encoder.
-        inner: sigma of the kernel that smooths the loss, over that of the samples.
+        inner: sigma of the kernel that smooths the loss / sigma of the samples.
         fit_rate: learning rate of the surrogate.
         fits: its steps for every step of the encoder.
         hidden: widths of its layers, with leaky ReLU.

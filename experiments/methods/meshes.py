@@ -1,4 +1,4 @@
-"""Methods for the vertices of a mesh: smoothed derivatives, with what is known about meshes and cameras around them.
+"""Methods for the vertices of a mesh: smoothed derivatives, with knowledge of meshes and cameras around them.
 
 | method | perturbed | derivatives of | step |
 |---|---|---|---|
@@ -68,9 +68,9 @@ def handles(
     Args:
         trial: the run.
         credit: whether a handle answers for all pixels or for those that it can change.
-        newton: on so many of the levels, from the first, steps are those of Newton with blocks of the Hessian, which
-            needs credit "local"; on the others those of Adam. The finer the level, the fewer pixels a handle has, and
-            the more of its sampled curvature is noise.
+        newton: number of levels, from the first, with Newton steps by blocks of the Hessian, which needs credit
+            "local"; the other levels have Adam steps. The finer the level, the fewer pixels a handle has, and the more
+            of its sampled curvature is noise.
         levels: of the handles; one may come again.
         steps: on each level.
         samples: antithetic pairs; a step costs twice as many evaluations.
@@ -99,7 +99,7 @@ def handles(
             if credit == "local":
                 reach = BEYOND * width * float(unit[0]) * mesh.cameras.pixels + 1
                 local = _losses(trial, control, x, unit, reach, silhouette)
-                estimate = zh.estimate(local, zero, smoothing, value="smoothed")
+                estimate = zh.estimate(local, zero, smoothing, value="smoothed", joint=True)
             else:
                 estimate = zh.estimate(_loss(trial, control, x, unit), zero.flatten(), smoothing, value="smoothed")
             gradient = estimate.gradient.view_as(zero)
@@ -190,18 +190,9 @@ def _loss(trial: Trial, control: Control, x: Tensor, unit: Tensor) -> Callable[[
 def _losses(
     trial: Trial, control: Control, x: Tensor, unit: Tensor, margin: float, silhouette: float
 ) -> Callable[[Tensor], Tensor]:
-    """The losses of all handles, as one black box of `channels` parameters that each handle evaluates as often.
-
-    A point of a handle goes into an image together with a point of every other one, in the order in which they come:
-    [handles * K, channels] -> [handles * K] for K evaluations.
-    """
+    """The losses of all handles, displacements [K, handles, channels] in units of `unit` -> [K, handles]."""
     sums, squared = control.sums(x, margin), _squared(trial.task, silhouette)
-
-    def losses(points: Tensor) -> Tensor:
-        z = points.unflatten(0, (len(control), -1)).transpose(0, 1)
-        return sums(squared(trial.image(control.displaced(x, z * unit)))).T.flatten()
-
-    return losses
+    return lambda z: sums(squared(trial.image(control.displaced(x, z * unit))))
 
 
 def _squared(task: Task, silhouette: float) -> Callable[[Tensor], Tensor]:

@@ -33,7 +33,7 @@ class Method:
     packages: tuple[str, ...] = ()
     """What must be installed, by the names on PyPI."""
     another_scene: bool = False
-    """Whether it loads a scene beside that of the black box, which slows both down."""
+    """Whether it loads a scene beside the scene of the black box, which slows both down."""
     train: Callable[[NetworkTrial, Any], object] | None = None
     """Train `trial.encoder`, in the same way; see `experiments.runs.network_trial`. None if the method fits only."""
     trains: Callable[[NetworkTask], str | None] = everywhere
@@ -73,8 +73,8 @@ class Method:
             return  # the list of all that is installed takes a third of a second
         for module, packages in importlib.metadata.packages_distributions().items():
             spec = importlib.util.find_spec(module) if set(packages) & set(self.packages) else None
-            # A wheel may name a folder that it does not install, or that is no module: that of botorch has one called
-            # "sphinx", which SciPy takes for Sphinx.
+            # A wheel may name a folder that it does not install, or that is no module: the wheel of botorch has a
+            # folder "sphinx", which SciPy takes for Sphinx.
             if spec is not None and spec.origin is not None:
                 importlib.import_module(module)
 

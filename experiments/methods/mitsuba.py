@@ -6,8 +6,8 @@
 | mitsuba_path | path |
 | mitsuba_projective | direct_projective where direct light is enough, prb_projective elsewhere |
 
-One step is two evaluations, a render and its adjoint. The loss is that of the task, to the reference with the seed of
-all its renders; the adjoint pass has a fresh seed at every step unless asked otherwise.
+One step is two evaluations, a render and its adjoint. The loss is the loss of the task: its reference and all renders
+have one seed. The adjoint pass has a fresh seed at every step unless asked otherwise.
 """
 
 from typing import Literal

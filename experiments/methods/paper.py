@@ -8,8 +8,8 @@
 | our_hvp | gradient, and Hessian-vector product from two others, independent, at +-sigma/3 | 6 S | line search |
 | our_hvpa | gradient and Hessian-vector product from one sample set, aggregate sampling | 2 S + 1 | line search |
 
-S antithetic pairs per sample set; evaluations are those of one gradient, or of one move of a line search. The line
-search is `zh.optim.NonlinearCG`. Sigma falls linearly from start to end in `steps` steps and stays there. The radius of
+S antithetic pairs per sample set; evaluations are per gradient, or per move of a line search. The line search is
+`zh.optim.NonlinearCG`. Sigma falls linearly from start to end in `steps` steps and stays there. The radius of
 the trust region is in units of the parameters for our_h, and in units of sigma for our_hvp and our_hvpa, as in the
 source. Settings: `experiments.methods.settings`. The same derivatives on network tasks:
 `experiments.methods.paper_networks`.
@@ -103,8 +103,8 @@ def second_order(
         line_search: moves at most, and the length of a move that ends it in units of the parameters.
         recompute: steps after which directions start anew.
         modification: of curvature that is not positive, see `NonlinearCG`.
-        baseline: what is subtracted from the values, of `Smoothing`; "mean" saves the evaluation of f(x), and has less
-            variance where there are many parameters. "differences" need none.
+        baseline: see `Smoothing`; "mean" saves the evaluation of f(x), and has less variance where there are many
+            parameters. "differences" need none.
         steps: from start to end.
     """
     task, differences = trial.task, derivatives == "differences"

@@ -8,7 +8,7 @@
 | our_hvp | Hessian by differences of independent gradients, along every parameter | Newton-CG with J^T abs(H) J |
 | our_hvpa | Hessian from shared aggregate samples | Newton-CG with J^T abs(H) J |
 
-The names are those of the source; its second-order steps are a nonlinear conjugate gradient on the weights. J is the
+The names are the source's names. Its second-order steps are a nonlinear conjugate gradient on the weights. J is the
 Jacobian of the network and H the smoothed Hessian of the black box at one image. H comes from one antithetic pair, so
 half of the time it is indefinite: abs takes the magnitude of its eigenvalues. Sigma and the step size (learning rate,
 trust radius) go down linearly over nine tenths of the evaluations. Step sizes and batches were chosen on runs 100 to

@@ -81,7 +81,7 @@ def bfgs(
 
 
 def _curvature(n: int, damped: bool) -> BFGS:
-    """A Hessian to be updated, or its inverse: Powell's damping is that of the Hessian."""
+    """A Hessian to be updated if `damped`, because Powell's damping is of the Hessian; otherwise its inverse."""
     curvature = BFGS(exception_strategy="damp_update" if damped else "skip_update")
     curvature.initialize(n, "hess" if damped else "inv_hess")
     return curvature

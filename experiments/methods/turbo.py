@@ -121,7 +121,7 @@ def candidate(z: Tensor, losses: Tensor, length: float, steps: int, generator: n
     candidates = torch.where(mask, moved, centre)
     with torch.no_grad():
         posterior = model.likelihood(model(candidates))
-    # The covariance is that of a smooth function at close points: its eigenvalues are cut at 0.
+    # The covariance of a smooth function at close points has negative eigenvalues by rounding: they are cut at 0.
     values, vectors = torch.linalg.eigh(posterior.covariance_matrix)
     normal = torch.from_numpy(generator.standard_normal(count))
     draw = posterior.mean + vectors @ (values.clamp_min(0.0).sqrt() * normal)

@@ -22,7 +22,7 @@ from experiments.problems.scenes.meshes import to_srgb
 Progress = Callable[[int, int], None]
 """Gets how many images are rendered, and of how many."""
 _HELD_OUT = 2**31
-"""Seed of the held-out images; those of training images are the numbers of the runs."""
+"""Seed of the held-out images; the seeds of training images are the numbers of the runs."""
 _PART = 16
 """Images that are rendered between two calls of a `Progress`."""
 
@@ -92,7 +92,7 @@ class NetworkTask(ABC):
     sigma: ClassVar[tuple[float, float]]
     """First and last."""
     bounds: ClassVar[tuple[tuple[float, ...], tuple[float, ...]] | None] = None
-    """Lower and upper, [n] or for all [1], if renders beyond are those of the nearest point within."""
+    """Lower and upper, [n] or for all [1], if a point beyond is rendered as the nearest point within."""
     measure: ClassVar[str]
     """Name of what `measured` returns."""
 

@@ -130,14 +130,14 @@ def rendered(
 ) -> RenderedTask:
     """Return the task of finding the parameters [n] of a scene from its render at the solution.
 
-    The loss is the mean squared difference of linear images; all renders share one seed, also that of the reference.
+    The loss is the mean squared difference of linear images; all renders share one seed, also with the reference.
 
     Args:
         scene: loads the scene in a setting.
         moving: the same with shapes in place of instances, for derivatives.
         variant: of both.
         setting: of this task.
-        full: that of the source.
+        full: the setting of the source.
         solution: [n].
         needs: why the setting is enough.
         parameter_error: of x [n]; the mean squared difference to the solution if None.

@@ -35,7 +35,7 @@ class SoftSquares:
         """Return the images [K, side, side] (row is y) of points [K, 2 count], in their type."""
         K, w, side = len(points), self.half_width, self.side
         center = points.reshape(K, -1, 2).clamp(w, 1 - w)[..., None]
-        # Only the pixels around each square are computed; those of the frame that fall outside have intensity zero.
+        # Only the pixels around each square are computed; of these, pixels outside of the image have intensity zero.
         pixel = ((center - w) * side).floor() + torch.arange(math.ceil(2 * w * side) + 1, device=points.device)
         power = (((pixel + 0.5) / side - center) / w).abs() ** self.exponent
         square = (1 - 2 * (power[:, :, 1, :, None] + power[:, :, 0, None, :])).clamp_(0, 1)

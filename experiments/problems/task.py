@@ -73,7 +73,7 @@ class Renderer:
     prepare: Callable[[], None] = _nothing
     """Load what the black box needs, before the clock of a run starts."""
     release: Callable[[], None] = _nothing
-    """Free what is loaded; the next call loads it again. Two loaded scenes slow each other down."""
+    """Free the scene; the next call loads it again. Two loaded scenes slow each other down."""
     skip: Callable[[int, int], None] = _nothing
     """Advance fresh noise by so many calls and points, which a replay has answered without the renderer."""
     full: "Callable[[], Task] | None" = None
@@ -82,7 +82,7 @@ class Renderer:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A black box of n parameters, and what is known about it."""
+    """A black box of n parameters, with its start, solution, output and errors."""
 
     name: str
     title: str

@@ -23,7 +23,7 @@ from experiments.problems.scenes.meshes import to_srgb
 from experiments.problems.task import Output, Task
 
 Noise = Literal["fixed", "other", "call", "point"]
-"""Seed of the renders: that of the reference, one other seed, a new one for every call or for every point."""
+"""Seed of the renders: the seed of the reference, another one, a new one for every call, or one for every point."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Change:
     """What differs from the task; nothing by default."""
 
     start: float = 1.0
-    """Distance of the start from the solution, over that of the task."""
+    """Distance of the start from the solution / the same distance in the task."""
     pairs: int | None = None
     """Antithetic pairs of the method, if not its own setting."""
     spp: float = 1.0
-    """Samples per pixel over those of the task, in the renders and in the reference; at least one sample."""
+    """Samples per pixel / samples of the task, in the renders and in the reference; at least one sample."""
     noise: Noise = "fixed"
     jpeg: int | None = None
     """Quality of the reference, 1 to 100, if it is compressed."""
@@ -82,7 +82,7 @@ def load(name: str, preset: Preset, variant: str, evaluations: int | None, chang
         name: of the task.
         preset: of it.
         variant: of Mitsuba.
-        evaluations: that a run may use; those of the task if None.
+        evaluations: of a run, at most; the number of the task if None.
         change: what differs; ValueError if the task cannot be changed in this way.
     """
     if change.noise in ("fixed", "other"):
@@ -140,7 +140,7 @@ def _seen(task: Task, change: Change) -> Task:
         task,
         loss=reference.loss,
         output=Output(reference.image, reference.loss_of, reference.residuals),
-        # The derivative is left out: it is that of the unchanged task.
+        # The derivative is left out: it belongs to the unchanged task.
         renderer=dataclasses.replace(
             made.renderer, adjoint=None, prepare=prepare, release=release, skip=reference.skip
         ),
@@ -159,7 +159,7 @@ class Seen(Reference):
     Args:
         task: whose scene it is.
         setting: of its renders.
-        noise: of the renders; that of the reference has the first seed.
+        noise: of the renders; the reference has the first seed.
         change: what happens to the reference [h, w, 3], if anything.
     """
 

@@ -62,7 +62,7 @@ def percent(error: float) -> str:
 
 @dataclass(frozen=True)
 class Look:
-    """What points of a task look like, and what is sought."""
+    """The pictures of points of a task, and the picture that is sought."""
 
     picture: Callable[[Tensor], Tensor]
     """[n] -> [h, w] or [h, w, 3] in [0, 1]."""
@@ -127,7 +127,7 @@ def shown_rows(found: Trace, count: int) -> list[int]:
 
 
 def frames(found: Trace, seen: Look, rows: Sequence[int], height: int) -> list[Picture]:
-    """Return a picture for each row: the point beside what is sought, with a line below."""
+    """Return a picture for each row: the point beside the target, with a line below."""
     target = tile(seen.target, height)
     return [
         captioned(
@@ -149,7 +149,7 @@ def tile(picture: Tensor, height: int) -> Picture:
 
 
 def pixels(picture: Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Return [h, w, 3] for files of a picture [h, w] or [h, w, 3] in [0, 1]; what is outside is clipped."""
+    """Return bytes [h, w, 3] of a picture [h, w] or [h, w, 3]; numbers are clipped to [0, 1]."""
     found = (255 * picture.detach().double().clamp(0, 1)).round().to(torch.uint8)
     return np.ascontiguousarray((found if found.ndim == 3 else found[..., None].expand(-1, -1, 3)).numpy())
 

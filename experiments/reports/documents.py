@@ -9,7 +9,7 @@ What is between the marks is written by the command. Marks in code are left alon
   `show=both|evaluations|seconds`, `share=plain|interval`, `quartiles=hide|show`, `titles=show|hide`;
 - networks: `tasks=`, `methods=`, `titles=show|hide`;
 - `speed_up` in place of a name: mean ratios of methods to `reference=` over the tables in `of=`, and `methods=`;
-- `table_2` in place of a name: the ratios of the source's Table 2 beside those of the tables in `of=`; `tasks=`,
+- `table_2` in place of a name: the ratios of the source's Table 2 beside our ratios from the tables in `of=`; `tasks=`,
   `metric=`;
 - a study: `columns=`, and `column=value` for the rows to show;
 - any: `origin=full|commit`, where `commit` leaves out machine and command.
@@ -39,7 +39,7 @@ def readme(
     """Write the tables and numbers of the documents from experiments/results/*.csv.
 
     Args:
-        documents: Markdown files; those of the repository if not given.
+        documents: Markdown files; all of the repository if not given.
         check: write nothing, and fail where a document differs from the files.
     """
     paths = documents or tuple(path for name in DOCUMENTS if (path := ROOT / name).exists())
@@ -67,7 +67,7 @@ def filled(text: str) -> str:
 
 
 def differences(text: str) -> list[str]:
-    """Return the marks of a document whose content is not what is stored."""
+    """Return the marks of a document whose content differs from the stored results."""
     marks = [(match, new) for part in _CODE.split(text)[::2] for mark, new in _MARKS for match in mark.finditer(part)]
     return [match[0].splitlines()[0] for match, new in marks if new(match) != match[0]]
 

@@ -86,9 +86,9 @@ def curves(
 def quartiles(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Return the positions [P] where any of the runs changes and the quartiles [3, P] of their errors from there on.
 
-    lines: positions and errors of every run. An error holds until the next row; before the first row it is that of the
-    start, after the last one the last. Between two runs quartiles are interpolated on the logarithmic axis they are
-    drawn on: on a linear one the larger error alone would count.
+    lines: positions and errors of every run. An error holds until the next row. Before the first row it is the error at
+    the start, after the last row the last error. Between two runs quartiles are interpolated on the logarithmic axis
+    they are drawn on: on a linear one the larger error alone would count.
     """
     grid = np.unique(np.concatenate([x for x, _ in lines]))
     if len(grid) > _POINTS:

@@ -112,7 +112,7 @@ def summary(task: NetworkTask, results: Sequence[Result]) -> str:
 
 
 def _remember(rows: pd.DataFrame, path: Path) -> None:
-    """Write the rows of some runs to a file, beside those of other runs."""
+    """Write the rows of some runs to a file, beside the rows of other runs."""
     if path.exists():
         known = pd.read_csv(path)
         rows = pd.concat([known, rows]).drop_duplicates(["method", "run"], keep="last")

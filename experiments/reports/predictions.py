@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 
 
 def draw(task: NetworkTask, results: Sequence[Result], path: Path, count: int = 4) -> None:
-    """Show held-out inputs, the render of the untrained prediction and of that of every trained encoder."""
+    """Show held-out inputs, and the renders of the predictions: of the untrained and of every trained encoder."""
     images, parameters = task.held_out
     images, parameters = images[:count], parameters[:count]
     columns = [("input", images, parameters)]

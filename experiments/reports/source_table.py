@@ -1,6 +1,6 @@
 """Table 2 of the source beside ours: ratios of the methods to OurHVPA, over the same tasks, errors and levels.
 
-`experiments/results/source_table_2.csv` has the printed numbers: seconds until an error is reduced, divided by those of
+`experiments/results/source_table_2.csv` has the printed numbers: seconds until an error is reduced / seconds of
 OurHVPA, empty where a method did not converge or does not apply. The source counts time; a ratio of evaluations is ours
 alone.
 """

@@ -48,7 +48,7 @@ def keep(headers: Sequence[str], rows: Sequence[Sequence[object]], name: str) ->
 
 
 def may_keep(name: str) -> None:
-    """SystemExit if the code of this process is not that of a commit, or the name is none: before it measures."""
+    """SystemExit, before a measurement, if the code differs from the commit or the name is no name of a table."""
     _check(name)
     _this_origin()
 
@@ -87,7 +87,7 @@ def origin(commands: Sequence[Mapping[str, Any]], what: str) -> dict[str, str]:
 
 
 def _elsewhere(command: str) -> str:
-    """Return a command without what is of this machine only: its folder, and how many processes it had."""
+    """Return a command without the options that concern this machine alone: the folder and the number of processes."""
     words, kept = iter(shlex.split(command)), []
     for word in words:
         if word in ("--out", "--jobs"):

@@ -56,7 +56,7 @@ class Column:
 
 
 def overview(shown: Sequence[Column], path: Path) -> None:
-    """Draw figure 9: a column per task, with its start, where the run ended, and what is sought."""
+    """Draw figure 9: a column per task, with its start, the end of the run, and the target."""
     bands = -(-len(shown) // _ACROSS)
     across = -(-len(shown) // bands)
     figure = plt.figure(figsize=(1.35 * across + 0.4, 4.3 * bands), layout="constrained")
@@ -68,7 +68,7 @@ def overview(shown: Sequence[Column], path: Path) -> None:
 
 
 def _band(figure: Any, shown: Sequence[Column], across: int, method: str | None) -> None:
-    """Draw `across` columns; `method` is that of all runs, None if there are several."""
+    """Draw `across` columns; `method` is the method of all runs, None if there are several."""
     axes = figure.subplots(3, across, squeeze=False)
     for axis in axes[:, len(shown) :].flat:
         axis.axis("off")

@@ -23,7 +23,7 @@ _FCNTL = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") e
 
 
 class DivergedError(Exception):
-    """A replayed run asks for other points than those of its journal: the method or its settings have changed."""
+    """A replayed run asks for other points than its journal has: the method or its settings have changed."""
 
 
 class BusyError(Exception):

@@ -1,6 +1,6 @@
 """What every run has in common: a counted black box, rows, an end, and a replay after a kill.
 
-`Trial` is the run of a fitting task, `NetworkTrial` that of a network task.
+`Trial` is the run of a fitting task, `NetworkTrial` the run of a network task.
 """
 
 import traceback

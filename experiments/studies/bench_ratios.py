@@ -25,7 +25,7 @@ from torch_zerohess.sampling import kernels, proposals
 
 @dataclass(frozen=True)
 class Ratio:
-    """Median seconds of what is measured and of what it is compared with."""
+    """Median seconds of a measured operation and of its reference."""
 
     operation: str
     n: int

@@ -63,13 +63,13 @@ class Row:
 
     @property
     def ratio(self) -> float:
-        """Error of "auto" over that of the best of the others."""
+        """Error of "auto" / least error of the others."""
         return self.errors["auto"] / self.errors[self.best_rival]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A function around x = 0 with sigma = 1, and what is true there."""
+    """A function around x = 0 with sigma = 1, and its true smoothed value and derivatives there."""
 
     name: str
     fn: Function

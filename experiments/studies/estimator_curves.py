@@ -40,7 +40,7 @@ class Measurement:
 def curve(
     measurements: Sequence[Measurement], problem: str, method: str, quantity: str, against: str
 ) -> tuple[list[float], list[float]]:
-    """Return what is on the axis and errors, in order of the budget; each number of evaluations once."""
+    """Return positions on the axis and errors, in order of the budget; each number of evaluations once."""
     chosen = [m for m in measurements if (m.problem, m.method, m.quantity) == (problem, method, quantity)]
     once = {m.evaluations: m for m in reversed(chosen)}
     chosen = [m for m in chosen if once[m.evaluations] is m]
@@ -57,7 +57,7 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 def _style(method: Estimator) -> dict[str, Any]:
-    """Colour says where points come from, the line what is subtracted, the marker how points depend on each other."""
+    """The colour shows the proposal, the line the baseline, the marker how points depend on each other."""
     colors = {
         "auto": "#7a9a01",
         "aggregate": "#c1272d",

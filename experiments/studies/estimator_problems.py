@@ -33,7 +33,7 @@ _TRUTH_SCRAMBLES = 16
 
 @dataclass(frozen=True)
 class Problem:
-    """A black box, a point, a sigma and what is true there."""
+    """A black box, a point, a sigma, and the true value and derivatives there."""
 
     name: str
     fn: Function

@@ -1,4 +1,4 @@
-"""The ways to estimate that `variance` compares: where points come from, what is subtracted, how points depend."""
+"""The estimators that `variance` compares: their proposal, their baseline, and the dependence between their points."""
 
 import copy
 from collections.abc import Callable

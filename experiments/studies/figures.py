@@ -11,7 +11,7 @@
 | 12 | CAUSTIC |
 | 13 | MIRROR |
 
-Figures 9, 12 and 13 are those of `gallery`, figure 10 is that of `robustness`. Runs of 7 and 8 have 20 starts.
+Figures 9, 12 and 13 come from `gallery`, figure 10 from `robustness`. Runs of 7 and 8 have 20 starts.
 """
 
 from collections.abc import Callable, Mapping, Sequence

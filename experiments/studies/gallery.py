@@ -1,6 +1,6 @@
 """`python -m experiments gallery`: what the tasks look like, and what an optimisation of each of them does.
 
-Each task is run once and its pictures are those of the points that the method reported: an overview of all tasks, the
+Each task is run once, and its pictures show the points that the method reported: an overview of all tasks, the
 experiments with a caustic and with two mirrors (figures 9, 12 and 13 of the source's supplement), and an animation per
 task. Tasks that are not pictures are shown as a map of their loss if they have two parameters.
 """

@@ -5,8 +5,8 @@ Each gradient is of the task's own render with few samples; its cosine to the tr
 to the way from the solution (1: a step against it leads straight to the solution) are medians over repetitions with
 other seeds. A gradient that is exactly zero has no direction: its cosine is 0.
 
-The loss may have ripples, on MUG one per degree from the facets of the handle: a right derivative then leads astray,
-and a sampled one, which is that of the smoothed loss, is not the true one and may lead to the solution.
+The loss may have ripples, on MUG one per degree from the facets of the handle. The exact derivative then leads astray.
+A sampled derivative is the derivative of the smoothed loss. It is not the exact one, and may lead to the solution.
 """
 
 import math
@@ -32,7 +32,7 @@ from experiments.reports.progress import progress
 from experiments.reports.tables import Printer
 
 POINTS = {"start": 1.0, "middle": 0.5, "near": 0.1}
-"""Distance from the solution, over that of the start."""
+"""Distance from the solution / distance of the start from the solution."""
 
 
 @dataclass(frozen=True)

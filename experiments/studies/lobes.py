@@ -148,7 +148,7 @@ LOBES = (
         lambda count, seed: _points(count, seed, 2, "aggregate"),
     ),
 )
-"""All densities; those of the aggregates have a Gaussian share."""
+"""All densities; the aggregates have a Gaussian share."""
 
 
 def inverse(cdf: Callable[[Tensor], Tensor], p: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ mean variance of a pixel under the perturbations. Measured for every loss of `zh
 
 - bias: both objectives along the line from the solution of a task through its start, and where they are smallest. On
   BOX2 the line crosses the plateau on which the squares do not overlap and L(f(x)) is constant;
-- error of the estimated gradient, relative to that of the objective itself, from the same evaluations;
+- error of the estimated gradient / error of the estimated gradient of the objective itself, from the same evaluations;
 - evaluations that the trust region needs until the mean squared error of the image is reduced by 99 %.
 
 The truth about a gradient is a far larger sample of scrambled Sobol points; its own error is reported.
@@ -79,7 +79,7 @@ class Fit:
     loss: str
     form: str
     metric: str
-    """image: mean squared error of the picture, whatever the loss; parameter: that of x."""
+    """image: mean squared error of the picture, whatever the loss; parameter: mean squared error of x."""
     evaluations: float | None
     """Median over the runs that get there, if they are at least half of all."""
     evaluations_low: float | None
@@ -220,7 +220,7 @@ def _spread(fit: Fit) -> str:
 
 
 def _pairs(rows: Sequence[_Row]) -> Iterator[tuple[_Row, _Row]]:
-    """Rows of the loss inside with those of the image, in the order they were measured in."""
+    """Pairs of a row with the loss inside and the row of the image, in the order of measurement."""
     return zip(rows[::2], rows[1::2], strict=True)
 
 

@@ -1,6 +1,6 @@
 """How many samples tell a sparse Jacobian: ours, LASSO and least norm on the same samples of maps that are known.
 
-Each of m outputs depends on s of n parameters. The samples are those of `zh.sparse_jacobian`, antithetic pairs: a pair
+Each of m outputs depends on s of n parameters. The samples are as in `zh.sparse_jacobian`, antithetic pairs: a pair
 gives one difference along one direction. The support of s entries among n takes of the order of s log n differences
 (Wainwright 2009). A second part draws a row and a column of the Jacobian of CAUSTIC beside finite differences.
 

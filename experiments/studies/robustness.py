@@ -2,7 +2,7 @@
 
 The sweeps of the source (supplement, Sec. I) and two more. Each value of a sweep is a task of its own with a name that
 says what differs, run and logged as any other, so that `table`, `plot` and `report` read the folder too. What is the
-same in several sweeps is run once. All errors are those of the unchanged task, see `experiments.problems.variations`.
+same in several sweeps is run once. Errors are measured on the unchanged task, see `experiments.problems.variations`.
 """
 
 import csv
@@ -66,7 +66,7 @@ SWEEPS = {
     ),
     "noise": Sweep("seed of the renders", ("fixed", "other", "call", "point"), lambda value: Change(noise=value), str),
 }
-"""By name. Starts and samples per pixel are factors of those of the task."""
+"""By name. Starts and samples per pixel are factors; a factor of 1 is the value of the task."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ def robustness(
 
     Sweeps are start (distance from the solution), pairs (antithetic pairs of methods that have such a setting), spp
     (samples per pixel of renders and reference), noisy_spp (the same, every render with a new seed), jpeg (quality of
-    the reference) and noise (seed of the renders: fixed as that of the reference, other, new for every call or point).
-    Only start and pairs apply to tasks that are not rendered.
+    the reference) and noise (seed of the renders: fixed to the seed of the reference, other, new for every call or
+    point). Only start and pairs apply to tasks that are not rendered.
 
     Args:
         tasks: names, see `list`.
@@ -138,7 +138,7 @@ def robustness(
         jobs: processes, one thread each.
         seed: number of the first run.
         limit: seconds that a run may take.
-        evaluations: that a run may use; those of the task if not given.
+        evaluations: of a run, at most; the number of the task if not given.
         variant: of Mitsuba.
     """
     if evaluations is not None and evaluations < 1:
@@ -246,7 +246,7 @@ def _settings(jobs: Sequence[Job]) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def _runs(results: Results, cell: Cell, numbers: range) -> list[Run]:
-    """Return those of this command: the folder may have more of some cells."""
+    """Return the runs of this command: the folder may have more runs of some cells."""
     return [one for one in results.runs.get(cell.varied, {}).get(cell.method, []) if one.outcome.run in numbers]
 
 

@@ -1,6 +1,6 @@
 """Where further workers stop paying: measured for the workers of this machine, simulated for up to 10 000.
 
-The simulation is that of `evaluators`: one process gives chunks of a batch to idle workers, and takes their values, one
+The simulation follows `evaluators`: one process gives chunks of a batch to idle workers, and takes their values, one
 after the other.
 
 | stated | workers of this machine (`ProcessPool`) | actors of a cluster (`Ray`) |

@@ -36,7 +36,7 @@ _EPS = {torch.float32: 2.0**-23, torch.float64: 2.0**-52}
 
 @dataclass(frozen=True)
 class Accuracy:
-    """One row of the table. Standard errors are those of the worst element, or their RMS where there are more than 100.
+    """One row of the table. Standard errors are of the worst element, or their RMS where there are more than 100.
 
     A dash stands for a relative error where the truth is zero.
     """

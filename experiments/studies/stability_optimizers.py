@@ -32,7 +32,7 @@ class HardCase:
     start: Tensor
     aim: float = 1e-3
     noise: float = 0.0
-    """Standard deviation of what is added to every value."""
+    """Standard deviation of the noise added to every value."""
     bounds: tuple[float, float] = (-10.0, 10.0)
     settings: dict[str, Any] = field(default_factory=dict)
 

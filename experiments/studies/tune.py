@@ -80,7 +80,7 @@ def tune(
         seed: of the draw.
         first: number of the first start, at least 1000: those below are for the tables.
         level: reduction of the image error that counts.
-        evaluations: that a run may use; those of the task if not given.
+        evaluations: of a run, at most; the number of the task if not given.
         preset: fast or paper.
         over: settings to vary and their choices, `samples=4,8 sigma=(0.2,0.1),(0.2,0.01)`; the others stay as they are
             in use. Everything in the search space varies if not given.

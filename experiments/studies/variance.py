@@ -43,7 +43,7 @@ _TRUTH_SHARE = 512  # evaluations of the truth per evaluation of the largest bud
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times larger the Hessian error of a method of per-element sampling is than that of ours."""
+    """Hessian error of a method of per-element sampling / Hessian error of ours."""
 
     problem: str
     budget: int
@@ -219,6 +219,6 @@ def _print_checks(report: VarianceReport) -> None:
     print("Relative standard error of the truth\n")
     truth = [[name, *errors.values()] for name, errors in report.truth_error.items()]
     print(table(["problem", *QUANTITIES], truth))
-    print(f"\nHessian error relative to that of {OURS}\n")
+    print(f"\nHessian error / Hessian error of {OURS}\n")
     ratios = [[r.problem, r.budget, r.method, r.evaluations, r.ratio, r.ratio_error] for r in report.ratios]
     print(table(["problem", "budget", "method", "evaluations", "ratio", "+-"], ratios))

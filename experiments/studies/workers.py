@@ -7,8 +7,8 @@
 | 48 kB, 1 point | a value of 48 kB | the same |
 | task | the images of a task, as many points as there are chunks for the workers | one process |
 
-The faults are kills of workers at random times, and evaluations that hang. All values must be those of an undisturbed
-call, bit by bit, and nothing may be left: no process, and no file open that was not open before.
+The faults are kills of workers at random times, and evaluations that hang. All values must equal the values of an
+undisturbed call, bit by bit. No process may remain, and no file may be open that was not open before.
 
 `scaling` has a module of its own.
 """
@@ -73,7 +73,7 @@ class Faults:
     kills: int
     hangs: int
     different: int
-    """Values that differ from those of an undisturbed call in any bit."""
+    """Values that differ in any bit from the values of an undisturbed call."""
     lost: int
     """Points without a value."""
     processes: int
@@ -192,7 +192,7 @@ class Hanging:
 
 
 def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, timeout: float = 1.0) -> Faults:
-    """Evaluate in workers of which some are killed and some hang, and count what is wrong."""
+    """Evaluate in workers of which some are killed and some hang, and count the faults in the result."""
     resource_tracker.ensure_running()  # by multiprocessing, with a pipe, for as long as the interpreter lives
     before, start = _open_files(), time.monotonic()
     generator = torch.Generator().manual_seed(seed)

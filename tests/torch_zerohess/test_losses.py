@@ -237,7 +237,7 @@ def test_minimize_with_the_loss_after_or_inside_the_black_box(name, inside) -> N
 
 @EACH
 def test_a_network_learns_through_an_image_and_its_loss(name) -> None:
-    """Derivatives of loss(layer(x)) are those of the loss at the image, times the Jacobian of the layer."""
+    """d loss(layer(x)) / dx = loss'(image) J, with the Jacobian J of the layer."""
     loss = FACTORIES[name](blob(torch.tensor([[0.3, 0.6]]))[0])
     layer = zh.BlackBox(blob, zh.Smoothing(sigma=0.1, samples=16, seed=0))
     x = torch.tensor([0.6, 0.4], dtype=torch.float64, requires_grad=True)

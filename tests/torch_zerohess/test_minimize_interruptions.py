@@ -34,7 +34,7 @@ class Point:
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_every_value_that_is_known_is_kept_and_paid_once(noise, bounds, tmp_path):
-    """Wherever it is interrupted, a search goes on to the bits that it would have had, also to those of the noise."""
+    """Wherever it is interrupted, a search goes on to the same bits, also of the measured noise."""
     whole = zh.minimize(Point(noise=noise), zeros(2), bounds=bounds, **SETTINGS)
     for k in range(1, 20, 2 if bounds is None else 5):
         path, memory = tmp_path / f"{k}.pt", zh.Memory()

@@ -1,6 +1,6 @@
 """A Mitsuba scene as a black box: parameters in, images or losses out.
 
-Each parameter says which part of the scene it changes and in which unit; what is not named stays as it is. The scene is
+Each parameter says which part of the scene it changes and in which unit; all other parts stay as they are. The scene is
 loaded once and rendered again for every point. Renders have the same noise unless asked otherwise: with fresh noise
 at few samples per pixel the loss varies as much from render to render as from start to solution.
 
@@ -99,7 +99,7 @@ class MitsubaScene:
         if depth is not None:
             integrator = {"type": "path", "max_depth": depth, "rr_depth": depth}
         self.integrator: Any = None if integrator is None else self.mi.load_dict(dict(integrator))
-        """None for that of the scene."""
+        """None for the integrator of the scene."""
         known = list(self.values.keys())
         for parameter in parameters:
             for name in parameter.names:
@@ -238,7 +238,7 @@ def _check(
         if value is not None and not least <= checked_integer(name, value) < _MOST:
             raise ValueError(f"{name} must be from {least} to {_MOST - 1}, got {value!r}")
     if depth is not None and integrator is not None:
-        raise ValueError("depth is that of the integrator `path`: give either depth or integrator, got both")
+        raise ValueError("depth is a setting of the integrator `path`: give either depth or integrator, got both")
     for name, text, choices in (("noise", noise, ("fixed", "call", "point")), ("nan", nan, ("raise", "keep"))):
         if text not in choices:
             raise ValueError(f"{name} must be one of {', '.join(choices)}, got {text!r}")

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.batch import numbers
+from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
 from torch_zerohess.evaluators.values import as_tensor
 
@@ -42,10 +43,10 @@ class Program(Closing):
     A server flushes its output after each answer, and writes messages to the standard error alone. It ends when its
     standard input does. A server that ended or took too long is started again by the next call.
 
-    A run fails if it ends with a code other than 0, takes too long, or writes what is no number. With on_failure="nan"
-    all points of the run have NaN as their values, in the shape of earlier outputs. Before the first output that is one
-    NaN per point: if outputs are tensors, call the program first where it works. What becomes of a NaN is said by
-    `on_nonfinite` of a layer; `minimize` avoids it.
+    A run fails if it ends with a code other than 0, takes too long, or writes no number. With on_failure="nan" all
+    points of the run have NaN as their values, in the shape of earlier outputs. Before the first output that is one
+    NaN per point: if outputs are tensors, call the program first where it works. `on_nonfinite` of a layer says how it
+    treats a NaN; `minimize` avoids the point.
 
     A `Program` can be pickled; a copy starts a program of its own.
 
@@ -55,7 +56,7 @@ class Program(Closing):
         format: see above.
         timeout: seconds per point; None for no limit.
         folder: where the program runs; here if None.
-        environment: variables beside those of this process.
+        environment: variables added to the environment of this process.
         on_failure: "raise", or "nan" to go on without the values of a run that fails.
 
     Raises:
@@ -120,10 +121,16 @@ class Program(Closing):
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...]."""
         if callable(self.command):
-            runs = [functools.partial(self._run, _found(self.command(one)), b"", 1) for one in x.detach()]
-            found = [self._unless_failed(run, one) for run, one in zip(runs, x, strict=True)]
-            self._shape = next((one.shape for one in found if one is not None), self._shape)
-            return torch.stack([_missing(self._shape) if one is None else one for one in found])
+            found: dict[int, Tensor | None] = {}
+            try:
+                for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
+                    run = functools.partial(self._run, _found(self.command(one)), b"", 1)
+                    found[k] = self._unless_failed(run, one)
+            except BaseException as error:  # Ctrl-C, too
+                keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
+                raise
+            self._shape = next((one.shape for one in found.values() if one is not None), self._shape)
+            return torch.stack([_missing(self._shape) if one is None else one for one in found.values()])
         request = self._request(x, aux)
         answer = self._serve if self.server else functools.partial(self._run, self.command)
         values = self._unless_failed(functools.partial(answer, request, len(x)), x)
@@ -209,9 +216,10 @@ class Program(Closing):
         except Exception as error:  # a function may raise any
             shown = output[:200].decode(errors="replace")
             named = "what the function `format` reads" if callable(self.format) else f"values as {self.format}"
+            advice = "" if output.strip() == b"null" else ": let it print messages to its standard error"
             raise ValueError(
                 f"the program must write {named} and nothing else to its standard output, got {shown!r} "
-                f"({type(error).__name__}: {error}): let it print messages to its standard error{_shown(errors)}"
+                f"({type(error).__name__}: {error}){advice}{_shown(errors)}"
             ) from error
 
 

@@ -60,14 +60,15 @@ class BlackBox(nn.Module):
     randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
     "different" where neither x nor aux is mapped over.
 
-    `state_dict` carries all settings of the smoothing, not sigma alone, and what the memory keeps. `load_state_dict`
-    puts them in the place of those that the layer was made with. Settings that are to differ are set after it:
+    `state_dict` has all settings of the smoothing, not sigma alone, and the contents of the memory. `load_state_dict`
+    replaces the settings that the layer was made with. To change a setting, set it after loading:
     `layer.smoothing = layer.smoothing.replace(samples=16)`.
 
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
     `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it. A layer with a memory
-    is called between graphs: fullgraph=True is an error. `torch.export` raises RuntimeError: no file holds a black box.
+    is called between graphs: fullgraph=True is an error, and so is `torch.func.grad` inside of compiled code.
+    `torch.export` raises RuntimeError: no file holds a black box.
 
     Example:
         >>> layer = BlackBox(lambda z: z.round().sum(1), Smoothing(sigma=1.0, samples=2000, seed=0))
@@ -142,8 +143,8 @@ class BlackBox(nn.Module):
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order. Those of proposals "optimal" (with order=2) and "fr22"
-        end at the second and first, and higher ones raise ValueError. It makes no further evaluation.
+        smoothed black box and has derivatives of every order, but for proposals "optimal" (with order=2) and "fr22":
+        they have two and one, and higher ones raise ValueError. The function makes no further evaluation.
         """
         _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]

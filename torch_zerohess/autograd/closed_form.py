@@ -1,7 +1,8 @@
 """The value of a layer in plain eager mode: its gradient in closed form, further derivatives from the general graph.
 
-Plain means: no transform of `torch.func`, no forward mode, no compilation. There a function with `setup_context` costs
-more time than a small estimate, and so does the graph of the general formula. Most calls need the gradient alone.
+Plain means: no transform of `torch.func`, no forward mode, no compilation. In plain mode a function with
+`setup_context` takes more time than a small estimate, and so does the graph of the general formula. Most calls need
+the gradient alone.
 """
 
 from collections.abc import Callable

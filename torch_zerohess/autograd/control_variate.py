@@ -1,4 +1,4 @@
-"""A layer with a memory: the smoothed surrogate, differentiable by torch, plus the estimate of what it leaves."""
+"""A layer with a memory: the smoothed surrogate, differentiable by torch, plus an estimate of the residual."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -149,8 +149,8 @@ def hvp(
 ) -> Tensor | list[Tensor]:
     """Return the Hessian of a loss with respect to `inputs`, times v.
 
-    v has the shape of `inputs`, a tensor or a sequence of tensors, and so has the result. The graph is kept. `mode` and
-    `through` are those of `CurvatureOperator`.
+    v has the shape of `inputs`, a tensor or a sequence of tensors, and so has the result. The graph is kept. For `mode`
+    and `through` see `CurvatureOperator`.
 
     Example:
         >>> w = torch.tensor([1.0, 2.0], requires_grad=True)

@@ -1,8 +1,8 @@
 """Derivatives of a higher order than the samples serve raise, instead of being zero.
 
-The weights of some families are polynomials in x. Their higher derivatives are zero, and that is not an estimate. So
-`limited(x, order)` is an identity that counts. Its derivative adds a zero that depends on x and has order - 1
-derivatives, the derivative of that zero another zero with one derivative less, and the last zero has none: it raises.
+The weights of some families are polynomials in x. Their higher derivatives are zero, which is not an estimate. So
+`limited(x, order)` is an identity that counts derivatives. Its derivative adds a zero that depends on x and has
+order - 1 derivatives. The derivative of this zero is a zero with one derivative less. The last zero raises.
 Derivatives with respect to anything else, such as a vector that multiplies the gradient, pass.
 
 Every `jvp` here applies autograd functions and nothing else. In nested forward mode torch (tried: 2.15) switches the

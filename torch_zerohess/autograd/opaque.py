@@ -24,7 +24,7 @@ from torch_zerohess.surrogates.memory import Memory
 
 
 class Owner(Protocol):
-    """What an operator needs to know of the module it serves."""
+    """The parts of a module that its operator uses."""
 
     call: BlackBoxCall
     smoothing: Smoothing

@@ -5,7 +5,7 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | question | private name | why no public name serves |
 |---|---|---|
 | is a functorch transform active | `torch._C._functorch.maybe_current_level` | `torch.func` does not tell |
-| what is inside a functorch wrapper | `torch._C._functorch.get_unwrapped`, `is_functorch_wrapped_tensor` |
+| which tensor a functorch wrapper holds | `torch._C._functorch.get_unwrapped`, `is_functorch_wrapped_tensor` |
 `torch.func.debug_unwrap` skips all levels at once |
 | is a forward-mode level open | `forward_ad._current_level` | `forward_ad.unpack_dual` answers for one tensor only |
 | how large is a batch under vmap | `torch._C._functorch.is_batchedtensor`, `maybe_get_level`, `maybe_get_bdim` |

@@ -1,1 +1,1 @@
-"""One batch of evaluations, and what it says about a smoothed function."""
+"""One batch of evaluations, and the estimates of a smoothed function from it."""

@@ -1,4 +1,4 @@
-"""As many batches as a wanted accuracy takes."""
+"""Draw batches until an accuracy is reached."""
 
 import math
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from torch_zerohess.smoothing import Smoothing
 
 MOST = 100_000
 """Evaluations that a tolerance may take where no other number is given."""
-_STEP = 0x9E3779B97F4A7C15  # from the seed of a batch to that of the next
+_STEP = 0x9E3779B97F4A7C15  # from the seed of a batch to the seed of the next
 
 
 def draw_until(

@@ -1,6 +1,6 @@
-"""A surrogate as a control variate: what it predicts for the points of a batch, through the head.
+"""A surrogate as a control variate: its predictions for the points of a batch, through the head.
 
-The surrogate and the coefficient are those of earlier calls. They do not change while one call is made.
+The surrogate and the coefficient come from earlier calls. They do not change during a call.
 """
 
 from collections.abc import Callable, Sequence
@@ -52,7 +52,7 @@ class Control:
         added: Callable[[Tensor], list[Tensor]],
         kept: Tensor | None,
     ) -> Tensor | None:
-        """Keep new evaluations and return what the surrogate predicts for them, float64 [B, E, *out], if it is used.
+        """Keep new evaluations and return their predictions by the surrogate, float64 [B, E, *out], if it is used.
 
         Args:
             values: [B, E, *out].

@@ -121,7 +121,7 @@ class Elementwise(Stein):
     ) -> Spread:
         """Spread of the S draws of each element, which are the only ones that estimate it: S - 1 degrees of freedom.
 
-        The hvp is a sum of elements with their own variances; its degrees are those of Welch and Satterthwaite. Raises
+        The hvp is a sum of elements with their own variances; its degrees are by Welch and Satterthwaite. Raises
         ValueError if an element has one sample.
         """
         if quantity not in ("value", "gradient") and self.first_order:

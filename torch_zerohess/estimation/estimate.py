@@ -34,6 +34,7 @@ def estimate(
     evaluator: Evaluator | None = None,
     value: ValueMode = "center",
     on_nonfinite: str | float = "raise",
+    joint: bool = False,
     tolerance: float | None = None,
     max_evaluations: int | None = None,
 ) -> Estimate:
@@ -61,6 +62,11 @@ def estimate(
         evaluator: where evaluations run; in this process if None.
         value: "center" returns f(x) as the value, "smoothed" an estimate of F(x).
         on_nonfinite: "raise", "drop", or a number that replaces NaN and infinities.
+        joint: whether one evaluation takes a point of every batch element, for x [B, n]: fn is [K, B, n],
+            *aux [K, B, ...] -> [K, B, *out], or [B, n] -> [B, *out] where not `vectorized`. Use it where each of B
+            parts of a scene changes a loss of its own, such as the pixels near it: K evaluations then tell the
+            derivatives of B small functions. Each function is smoothed over the perturbations of the other parts, too.
+            These have the density of the samples, which is the Gaussian with proposal "gaussian".
         tolerance: relative error of the gradient at which to stop; None for one batch.
         max_evaluations: of fn, over all of x, f(x) in every batch included: where to stop in any case; 100 000 if None.
 
@@ -74,10 +80,15 @@ def estimate(
     """
     if not isinstance(smoothing, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
-    call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
+    call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head, joint)
     check_limits(tolerance, max_evaluations)
     _check_memory(call, memory, tolerance)
     x = checked_input(x).detach().clone()
+    if joint and (x.ndim != 2 or head is not None or memory is not None):
+        raise ValueError(
+            f"joint=True needs x of shape [B, n], and neither head nor memory, got x {list(x.shape)}, "
+            f"head={head!r}, memory={memory!r}"
+        )
     batch, flat, aux_rows = x.shape[:-1], working(x).reshape(-1, x.shape[-1]), folded_aux(aux, x.shape[:-1])
     B, n = flat.shape
     given, smoothing = smoothing, smoothing.resolved(n)
@@ -97,6 +108,7 @@ def estimate(
             value=value,
             term=term,
             chosen=chosen,
+            joint=joint,
         )
 
     alone = "one batch: no tolerance was given"
@@ -114,7 +126,7 @@ def estimate(
         draw,
         _relative_error,
         smoothing,
-        lambda own: B * own.evaluations(n, center=center),
+        lambda own: (1 if joint else B) * own.evaluations(n, center=center),
         smoothing.drawn_seed(),
         float(tolerance),
         MOST if max_evaluations is None else max_evaluations,

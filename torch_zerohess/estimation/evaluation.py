@@ -36,6 +36,7 @@ class BlackBoxCall:
     fn: [K, n], *aux [K, ...] -> [K, *out], or of one point [n] -> [*out] where not `vectorized`. Without aux if there
         is a head.
     head: white box after fn, see `estimation.head`; None: the outputs of fn are the values.
+    joint: one evaluation takes a point of every batch element: [K, B, n], *aux [K, B, ...] -> [K, B, *out].
     on_nonfinite: "raise", "drop" (leave out the whole antithetic pair), or a number to put in its place.
     """
 
@@ -45,6 +46,7 @@ class BlackBoxCall:
     value: ValueMode = "center"
     on_nonfinite: str | float = "raise"
     head: Head | None = None
+    joint: bool = False
     answered: bool = field(default=False, init=False, repr=False, compare=False)
     """Whether a call has given values."""
 
@@ -64,7 +66,7 @@ class BlackBoxCall:
 
     @property
     def outer(self) -> Outer:
-        """What stands around the expectation of the values."""
+        """The function outside of the expectation of the values."""
         return outer_of(self.head)
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -91,6 +93,8 @@ class BlackBoxCall:
         spare: nobody needs the points again; else the black box gets a copy, because it may write to its input.
         """
         B, E = points.shape[:2]
+        if self.joint:
+            return (self._jointly(points.transpose(0, 1).contiguous(), aux),) * 2
         flat = points.flatten(0, 1) if spare else points.flatten(0, 1).clone()
         if self.head is None:
             values = self(flat, [one.repeat_interleave(E, 0) for one in aux]).unflatten(0, (B, E))
@@ -102,6 +106,18 @@ class BlackBoxCall:
             values = values.clone()
             values[[k // E for k in lost], [k % E for k in lost]] = torch.nan
         return values, outputs
+
+    def _jointly(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
+        """Return values [B, E, *out] of points [E, B, n], of which each row is one evaluation."""
+        E, B = points.shape[:2]
+        values = self(points, [one.expand(E, *one.shape).clone() for one in aux])
+        if values.shape[1:2] != (B,):
+            raise ValueError(
+                f"fn must return one value per batch element, [{E}, {B}, *out] for points {list(points.shape)}, "
+                f"got {list(values.shape)}"
+            )
+        self._lost(points.flatten(1))
+        return values.transpose(0, 1)
 
     def _lost(self, points: Tensor) -> list[int]:
         """Return which of the points [K, n] of the last call the evaluator has no value of."""
@@ -143,7 +159,7 @@ class Evaluations:
 
     @property
     def rest(self) -> Tensor:
-        """What is smoothed at the perturbed points, [B, K, P]."""
+        """The values at the perturbed points that are smoothed, [B, K, P]."""
         B, K, _ = self.share.shape
         return self.remaining[:, :K].reshape(B, K, -1)
 
@@ -189,7 +205,7 @@ def evaluate(
         aux: [B, ...] each, for every point of its batch element.
         smoothing: how to sample.
         keep: see `perturb`.
-        control: what is subtracted from the values before they become coefficients.
+        control: control variate, subtracted from the values before they become coefficients.
     """
     smoothing = smoothing.resolved(x.shape[1])
     seed = smoothing.drawn_seed()
@@ -228,7 +244,7 @@ def evaluate(
         if predicted is not None:
             remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
     baseline, coefficients = _coefficients(remaining.reshape(B, K + with_center, -1), share, smoothing, n)
-    # The sum of finite numbers may be infinite, but that of others is never finite.
+    # A sum is finite only if all terms are; a sum of finite terms may overflow.
     if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
         raise ValueError(
             f"fn returned values up to {float(values[:, :K].abs().max()):.3g}, whose differences are not finite in "

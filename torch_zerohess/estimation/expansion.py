@@ -1,4 +1,4 @@
-"""The smoothed function near x, as one batch of evaluations tells it: what estimates and the layer are made of."""
+"""The smoothed function near x, estimated from one batch of evaluations: the core of estimates and of the layer."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class Expansion:
     def tensors(self) -> list[Tensor]:
         """Return the tensors that represent the expansion, for `rebuild`; `base` and `sigma` are copies.
 
-        Those two may share memory with values or settings, which outputs of an operator of torch must not.
+        The two could share memory with values or settings, which outputs of an operator of torch must not do.
         """
         return [self.base.clone(), self.coefficients, self.sigma.clone(), self.constants, *self.stein.tensors()]
 

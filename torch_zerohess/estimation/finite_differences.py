@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.estimate import estimate
-from torch_zerohess.estimation.inputs import checked_input
+from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing
 
@@ -36,7 +36,7 @@ def finite_difference_hvp(
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out], or of one point where not `vectorized`, as for `estimate`.
-        x: [*batch, n], float32 or float64.
+        x: [*batch, n], float32 or float64; float16 and bfloat16 are computed in float32 and returned as they came.
         v: [*batch, n] or [n]; a zero vector gives zero.
         smoothing: how to sample each of the two gradients.
         *aux: further inputs of fn, [*batch, ...] each.
@@ -61,9 +61,10 @@ def finite_difference_hvp(
     """
     if not isinstance(smoothing, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
-    n = checked_input(x).shape[-1]
+    dtype, x = checked_input(x).dtype, working(x)
+    n = x.shape[-1]
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):
-        raise ValueError(f"v must be a tensor of shape [{n}] or that of x, got {getattr(v, 'shape', v)}")
+        raise ValueError(f"v must be a tensor of shape [{n}] or of the shape of x, got {getattr(v, 'shape', v)}")
     if not 0 < checked_number("step", step) < math.inf:
         raise ValueError(f"step must be positive and finite, in units of sigma, got {step}")
     sigma = smoothing.sigma_vector(n, x.device)
@@ -81,4 +82,4 @@ def finite_difference_hvp(
         for sign, s in ((1.0, seed), (-1.0, other))
     )
     scale = length.reshape(*length.shape[:-1], *[1] * (forward.dim() - length.dim()), 1)
-    return (forward - backward) * (scale / (2 * step)).to(x.dtype)
+    return ((forward - backward) * (scale / (2 * step)).to(x.dtype)).to(dtype)

@@ -15,7 +15,7 @@ Head = Callable[..., Tensor]
 """(outputs [K, *out], *aux [K, ...]) -> [K], made of differentiable torch operations."""
 _ALONE = (
     "but the layer is differentiated with respect to x alone: call requires_grad_(False) or detach() first, or put "
-    "what is trained behind a layer without a head"
+    "trainable parts behind a layer without a head"
 )
 
 

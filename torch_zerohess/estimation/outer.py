@@ -1,4 +1,4 @@
-"""What stands around the expectation of losses: nothing, or the logarithm of a local entropy.
+"""The function outside of the expectation of losses: the identity, or the logarithm of a local entropy.
 
 A layer estimates F = outer(Z) with Z = E inner(l), where l are losses. For the mean both functions are the identity.
 For the local entropy F = -T log E exp(-l / T) they are inner(l) = exp((m - l) / T) and outer(Z) = m - T log Z. T and m
@@ -35,7 +35,7 @@ class Outer:
         return None
 
     def inner(self, values: Tensor, scales: Tensor | None) -> Tensor:
-        """Return what Z is the expectation of."""
+        """Return the numbers whose expectation is Z."""
         return values
 
     def kept(self, scales: Tensor | None, values: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ class Entropy(Outer):
     constants: ClassVar[int] = 3
 
     def share(self, coefficient: float) -> float:
-        """All of the surrogate, or none: the logarithm of a share is not that share of the logarithm."""
+        """All of the surrogate, or none: log(c z) is not c log(z)."""
         return 1.0 if coefficient >= 0.5 else 0.0
 
     def scales(self, losses: Callable[[], Tensor], mean: Callable[[Tensor], Tensor]) -> Tensor:
@@ -92,5 +92,5 @@ class Entropy(Outer):
 
 
 def outer_of(head: Head | None) -> Outer:
-    """Return what stands around the expectation of the losses of a head."""
+    """Return the function outside of the expectation of the losses of a head."""
     return Entropy(head.head, head.temperature) if isinstance(head, LocalEntropy) else Outer(head)

@@ -1,4 +1,4 @@
-"""What an estimate says: the value and derivatives, and how far each of them may be from the truth."""
+"""The result of an estimate: the value and derivatives, and the error of each."""
 
 import math
 from collections.abc import Sequence
@@ -51,10 +51,11 @@ class Estimate:
         value: ValueMode = "center",
         term: SurrogateTerm | None = None,
         chosen: str = "",
+        joint: bool = False,
     ) -> None:
         self._batches = [Sums(evaluations, smoothing), *more]
         self._batch, self._x, self._smoothing, self.reason = batch, x, smoothing, reason
-        self._value_mode, self._term, self._chosen = value, term, chosen
+        self._value_mode, self._term, self._chosen, self._joint = value, term, chosen, joint
         self._sigma = evaluations.expansion.sigma
         self._out = evaluations.expansion.base.shape[1:]
 
@@ -97,8 +98,8 @@ class Estimate:
         """Standard error of an estimate, in the shape of the estimate, from the spread of its independent draws.
 
         An antithetic pair is one draw. So are a whole scramble of sampler "sobol" and a block of "orthogonal". Few
-        draws tell their spread badly: for an interval take `confidence_interval`, not a fixed number of standard
-        errors. With baseline "mean" the draws depend on each other, and the error is that of the jackknife.
+        draws give a poor estimate of their spread: for an interval take `confidence_interval`, not a fixed number of
+        standard errors. With baseline "mean" the draws depend on each other, and the error is by the jackknife.
 
         Args:
             quantity: "value" (of the smoothed value), "gradient", "hessian_diagonal", "hessian" or "hvp".
@@ -151,9 +152,10 @@ class Estimate:
 
     @property
     def evaluations(self) -> int:
-        """How often the black box was evaluated, f(x) included."""
+        """How often the black box was evaluated, f(x) included; a joint evaluation counts once."""
         found = [one.evaluations for one in self._batches]
-        return sum(one.share.numel() + len(one.share) * (one.center is not None) for one in found)
+        each = sum(one.share.shape[1] + (one.center is not None) for one in found)
+        return each if self._joint else each * self._batch.numel()
 
     @cached_property
     def points(self) -> Tensor:
@@ -212,7 +214,7 @@ class Estimate:
     def _shaped(self, flat: Tensor, what: str) -> Tensor:
         """Return [B, P, ...] as [*batch, *out, ...] in the dtype of x; ValueError if it is not finite there."""
         result = flat.reshape((*self._batch, *self._out, *flat.shape[2:])).to(self._x.dtype)
-        # The sum of finite numbers may be infinite, but that of others is never finite.
+        # A sum is finite only if all terms are; a sum of finite terms may overflow.
         if not math.isfinite(float(result.sum())) and not bool(torch.isfinite(result).all()):
             largest = max(float(one.evaluations.values.abs().max()) for one in self._batches)
             raise ValueError(

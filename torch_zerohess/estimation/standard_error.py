@@ -45,11 +45,11 @@ def variance_of_draws(
     With D independent draws y_d, each of share s_d of the sum Y, the variance is sum_d (y_d - s_d Y)^2 / s_d / (D - 1):
     the sample variance over D where all shares are 1/D. It has D - 1 degrees of freedom.
 
-    A baseline that is the mean of the other draws makes the draws depend on each other. The variance is then that of
-    the jackknife (Efron and Stein 1981), from the estimates Y_d without draw d, whose baselines leave it out as well:
-    sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 / (D - 1). It counts the variance that products of two draws have, a baseline
-    times a kernel, 2 (D - 1) / (D - 2) times: the standard error of four draws is 20 to 40 % too large where such
-    products matter (the Hessian, and the gradient without antithetic pairs), that of sixteen 3 to 8 %.
+    A baseline that is the mean of the other draws makes the draws depend on each other. The variance is then by the
+    jackknife (Efron and Stein 1981), from the estimates Y_d without draw d, whose baselines leave it out as well:
+    sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 / (D - 1). It counts the variance of products of two draws, a baseline times a
+    kernel, 2 (D - 1) / (D - 2) times. Where such products matter (the Hessian, and the gradient without antithetic
+    pairs), the standard error is 20 to 40 % too large for four draws, and 3 to 8 % for sixteen.
 
     Args:
         stein: the family.

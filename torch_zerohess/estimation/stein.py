@@ -1,4 +1,4 @@
-"""Stein's identities as sums over samples: what a family of weights must know.
+"""Stein's identities as sums over samples: the interface of a family of weights.
 
 Every estimate is a weighted sum of black-box values f_k. The weight is a kernel of the dimensionless perturbation u_k:
 

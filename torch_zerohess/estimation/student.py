@@ -1,4 +1,4 @@
-"""Student's t distribution: how many standard errors wide an interval of few draws must be."""
+"""Student's t distribution: the half width, in standard errors, of an interval from few draws."""
 
 import math
 from functools import lru_cache
@@ -8,7 +8,7 @@ from torch import Tensor
 
 _NODES = 48  # of the quadrature, of relative error below 1e-4 up to a level of 0.9999, and mostly below 1e-8
 _STEPS = 200
-_MOST_DEGREES = 1e6  # beyond, the factor differs from that of the normal distribution by less than 1e-5 of it
+_MOST_DEGREES = 1e6  # beyond, the factor is within a relative 1e-5 of the normal distribution's
 
 
 def student_factor(level: float, degrees: Tensor) -> Tensor:

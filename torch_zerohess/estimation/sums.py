@@ -56,7 +56,7 @@ class Sums:
 
     @property
     def _pooled(self) -> Tensor:
-        """(f - mean of f) * share, [B, P, K], where f is what is smoothed."""
+        """(f - mean of f) * share, [B, P, K], where f are the values `rest` that are smoothed."""
         share, f = self.evaluations.share, self.evaluations.rest.double()
         origin = f[:, :1]  # differences to one of the values keep the precision of a small variation
         return (((f - origin) - ((f - origin) * share).sum(1, keepdim=True)) * share).mT.contiguous()

@@ -137,7 +137,7 @@ class SurrogateTerm:
 
         Args:
             error: standard error of the independent estimate.
-            degrees: its degrees of freedom; those of the sum are by Satterthwaite.
+            degrees: its degrees of freedom; the degrees of freedom of the sum are by Satterthwaite.
             quantity: which.
             v: [B, n], the vector of the "hvp".
         """

@@ -3,7 +3,7 @@
 Calls are served in rounds: give points to workers, wait until one of them has news, take it. A call alone is served by
 the thread that made it. The first `submit`, or a call beside another one, starts a thread that serves all calls from
 then on; a call that is under way is handed to it between two rounds. Calls are begun in their order, so the values of
-an early one come early. The bits of a call are those that it would have alone.
+an early call come early. A call has the same bits as it would have alone.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ class Function:
 
 @dataclass(eq=False)
 class Job:
-    """A call: its points, and what is known of their values."""
+    """A call: its points, and the values known so far."""
 
     function: Function
     tensors: tuple[Tensor, ...]

@@ -1,9 +1,9 @@
 """The points of one call, cut into chunks: what waits, what came back, what failed.
 
-Where the cuts are depends on the number of points alone (with `Ray` on the number of actors, too), and values are put
-together in the order of the points. So neither the number of workers nor the order in which they finish changes a bit,
-if the black box is deterministic. The bits are those of one call with all points, if the value of a point does not
-depend on which points share its call.
+The cuts depend on the number of points alone (with `Ray` on the number of actors, too), and values are put together in
+the order of the points. If the black box is deterministic, neither the number of workers nor the order in which they
+finish changes a bit. If also the value of a point does not depend on which points share its call, the bits are the same
+as in one call with all points.
 
 A chunk that fails is tried again. A chunk that failed too often is cut into its points, and each of them is tried as
 often: a point that shares a chunk with one that ends the process is not lost. The value of a point that failed too

@@ -32,8 +32,8 @@ class Executor(Closing):
     `ProcessPoolExecutor` (use one with `mp_context` "spawn"), almost anything for loky, dask and threads. It is sent
     with every task; pass `Factory(make, *args)` for one that is large or slow to make, which each process makes once.
 
-    Values have the same bits as those of `Inline`, see `ProcessPool`. An exception of the black box is raised, that of
-    the first point that has one. An executor whose workers ended raises its own error (`BrokenExecutor`): it has no
+    Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception
+    of the first point is raised. An executor whose workers ended raises its own error (`BrokenExecutor`): it has no
     limit of time and no second try, which `ProcessPool` and `Ray` have.
 
     The executor is the caller's: `close()` does not shut it down.
@@ -112,7 +112,7 @@ class Executor(Closing):
 
 
 def _joined(batch: Batch, tasks: Tasks) -> Tensor:
-    for chunk, task in tasks:  # in order, so that the first error is that of the first point
+    for chunk, task in tasks:  # in order, so that the first error is of the first point
         batch.came(chunk, transfer.unpacked(task.result())[0])
     return batch.result()
 

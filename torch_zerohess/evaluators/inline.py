@@ -1,4 +1,4 @@
-"""Evaluation in this process, and what every evaluator is."""
+"""Evaluation in this process, and the interface of every evaluator."""
 
 import concurrent.futures
 from collections.abc import Callable

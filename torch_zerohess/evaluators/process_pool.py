@@ -54,7 +54,7 @@ class ProcessPool(Ahead):
     says what becomes of them, "raise" names the point and how the worker ended. An exception of the black box is not
     tried again. It is raised here, with the worker's traceback as its cause.
 
-    Values have the same bits as those of `Inline` for every number of workers, if the black box is deterministic and
+    Values have the same bits as with `Inline` for every number of workers, if the black box is deterministic and
     its value of a point does not depend on which points share its call. (Matrix products, and some functions of torch
     such as `sigmoid`, may round differently in the last bit when a call has fewer points. The number of workers makes
     no difference to them either.) fn gets tensors on the CPU.

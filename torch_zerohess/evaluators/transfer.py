@@ -1,6 +1,6 @@
 """Tensors between processes: in one message of a pipe, or in memory that both processes map.
 
-Memory is that of a file without a name: nothing is left of it when the processes have ended, however they end.
+The memory is a file without a name: nothing is left of it when the processes have ended, however they end.
 """
 
 import mmap

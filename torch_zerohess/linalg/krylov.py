@@ -19,7 +19,7 @@ def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: T
     the iterate of conjugate gradients on H + shift after `iterations` products, at the most, which all steps share.
     Negative curvature counts as none. float64; zeros if the gradient is zero.
 
-    The space is that of Lanczos with full reorthogonalization: iterations n numbers.
+    The basis is built by Lanczos with full reorthogonalization: iterations * n numbers.
     """
     length = float(gradient.norm())
     if length == 0.0:

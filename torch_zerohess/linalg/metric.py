@@ -32,8 +32,8 @@ def learned(root: Tensor, hessian: Tensor, rate: float, floor: float = 0.0) -> T
 def region_step(gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """Return s [n] that minimises gradient.s + s.hessian s/2 within |B^-1 s| <= 1 and lower <= s <= upper.
 
-    The parameter that is farthest beyond a bound stays there, and the others get a new step in what is left of the
-    region, until none is beyond. Which ones hit is a guess.
+    The parameter farthest beyond a bound is set to the bound, and the others get a new step in the rest of the region,
+    until none is beyond. The set of parameters at bounds is a guess.
     """
     s = root @ ball_step(root.mT @ gradient, root.mT @ hessian @ root, 1.0)
     beyond = torch.maximum(lower - s, s - upper)

@@ -85,15 +85,15 @@ def noise_level(estimates: Tensor, noise: float) -> float:
     """Return the length below which the mean of independent estimates [R, N] does not differ from zero.
 
     If there is nothing but errors, the squared length of the mean has the expectation tr C and the variance 2 tr C^2,
-    C the covariance of the mean [N, N], here from the spread of the R. The level is the root of that expectation plus
-    `noise` standard deviations: `noise` = 2 is 1.96 standard errors of a number, and tends to one of a long vector.
-    Zero where there is one estimate, or no `noise`.
+    with the covariance C [N, N] of the mean, here from the spread of the R. The level is the root of the expectation
+    plus `noise` standard deviations. With `noise` = 2 it is 1.96 standard errors for N = 1, and tends to one standard
+    error for large N. It is zero for one estimate, or without `noise`.
     """
     R = len(estimates)
     if R < 2 or noise == 0.0:
         return 0.0
     deviations = estimates - estimates.mean(0)
-    gram = deviations @ deviations.mT / (R * (R - 1))  # has the trace of C, and C^2 that of its square
+    gram = deviations @ deviations.mT / (R * (R - 1))  # trace(gram) = tr C, |gram|^2 = tr C^2
     return float((gram.trace() + noise * math.sqrt(2) * gram.norm()).sqrt())
 
 

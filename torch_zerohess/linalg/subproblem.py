@@ -72,7 +72,7 @@ def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
 def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:
     """Return a step as `ball_step` that also stays within lower <= s <= upper [r].
 
-    Parameters that hit a bound stay there, and the others get a new step. Which ones hit is a guess. The best point
+    Parameters that hit a bound stay there, and the others get a new step. The set that hits is a guess. The best point
     along the projected gradient is returned if it is better.
     """
     s, free = torch.zeros_like(gradient), torch.ones_like(gradient, dtype=torch.bool)

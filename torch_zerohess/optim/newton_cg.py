@@ -28,8 +28,8 @@ class NewtonCG(NewtonStep):
     - "clip": conjugate gradients without a boundary; the step is shortened to the radius afterwards. The direction is
       Newton's, however short the step.
     - "dual": the same with an exact solution, by a system of as many equations as the network has outputs in the batch
-      (`linalg.dual.dual_step`). It costs one product J J^T: for batches of few outputs and many weights. Where the
-      curvature over the outputs is indefinite, and not modified, the step is that of "clip".
+      (`linalg.dual.dual_step`). It costs one product J J^T: for batches of few outputs and many weights. If the
+      curvature over the outputs is indefinite, and not modified, the step is the step of "clip".
 
     With `adapt` the closure is called again, without derivatives, up to ten times if the loss is not finite. A step
     that does not lower the loss is taken back, and the radius follows the ratio of actual to predicted decrease

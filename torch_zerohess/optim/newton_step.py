@@ -19,8 +19,8 @@ class NewtonStep(SecondOrder):
 
     With `adapt` the closure is called again, without derivatives: a step that does not lower the loss is taken
     back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Where
-    the predicted decrease is within the rounding of the loss no step is taken, and the radius stays. The length that is
-    compared with the radius is that of the step times `lr`.
+    the predicted decrease is within the rounding of the loss no step is taken, and the radius stays. The length
+    compared with the radius is the length of the step times `lr`.
     """
 
     exit: str | None = None

@@ -2,8 +2,8 @@
 
 CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms` and `sample`
 go to Triton kernels, which were never run on a real GPU. The first call on a device compares some of their numbers
-with the reference. Where they differ, or a kernel fails, a warning says so and the reference is used from then on. All
-other tensors, and those of an installation without a compiler, go to the reference. All of them draw the same bits.
+with the reference. If they differ, or a kernel fails, a warning says so and the reference is used from then on. All
+other tensors go to the reference, and so do CPU tensors without the extension. All of them draw the same bits.
 Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
 """
 
@@ -239,7 +239,7 @@ def _triton_kernels(device: torch.device) -> Any:
     rows = proposals.pick_rows(0, 0, 64, n, proposals.SECOND_ORDER)
     for single in (False, True):
         if not torch.equal(module.draw(rows.to(device), n, single).cpu(), proposals.draw(rows, n, single)):
-            raise RuntimeError(f"its numbers on {device} are not those of the reference")
+            raise RuntimeError(f"its numbers on {device} differ from the reference")
     return module
 
 

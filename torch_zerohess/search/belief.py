@@ -1,4 +1,4 @@
-"""What all evaluations of a loss with noise say together: where it is lowest, its value there, and how sure that is."""
+"""The minimum of a noisy loss from all evaluations together: where it is, its value, and the standard error of that."""
 
 import math
 from typing import NamedTuple

@@ -38,7 +38,7 @@ _RIDGE = 1e-6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BlockProgress(JacobianProgress):
-    """An output, the Jacobian there, and what is asked for to go on."""
+    """The output at the center, the Jacobian there, and the samples asked for next."""
 
     wanted: int
     """Samples that are still wanted in this iteration."""

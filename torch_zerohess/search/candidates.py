@@ -1,4 +1,4 @@
-"""Where in a box a model is lowest, or a process knows least, or points are far: the best of many random candidates."""
+"""Points of a box where a model is low, a process uncertain, or other points far: the best of random candidates."""
 
 from collections.abc import Callable
 
@@ -53,7 +53,7 @@ def farthest(points: Tensor, count: int, lower: Tensor, upper: Tensor, generator
 
 
 def is_known(process: GaussianProcess, x: Tensor) -> bool:
-    """Whether a point [n] is one of those that the process knows."""
+    """Whether a point [n] is one of the known points of the process."""
     return float((process.points - x).norm(dim=1).min()) < _SAME
 
 

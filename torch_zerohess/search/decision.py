@@ -14,13 +14,13 @@ _OTHERS = 2
 
 @dataclass(frozen=True)
 class Decision:
-    """Which of the best points in noise has the lowest mean, its mean, and the standard error of that."""
+    """The point with the lowest mean among the best points in noise, the mean, and its standard error."""
 
     x: Tensor
     value: float
     error: float
     evaluations: int
-    """With those for the decision."""
+    """Number of evaluations, including the evaluations for the decision."""
 
 
 def decide(
@@ -32,15 +32,15 @@ def decide(
     most: int,
     noise: float,
 ) -> tuple[Tensor, float, float] | None:
-    """Evaluate the best points again; return the one with the lowest mean, that, and its standard error.
+    """Evaluate the best points again; return the point with the lowest mean, the mean, and its standard error.
 
     Args:
         evaluate: points [K, n] -> losses [K].
         points: all evaluations [P, n], in order.
         losses: [P].
         likely: points [n] that may be best.
-        before: evaluations before the decision. Those after it are of a decision that was interrupted: where they are
-            of the same points they are not made again.
+        before: number of evaluations before the decision. Later evaluations belong to an interrupted decision, and are
+            used again if they are of the same points.
         most: evaluations that the decision gets.
         noise: standard deviation of a loss.
     """

@@ -70,7 +70,7 @@ class LocalQuadratics(Method[DescentProgress]):
         return known, self.points(known, generator)
 
     def take(self, known: DescentProgress, evaluated: Evaluated, generator: torch.Generator) -> DescentProgress:
-        """Return what is known after an evaluation, with a step or the number of samples to ask for next."""
+        """Return the progress after an evaluation, with a step or the number of samples to ask for next."""
         known = self._remembered(known, evaluated)
         if known.refused >= _REFUSED:
             reason = f"{_REFUSED} batches in a row had values that are not finite"
@@ -102,7 +102,7 @@ class LocalQuadratics(Method[DescentProgress]):
         return self._drawn(known, known.need, generator, paired=known.paired)
 
     def more(self, known: DescentProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        """Return samples around the end of the step, or where else the search is."""
+        """Return samples around the end of the step; without a step, around the center."""
         end = replace(known, center=points[0], sigma=_BESIDE * known.sigma)
         around = end if known.phase == "trial" else known
         return self._drawn(around, count, generator, paired=False)
@@ -189,7 +189,7 @@ class LocalQuadratics(Method[DescentProgress]):
         )
 
     def _agreeing(self, known: DescentProgress) -> DescentProgress:
-        """Count a round that has arrived. One around the best point confirms nothing, and neither does a plateau."""
+        """Count a round that has arrived. A round around the best point, or on a plateau, confirms nothing."""
         end, tolerance = known.lowest, self.settings.tolerance
         if known.pool.ties(end.point, end.loss, tolerance):
             return replace(known, agreed=0)
@@ -228,7 +228,7 @@ class LocalQuadratics(Method[DescentProgress]):
         """Fit a model and find its step; where too few evaluations lie near, ask for more first."""
         points, center, sigma = known.pool.points, known.center, known.sigma
         weights = known.pool.weights(center, sigma)
-        if known.faithful:  # the model is about to interpolate: what is nearest counts most
+        if known.faithful:  # the model is about to interpolate: the nearest evaluations count most
             distance = ((points - center) / sigma).square().mean(1)
             weights = weights / (_SHARPNESS + distance).square()
         near = weights > _NEAR

@@ -1,4 +1,4 @@
-"""What a descent knows between two evaluations."""
+"""The progress of a descent between two evaluations."""
 
 import math
 from dataclasses import dataclass, replace

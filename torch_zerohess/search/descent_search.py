@@ -26,7 +26,7 @@ class Descent(AskTell[Any]):
     possibly a local one. It then starts again, up to `restarts` times: from a random point, or in turn from a random
     point and around the best one with more samples per iteration.
 
-    Settings are those of `AskTell`. Decreases below twice the `noise` do not count. By default the pool keeps three
+    It has the settings of `AskTell`. Decreases below twice the `noise` do not count. By default the pool keeps three
     times the evaluations that the quadratic of a loss is fitted to, and of an output max(60, 6 n).
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second

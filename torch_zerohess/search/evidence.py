@@ -1,9 +1,9 @@
 """The choice between a dense and a sparse model of the output, by how well each predicts held-out samples.
 
-The first batch is that of `Descent`, in two parts. If the sparse Jacobian of the first part predicts most of the
-change of held-out samples, the search goes on as `LocalGaussNewton`. The same holds if the Jacobian of the whole batch
-predicts clearly more than the dense one of least norm. Otherwise the search is `Descent`, with all that was evaluated:
-then it asks for the points that `Descent` alone would ask for.
+The first batch has the points of the first batch of `Descent`, in two parts. The search goes on as `LocalGaussNewton`
+if the sparse Jacobian of the first part predicts most of the change of held-out samples, or if the sparse Jacobian of
+the whole batch predicts clearly more than the dense Jacobian of least norm. Otherwise it goes on as `Descent` with all
+evaluations, and asks for the points that `Descent` alone would ask for.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -32,7 +32,7 @@ _MORE = 0.1
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EvidenceProgress(Progress):
-    """What was evaluated before the choice, and after it the search that was chosen."""
+    """The evaluations before the choice; after the choice, the progress of the chosen search."""
 
     chosen: Literal["", "descent", "local"] = ""
     """Empty before the choice."""
@@ -145,5 +145,5 @@ def _emptied(known: EvidenceProgress) -> EvidenceProgress:
 
 
 def _with(known: EvidenceProgress, inner: Progress) -> EvidenceProgress:
-    """Take what every search knows from the one that was chosen."""
+    """Copy the fields that every search has from the chosen search."""
     return replace(known, **{name: getattr(inner, name) for name in _SHARED})

@@ -1,7 +1,8 @@
-"""What searches by Gauss-Newton have in common: samples tell the Jacobian of an output, then steps are tried.
+"""The common part of Gauss-Newton searches: estimate the Jacobian of an output from samples, then try steps.
 
-Steps of several lengths are evaluated together. The best of them is taken if it lowers the loss, and its length is the
-radius of the next ones; otherwise the radius shrinks. A search says how the Jacobian is sampled, kept and solved.
+Steps of several lengths are evaluated together. If the best step lowers the loss, the search goes there, and the length
+of the step is the next radius. Otherwise the radius shrinks. A subclass defines how the Jacobian is sampled and kept,
+and how the model is solved for a step.
 """
 
 import math
@@ -28,7 +29,7 @@ Q = TypeVar("Q", bound="JacobianProgress")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JacobianProgress(Progress):
-    """An output, and what is asked for to go on. A search adds the Jacobian there."""
+    """The output at the center, and the kind of points asked for next. A subclass adds the Jacobian."""
 
     phase: Literal["sample", "trial"] = "sample"
     """What is asked for: samples, after the start itself at first, or steps."""
@@ -40,7 +41,7 @@ class JacobianProgress(Progress):
     """Batches in a row without a finite value."""
 
     def counted(self: Q, evaluated: Evaluated) -> Q:
-        """Return what is known with a batch counted; it is done after too many batches without a finite value."""
+        """Return the progress with a batch counted; it is done after too many batches without a finite value."""
         refused = 0 if bool(evaluated.finite.any()) else self.refused + 1
         known = replace(self, shape=evaluated.shape, evaluations=self.evaluations + len(evaluated), refused=refused)
         if refused < _ENDLESS:
@@ -56,7 +57,7 @@ class GaussNewton(Method[Q]):
 
     @abstractmethod
     def begun(self) -> Q:
-        """Return what is known before the first values."""
+        """Return the progress before the first values."""
 
     @abstractmethod
     def samples(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
@@ -72,7 +73,7 @@ class GaussNewton(Method[Q]):
 
     @abstractmethod
     def moved(self, known: Q, step: Tensor, change: Tensor) -> Q:
-        """Return what is known after a step [n] that changed the output by [m], with the old Jacobian until now."""
+        """Return the progress after a step [n] that changed the output by [m]; `known` has the Jacobian before it."""
 
     @abstractmethod
     def distance(self, radius: float) -> float:

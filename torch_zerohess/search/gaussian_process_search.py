@@ -44,9 +44,9 @@ class GaussianProcessSearch(AskTell[Any]):
     loss, and `value` is that prediction. Noise in outputs is detected after some 10 (n + 1) of them; noise in a plain
     loss is declared with `noise`.
 
-    Settings are those of `AskTell`; `bounds` are required and finite. By default the pool keeps 60 evaluations. The
-    time of a step grows with the third power of their number. More parameters than four are allowed, but random
-    candidates cover a box of them badly.
+    It has the settings of `AskTell`; `bounds` are required and finite. By default the pool keeps 60 evaluations. The
+    time of a step grows with the third power of their number. More than four parameters are allowed, but random
+    candidates cover a box of so many dimensions badly.
 
     Raises ValueError for settings out of range, or if a bound is missing or infinite. Source: Rasmussen and Williams
     (2006) for the process; Astudillo and Frazier (2019) for the composite function.

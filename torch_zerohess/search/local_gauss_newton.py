@@ -5,8 +5,8 @@ The start and a few dozen samples of all parameters at once tell a sparse Jacobi
 
 An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths then minimise
 the model g J s + s J^T H J s / 2 by conjugate gradients, where g and H are gradient and Hessian of the loss after the
-output; see `gauss_newton`. Where the output of the step that is taken was predicted well, the next steps use the same
-J. Sigma is a share of the radius.
+output; see `gauss_newton`. If the output at the end of the step was predicted well, the next steps use the same J.
+Sigma is a share of the radius.
 """
 
 import math
@@ -29,7 +29,7 @@ from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings,
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _TRUSTED = 0.9
-"""Share of the held-out change from which on the first radius is that of the samples, 1."""
+"""Share of the held-out change. If the Jacobian predicts more, the first radius is at least 1, as for the samples."""
 _FAITHFUL = 0.1
 """Squared error of a predicted output, over its squared change, up to which the Jacobian needs no new samples."""
 _SLOW, _FAST, _MOST = 0.02, 0.1, 2
@@ -72,7 +72,7 @@ class LocalSettings:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalProgress(JacobianProgress):
-    """An output, the sparse Jacobian there, and what is asked for to go on."""
+    """The output at the center, the sparse Jacobian there, and the samples asked for next."""
 
     jacobian: SparseJacobian | None = None
     """float32: errors of sampling are far above its rounding."""
@@ -101,7 +101,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         )
 
     def started(self, evaluated: Evaluated) -> LocalProgress | None:
-        """Return what the start and samples around it at sigma tell; None if that is too little."""
+        """Return the progress after the start and samples around it at sigma; None if they give no Jacobian."""
         if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
             return None
         known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated))
@@ -140,14 +140,14 @@ class LocalMethod(GaussNewton[LocalProgress]):
         return krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
 
     def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
-        """Twice the samples follow a small gain, and half of them a large one."""
+        """Take the best step; double the samples after a small gain, and halve them after a large one."""
         after = super().taken(known, evaluated)
         before, gain = known.best.loss, known.best.loss - after.best.loss
         count = known.samples * (2 if gain < _SLOW * abs(before) else 1) // (2 if gain > _FAST * abs(before) else 1)
         return replace(after, samples=min(max(count, self.own.samples), _MOST * self.own.samples))
 
     def moved(self, known: LocalProgress, step: Tensor, change: Tensor) -> LocalProgress:
-        """The Jacobian needs no samples where it predicted the change of the output."""
+        """Keep the Jacobian, without new samples, if it predicted the change of the output."""
         assert known.jacobian is not None
         miss = change - known.jacobian.matvec(step).flatten()
         faithful = float(miss.square().sum()) <= _FAITHFUL * float(change.square().sum())

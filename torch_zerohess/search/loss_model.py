@@ -63,7 +63,7 @@ class LossModel:
         return self._loss(c) - reach * steepness + 0.5 * self.trace / self.elements * reach.square()
 
     def pending(self, x: Tensor) -> "LossModel":
-        """Return the model where the output at x [n] is taken to be the one that the process predicts."""
+        """Return the model as if the output at x [n] had been evaluated and equalled its prediction."""
         model = copy.copy(self)
         model.process = self.process.pending(x)
         return model

@@ -1,9 +1,9 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
-The process finds the way over plateaus and out of local minima (`ProcessMethod`), quadratics end it
-(`MetricQuadratics`): a process that is to hold all over the box leaves a millionth of the loss unexplained, a quadratic
-around a smooth minimum next to nothing. Where a function has more minima than the process can tell apart, it finds
-nothing better; then quadratics begin at a random point of the box.
+The process crosses plateaus and leaves local minima (`ProcessMethod`). Quadratics finish (`MetricQuadratics`): a
+process of the whole box leaves a millionth of the loss unexplained, a quadratic around a smooth minimum next to
+nothing. If a function has more minima than the process can tell apart, the process finds nothing better. Then
+quadratics begin at a random point of the box.
 """
 
 import math
@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_descent import MetricQuadratics
 from torch_zerohess.search.metric_progress import MetricProgress
-from torch_zerohess.search.process_method import APART, ProcessMethod
+from torch_zerohess.search.process_method import APART, ROUND, ProcessMethod
 from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -134,9 +134,13 @@ class LossProcess(ProcessMethod[LossProgress]):
         patient = known.waited < _QUADRATIC_PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
+        converged = now.done and not now.lost
         if best is now.best:
-            converged = now.done and not now.lost
             solved = best.point if converged else torch.full_like(best.point, math.inf)
             known = replace(known, finished=best.point, solved=solved)
         known = replace(known, finishing=False, waited=0)
-        return self.arrived(known, "quadratics have arrived or found nothing better for a while"), points
+        if plateau or (best is not now.best and not converged):  # they have found no minimum
+            return replace(known, settled=0, exploring=ROUND * self.settings.n), points
+        known = self.arrived(known, "quadratics have arrived or found nothing better for a while")
+        other = float((now.best.point - best.point).norm()) > APART
+        return (replace(known, agreed=0) if other else known), points

@@ -1,4 +1,4 @@
-"""What an evaluated step tells a descent that has a model of the loss: move, shrink, or grow on a plateau."""
+"""The rule after a step on a model of the loss: move to its end, shrink sigma, or let sigma grow on a plateau."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ _PLATEAU, _PATIENCE = 1.3, 2
 
 
 def after_loss(known: DescentProgress, point: Tensor, loss: float, noise: float) -> DescentProgress:
-    """Return what is known after the loss at the end [n] of a step, and what to do next."""
+    """Return the progress after the loss at the end [n] of a step, with what to ask for next."""
     model = known.model
     assert model is not None
     slack = _SLACK * noise

@@ -1,7 +1,7 @@
-"""What a search is behind ask and tell: settings that never change, and a pure step.
+"""A search behind ask and tell: settings that never change, and a pure step.
 
-The step goes from what the search knows (`Progress`) and what was evaluated (`Evaluated`) to what it knows next and the
-points to evaluate next.
+The step takes the progress so far (`Progress`) and the latest values (`Evaluated`), and returns the next progress and
+the points to evaluate next.
 """
 
 import math
@@ -46,7 +46,7 @@ class Settings:
 class Method(ABC, Generic[P]):
     """A search as settings and a pure step.
 
-    Nothing in it changes, and nothing in a `Progress` that it was given. All randomness is drawn from the generator.
+    A method changes neither itself nor a `Progress` that it was given. All randomness is drawn from the generator.
     Both `first` and `next` return points [K, n] within the bounds, at least one unless the search is done.
     """
 
@@ -60,11 +60,11 @@ class Method(ABC, Generic[P]):
 
     @abstractmethod
     def first(self, generator: torch.Generator) -> tuple[P, Tensor]:
-        """Return what is known at the beginning, and the first points [K, n], the start before all others."""
+        """Return the progress at the beginning, and the first points [K, n], of which the first is the start."""
 
     @abstractmethod
     def next(self, known: P, evaluated: Evaluated, generator: torch.Generator) -> tuple[P, Tensor]:
-        """Return what is known after an evaluation, and the next points [K, n]."""
+        """Return the progress after an evaluation, and the next points [K, n]."""
 
     def more(self, known: P, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Return up to `count` points that are worth evaluating at once with those [K, n] that the search asks for.

@@ -26,7 +26,7 @@ from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_values
 
 MOST = 40
-"""Parameters up to which a metric is learned. A step costs the cube of their number and of that of evaluations."""
+"""Parameters up to which a metric is learned. A step costs O(n^3 + P^3) for n parameters and P evaluations."""
 _FITTED = 300
 """Evaluations that a quadratic is fitted to, at most; otherwise n more than it has coefficients."""
 _KEPT, _LEAST_KEPT = 3, 200
@@ -258,7 +258,7 @@ class MetricQuadratics(Method[MetricProgress]):
         return self._widely(known, wide, self._wide.points(wide, generator))
 
     def _widely(self, known: MetricProgress, wide: DescentProgress, points: Tensor) -> tuple[MetricProgress, Tensor]:
-        """Return what isotropic quadratics know, and their points."""
+        """Return the progress of isotropic quadratics, and their points."""
         names = (*_SHARED, "center", "sigma", "iterations", "done", "message")
         return replace(known, wide=wide, **{name: getattr(wide, name) for name in names}), points
 

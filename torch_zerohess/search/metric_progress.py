@@ -1,4 +1,4 @@
-"""What a descent in a learned metric knows between two evaluations."""
+"""The progress of a descent in a learned metric between two evaluations."""
 
 import math
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""What a minimisation tells while it goes on and at its end."""
+"""The iterates of a minimisation, and its result."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -40,18 +40,19 @@ class Minimum:
     """The best point found, and the smoothed function around it.
 
     Attributes:
-        x: [n], the point with the lowest loss; in noise, with the lowest expected loss. Type and device are those of
+        x: [n], the point with the lowest loss; in noise, with the lowest expected loss. It has the type and device of
             x0.
-        value: the loss at x. In noise the mean of evaluations at x that were made for it; where the search was
-            interrupted before these, what a Gaussian process of the evaluations expects.
+        value: the loss at x. In noise it is the mean of evaluations at x that were made for it. If the search was
+            interrupted before them, it is the prediction of a Gaussian process of all evaluations.
         value_error: standard error of `value`; 0 without noise.
         gradient: [n], of a quadratic around x of width `sigma`; None if too few evaluations lie around x.
         hessian: [n, n], of the same quadratic; None likewise.
         standard_errors: of these by the names "gradient" [n] and "hessian_diagonal" [n]; None likewise. They are
-            infinite where the evaluations do not tell. Without noise they bound what is not quadratic. In noise, and up
-            to 40 parameters, twice the error covers the derivative of a quadratic in about 93 % of all runs. It covers
-            less, some 70 %, where third derivatives change the function by several times the noise within `sigma`. With
-            fewer evaluations than a quadratic has coefficients, and with more parameters, it covers about 85 %.
+            infinite where the evaluations do not determine the derivative. Without noise they bound the error due to
+            terms that are not quadratic. In noise, and up to 40 parameters, twice the error covers the derivative of a
+            quadratic in about 93 % of all runs. It covers less, some 70 %, where third derivatives change the function
+            by several times the noise within `sigma`. With fewer evaluations than a quadratic has coefficients, and
+            with more parameters, it covers about 85 %.
         sigma: [n], width of the quadratic along every parameter.
         evaluations: how many there were.
         points: [evaluations, n], where, in order.

@@ -25,12 +25,12 @@ def deviation(losses: Tensor) -> float:
 
 
 def reserved(evaluations: int) -> int:
-    """How many of the evaluations of a search in noise the decision at its end gets."""
+    """Return how many evaluations a search in noise reserves for the decision at its end."""
     return min(max(evaluations // _SHARE, _LEAST), _MOST)
 
 
 def distinct(points: Sequence[Tensor]) -> Tensor:
-    """Return the points [C, n] without those that are there already, in order."""
+    """Return the points [C, n] without duplicates, in order."""
     chosen: list[Tensor] = []
     for one in points:
         if not any(torch.equal(one, other) for other in chosen):
@@ -43,16 +43,16 @@ def lowest_mean(
 ) -> tuple[int, float, float] | None:
     """Evaluate points [C, n] again; return which has the lowest mean, and its mean and standard error.
 
-    The first half of the evaluations chooses: all points that are left get the same number, then the better half is
-    left (successive halving: Karnin, Koren and Somekh 2013). The second half are all at the point that is chosen. Only
-    the second half enters the mean: the values by which a point was chosen are too low on average. Where none of it is
-    finite the first half has to do; None if none of that is finite, either.
+    The first half of the evaluations chooses: all remaining points get the same number, then the better half remains
+    (successive halving: Karnin, Koren and Somekh 2013). The second half are all at the chosen point. Only the second
+    half enters the mean, because the values by which a point was chosen are too low on average. If no value of the
+    second half is finite, the mean is over the first half; None if no value of the first half is finite, either.
 
     Args:
         evaluate: points [K, n] -> losses [K].
-        points: what to choose from.
-        evaluations: how many there may be.
-        noise: standard deviation of a loss; what is measured counts where it is more.
+        points: to choose from.
+        evaluations: how many may be made.
+        noise: standard deviation of a loss; a larger measured deviation takes its place.
     """
     left, choosing = torch.arange(len(points), device="cpu"), evaluations // 2
     losses = torch.zeros(len(points), 0, dtype=torch.float64, device="cpu")  # of those that are left

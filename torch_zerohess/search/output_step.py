@@ -1,4 +1,4 @@
-"""What an evaluated step tells a descent that has a model of the output: follow its minimum, and sample where it erred.
+"""The rule after a step on a model of the output: follow the minimum of the model, and sample where it erred.
 
 The search moves with the minimum of loss(E f), the loss of the smoothed output, also where the loss itself rises for a
 while, and sigma goes to zero. The worse the output of a step was predicted, the more samples the next step gets.
@@ -42,7 +42,7 @@ _BETTER = 0.9
 
 
 def after_output(known: DescentProgress, point: Tensor, loss: float, output: Tensor) -> DescentProgress:
-    """Return what is known after the output [m] and its loss at the end [n] of a step, and what to do next."""
+    """Return the progress after the output [m] and its loss at the end [n] of a step, with what to ask for next."""
     model, length, before = known.model, known.length, known.value
     assert model is not None
     misfit, gain = model.misfit(known.step, output), before - loss

@@ -1,9 +1,9 @@
-"""Steps by a Gaussian process in a finite box: what `GaussianProcessSearch` does for an output and for a loss alone.
+"""Steps by a Gaussian process in a finite box, for an output with a loss and for a loss alone.
 
 The process predicts the output anywhere in the box from all evaluations. The next point is the one with the lowest loss
 among the outputs that lie within `_OPTIMISM` standard deviations of the prediction (Bayesian optimization of a
-composite function: Astudillo and Frazier 2019). Where that point is known already, the search evaluates the point that
-is known least, so it escapes local minima and plateaus.
+composite function: Astudillo and Frazier 2019). If the process knows that point already, the search evaluates the point
+of the largest uncertainty, so it escapes local minima and plateaus.
 
 If the black box is noisy, the best point is the one whose *predicted* output has the lowest loss. Noise in outputs is
 detected by the evidence; noise in a plain loss is declared with `noise`.
@@ -39,7 +39,7 @@ _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
 _FLOOR = 1e-2
 """Least sigma, over the tolerance."""
-_ROUND = 2
+ROUND = 2
 """Steps after an arrival, over n, that are more optimistic."""
 _REFUSED = 10
 """Batches in a row with values that are not finite, after which the search ends."""
@@ -70,7 +70,7 @@ class ProcessMethod(Method[Q]):
         self._latest: tuple[Pool, LossModel] | None = None  # what `_model` would make again
 
     def take(self, known: Q, evaluated: Evaluated) -> Q:
-        """Return what is known after an evaluation."""
+        """Return the progress after an evaluation."""
         finite, trial = evaluated.finite, known.phase == "trial"
         known = replace(
             known,
@@ -91,7 +91,7 @@ class ProcessMethod(Method[Q]):
         return replace(known, center=evaluated.needed.points[-1], phase="trial")
 
     def points(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
-        """Draw the next points [K, n]. What the process says about noise is known afterwards, too."""
+        """Return the progress, with the noise that the process found, and the next points [K, n]."""
         best, settings = known.best.point, self.settings
         if known.done:
             return known, best[None][:0]
@@ -177,8 +177,7 @@ class ProcessMethod(Method[Q]):
 
     def arrived(self, known: Q, reason: str) -> Q:
         """End, or explore."""
-        known = replace(known, settled=0, exploring=_ROUND * self.settings.n, rounds=known.rounds + 1)
-        known = replace(known, arrived=min(known.arrived, known.best.loss))
+        known = replace(known, settled=0, exploring=ROUND * self.settings.n, rounds=known.rounds + 1)
         known = known.agreeing(self.settings.tolerance)
         if known.rounds > self.settings.restarts:
             return replace(known, done=True, message=f"{reason}, {known.rounds} times")
@@ -223,7 +222,7 @@ class ProcessMethod(Method[Q]):
 
     @torch.no_grad()
     def _model(self, known: Q) -> LossModel:
-        """Return the model of the last step: kept, or made again from what is known."""
+        """Return the model of the last step: the kept one, or a new one from the same evaluations."""
         if self._latest is not None and self._latest[0] is known.pool:
             return self._latest[1]
         if not known.expands:
@@ -274,7 +273,7 @@ class ProcessMethod(Method[Q]):
     def _of_losses(self, known: Q) -> tuple[Q, LossModel]:
         values = known.pool.values
         least, middle = float(values.min()), float(values.median())
-        if middle > least:  # what is out of all proportion, such as a penalty, says no more than that it is high
+        if middle > least:  # a value out of all proportion, such as a penalty, counts as high and no more
             values = values.clamp(max=least + _PROPORTION * (middle - least))
         spread = float(values.max()) - least or 1.0
         values = (values - least) / spread  # their squares do not overflow
@@ -285,12 +284,12 @@ class ProcessMethod(Method[Q]):
         return known, LossModel(process, values.min()[None], torch.sum, torch.Size([1]), _EXPLORING)
 
     def _fitted(self, known: Q, outputs: Tensor, deviation: float = 0.0) -> tuple[Q, GaussianProcess]:
-        """Return the process of outputs [P, m]; where it ceases to find noise, what was evaluated counts again.
+        """Return the process of outputs [P, m]; if it ceases to find noise, the best point is `record` again.
 
         deviation: of repeated outputs at one point; 0 if it is not known.
 
-        Where an output was not finite it is taken to be as the one with the highest loss. A loss alone says too little
-        to tell noise from ripples: it is noisy if `noise` says so.
+        An output that is not finite is replaced by the output with the highest loss. A loss alone is too little
+        evidence to tell noise from ripples: it counts as noisy only if `noise` is given.
         """
         pool, n = known.pool, self.settings.n
         worst = outputs[int(pool.values.argmax())]

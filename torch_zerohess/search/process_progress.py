@@ -1,4 +1,4 @@
-"""What a search by a Gaussian process knows between two evaluations."""
+"""The progress of a search by a Gaussian process between two evaluations."""
 
 import math
 from dataclasses import dataclass, replace
@@ -53,9 +53,11 @@ class ProcessProgress(Progress):
     def agreeing(self: Q, tolerance: float) -> Q:
         """Count an arrival at the best point.
 
-        It agrees with those before if the search has since looked elsewhere for as long as it had taken until then:
-        what was hard to find may have something better beside it that is just as hard to find.
+        It agrees with earlier arrivals if the search has since evaluated elsewhere as often as it had evaluated until
+        then: beside a minimum that was hard to find there may be a lower one that is as hard to find.
         """
+        if not self.pool.ties(self.best.point, self.best.loss, tolerance):  # a plateau is no minimum
+            self = replace(self, arrived=min(self.arrived, self.best.loss))
         if not self.is_minimum(tolerance):
             return self
         looked, least = self.evaluations - self.counted, _LOOKING * (len(self.center) + 1)

@@ -1,4 +1,4 @@
-"""Ask and tell, the same for every search: what is checked, what is told, what is saved.
+"""Ask and tell, the same for every search: the checks, the values told, and the state that is saved.
 
 A search is a `Method`, and `AskTell` puts the public classes around it. `tell` computes the whole next `State` and
 assigns it at the end, so a search is as it was if anything raises. `ask` reads the state, and notes which points it has

@@ -16,7 +16,7 @@ def uniform(generator: torch.Generator, lower: Tensor, upper: Tensor, count: int
 
 
 def reflect(z: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Mirror points [K, n] into the box; what is still outside of it is moved to its sides."""
+    """Mirror points [K, n] into the box; points that are still outside are moved to its sides."""
     z = torch.where(z < lower, 2 * lower - z, z)
     z = torch.where(z > upper, 2 * upper - z, z)
     return z.clamp(lower, upper)

@@ -44,19 +44,19 @@ class Record:
 
     @property
     def told(self) -> tuple[Tensor, Tensor]:
-        """All points [evaluations, n] and their losses [evaluations], those of an interrupted request at the end."""
+        """All points [evaluations, n] and their losses [evaluations]; an interrupted request comes last."""
         if len(self._batches) > 1:
             self._batches = [_joined(self._batches)]
         return _joined([*self._batches, self._interrupted]) if self._numbers else self._batches[0]
 
     @property
     def evaluations(self) -> int:
-        """How many there are, with those of an interrupted request."""
+        """Number of evaluations, including the evaluations of an interrupted request."""
         return self.complete + (len(self._interrupted[1]) if self._numbers else 0)
 
     @property
     def _interrupted(self) -> tuple[Tensor, Tensor]:
-        """Points [k, n] and losses [k] of the request, as far as they are known; none if the loss raises."""
+        """Points [k, n] and losses [k] of the request, whose values are known; none if the loss raises."""
         if self._open is None:
             assert self.requested is not None
             self._open = self.requested[:0], self._batches[0][1][:0]
@@ -65,7 +65,7 @@ class Record:
         return self._open
 
     def values(self, points: Tensor) -> Tensor:
-        """Return the values [K, *out] of points [K, n]; what is known of the request is not evaluated again.
+        """Return the values [K, *out] of points [K, n]; points of the request with known values are not evaluated.
 
         The request stays open until `note`. Further points may be added to it.
         """
@@ -88,7 +88,7 @@ class Record:
         self.requested, self._numbers, self._values = None, [], self._values[:0]
 
     def note_known(self) -> None:
-        """Add what is known of the request, and close it."""
+        """Add the known values of the request, and close it."""
         if self.requested is not None:
             self.note(*self._interrupted)
 

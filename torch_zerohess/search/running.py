@@ -33,7 +33,7 @@ class Running:
 
     Args:
         make: the search for a standard deviation of repeated losses.
-        call: outputs or losses of points [K, n], as far as they are known if it is interrupted.
+        call: outputs or losses of points [K, n]; the known ones if it is interrupted.
         noise: that standard deviation; measured at the start if None.
         batch: points that are evaluated at once.
         least: evaluations that the search needs for one step.
@@ -85,7 +85,7 @@ class Running:
 
     @property
     def evaluations(self) -> int:
-        """Values so far, those that measure noise and those of an interrupted batch included."""
+        """Evaluations so far, including the measurement of noise and the finished part of an interrupted batch."""
         return self._record.evaluations
 
     @property
@@ -95,7 +95,7 @@ class Running:
 
     @property
     def left(self) -> int:
-        """Evaluations that the search may still use. In noise it leaves those that it does not need for the end."""
+        """Evaluations that the search may still use. In noise some are reserved for the decision at the end."""
         rest = self._most - self.evaluations
         needed = max(self._least - self.search.evaluations, 0)
         return rest - (min(reserved(self._most), max(rest - needed, 0)) if self.noise else 0)
@@ -117,7 +117,7 @@ class Running:
 
     @property
     def iterate(self) -> Iterate:
-        """What is known after the latest batch."""
+        """The best point and the values of the latest batch."""
         x, value, _ = self._best()
         points, losses = self._record.last
         return Iterate(self.evaluations, value, x, points.clone(), losses.clone())
@@ -141,13 +141,13 @@ class Running:
         self._noted(points, search.told)
 
     def ending(self, *, arrived: bool) -> Status:
-        """Return what an end is where the search has `arrived`: in noise a small region is no evidence of a minimum."""
+        """Return the status when the search ends by itself: in noise a small region is no evidence of a minimum."""
         return "solved" if arrived and not self.flat and not self.noise else "stalled"
 
     def reaches(self, target: float) -> bool:
-        """Whether the value is at most the target; in noise, that of the decision, or one that is worth a decision.
+        """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.
 
-        That is the value of the search. After a decision for another value it is the lowest one since.
+        That loss is the value of the search. After an earlier decision it is the lowest loss since then.
         """
         if self._last is not None:
             return self._last.value <= target
@@ -240,7 +240,7 @@ class Running:
         return decided if decided is not None and decided.evaluations == self.evaluations else None
 
     def _best(self) -> Belief:
-        """Return the best point, its value and the error of that; in noise what all evaluations say."""
+        """Return the best point, its value and the error of the value; in noise from all evaluations together."""
         if self._last is not None:
             return Belief(self._last.x, self._last.value, self._last.error)
         search = self.search
@@ -248,20 +248,20 @@ class Running:
             return self._believed(self.evaluations)
         if search.evaluations and self._record.requested is None:
             return Belief(search.x, search.value, 0.0)
-        points, losses = self._record.told  # those of the interrupted batch, too, which the search does not know
+        points, losses = self._record.told  # with the interrupted batch, which was not told to the search
         k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
         return Belief(points[k], float(losses[k]), 0.0)
 
     def _believed(self, count: int) -> Belief:
-        """Return what the first evaluations say together in noise."""
+        """Return the minimum of a noisy loss from the first `count` evaluations together."""
         assert self.noise
         points, losses = self._record.told
         return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise)
 
     def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
-        """Return the search's quadratic model around x and its sigma; or the one through all evaluations, if better.
+        """Return the search's quadratic model around x and its sigma; or the regression on all evaluations, if better.
 
-        In noise the latter is better if there is one: its errors are those of the noise.
+        In noise the regression is better if there is one: its standard errors come from the noise.
         """
         found = self.search.model_at_best(x)
         if len(x) > _FITTED:

@@ -1,4 +1,4 @@
-"""What a search knows, as frozen dataclasses, and the plain dictionaries that `state_dict` makes of them."""
+"""The state of a search as frozen dataclasses, and the plain dictionaries that `state_dict` makes of them."""
 
 import dataclasses
 import math
@@ -56,7 +56,7 @@ P = TypeVar("P", bound=Progress)
 def agreeing(known: P, end: Tensor, tolerance: float) -> P:
     """Count a round that has arrived at a point [n] whose loss is the lowest of the round.
 
-    It agrees with the rounds before it if it ends at the best point, and if that is still where they arrived. Points
+    It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point. Points
     are the same within the tolerance, root mean square over the parameters.
     """
     best, tolerance = known.best.point, tolerance * math.sqrt(len(end))
@@ -103,16 +103,16 @@ class Evaluated:
 
     @property
     def needed(self) -> "Evaluated":
-        """Those that the method itself asked for."""
+        """The points that the method itself asked for."""
         return self.those(torch.arange(len(self), device=self.points.device) < len(self) - self.extra)
 
     @property
     def further(self) -> "Evaluated":
-        """Those from `Method.more`."""
+        """The points from `Method.more`."""
         return self.those(torch.arange(len(self), device=self.points.device) >= len(self) - self.extra)
 
     def those(self, which: Tensor | slice) -> "Evaluated":
-        """The ones that `which` selects: bools [K], indices, or a slice."""
+        """The points that `which` selects: bools [K], indices, or a slice."""
         outputs = None if self.outputs is None else self.outputs[which]
         extra = int((torch.arange(len(self), device=self.points.device)[which] >= len(self) - self.extra).sum())
         return Evaluated(self.points[which], self.losses[which], outputs, self.shape, extra)

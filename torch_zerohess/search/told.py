@@ -1,4 +1,4 @@
-"""What a caller tells about the points of a search: checked, and kept until all of them are known."""
+"""The values that a caller tells about the points of a search: checked, and kept until all of them are known."""
 
 from collections.abc import Callable, Sequence
 
@@ -9,12 +9,12 @@ from torch_zerohess.search.state import Evaluated
 
 
 def evaluated(values: Tensor, points: Tensor, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size) -> Evaluated:
-    """Return what was told about points [K, n] as losses and outputs.
+    """Return the values told about points [K, n] as losses and outputs.
 
     values: [K], or [K, *out] if there is a loss, float64.
     shape: of earlier outputs [*out]; empty if there are none.
 
-    Raises ValueError or TypeError for values, or losses of them, that cannot be that.
+    Raises ValueError or TypeError for values, or losses of them, of a wrong shape or type.
     """
     if loss is None and values.shape == (len(points), 1):
         values = values[:, 0]

@@ -1,4 +1,4 @@
-"""The door to the searches: chooses one by the number of parameters, their bounds, and the first evaluations."""
+"""The choice of a search by the number of parameters, their bounds, and the first evaluations."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal

@@ -1,4 +1,4 @@
-"""A surrogate chosen by the evaluations: the one that predicts held-out ones best.
+"""A surrogate chosen by its predictions of held-out evaluations.
 
 Up to 32 parameters it is a Gaussian process or an affine map. For more parameters it is an affine map: of least norm,
 or with a sparse Jacobian where elements of the output depend on few parameters each. Outputs of many elements are

@@ -2,8 +2,8 @@
 
 All elements of an output share one kernel and one variance. A predicted output is therefore a weighted sum of known
 outputs, and the weights do not depend on the size of an output. The kernel is a constant plus one of `KERNELS`: the
-Gaussian kernel suits smooth functions, the Matern kernel suits renders with hard edges. Kernel, length and noise are
-those with the highest evidence, the likelihood of the outputs (Rasmussen and Williams 2006, section 5.4).
+Gaussian kernel suits smooth functions, the Matern kernel suits renders with hard edges. Kernel, length and noise
+maximise the evidence, the likelihood of the outputs (Rasmussen and Williams 2006, section 5.4).
 
 One length serves all parameters. For one length per parameter divide the points by these lengths (`ProcessSurrogate`).
 """
@@ -26,7 +26,7 @@ CONSTANT = 1.0
 _SPREAD = 1.5
 """Standard deviation of the prior over the log of a length."""
 _TOLD = 7
-"""Degrees of freedom of a deviation that the caller knows: that of eight values at one point."""
+"""Degrees of freedom of a deviation that the caller knows: as many as eight values at one point give."""
 _FLAT = 1e-14
 """Change of outputs, relative to their size, that is rounding."""
 _ZERO = 1e-16

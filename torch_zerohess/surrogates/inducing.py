@@ -1,7 +1,7 @@
-"""A Gaussian process given thousands of points, at the price of few: points that explain the others.
+"""A Gaussian process given thousands of points, at the cost of a few points that explain the others.
 
-Most of many points lie close to others, and the covariance of all of them has nearly the rank of a part of them. The
-part is chosen by the pivoted Cholesky decomposition: the next point is the one that those before it explain least
+Where there are many points, most lie close to others, and the covariance of all is nearly of the rank of a subset. The
+pivoted Cholesky decomposition chooses the subset: the next point has the largest variance given the chosen points
 (Fine and Scheinberg 2001; for Gaussian processes Burt, Rasmussen and van der Wilk 2020, section 4.2). The posterior
 mean is a regression of all outputs on the covariances with the chosen points ("subset of regressors", Quinonero-Candela
 and Rasmussen 2005, section 5).

@@ -1,8 +1,8 @@
 """Quadratic of a loss by least change: interpolate the values near a point, and change the Hessian no more than needed.
 
-A full quadratic in n parameters has (n + 1)(n + 2)/2 coefficients, more than a search has evaluations. Of all
-quadratics through the values, the one whose Hessian is nearest to an earlier Hessian in the Frobenius norm is unique
-once the points span the space (Powell 2004, "Least Frobenius norm updating of quadratic models").
+A full quadratic in n parameters has (n + 1)(n + 2)/2 coefficients, more than a search has evaluations. Many quadratics
+interpolate the values. We take the quadratic with the Hessian nearest to an earlier Hessian in the Frobenius norm. It
+is unique once the points span the space (Powell 2004, "Least Frobenius norm updating of quadratic models").
 """
 
 import torch
@@ -24,8 +24,8 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
         values: [P], of the order of 1.
         hessian: the earlier one [n, n].
 
-    Where points are fewer than n + 1 the gradient is the one of least norm. Where they are more than a quadratic has
-    coefficients it is a regression, in which near points count more than far ones.
+    With fewer than n + 1 points the gradient has the least norm. With more points than a quadratic has coefficients the
+    result is a regression, in which near points count more than far ones.
     """
     P, n = u.shape
     inner = u @ u.mT

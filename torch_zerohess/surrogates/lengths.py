@@ -30,7 +30,7 @@ _ITERATIONS = 20
 
 
 class Choice(NamedTuple):
-    """What is left to choose of a Gaussian process, and its evidence."""
+    """Kernel, lengths and noise of a Gaussian process, and its evidence."""
 
     kernel: Kernel
     lengths: Tensor

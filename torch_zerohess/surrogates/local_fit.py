@@ -1,4 +1,4 @@
-"""The quadratic through the evaluations around a point, as wide as they tell its curvature best."""
+"""A least-squares quadratic around a point, from as many near evaluations as give the least error of its curvature."""
 
 import math
 
@@ -14,7 +14,7 @@ _WIDER = 1.3
 _MOST = 3
 """Evaluations without noise that are tried at most, over the coefficients."""
 _TOLD = 7
-"""Degrees of freedom of a known deviation: that of eight values at one point."""
+"""Degrees of freedom of a known deviation: as many as eight values at one point give."""
 _CHANCE = 2.0
 """Standard deviations by which the residuals may exceed the noise before the rest is no quadratic."""
 _APART = 3.0
@@ -36,9 +36,10 @@ def quadratic_around(
         values: their losses [P]; points whose loss is not finite are left out.
         noise: standard deviation of repeated losses at one point.
 
-    Of the nearest evaluations, as many are taken as make that error smallest. A quadratic is found exactly, but for the
-    noise. None if the evaluations do not tell one. In noise the widest quadratic is the most precise one, but not of
-    the function at x: the first one that contradicts a narrower one ends the widening (Lepski 1991).
+    The number of nearest evaluations is chosen for the least of this error. A quadratic function is found exactly, but
+    for the noise. None if the evaluations do not determine a quadratic. In noise a wider quadratic has smaller standard
+    errors, but may not describe the function at x: the widening ends where a quadratic contradicts a narrower one
+    (Lepski 1991).
     """
     finite = torch.isfinite(values)
     points, values = points[finite], values[finite]

@@ -33,8 +33,8 @@ class LossCurvature:
 def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurvature:
     """Expand a loss at an output [*out], float64.
 
-    Derivatives that are not finite, such as the derivative of a norm at zero, count as zero. Where the second
-    derivative is a multiple of the identity, as that of a mean square, products take no call of autograd.
+    Derivatives that are not finite, such as the derivative of a norm at zero, count as zero. If the second
+    derivative is a multiple of the identity, as for a mean square, products take no call of autograd.
     """
     with torch.enable_grad():
         y = output.detach().requires_grad_(True)

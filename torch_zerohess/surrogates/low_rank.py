@@ -45,11 +45,11 @@ class LowRank:
         return cls(mean, span.mT @ directions / math.sqrt(flat.shape[1]), outputs.shape[1:])
 
     def encode(self, outputs: Tensor) -> Tensor:
-        """Coordinates [K, r] of outputs [K, *out]; what is outside of the span is left out."""
+        """Coordinates [K, r] of outputs [K, *out] projected to the span."""
         return self._change(outputs) @ self.basis
 
     def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Coordinates [K, r] of outputs [K, *out], and the mean square [K] of what is outside of the span."""
+        """Coordinates [K, r] of outputs [K, *out], and the mean square [K] of the residual outside of the span."""
         change = self._change(outputs)
         known = change @ self.basis
         return known, (change.square().mean(1) - known.square().sum(1)).clamp_min(0.0)

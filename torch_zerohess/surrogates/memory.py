@@ -33,7 +33,7 @@ class Memory:
 
         F(x, r) = c E h(g(x + sigma u), r)  +  E[ h(f(x + sigma u), r) - c h(g(x + sigma u), r) ].
 
-    The first term takes no evaluations; its derivatives are those of h and g. The second one is estimated from the
+    The first term takes no evaluations; its derivatives come from h and g. The second term is estimated from the
     evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g, provided that
     h(g(z), r) is differentiable in z (once for gradients, and with a continuous derivative for Hessians). A bad g
     costs variance, and c falls to zero.
@@ -43,11 +43,11 @@ class Memory:
             `__call__(z [K, n]) -> [K, *out]`; an `nn.Module` without `fit`, which the caller trains; or None: a
             Gaussian process or an affine map, of the coordinates of large outputs, chosen by held-out evaluations. An
             affine map of hundreds of parameters is sparse where its outputs depend on few of them each.
-        capacity: evaluations that are kept. Beyond it, of the points closest to each other the older ones are dropped.
+        capacity: evaluations that are kept. Beyond it, of points that are close to each other the older are dropped.
             Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
-            None: all of them. 0: none; the estimate is then that of g, and biased towards it.
-        order: highest derivative that new evaluations enter. 1: second derivatives are those of the surrogate alone,
+            None: all of them. 0: none; the estimate is then the first term alone, and biased towards g.
+        order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
         draws: points per element at which the surrogate's term is evaluated. None: 4 for more than 32 parameters,
             otherwise 1024 / B and at least 64.
@@ -176,8 +176,9 @@ class Memory:
     def coefficient(self) -> float:
         """Coefficient c in [0, 1]: the regression of h(f) on h(g) over evaluations that g had not seen; 0 before.
 
-        The regressions of what evaluations add to the derivatives of the estimate differ: a surrogate may explain
-        values and no curvature. c is the smallest of them, so that no derivative becomes noisier.
+        There is one regression for values and one for each order of derivatives, on the contributions of the
+        evaluations. They differ: a surrogate may explain values and no curvature. c is the smallest coefficient, so
+        that no derivative becomes noisier.
         """
         if self.fresh == 0:
             return 1.0
@@ -196,7 +197,7 @@ class Memory:
         Args:
             losses: values [B, K, *out].
             predicted: the same by the surrogate.
-            derivatives: for each order what the values, and the predicted ones, add to it: [B, *] each.
+            derivatives: for each order the contributions of the values, and of the predicted ones: [B, *] each.
             kept: which values count [B, K]; all of them if None.
         """
         a, b = (one.double().reshape(*one.shape[:2], -1) for one in (losses, predicted))
@@ -272,6 +273,6 @@ def _to_later(points: Tensor, first: int) -> Tensor:
 
 
 def check_memory(memory: Any) -> None:
-    """Raise TypeError for what is neither None nor a `Memory`."""
+    """Raise TypeError for an argument that is neither None nor a `Memory`."""
     if memory is not None and not isinstance(memory, Memory):
         raise TypeError(f"memory must be a Memory, got {type(memory).__name__}")

@@ -1,4 +1,4 @@
-"""Evaluations of earlier iterations, and what each is worth at the current point."""
+"""Evaluations of earlier iterations, and their weights at the current point."""
 
 import math
 from dataclasses import dataclass

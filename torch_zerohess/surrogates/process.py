@@ -17,9 +17,9 @@ _EVIDENCE = 200
 class ProcessSurrogate:
     """Gaussian process of outputs [*out] over parameters [n], a `Surrogate`.
 
-    Kernel, lengths and noise are those with the highest evidence on a random part of the points. The posterior is the
-    one given all points, as a sum over those of them that explain the others (`InducedProcess`). Up to 10 parameters
-    have one length each.
+    Kernel, lengths and noise maximise the evidence on a random part of the points. The posterior is conditioned on all
+    points, as a sum over some points that explain the others (`InducedProcess`). Up to 10 parameters have one length
+    each.
 
     Args:
         capacity: points that are used, the latest ones.

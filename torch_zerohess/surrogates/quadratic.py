@@ -48,7 +48,7 @@ class LocalModel:
     curvature_error: Tensor
     """Standard error of the diagonal of the Hessian [r]."""
     significance: float = math.inf
-    """Log of the evidence of the model over that of a constant: below 0 the values may as well be noise."""
+    """log(evidence of the model / evidence of a constant): below 0 the values may as well be noise."""
     intercept: Tensor | None = None
     """Output at u = 0, [m]."""
     jacobian: Tensor | None = None

@@ -8,8 +8,8 @@ the slopes J minimise
     |d - A J|^2 + K |ridge (J - J')|^2 ,     A [K, keep] the columns of u,
 
 where J' are the previous slopes, or 0 for an entry that is new. Where an old entry is outside of the support it is 0.
-The ridges are those that predict held-out samples best. The support is found anew without each held-out part, so that
-the share of the change that is predicted there is honest.
+The ridges are chosen for the best prediction of held-out samples. The support is found anew without each held-out part,
+so that the predicted share of its change is unbiased by the selection.
 """
 
 import math
@@ -85,7 +85,7 @@ def fit_sparse(
     """Fit the Jacobian of outputs of a shape [*out] to their changes [K, m] along directions u [K, n].
 
     A constant is part of the fit, so changes need not be zero at u = 0. `weights` [K] multiply the squares of the
-    samples. The type and device of the result are those of u.
+    samples. The result has the type and device of u.
     """
     grids = Grids.of(shape, settings.grid)
     before = SparseJacobian.empty(u.shape[1], shape, settings.keep, u) if previous is None else previous
@@ -157,7 +157,7 @@ def _significant(values: Tensor, errors: Tensor, used: Tensor, K: int, rate: flo
     """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries.
 
     Student's t with K - 1 - s degrees of freedom, s entries of the row, becomes a normal number (Wallace 1959). The
-    threshold for its probability is that of Benjamini and Hochberg (1995).
+    threshold for its probability is by Benjamini and Hochberg (1995).
     """
     nu = (K - 1 - used.sum(1, keepdim=True)).clamp_min(1).double()
     t = values.double() / errors.double().clamp_min(torch.finfo(torch.float64).tiny)
@@ -173,7 +173,7 @@ def _support(
 ) -> tuple[Tensor, Tensor]:
     """Return the support: parameters [m, keep] and which of them are used.
 
-    What is found in one round is subtracted before the next, which then finds what is weaker.
+    Each round subtracts the fit of the entries found so far, so the next round finds weaker entries.
     """
     m = d.shape[1]
     index, values = previous.index, previous.values

@@ -1,8 +1,8 @@
-"""Which parameters an element of an output depends on: correlations that chance does not give.
+"""The parameters that an element of an output depends on, by correlations too large to be chance.
 
 K directions u [K, n] of all parameters at once and the changes d [K, m] of the outputs along them have the correlations
-r [m, n]. Where an output does not depend on a parameter, r^2 is about 1/K, and the same for every such pair. So the
-largest r^2 that chance gives are those of a decoy: the directions moved on by one sample, which no output depends on.
+r [m, n]. For an output and a parameter that it does not depend on, r^2 is about 1/K, with the same distribution for
+every such pair. Decoys have this distribution: the directions moved on by one sample, which no output depends on.
 An r^2 counts from the threshold t on at which
 
     (1 + number of decoys with r^2 >= t) / number of pairs with r^2 >= t  <=  rate,

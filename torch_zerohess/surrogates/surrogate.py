@@ -1,4 +1,4 @@
-"""What a surrogate is: a model of a black box, fitted to evaluations, that torch can differentiate."""
+"""The interface of a surrogate: a model of a black box, fitted to evaluations, that torch can differentiate."""
 
 from typing import Protocol
 

@@ -1,4 +1,4 @@
-"""Settings of our methods: everything at its default but what is here."""
+"""Settings of our methods that are not at their defaults."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ _SIGMAS: dict[str, dict[str, Any]] = {
     "nonpsd": {"sigma": 0.7},
 }
 SEARCH = {task: dict.fromkeys(SEARCHES, one) for task, one in _SIGMAS.items()}
-"""Sigma, where that of the task was not the best of those tried.
+"""Sigma, where another value than the sigma of the task was the best of the values tried.
 
 The defaults of the engines (batches, thresholds of misfit and gain, weights) were chosen on runs from 1000 upward of
 QUAD, BOX2, BOX10, BRDF, NONPSD and TEXTURE, on BRDF again after a look at the reported runs."""

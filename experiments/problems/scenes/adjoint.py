@@ -1,7 +1,7 @@
 """The renderer's own derivative of an image loss: what a user of Mitsuba has without sampling of ours.
 
-The loss and its derivative with respect to the image are those of the black box, from the same render; Mitsuba carries
-the latter back to the parameters with a seed of its own, since noise that both share would make the product biased.
+The loss and its derivative with respect to the image come from the render of the black box. Mitsuba carries this
+derivative back to the parameters with another seed: noise that both passes share would make the product biased.
 One such gradient is a render and an adjoint pass, however many parameters there are.
 
 | integrator | knows |
@@ -55,7 +55,7 @@ def value_and_gradient(
         moving: the same scene with shapes in place of instances, of which Mitsuba does not sample the silhouettes; the
             scene itself if None.
         seed: of the adjoint pass, at least 0.
-        spp: its samples per pixel; those of the scene if None.
+        spp: its samples per pixel; the number of the scene if None.
     """
     image = scene(x[None])[0].double().requires_grad_()
     with torch.enable_grad():
@@ -132,7 +132,7 @@ def _quiet(mi: Any) -> Iterator[None]:
 
 
 def resolved(variant: str) -> str:
-    """Return the variant that "auto" is here, or the one that is given."""
+    """Return the variant that "auto" stands for here; any other variant as given."""
     if variant != "auto":
         return variant
     llvm = find_llvm()

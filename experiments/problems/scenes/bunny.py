@@ -1,6 +1,6 @@
 """The Stanford bunny before a wall (task BUNNY), and seen through two mirrors only (task MIRROR).
 
-Lengths are those of the source, where the bunny is about one unit high; y is up.
+Lengths are in units of the source, where the bunny is about one unit high; y is up.
 """
 
 from dataclasses import replace

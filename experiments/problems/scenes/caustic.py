@@ -24,7 +24,7 @@ FAR = 1e6
 
 
 class Caustic:
-    """Irradiance on the screen behind a slab, in units of that of the incoming light.
+    """Irradiance on the screen behind a slab, in units of the irradiance of the incoming light.
 
     Example:
         >>> flat = Caustic(side=4, photons=8).image(torch.zeros(1, 1024))

@@ -1,6 +1,6 @@
-"""A mesh whose vertices are the parameters of a black box: what is known about them without a render.
+"""A mesh whose vertices are the parameters of a black box: geometry that needs no render.
 
-The parameters are those of the vertices one after the other: x, y, z, and red, green, blue where the mesh has colours.
+The parameters are, vertex by vertex, x, y, z, and red, green, blue where the mesh has colours.
 """
 
 from dataclasses import dataclass
@@ -83,7 +83,7 @@ class Control:
 
     Args:
         mesh: the mesh.
-        level: of the handles, at most that of the mesh.
+        level: of the handles, at most the level of the mesh.
     """
 
     def __init__(self, mesh: FittedMesh, level: int) -> None:

@@ -1,7 +1,7 @@
 """The icosphere: an icosahedron whose triangles are split into four, with the new vertices pushed out to the sphere.
 
-The vertices of a level come first among those of the next one, so a prefix of an array over vertices is the array over
-a coarser sphere. Level L has 10 * 4^L + 2 vertices and 20 * 4^L triangles: 12, 42, 162, 642, 2562, ...
+The vertices of a level come first in the next level, so a prefix of an array over vertices is the array over a coarser
+sphere. Level L has 10 * 4^L + 2 vertices and 20 * 4^L triangles: 12, 42, 162, 642, 2562, ...
 
 trimesh has an icosphere too, and a test compares the two. This one is kept because the parameters of MESHFIT are the
 vertices in this order, and because `split` returns the edges that the rows of a subdivision matrix stand for.

@@ -129,7 +129,7 @@ def banana() -> Target:
 def _without_seam(faces: Index) -> tuple[Index, Index]:
     """Join the first and the last column of the grid, and each of the two ends to one vertex.
 
-    Returns: vertices that are kept, as numbers of those of the grid, and triangles [k, 3] over them.
+    Returns: the kept vertices, by their numbers in the grid, and triangles [k, 3] over them.
     """
     number = np.arange(ALONG * (AROUND + 1)).reshape(ALONG, AROUND + 1)
     joined = number.copy()

@@ -29,7 +29,7 @@ class Cameras:
     Args:
         eyes: [v, 3], none of them above or below the origin; y is up.
         side: of the film in pixels.
-        extent: half of what is seen of the plane through the origin that faces the camera.
+        extent: half of the visible width of the plane through the origin that faces the camera.
     """
 
     eyes: Tensor
@@ -128,7 +128,7 @@ def _on_film(cameras: Cameras, vertices: Tensor, faces: Tensor) -> tuple[Tensor,
     """
     x, y, depth = cameras.project(vertices)
     nearness = torch.where(depth > NEAREST, 1 / depth, math.nan)
-    # Vertices first: what is gathered are then whole rows, one number for every image.
+    # Vertices first: a gather then reads whole rows, one number for every image.
     rows = [one.flatten(0, 1).T.contiguous() for one in (x, y, nearness)]
     planes = [one.index_select(0, corner) for corner in faces.unbind(1) for one in rows]
     box = _box(planes, cameras.side)

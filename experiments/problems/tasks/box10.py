@@ -3,8 +3,8 @@
 Parameters: x and y of every square, in units of the image side; half width 0.1, bounds 0.1 and 0.9 as in BOX2.
 Targets (.21, .21), (.5, .5), (.79, .79), (.21, .79), (.79, .21); starts (.41, .41), (.5, .5), (.59, .59), (.41, .59),
 (.59, .41), each coordinate uniform within +-0.025. The image is the clamped sum of the squares. The squares are
-interchangeable: the parameter error is that of the best assignment of squares to places. Loss: mean squared difference
-of the images; it has many local minima. Sigma: a sixth of the side.
+interchangeable: the parameter error is the least over all assignments of squares to places. Loss: mean squared
+difference of the images; it has many local minima. Sigma: a sixth of the side.
 
 One channel is enough, as the squares are grey. The `fast` preset has 64x64 pixels, the `paper` preset the source's
 500x500.

@@ -12,7 +12,7 @@ where the light is above the horizon, and black elsewhere; I falls with the squa
 clamped before it is raised to the power, so that the derivative for the exponent exists. Loss: mean squared difference
 over the pixels of the sphere. Sigma: 0.2.
 
-Direct light is enough: a sphere casts no shadow on itself but that of the horizon. Pixels beside the sphere are left
+Direct light is enough: a sphere has no shadow on itself but beyond the horizon. Pixels beside the sphere are left
 out. The `fast` preset has 64x64 pixels, the `paper` preset 256x256.
 
 The convolution of the loss with a Gaussian is known: it is quadratic in the albedos, and an integral over the gloss

@@ -1,8 +1,8 @@
 """CNN5: a network predicts position, rotation and colour of a mug from an image, without labels.
 
 Five black-box parameters in units that change the image about equally: position across the view in 4 mm, rotation of
-the handle in 20 degrees, diffuse reflectance (r, g, b) in 0.1. The network is that of CNN with five outputs: 268 773
-weights, as in the source. Positions are U(-2, 2) cm, rotations those of CNN, reflectances U(0.1, 0.9).
+the handle in 20 degrees, diffuse reflectance (r, g, b) in 0.1. The network is the network of CNN with five outputs:
+268 773 weights, as in the source. Positions are U(-2, 2) cm, rotations as in CNN, reflectances U(0.1, 0.9).
 """
 
 import math

@@ -1,9 +1,9 @@
 """CNN-TEXTURE: a network emits the 32x32 texture on a mug from an image of the mug, without ever seeing a texture.
 
 1024 black-box parameters, the reflectances of a grey label on the front of the mug. Textures are 32x32 crops of
-pictures of skimage.data, 2 to 8 of their pixels to one of the texture; the held-out ones are from other pictures than
-those of training. The label is 34 pixels wide at 96x96, so that the render determines all 32x32 pixels of the texture.
-It determines the pixels at the sides least, since they are seen at a slant.
+pictures of skimage.data, 2 to 8 of their pixels to one of the texture. Held-out textures are crops of other pictures.
+The label is 34 pixels wide at 96x96, so that the render determines all 32x32 pixels of the texture. It determines the
+pixels at the sides least, since they are seen at a slant.
 """
 
 from collections.abc import Sequence
@@ -32,8 +32,8 @@ SIZES = {
 class Decoder(nn.Module):
     """Image [B, 3, h, w] to texture [B, 1024] in (0, 1): about 10 000 weights.
 
-    Two convolutions, a linear map along each axis from the pixels of the image to those of the texture, and two more
-    convolutions. Where the label is in the image is learned.
+    Two convolutions, a linear map along each axis from pixels of the image to pixels of the texture, and two more
+    convolutions. The position of the label in the image is learned.
     """
 
     def __init__(self, film: int, channels: int = 8) -> None:

@@ -51,7 +51,7 @@ class MeshFit:
 
     Args:
         side: of the images in pixels.
-        target: the mesh that is sought; vertices of the fitted one have colours if those of the target have.
+        target: the mesh that is sought; the fitted mesh has colours if the target has.
     """
 
     def __init__(self, side: int, target: Target) -> None:

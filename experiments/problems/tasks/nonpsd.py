@@ -2,7 +2,7 @@
 
 Parameters: x0 and x1 in [-3, 3]. Loss: -N(x; 0, s1^2 I), the negated density of the normal distribution with s1 = 1;
 its convolution with N(0, s2^2 I) is -N(0, s3^2 I) with s3^2 = s1^2 + s2^2. The solution is 0. There is no image: the
-image error is the loss less that of the solution. Beyond |x| = s1 the Hessian has a negative eigenvalue: a Newton step
+image error is loss(x) - loss(solution). Beyond |x| = s1 the Hessian has a negative eigenvalue: a Newton step
 without modification goes away from the solution.
 
 Starts: runs 0 to 399 are the points of a 20x20 grid over [-3, 3]^2, corners included, in an order that is random but

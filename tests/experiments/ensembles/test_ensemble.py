@@ -196,7 +196,7 @@ if __name__ == "__main__":
     ids=["SIGKILL", "SIGINT", "network"],
 )
 def test_a_killed_ensemble_goes_on(tmp_path, one_process, by, method, task, workers):
-    """All processes end with the one that is killed, and starting it again gives the rows of one that was not."""
+    """All processes end with the killed process; started again, the ensemble has the rows of an undisturbed one."""
     root = Path(__file__).parents[3]
     script, folder, gate = tmp_path / "script.py", tmp_path / "out", tmp_path / "gate"
     gate.mkdir()

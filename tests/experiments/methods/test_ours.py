@@ -39,7 +39,7 @@ def points_of(task, name, settings=None):
 @pytest.mark.parametrize("output", [True, False])
 @pytest.mark.parametrize("sigma", [None, 0.3])
 def test_a_method_asks_its_engine(engine, output, sigma):
-    """The points are those of the engine alone, with sigma, bounds and seed of the trial."""
+    """The points equal the points of the engine alone, with sigma, bounds and seed of the trial."""
     name = engine if output else f"{engine}_loss"
     found, images = points_of(BOUNDED, name, None if sigma is None else {"sigma": sigma})
     assert images == output

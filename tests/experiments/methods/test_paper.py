@@ -172,7 +172,7 @@ def test_table_3_in_the_units_of_the_tasks():
         # Table 3 alone, and with what it leaves open.
         ("our_hvpa_source", "mug", {"trust_region": 4, "sigma": (3.0, 0.01), "recompute": 5, "line_search": (1, 1e-3)}),
         ("our_hvpa", "quad", {"trust_region": 50, "sigma": (1.0, 0.05), "steps": 100, "modification": "radius"}),
-        # Some of it replaced: samples and recompute are those of the table.
+        # Some of it replaced: samples and recompute are from the table.
         ("our_hvpa", "box2", {"samples": 6, "recompute": 10, "sigma": (0.2, 2e-5), "trust_region": 0.2, "steps": 80}),
         ("our_g", "texture", {"samples": 4, "learning_rate": 0.01, "sigma": (0.1, 0.1)}),
         ("our_h", "mug", {"samples": 1, "recompute": 10, "trust_region": 6.0, "sigma": (3.0, 0.3), "steps": 10}),

@@ -23,7 +23,7 @@ TASK = catalogue.load("caustic")
 
 
 def quadratic(curvature: float) -> torch.Tensor:
-    """Coefficients of -curvature/2 ((x - 1/2)^2 + (y - 1/2)^2): those of t^2 are i^2 - 1/3 (polar form)."""
+    """Coefficients of -curvature/2 ((x - 1/2)^2 + (y - 1/2)^2): coefficients of t^2 are i^2 - 1/3 (polar form)."""
     one = (torch.arange(-1, 31).double() / PATCHES - 0.5) ** 2 - 1 / (3 * PATCHES**2)
     return (-0.5 * curvature * (one[:, None] + one)).flatten()
 
@@ -239,7 +239,7 @@ def test_gauss_newton_bends_the_light_within_one_jacobian() -> None:
 def test_particle_tracer_sees_the_same_light() -> None:
     flat = check(torch.zeros(1024), side=16, spp=100)
     assert flat.mean() == pytest.approx(1.0, abs=5 / math.sqrt(100 * 16**2))
-    # x and y are not exchanged or mirrored, and the light is that of the splat: a quarter of it leaves to one side.
+    # x and y are not exchanged or mirrored. The light is as in the splat: a quarter of it leaves to one side.
     x = 1e3 * (prism(0.1) + 0.5 * prism(0.1).view(32, 32).T.flatten()) + waves(3.0)
     x = (x - x.mean()).clamp(-caustic.LARGEST, caustic.LARGEST)
     splat = Caustic(16, 128, caustic.DISTANCE, caustic.UNIT).image(x[None])[0]

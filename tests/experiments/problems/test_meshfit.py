@@ -110,12 +110,12 @@ def test_losses_of_handles_share_their_renders() -> None:
     control = TASK.mesh.control(1)
     unit = torch.full((3,), 0.1, dtype=torch.float64)
     losses = _losses(trial, control, trial.start, unit, margin=1000.0, silhouette=0.0)
-    z = torch.randn(len(control), 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = losses(z.flatten(0, 1)).view(len(control), 2)
+    z = torch.randn(2, len(control), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = losses(z)
     assert trial.evaluations == 2
     # With boxes as large as the images every handle has the whole loss of the image that it was in.
-    whole = TASK.loss(control.displaced(trial.start, z.transpose(0, 1) * unit))
-    torch.testing.assert_close(found, whole.expand(len(control), 2), rtol=1e-4, atol=0)
+    whole = TASK.loss(control.displaced(trial.start, z * unit))
+    torch.testing.assert_close(found, whole[:, None].expand(2, len(control)), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("name", ["meshfit", "meshfit_color"])
@@ -125,7 +125,8 @@ def test_a_pixel_that_only_one_covers_counts_more(name) -> None:
     zero = torch.zeros(len(control), task.mesh.channels, dtype=torch.float64)
     unit = torch.ones(task.mesh.channels, dtype=torch.float64)
     without, found = (
-        _losses(trial, control, trial.start, unit, margin=1000.0, silhouette=weight)(zero) for weight in (0.0, 0.5)
+        _losses(trial, control, trial.start, unit, margin=1000.0, silhouette=weight)(zero[None])[0]
+        for weight in (0.0, 0.5)
     )
     mesh, target = (
         task.output.image(trial.start[None])[0],

@@ -147,7 +147,7 @@ def test_a_shadow_takes_the_light_that_its_place_and_size_say() -> None:
     task = TASKS["shad"]
     (y0, z0), (y1, z1) = (side.tolist() for side in task.bounds)
     points = torch.tensor([[y0, z0], [y0, z1], [y1, z0], [y1, z1], [-1.5, 1.0], [100.0, 100.0]]).double()
-    images = task.output.image(points)[..., 0]  # red: that of the light
+    images = task.output.image(points)[..., 0]  # red, the colour of the light
     missing = (images[-1] - images[:-1]).mean((1, 2))
     half_width = shad.CAMERA * math.tan(math.radians(shad.FIELD_OF_VIEW / 2))
     for found, point in zip(missing.tolist(), points[:-1].tolist(), strict=True):

@@ -258,7 +258,7 @@ def test_error_of_the_hessian_of_nonpsd(capsys) -> None:
     assert error.evaluations == 100
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("Mean error within 0.0001 of 2 rows: signed in 2, squared in 2, absolute in 0. Relative")
-    # Unbiased: the signed mean is noise. The mean size of an error is far from the claim, that of its square is not.
+    # Unbiased: the signed mean is noise. The mean of |error| is far from the claim, the mean of error^2 is not.
     assert error.signed < 5 * error.signed_noise
     assert error.squared < 1e-4 < error.absolute
     assert error.absolute**2 < error.squared

@@ -16,7 +16,7 @@ def fits(*rows) -> pd.DataFrame:
 
 
 def test_the_numbers_are_those_of_the_source() -> None:
-    """Two means over them: of all, and the one that gives the headline of the paper (see `speed_ups`)."""
+    """Two means over them: of all, and the mean that the paper's headline has (see `speed_ups`)."""
     there = source_table.printed()
     others = there[there["method"] != "OurHVPA"].dropna()
     assert others["printed"].mean() == pytest.approx(2.99, abs=0.005)

@@ -25,7 +25,7 @@ COMMIT = "0123456789abcdef"
 
 @pytest.fixture(autouse=True)
 def results(tmp_path, monkeypatch):
-    """An empty folder for stored tables, and code that is that of a commit."""
+    """An empty folder for stored tables, and code without changes to its commit."""
     monkeypatch.setattr(stored, "RESULTS", tmp_path / "stored")
     monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": True})
     own = ["--out", "/home/somebody/a folder", "--jobs=2"]  # of this machine: not to be stored

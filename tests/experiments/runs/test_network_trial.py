@@ -1,4 +1,4 @@
-"""Runs of network tasks: what is counted and logged, how they end, their weights, and that a kill changes nothing."""
+"""Runs of network tasks: counts, logs, how runs end, their weights, and that a kill changes nothing."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Runs of fitting tasks: what is counted and logged, how they end, and that a kill changes nothing."""
+"""Runs of fitting tasks: counts, logs, how runs end, and that a kill changes nothing."""
 
 import importlib.util
 import os

@@ -62,7 +62,7 @@ def test_objectives_of_a_square_of_the_parameter() -> None:
         assert gradients.shape == (3, 1)
         assert float(values[mse]) == pytest.approx(value, rel=0.01)
         assert float(gradients[mse, 0]) == pytest.approx(slope, rel=0.04)
-        # One estimate of the package: its relative error is that of 512 samples, below a tenth.
+        # One estimate of the package: its relative error, with 512 evaluations, is below a tenth.
         estimate = one.estimate(torch.tensor([x]).double(), zh.Smoothing(sigma=s, samples=256, seed=0))
         assert float(one.objective(estimate, form)[1][mse, 0]) == pytest.approx(slope, rel=0.3)
 

@@ -1,4 +1,4 @@
-"""The study of sparse Jacobians, run small: what is found is compared with maps that are known."""
+"""The study of sparse Jacobians, run small: the entries found are compared with known maps."""
 
 import math
 from dataclasses import replace

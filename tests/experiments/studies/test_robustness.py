@@ -178,7 +178,7 @@ def test_scenes_are_loaded_before_the_clock_starts(task, scenes):
         loaded.append(len(scenes))
 
     attempt(varied(task, Change(noise="point")), "m", 0, solve)
-    assert loaded[0] == loaded[1] == 2  # that of the task, for the errors, and its own
+    assert loaded[0] == loaded[1] == 2  # the scene of the task, for the errors, and its own
 
 
 def test_srgb_there_and_back():

@@ -1,4 +1,4 @@
-"""The study of worker processes, run small: what is measured, and that a fault is noticed."""
+"""The study of worker processes, run small: its measurements, and that it notices a fault."""
 
 import json
 

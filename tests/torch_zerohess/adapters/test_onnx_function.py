@@ -63,7 +63,7 @@ def test_gradient_and_hessian_are_those_of_the_module():
 
 
 def test_derivatives_behind_a_quantised_pre_processing():
-    """Gain and offset of what is rounded to 8 bits: the same samples through onnxruntime and through torch."""
+    """Gain and offset of an image rounded to 8 bits: the same samples through onnxruntime and through torch."""
     f = OnnxFunction(model(), constants={"c": C[0]}, output="y")
     photo = vector(0.2, 0.9)
 

@@ -10,6 +10,7 @@ import torch
 
 import torch_zerohess as zh
 from torch_zerohess.adapters.process import Program
+from torch_zerohess.evaluators.finished import finished_values
 from truths import vector
 
 READ = "import json, sys, time\n"
@@ -114,6 +115,22 @@ def test_a_run_that_fails_has_no_value_or_names_its_point(wrong, message):
     if "timeout" not in message:
         with pytest.raises((RuntimeError, ValueError), match=rf"point \[1.5, 0.25\] and 1 more: (.|\n)*{message}"):
             python(code)(bad.expand(2, 2))
+
+
+def test_a_command_is_made_when_its_run_begins(tmp_path):
+    """It may write the point to a file that the program reads."""
+
+    def command(point: torch.Tensor) -> list[str]:
+        (tmp_path / "point").write_text(" ".join(map(str, point.tolist())))
+        return ["awk", "{ if ($1 > 4) exit 1; print $1 + $2 }", str(tmp_path / "point")]
+
+    points = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], dtype=torch.float64)
+    program = Program(command, format=float)
+    assert program(points[:2]).tolist() == [3.0, 7.0]
+    with pytest.raises(RuntimeError, match=r"at the point \[5, 6\]") as caught:
+        program(points)
+    numbers, values = finished_values(caught.value, points)
+    assert (numbers, values.tolist()) == ([0, 1], [3.0, 7.0])
 
 
 def test_a_search_goes_on_after_a_run_that_failed():

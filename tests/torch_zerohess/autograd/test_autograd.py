@@ -1,4 +1,4 @@
-"""The layer under every transform of torch: its derivatives are those of `estimate` with the same seed, to rounding."""
+"""The layer under every transform of torch: its derivatives equal `estimate` with the same seed, to rounding."""
 
 import pytest
 import torch

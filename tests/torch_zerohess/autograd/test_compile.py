@@ -102,6 +102,11 @@ def test_a_layer_with_a_memory_is_one_graph_break_without_warnings() -> None:
             assert torch.equal(x.grad, y.grad)
     assert [str(one.message) for one in caught] == []
     assert len(graphs) == 2
+    calls = []
+    model.layer.register_forward_hook(lambda *_: calls.append(1))
+    compiled(leaf(BATCH))
+    assert len(calls) == 1
+    plain(leaf(BATCH))
     assert model.layer.memory.evaluations == plain.layer.memory.evaluations > 0
     torch.compiler.reset()
     with pytest.raises(RuntimeError, match="the surrogate of a layer with a memory changes from call to call"):

@@ -1,6 +1,6 @@
 """Grey-box curvature against `torch.func.hessian` of the same network with the analytic smoothed function behind it.
 
-The samples are many and quasi-random, so that what is left of their error is far below the tolerances, which are
+The samples are many and quasi-random, so that their error is far below the tolerances, which are
 relative to the largest element; the structure (symmetry, agreement of matrix-free and dense) holds to rounding.
 """
 

@@ -308,7 +308,7 @@ def test_batch_dimensions_and_one_number_for_sigma() -> None:
     for name in ("value", "gradient", "hessian_diagonal"):
         assert got.standard_error(name).shape == (got.value if name == "value" else got.gradient).shape
     assert torch.equal(got.hessian(), same.hessian())
-    # Rows of a batch are numbered on: the first element has those of a single point.
+    # Rows of a batch are numbered on: the first element has the rows of a single point.
     torch.testing.assert_close(got.hessian()[0, 0], first.hessian(), rtol=1e-13, atol=1e-13)
     assert torch.equal(got.points[0, 0], first.points)
     assert not torch.equal(got.points[0, 1] - x[0, 1], got.points[0, 0] - x[0, 0])

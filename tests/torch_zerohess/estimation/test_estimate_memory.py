@@ -85,7 +85,7 @@ def estimated(memory: Memory | None, seed: int, *, batch: int = 12, **options):
 
 
 def unbiased(found) -> None:
-    """The other second derivatives are those of the Hessian, so that its mean tells theirs."""
+    """Diagonal and products are parts of the Hessian, so that the mean of the Hessian has theirs."""
     true = closed_form()
     for quantity in ("value", "gradient", "hessian"):
         # one number per call: the elements of a batch share the points of the surrogate's term

@@ -31,7 +31,7 @@ def holes(*rows: int):
 
 
 def test_a_center_that_is_not_finite_cannot_be_dropped() -> None:
-    """The last point is x itself. Other points are not finite either: x is the one that is named."""
+    """The last point is x itself. Other points are not finite either, but the message names x."""
     with pytest.raises(ValueError, match=r"fn returned nan at the point \[0\.1, 0\.2\]"):
         estimate(holes(0, 16), X, S, on_nonfinite="drop")
     plain = S.replace(baseline="none")
@@ -56,7 +56,7 @@ def test_too_few_draws_left_is_an_error() -> None:
         estimate(everything_but_one, X, S.replace(baseline="mean"), on_nonfinite="drop")
     with pytest.raises(ValueError, match="left 0 of 8 draws, 1 are needed"):
         estimate(holes(*range(8)), X, S, on_nonfinite="drop")
-    # 16 points in two scrambles: a whole one is gone, and what is left is one draw.
+    # 16 points in two scrambles: a whole scramble is dropped, and one draw remains.
     sobol = S.replace(samples=16, sampler="sobol", baseline="mean")
     with pytest.raises(ValueError, match="left one independent draw, baseline 'mean' needs two"):
         estimate(holes(*range(8)), X, sobol, on_nonfinite="drop", value="smoothed")

@@ -91,9 +91,21 @@ def test_evaluators_and_values_that_are_not_finite() -> None:
         zh.finite_difference_hvp(square, vector(0.3, -0.2), vector(1.0, 2.0), smoothing)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    """The step is below the distance of neighbouring numbers of bfloat16 at 100."""
+    smoothing, v = zh.Smoothing(sigma=0.5, samples=256, seed=0), torch.tensor([1.0, 0.0])
+    x = torch.tensor([100.0, 1.0])
+    expected = zh.finite_difference_hvp(lambda z: z.square().sum(1), x, v, smoothing)
+    found = zh.finite_difference_hvp(lambda z: z.square().sum(1), x.to(dtype), v.to(dtype), smoothing)
+    assert found.dtype == dtype
+    assert torch.equal(found, expected.to(dtype))
+    assert abs(float(found[0]) - 2.0) < 0.1
+
+
 def test_errors() -> None:
     smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
-    with pytest.raises(ValueError, match=r"v must be a tensor of shape \[3\] or that of x, got torch.Size\(\[2\]\)"):
+    with pytest.raises(ValueError, match=r"shape \[3\] or of the shape of x, got torch.Size\(\[2\]\)"):
         zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(2), smoothing)
     with pytest.raises(ValueError, match=r"step must be positive and finite, in units of sigma, got 0\.0"):
         zh.finite_difference_hvp(WAVE.f, torch.ones(3), torch.ones(3), smoothing, step=0.0)

@@ -63,7 +63,7 @@ SETTINGS = [
     ({"sampler": "sobol", "scrambles": 3}, ValueError, "scrambles must divide samples, got 3 of 8"),
     ({"sampler": "sobol", "scrambles": 0}, ValueError, "scrambles must be at least 1, got 0"),
     ({"sampler": "sobol", "scrambles": True}, TypeError, "scrambles must be an integer, got True"),
-    ({"scrambles": 2}, ValueError, "scrambles are those of sampler 'sobol', got 2 with 'random'"),
+    ({"scrambles": 2}, ValueError, "scrambles need sampler 'sobol', got 2 with sampler 'random'"),
     ({"width": 1.0}, TypeError, "width"),
 ]
 

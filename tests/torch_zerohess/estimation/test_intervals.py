@@ -221,7 +221,7 @@ def test_drawing_up_to_a_tolerance(proposal: str, sampler: str) -> None:
     assert bool(((got.hessian() - hessian).abs() < 5 * got.standard_error("hessian")).all())
     assert bool(((got.hvp(V) - hessian @ V).abs() < 5 * got.standard_error("hvp", V)).all())
     torch.testing.assert_close(got.hessian_diagonal(), got.hessian().diagonal())
-    # The first batch is that of the smoothing itself, and each later one as large as all before it.
+    # The first batch has the size of the smoothing, and each later batch the size of all before it.
     if proposal != "optimal":  # whose points are those of one element after the other
         assert torch.equal(got.points[: 8 * 2], estimate(SLOPE, X, smoothing).points[:16])
     assert [(one - 1) // (calls[0] - 1) for one in calls[:4]] == [1, 1, 2, 4]

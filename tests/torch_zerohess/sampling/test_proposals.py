@@ -123,7 +123,7 @@ def sampled(proposal: str, sampler: str, order: int, n: int, batch: int, samples
 @pytest.mark.parametrize(("proposal", "sampler", "order"), CONFIGURATIONS)
 def test_marginal(proposal: str, sampler: str, order: int, n: int) -> None:
     u = sampled(proposal, sampler, order, n, ROWS // 2, 8)
-    # One row of each estimate: rows of different estimates are independent, those of one need not be.
+    # One row of each estimate: rows of different estimates are independent, rows of one estimate need not be.
     chosen = u[torch.arange(ROWS // 2), torch.arange(ROWS // 2) % 8]
     cdf = {"gaussian": stats.norm.cdf, "uniform": box_cdf, "fr22": gradient_lobe_cdf}
     for d in range(n):

@@ -109,7 +109,7 @@ def test_a_process_is_fitted_once_for_a_step_and_the_points_around_it(name, monk
 
 @every_search
 def test_points_that_are_out_stay_out_until_all_are_told(name):
-    """Whatever batch is asked for, and after a restart: values are those of the points they were told for."""
+    """For every batch, and after a restart: each value belongs to the point it was told for."""
     search, other, f = make(name), make(name), SEARCHES[name][2]
     for _ in range(4):
         points = search.ask(8, limit=5)

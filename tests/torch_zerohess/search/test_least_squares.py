@@ -9,7 +9,7 @@ from torch_zerohess.optim import TrustRegion
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_minima_are_those_of_the_source(name):
-    """A start is above the minimum, and residuals [K, m] of two points are those of each."""
+    """A start is above the minimum, and residuals [K, m] of two points equal the residuals of each."""
     residuals, start, lowest = PROBLEMS[name]
     both = residuals(torch.stack([start, start + 0.1]))
     torch.testing.assert_close(both[:1], residuals(start[None]))

@@ -185,7 +185,7 @@ def test_a_sparse_jacobian_is_chosen_by_evidence():
 
 @pytest.mark.parametrize("n", [20, 100])
 def test_a_dense_jacobian_costs_no_evaluation_more_than_before(n):
-    """The points are those of `Descent`, to the last bit."""
+    """The points equal the points of `Descent`, to the last bit."""
     A, b = normal(150, n), normal(150, seed=1)
     search, descent = (
         door(n, square(b)),

@@ -159,3 +159,35 @@ def test_process_and_quadratics_take_turns(seed):
     assert handed >= 1
     assert len(elsewhere) >= 2
     assert all(float((one - finished).norm()) > 0.05 for one in elsewhere)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_plateau_uses_up_no_restarts_and_is_no_minimum(seed):
+    """Quadratics that begin elsewhere find the same plateau again and again; the needle is a percent of the box."""
+
+    def needle(z):
+        near = ((z - 3.3).abs() < 0.4).all(1)
+        return torch.where(near, (z - 3.3).square().sum(1), 1.0)
+
+    search = search_for(needle, vector(1.3, -2.2), 100, sigma=1.0, bounds=(-5.0, 5.0), restarts=3, seed=seed)
+    assert search.value < 1e-6 or (search.evaluations >= 100 and not search.done and not search.solved)
+
+
+def test_a_minimum_elsewhere_that_is_higher_agrees_with_nothing():
+    """Two bowls, the lower one narrow: a round that ends in the higher one is no evidence for the lower one."""
+
+    def bowls(z):
+        wide, narrow = (z - 2.0).square().sum(1) + 1.0, 100 * (z + 2.0).square().sum(1)
+        return torch.minimum(wide, narrow)
+
+    search = GaussianProcessSearch(vector(-1.9, -1.9), sigma=0.5, bounds=(-4.0, 4.0), restarts=10**6, seed=0)
+    higher = 0
+    while search.evaluations < 150:
+        before = search.state_dict()["progress"]
+        search.tell(bowls(search.ask()))
+        now = search.state_dict()["progress"]
+        if before["finishing"] and not now["finishing"] and now["quadratics"]["best"]["loss"] > 0.9:
+            higher += now["quadratics"]["done"]
+            assert now["agreed"] == 0 or not now["quadratics"]["done"]
+    assert higher >= 1
+    assert search.value < 1e-9

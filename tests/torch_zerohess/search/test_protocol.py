@@ -1,4 +1,4 @@
-"""Ask and tell, the same for every search: what is asked for, what is refused, what resumes."""
+"""Ask and tell, the same for every search: points asked for, refused values, and resumed searches."""
 
 import math
 
@@ -44,7 +44,7 @@ def test_looking_at_the_model_changes_nothing(name):
 
 @every_search
 def test_a_model_is_one_around_the_point_that_is_given(name):
-    """Not one around the best point: its value is nearer to that of the given point."""
+    """Not a model around the best point: the value is nearer to the value at the given point."""
     search, f, loss = make(name), black_box(name), loss_of(name)
     points, values = [], []
     for _ in range(12):

@@ -242,7 +242,7 @@ def test_a_climb_ends_where_the_evidence_is_flat():
 
 
 def test_a_climb_that_leaves_the_range_of_the_numbers_is_not_taken(monkeypatch):
-    """The first step of a line search overflows: lengths and noise stay those of the lists."""
+    """The first step of a line search overflows: lengths and noise stay entries of the lists."""
     honest, calls = lengths.log_evidence, []
 
     def evidence(points, change, kernel, length, noise):

@@ -57,7 +57,7 @@ def test_thinning_drops_older_points_that_are_crowded() -> None:
 
 
 def test_thinning_compares_few_points_at_once(monkeypatch) -> None:
-    """However many are added, distances are those of a block of points to twice the capacity at most."""
+    """However many are added, distances are computed between a block of points and at most 2 capacity points."""
     apart, shapes = torch.cdist, []
     monkeypatch.setattr(
         torch, "cdist", lambda a, b, **options: shapes.append((len(a), len(b))) or apart(a, b, **options)

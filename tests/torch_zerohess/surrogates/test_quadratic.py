@@ -223,7 +223,7 @@ def test_fewer_points_than_parameters_know_nothing_outside_of_their_span():
 
 
 def test_standard_errors_of_outputs_cover_the_truth():
-    """Linear outputs with noise of 0.2 and a linear loss, 300 fits: the gradient's error is that of least squares."""
+    """Linear outputs with noise of 0.2 and a linear loss, 300 fits: the error is the least-squares error."""
     _, _, J, f = linear_output(2, (3,))
     generator = torch.Generator().manual_seed(5)
     deviations = []

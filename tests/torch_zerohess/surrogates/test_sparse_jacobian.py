@@ -105,7 +105,7 @@ def test_a_dense_map_is_not_explained():
 
 
 def test_held_out_samples_are_not_used():
-    """The share that is predicted is that of samples which the fit has never seen, not of those that it has."""
+    """The predicted share is measured on samples that the fit has not seen."""
     A, u, v = sparse_map(200, 300, 3), normal(80, 300, seed=1), normal(200, 300, seed=2)
     noise = 3.0 * normal(280, 200, seed=3)
     J = fit_sparse(u, u @ A.mT + noise[:80], torch.Size([200]), SparseSettings(8))
@@ -146,7 +146,7 @@ def test_overlapping_footprints_and_neighbours():
 
 
 def test_pruning_keeps_the_rate_where_neighbours_share_evidence():
-    """Neighbours propose texels beside the nine of a pixel; what is not significant beside the others goes."""
+    """Neighbours propose texels beside the nine of a pixel; texels that are not significant are dropped."""
     side = 12
     eye = torch.eye(side**2).double().view(-1, 1, side, side)
     A = torch.nn.functional.avg_pool2d(eye, 3, 1, 1).view(side**2, -1).mT.contiguous()

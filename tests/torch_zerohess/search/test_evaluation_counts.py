@@ -1,7 +1,8 @@
 """How many evaluations searches take on fixed seeds, at most: a tuned constant that is disabled takes more.
 
 Each case is a black box with a known minimum and a target. The limit is the sum over the seeds, with a margin.
-`tests/README.md` lists which case guards which constant. A run that misses its target counts as `most`.
+A run that misses its target counts as `most`. `tests/README.md` lists which case guards which constant; the others
+watch a search as a whole.
 """
 
 from collections.abc import Callable

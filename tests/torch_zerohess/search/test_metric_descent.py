@@ -78,6 +78,16 @@ def test_a_hole_is_stepped_around():
     assert search.value < 1e-6
 
 
+def test_a_region_far_smaller_than_sigma_is_found():
+    """Finite within a hundredth of sigma of the start only."""
+
+    def f(z):
+        return torch.where(z.norm(dim=1) < 0.01, (z - 0.002).square().sum(1), math.nan)
+
+    search = run(Descent(zeros(3), sigma=1.0, seed=0, restarts=0), f, 80)
+    assert search.value < 1e-3 * float(f(zeros(3)[None]))
+
+
 def test_rounds_that_arrive_at_one_point_agree():
     search = Descent(zeros(3), sigma=2.0, seed=0, restarts=5)
     run(search, ellipsoid(10.0, 3, 0), 10_000)

@@ -7,21 +7,17 @@ import json
 import os
 import shutil
 import subprocess
-import threading
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.adapters.server import Server, ended, late, shown
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
 from torch_zerohess.evaluators.values import as_tensor
-
-_KEPT = 50
-"""Lines of the standard error that are shown in an error."""
 
 
 class Program(Closing):
@@ -100,7 +96,7 @@ class Program(Closing):
         self.folder, self.environment = folder, None if environment is None else dict(environment)
         if not callable(command):
             _found(command)
-        self._server: _Server | None = None
+        self._server: Server | None = None
 
     def __repr__(self) -> str:
         return f"Program({self.command!r}, server={self.server}, format={self.format!r})"
@@ -157,7 +153,7 @@ class Program(Closing):
         if self._server is not None and not self._server.alive:
             self.close()
         if self._server is None:
-            self._server = _Server(self._start(self.command))
+            self._server = Server(self._start(self.command))
         try:
             answer = self._server.ask(request, self.format == "npy", self._limit(points))
             return self._values(answer, b"".join(self._server.errors))
@@ -180,12 +176,12 @@ class Program(Closing):
                 output, errors = process.communicate(request, limit)
             except subprocess.TimeoutExpired:
                 process.kill()
-                raise TimeoutError(_late(command, limit, process.communicate()[1])) from None
+                raise TimeoutError(late(command, limit, process.communicate()[1])) from None
             except BaseException:
                 process.kill()
                 raise
         if process.returncode:
-            raise RuntimeError(_ended(command, process.returncode, errors))
+            raise RuntimeError(ended(command, process.returncode, errors))
         return self._values(output, errors)
 
     def _request(self, x: Tensor, aux: Sequence[Tensor]) -> bytes:
@@ -214,92 +210,13 @@ class Program(Closing):
                 raise ValueError("it printed null where a number was expected")
             return torch.tensor(json.loads(output), dtype=torch.float64, device="cpu")
         except Exception as error:  # a function may raise any
-            shown = output[:200].decode(errors="replace")
+            start = output[:200].decode(errors="replace")
             named = "what the function `format` reads" if callable(self.format) else f"values as {self.format}"
             advice = "" if output.strip() == b"null" else ": let it print messages to its standard error"
             raise ValueError(
-                f"the program must write {named} and nothing else to its standard output, got {shown!r} "
-                f"({type(error).__name__}: {error}){advice}{_shown(errors)}"
+                f"the program must write {named} and nothing else to its standard output, got {start!r} "
+                f"({type(error).__name__}: {error}){advice}{shown(errors)}"
             ) from error
-
-
-class _Server:
-    """A program that runs, and threads that read what it writes."""
-
-    def __init__(self, process: "subprocess.Popen[bytes]") -> None:
-        self.process = process
-        self.errors: deque[bytes] = deque(maxlen=_KEPT)
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
-
-    @property
-    def alive(self) -> bool:
-        return self.process.poll() is None
-
-    def ask(self, request: bytes, npy: bool, limit: float | None) -> bytes:
-        """Return the answer to a request."""
-        answer: list[bytes] = []
-
-        def exchange() -> None:
-            assert self.process.stdin is not None
-            assert self.process.stdout is not None
-            with contextlib.suppress(OSError, ValueError):
-                self.process.stdin.write(request)
-                self.process.stdin.flush()
-                answer.append(_read_npy(self.process.stdout) if npy else self.process.stdout.readline())
-
-        thread = threading.Thread(target=exchange, daemon=True)
-        thread.start()
-        thread.join(limit)
-        command: Any = self.process.args
-        if thread.is_alive():
-            self.process.kill()
-            thread.join()
-            self._listener.join(1.0)
-            raise TimeoutError(_late(command, limit, b"".join(self.errors)))
-        if not answer or not answer[0]:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(2.0)
-            self.process.kill()
-            self._listener.join(1.0)
-            raise RuntimeError(_ended(command, self.process.wait(), b"".join(self.errors)))
-        return answer[0]
-
-    def end(self) -> None:
-        """Close the input of the program, and kill it if it does not end."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError):
-            self.process.stdin.close()
-        try:
-            self.process.wait(1.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        self._listener.join(1.0)
-        for pipe in (self.process.stdout, self.process.stderr):
-            assert pipe is not None
-            pipe.close()
-
-    def _listen(self) -> None:
-        assert self.process.stderr is not None
-        with contextlib.suppress(OSError, ValueError):
-            self.errors.extend(self.process.stderr)
-
-
-def _read_npy(file: IO[bytes]) -> bytes:
-    """Return the bytes of one array, or of a line that is none."""
-    start = file.read(6)
-    if start != b"\x93NUMPY":
-        return start + (b"" if b"\n" in start else file.readline())
-    import numpy as np
-
-    version = file.read(2)
-    size = file.read(2 if version[0] == 1 else 4)
-    header = file.read(int.from_bytes(size, "little"))
-    shown = io.BytesIO(size + header)
-    read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(shown)
-    return start + version + size + header + file.read(int(np.prod(shape)) * dtype.itemsize)
 
 
 def _missing(shape: Sequence[int]) -> Tensor:
@@ -310,16 +227,3 @@ def _found(command: Sequence[str]) -> Sequence[str]:
     if shutil.which(str(command[0])) is None:
         raise FileNotFoundError(f"command: there is no program {str(command[0])!r} that could be run, see PATH")
     return command
-
-
-def _late(command: Sequence[str], limit: float | None, errors: bytes) -> str:
-    return f"the program {command[0]!r} gave no answer within timeout: {limit:g} s{_shown(errors)}"
-
-
-def _ended(command: Sequence[str], code: int, errors: bytes) -> str:
-    return f"the program {command[0]!r} ended with code {code} and without an answer{_shown(errors)}"
-
-
-def _shown(errors: bytes) -> str:
-    lines = errors.decode(errors="replace").strip().splitlines()[-_KEPT:]
-    return "; it wrote to its standard error:\n" + "\n".join(lines) if lines else ""

@@ -122,21 +122,22 @@ def py_bobyqa(trial: Trial, *, scale: float = 1.0, seek_global_minimum: bool = T
     """Py-BOBYQA: quadratic interpolation in a trust region (Cartis, Fiala, Marteau and Roberts 2019).
 
     With `seek_global_minimum` it starts again with a larger region where the last one has shrunk to nothing (Cartis,
-    Roberts and Sheridan-Methven 2022), which needs bounds.
+    Roberts and Sheridan-Methven 2022), which needs bounds. Where that finds nothing either, it has a further start.
     """
     import pybobyqa
 
     evaluate, bounds = _one_by_one(trial), trial.task.bounds
-    pybobyqa.solve(
-        evaluate,
-        trial.start.numpy(),
-        bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
-        rhobeg=scale * trial.task.sigma,
-        rhoend=1e-8 * scale * trial.task.sigma,
-        maxfun=trial.task.evaluations,
-        seek_global_minimum=seek_global_minimum and bounds is not None,
-        do_logging=False,
-    )
+    for start in starts(trial):
+        pybobyqa.solve(
+            evaluate,
+            start.numpy(),
+            bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
+            rhobeg=scale * trial.task.sigma,
+            rhoend=1e-8 * scale * trial.task.sigma,
+            maxfun=trial.task.evaluations,
+            seek_global_minimum=seek_global_minimum and bounds is not None,
+            do_logging=False,
+        )
 
 
 def _one_by_one(trial: Trial) -> Callable[[Array], float]:

@@ -106,16 +106,7 @@ def dfo_ls(trial: Trial, *, scale: float = 1.0) -> None:
         best(x[None], np.array([np.mean(values**2)]))
         return values
 
-    bounds = trial.task.bounds
-    for start in starts(trial):
-        dfols.solve(
-            evaluate,
-            start.numpy(),
-            bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
-            rhobeg=scale * trial.task.sigma,
-            maxfun=trial.task.evaluations,
-            do_logging=False,
-        )
+    _interpolate(trial, dfols.solve, evaluate, rhobeg=scale * trial.task.sigma)
 
 
 def py_bobyqa(trial: Trial, *, scale: float = 1.0, seek_global_minimum: bool = True) -> None:
@@ -126,17 +117,27 @@ def py_bobyqa(trial: Trial, *, scale: float = 1.0, seek_global_minimum: bool = T
     """
     import pybobyqa
 
-    evaluate, bounds = _one_by_one(trial), trial.task.bounds
+    _interpolate(
+        trial,
+        pybobyqa.solve,
+        _one_by_one(trial),
+        rhobeg=scale * trial.task.sigma,
+        rhoend=1e-8 * scale * trial.task.sigma,
+        seek_global_minimum=seek_global_minimum and trial.task.bounds is not None,
+    )
+
+
+def _interpolate(trial: Trial, solve: Callable[..., object], evaluate: Callable[[Array], Any], **settings: Any) -> None:
+    """Call the solver of DFO-LS or Py-BOBYQA, which have the same interface, from one start after the other."""
+    bounds = trial.task.bounds
     for start in starts(trial):
-        pybobyqa.solve(
+        solve(
             evaluate,
             start.numpy(),
             bounds=None if bounds is None else tuple(one.numpy() for one in bounds),
-            rhobeg=scale * trial.task.sigma,
-            rhoend=1e-8 * scale * trial.task.sigma,
             maxfun=trial.task.evaluations,
-            seek_global_minimum=seek_global_minimum and bounds is not None,
             do_logging=False,
+            **settings,
         )
 
 

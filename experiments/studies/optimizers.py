@@ -57,7 +57,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Reached:
-    """Evaluations until each of `bbob.TARGETS` was reached, as far as they were, and seconds of the processor."""
+    """Evaluations until each target of `bbob.TARGETS` that was reached, and seconds of the processor."""
 
     evaluations: Sequence[int]
     seconds: float

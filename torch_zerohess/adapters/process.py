@@ -206,13 +206,15 @@ class Program(Closing):
                 import numpy as np
 
                 return as_tensor(np.load(io.BytesIO(output), allow_pickle=False))
+            found = json.loads(output)
             if b"null" in output:
                 raise ValueError("it printed null where a number was expected")
-            return torch.tensor(json.loads(output), dtype=torch.float64, device="cpu")
+            return torch.tensor(found, dtype=torch.float64, device="cpu")
         except Exception as error:  # a function may raise any
             start = output[:200].decode(errors="replace")
             named = "what the function `format` reads" if callable(self.format) else f"values as {self.format}"
-            advice = "" if output.strip() == b"null" else ": let it print messages to its standard error"
+            read = self.format == "json" and not isinstance(error, json.JSONDecodeError)
+            advice = "" if read else ": let it print messages to its standard error"
             raise ValueError(
                 f"the program must write {named} and nothing else to its standard output, got {start!r} "
                 f"({type(error).__name__}: {error}){advice}{shown(errors)}"

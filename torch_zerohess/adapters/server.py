@@ -76,7 +76,7 @@ class Server:
 
 
 def _read_npy(file: IO[bytes]) -> bytes:
-    """Return the bytes of one array, or of a line that is none."""
+    """Return the bytes of one array. If the program wrote something else, return one line of it."""
     start = file.read(6)
     if start != b"\x93NUMPY":
         return start + (b"" if b"\n" in start else file.readline())

@@ -143,8 +143,8 @@ class BlackBox(nn.Module):
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order, but for proposals "optimal" (with order=2) and "fr22":
-        they have two and one, and higher ones raise ValueError. The function makes no further evaluation.
+        smoothed black box and has derivatives of every order. With proposal "optimal" and order=2 it has two
+        derivatives, with "fr22" one. Higher ones raise ValueError. The function makes no further evaluation.
         """
         _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]

@@ -17,7 +17,7 @@ for function in WHOLE:
 
 
 def _called(layer: Any, x: Tensor, *aux: Tensor) -> Tensor:
-    result: Tensor = layer.forward(x, *aux)  # its hooks are called around `forward` of the compiled model
+    result: Tensor = layer.forward(x, *aux)  # not `layer(x)`: the compiled model calls the hooks
     return result
 
 

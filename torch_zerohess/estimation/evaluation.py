@@ -232,10 +232,8 @@ def evaluate(
     def mean(losses: Tensor) -> Tensor:
         return (stein.value(losses[:, None] * share.mT) / stein.value(share.mT))[:, 0]
 
-    outer, counted = (
-        call.outer,
-        None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True),
-    )
+    outer = call.outer
+    counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
     if scales is None:
         scales = outer.scales(lambda: values[:, :K].double(), mean)
     remaining = outer.inner(values, scales)

@@ -26,7 +26,7 @@ class Expansion:
     sigma: Tensor
     """float64 [n]"""
     constants: Tensor
-    """What the function around the expectation needs, float64 [B, c], see `Outer.kept`; it gets F as Z."""
+    """Constants of the function around the expectation, float64 [B, c], see `Outer.kept`."""
     stein: Stein
 
     def tensors(self) -> list[Tensor]:

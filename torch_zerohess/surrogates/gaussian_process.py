@@ -25,7 +25,7 @@ CONSTANT = 1.0
 """Variance of the constant part of the kernel."""
 _SPREAD = 1.5
 """Standard deviation of the prior over the log of a length."""
-_TOLD = 7
+DEVIATION_DEGREES = 7
 """Degrees of freedom of a deviation that the caller knows: as many as eight values at one point give."""
 _FLAT = 1e-14
 """Change of outputs, relative to their size, that is rounding."""
@@ -151,8 +151,8 @@ def grid_evidence(
     """Log evidence for every kernel, length and noise of the lists, and the most likely variance for each of them.
 
     The evidence is 2/m times the log likelihood without its constants, plus 2 times the log prior of the length. (An
-    output counts as one observation: its elements are not independent.) A known deviation enters as `_TOLD` squares of
-    that size, each of noise alone.
+    output counts as one observation: its elements are not independent.) A known deviation enters as
+    `DEVIATION_DEGREES` squares of that size, each of noise alone.
 
     Args:
         points: [P, n].
@@ -171,7 +171,11 @@ def grid_evidence(
     spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [kernels x lengths, N, P]
     squares, logs, count = (power[:, None] / spectrum).sum(2) / m, spectrum.log().sum(2), P
     if deviation is not None:
-        squares, logs, count = squares + _TOLD * deviation**2 / levels, logs + _TOLD * levels.log(), P + _TOLD
+        squares, logs, count = (
+            squares + DEVIATION_DEGREES * deviation**2 / levels,
+            logs + DEVIATION_DEGREES * levels.log(),
+            P + DEVIATION_DEGREES,
+        )
     variances = squares / count + math.ulp(0.0)
     evidence = -count * variances.log() - logs
     evidence -= improbability(lengths).repeat(len(KERNELS))[:, None]

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.gaussian_process import DEVIATION_DEGREES
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 _SPARE = 5
@@ -13,8 +14,6 @@ _WIDER = 1.3
 """Factor between the numbers of evaluations that are tried."""
 _MOST = 3
 """Evaluations without noise that are tried at most, over the coefficients."""
-_TOLD = 7
-"""Degrees of freedom of a known deviation: as many as eight values at one point give."""
 _CHANCE = 2.0
 """Standard deviations by which the residuals may exceed the noise before the rest is no quadratic."""
 _APART = 3.0
@@ -95,7 +94,7 @@ def _least_squares(u: Tensor, values: Tensor, noise: float) -> tuple[LocalModel,
     averaged = 0.0
     if noise:
         variance = missed**2 / P
-        averaged = (_TOLD * (noise / size) ** 2 + spare * variance) / (_TOLD + spare)
+        averaged = (DEVIATION_DEGREES * (noise / size) ** 2 + spare * variance) / (DEVIATION_DEGREES + spare)
         missed = math.sqrt(P * max(variance - averaged * (1.0 + _CHANCE * math.sqrt(2.0 / spare)), 0.0))
     # What is not quadratic is no noise: it does not average out over the evaluations (Cauchy and Schwarz).
     error = math.hypot(missed, math.sqrt(averaged)) * inverse.norm(dim=1)

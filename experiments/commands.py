@@ -53,6 +53,9 @@ COMMANDS = {
         "experiments.studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True
     ),
     "recovery": Command("experiments.studies.recovery:recovery", "sparse Jacobians from few samples", long=True),
+    "full_setting": Command(
+        "experiments.studies.full_setting:full_setting", "time that tasks save over the source's setting", long=True
+    ),
     "figures": Command("experiments.studies.figures:figures", "figures of the source, by their numbers", long=True),
     "gallery": Command("experiments.studies.gallery:gallery", "pictures and animations of all tasks", long=True),
     "caustic": Command("experiments.studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),

@@ -9,9 +9,11 @@ import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.problems.catalogue import Preset
 from experiments.runs.records import write
 
 _ROOT = Path(__file__).parents[2]
@@ -28,6 +30,12 @@ def read_command(folder: Path) -> dict[str, Any]:
     path = folder / NAME
     known: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"commands": [], "settings": {}}
     return known
+
+
+def preset_and_variant(settings: Mapping[str, Mapping[str, Any]]) -> tuple[Preset, str]:
+    """Return the preset and the Mitsuba variant of a task's settings (method -> name -> value), which methods share."""
+    one = next(iter(settings.values()), {})
+    return one.get("preset", "fast"), one.get("variant", "auto")
 
 
 def register(folder: Path, settings: dict[str, dict[str, Any]]) -> None:

@@ -8,19 +8,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import matplotlib.image
-import torch
 import tyro
 from torch import Tensor
 
-from experiments.ensembles.provenance import flat, read_command
+from experiments.ensembles.provenance import flat, preset_and_variant, read_command
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING
+from experiments.problems.catalogue import FITTING, Preset
 from experiments.problems.task import Task
 from experiments.reports import error_curves
 from experiments.reports.animation import pixels
-from experiments.reports.full_setting import known_saving, line
 from experiments.reports.html_page import html_page, html_table, html_text
-from experiments.reports.results import Run, load
+from experiments.reports.results import Run, first_run, load
+from experiments.reports.savings import kept_saving
 from experiments.reports.similarity import described, measures
 from experiments.reports.speed_ups import HEADERS
 from experiments.reports.summary import Summary, summarize, task_table
@@ -62,13 +61,11 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
         parts.append(_speed_ups(summary))
     for name, methods in results.runs.items():
         settings = known["settings"].get(name, {})
-        preset = next((one.get("preset", "fast") for one in settings.values()), "fast")
-        task = (tasks or {}).get(name) or _load(name, preset)
+        task = (tasks or {}).get(name) or _load(name, *preset_and_variant(settings))
         parts += [f"<h2 id='{html_text(name)}'>{html_text(name)}</h2>", _about(task), _tables(summary, name)]
         parts.append(_curves(name, methods, chosen))
         if task is not None:
-            run, ends = _ends(task, methods)
-            parts += [_pictures(task, run, ends), _left_out(task, ends, folder / name)]
+            parts += [_pictures(task, *first_run(task, methods)), _left_out(task, folder)]
         parts.append(_settings(settings))
     title = f"Results of {', '.join(results.runs)}"
     if summary.unfinished:
@@ -76,9 +73,9 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
     return html_page(title, _STYLE, "".join(parts))
 
 
-def _load(name: str, preset: Any) -> Task | None:
+def _load(name: str, preset: Preset, variant: str) -> Task | None:
     try:
-        return catalogue.fitting(name, preset) if name in FITTING else None
+        return catalogue.fitting(name, preset, variant) if name in FITTING else None
     except ImportError:
         return None
 
@@ -125,18 +122,6 @@ def _curves(name: str, methods: dict[str, list[Run]], chosen: Mapping[str, error
     return f"<img class='curves' alt='error curves of {html_text(name)}' src='{_embedded(image.getvalue())}'>"
 
 
-def _ends(task: Task, methods: Mapping[str, Sequence[Run]]) -> tuple[int, dict[str, Tensor]]:
-    """Return the number of the first run, its start, and where each method ended from there."""
-    run = min(one.outcome.run for runs in methods.values() for one in runs)
-    ends = {
-        name: torch.tensor(one.outcome.x, dtype=torch.float64)
-        for name, runs in methods.items()
-        for one in runs
-        if one.outcome.run == run and len(one.outcome.x) == task.n
-    }
-    return run, {"start": task.start(run), **ends}
-
-
 def _pictures(task: Task, run: int, ends: Mapping[str, Tensor]) -> str:
     """Show the start, the results of the first run of every method, and the target, with how they differ from it."""
     shown = []
@@ -161,13 +146,12 @@ def _figure(name: str, picture: Tensor | None, caption: str) -> str:
     return f"<figure>{image}<figcaption><b>{html_text(name)}</b><br>{html_text(caption)}</figcaption></figure>"
 
 
-def _left_out(task: Task, ends: Mapping[str, Tensor], folder: Path) -> str:
-    """Say what the setting of the task saves over the source's, measured on the way to the best result."""
+def _left_out(task: Task, folder: Path) -> str:
+    """Say what the setting of the task saves over the source's."""
     if task.renderer is None or task.renderer.full is None:
         return ""
-    best = min(ends.values(), key=task.truth.image_error)
-    found = known_saving(task, line(ends["start"], best), folder)
-    used = f"Used: {task.needs}. Against the full setting of the source, {found}."
+    found = kept_saving(folder / task.name) or f"not measured: python -m experiments full_setting {folder}"
+    used = f"Used: {task.needs}. Against the full setting of the source: {found}."
     return f"<h3>Left out</h3><p>{html_text(used)}</p>"
 
 

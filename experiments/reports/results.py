@@ -1,10 +1,14 @@
 """The runs in a folder, as the tables, figures and reports read them."""
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
+from experiments.problems.task import Task
 from experiments.runs.records import Files, Outcome, Record, read, read_outcome
 from experiments.runs.trial import reduced
 
@@ -71,3 +75,15 @@ def _folders(folder: Path) -> list[Path]:
 
 def _run(files: Files) -> Run:
     return Run(read_outcome(files.outcome), list(read(files.log)) if files.log.exists() else [])
+
+
+def first_run(task: Task, methods: Mapping[str, Sequence[Run]]) -> tuple[int, dict[str, Tensor]]:
+    """Return the number of the first run, its start [n] under "start", and where each method ended from there [n]."""
+    run = min(one.outcome.run for runs in methods.values() for one in runs)
+    ends = {
+        name: torch.tensor(one.outcome.x, dtype=torch.float64)
+        for name, runs in methods.items()
+        for one in runs
+        if one.outcome.run == run and len(one.outcome.x) == task.n
+    }
+    return run, {"start": task.start(run), **ends}

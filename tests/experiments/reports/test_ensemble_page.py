@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 import math
 import re
 from dataclasses import replace
@@ -15,10 +14,8 @@ from small import TARGET, TASK
 from written_runs import write
 
 import torch_zerohess as zh
-from experiments.problems.task import Renderer
 from experiments.reports.ensemble_page import page, report
 from experiments.reports.error_curves import plot, quartiles, styles_of
-from experiments.reports.full_setting import Saving, known_saving, line, saving
 from experiments.reports.results import load as load_results
 from experiments.reports.similarity import described, measures
 
@@ -88,93 +85,6 @@ def test_pictures_say_how_far_they_are_from_the_target(folder, no_curves):
         ("gaussian_process", "distance 0"),
         ("our_g", "distance 0"),
     ]
-
-
-class Clock:
-    """Time that passes only when a loss says so."""
-
-    def __init__(self):
-        self.now, self.calls, self.released = 0.0, 0, False
-
-    def release(self):
-        self.released = True
-
-    def alone(self, loss):
-        def evaluate(x):
-            assert self.released  # by the task that was measured before
-            return loss(x)
-
-        return evaluate
-
-    def loss(self, seconds, factor):
-        def evaluate(x):
-            self.calls += 1
-            self.now += next(seconds)
-            return factor * TASK.loss(x)
-
-        return evaluate
-
-
-@pytest.fixture
-def halved(monkeypatch):
-    """`bowl` in 3 ms, its full setting in 36 ms with a loss that is larger by a quarter; both load for 100 s."""
-    clock = Clock()
-    monkeypatch.setattr("experiments.reports.full_setting.time.perf_counter", lambda: clock.now)
-    whole = replace(TASK, loss=clock.loss(iter([100, 0.036, 0.7, 0.036, 0.036, 0.001, 0.036]), 1.25))
-    task = replace(
-        TASK,
-        loss=clock.loss(iter([100, 0.003, 0.003, 0.5, 0.003, 0.003, 0.002]), 1.0),
-        renderer=Renderer(full=lambda: replace(whole, loss=clock.alone(whole.loss)), release=clock.release),
-    )
-    return task, clock
-
-
-def test_saving_is_measured_at_the_same_points_without_the_loading(halved):
-    task, clock = halved
-    points = line(TARGET + 2, TARGET)
-    # The way is 2 sqrt(2) long; losses are its squared length.
-    assert torch.allclose(points, TARGET + torch.tensor([2, 1.6, 1.2, 0.8, 0.4, 0]).double()[:, None])
-    found = saving(task, points)
-    squares = [8 * t**2 for t in (1, 0.8, 0.6, 0.4, 0.2, 0)]
-    rms = math.sqrt(sum((0.25 * square) ** 2 for square in squares) / 6)
-    assert found == Saving(pytest.approx(0.003), pytest.approx(0.036), pytest.approx(rms / (1.25 * 8)))
-    assert clock.calls == 2 * 7
-    assert str(found) == ("time saved: 12x (3 ms against 36 ms per evaluation), loss differs by 10 % of its peak")
-
-
-def test_times_have_units():
-    assert "2x (1.5 s against 3 s" in str(Saving(1.5, 3.0, 0.0))
-    text = "time saved: 120x (12 us against 1.5 ms per evaluation), loss differs by 140 % of its peak"
-    assert str(Saving(1.2e-5, 1.4999e-3, 1.4)) == text
-
-
-def test_the_report_measures_the_saving_once(folder, halved, no_curves):
-    task, clock = halved
-    first = page(folder, {"bowl": task})
-    assert "12x (3 ms against 36 ms per evaluation)" in first
-    assert json.loads((folder / "bowl" / "saving.json").read_text())["full_seconds"] == pytest.approx(0.036)
-    calls = clock.calls
-    assert page(folder, {"bowl": task}) == first
-    assert clock.calls == calls
-    assert known_saving(TASK, line(TARGET, TARGET), folder) is None
-    assert not (folder / "saving.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("task", "points", "message"),
-    [
-        (TASK, torch.zeros(1, 2), "task must have a full setting .* bowl has none"),
-        (replace(TASK, renderer=Renderer(full=lambda: TASK)), torch.zeros(2), r"points must be \[P, 2\], got \[2\]"),
-        (
-            replace(TASK, renderer=Renderer(full=lambda: TASK)),
-            torch.zeros(0, 2),
-            r"points must be \[P, 2\], got \[0, 2\]",
-        ),
-    ],
-)
-def test_saving_names_what_is_wrong(task, points, message):
-    with pytest.raises(ValueError, match=message):
-        saving(task, points)
 
 
 @pytest.mark.parametrize("shape", [(20, 16), (20, 16, 3)])

@@ -1,43 +1,55 @@
-"""What leaving out parts of the source's setting saves: time per evaluation, and by how much the loss differs."""
+"""`python -m experiments full_setting`: what leaving out parts of the source's setting saves.
 
-import json
+A rendered task leaves out what its loss does not need. The time of an evaluation and the loss are measured against the
+same task in the source's full setting, on the line from the start to the best result of a folder. `report` shows both.
+"""
+
 import math
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import torch
+import tyro
 from torch import Tensor
 
+from experiments.ensembles.provenance import preset_and_variant, read_command
+from experiments.problems import catalogue
+from experiments.problems.catalogue import FITTING
 from experiments.problems.task import Task
-from experiments.runs.records import write
+from experiments.reports.results import Run, first_run, load
+from experiments.reports.savings import Saving, kept_saving
 
 POINTS = 6
-"""Of the line from start to solution, both ends included."""
-NAME = "saving.json"
+"""Points on the line from start to result, both ends included."""
 
 
-@dataclass(frozen=True)
-class Saving:
-    """A task as it is used against the same task in the source's full setting."""
+def full_setting(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")], /) -> None:
+    """Measure those tasks of a folder that leave out something of the source's setting; each is measured once.
 
-    seconds: float
-    """Per evaluation, median."""
-    full_seconds: float
-    difference: float
-    """RMS difference of the losses at the same points, each against its own reference, over the largest full loss."""
+    Args:
+        folder: written by `run`.
+    """
+    settings = read_command(folder)["settings"]
+    runs = load(folder).runs
+    tasks = [catalogue.fitting(name, *preset_and_variant(settings.get(name, {}))) for name in runs if name in FITTING]
+    reduced = [task for task in tasks if task.renderer is not None and task.renderer.full is not None]
+    if not reduced:
+        raise SystemExit(f"DIR must have a task that leaves out something of the source's, got {', '.join(runs)}")
+    for task in reduced:
+        print(f"{task.name}: {measured(task, runs[task.name], folder / task.name)}", flush=True)
 
-    @property
-    def ratio(self) -> float:
-        return self.full_seconds / self.seconds
 
-    def __str__(self) -> str:
-        return (
-            f"time saved: {_number(self.ratio, 2)}x ({_time(self.seconds)} against {_time(self.full_seconds)} per "
-            f"evaluation), loss differs by {_number(100 * self.difference, 2)} % of its peak"
-        )
+def measured(task: Task, methods: Mapping[str, Sequence[Run]], folder: Path) -> Saving:
+    """Return the saving that is kept in a task's folder of results, measured first if there is none."""
+    found = kept_saving(folder)
+    if found is None:
+        _, ends = first_run(task, methods)
+        found = saving(task, line(ends["start"], min(ends.values(), key=task.truth.image_error)))
+        found.keep(folder)
+    return found
 
 
 def saving(task: Task, points: Tensor) -> Saving:
@@ -56,18 +68,6 @@ def saving(task: Task, points: Tensor) -> Saving:
         statistics.median(seconds for seconds, _ in whole),
         _difference([value for _, value in used], [value for _, value in whole]),
     )
-
-
-def known_saving(task: Task, points: Tensor, folder: Path) -> Saving | None:
-    """Return the saving of a task, measured once and kept in a folder; None if it has no other setting."""
-    if task.renderer is None or task.renderer.full is None:
-        return None
-    path = folder / NAME
-    if path.exists():
-        return Saving(**json.loads(path.read_text()))
-    found = saving(task, points)
-    write(path, json.dumps(asdict(found), indent=1))
-    return found
 
 
 def line(start: Tensor, end: Tensor) -> Tensor:
@@ -94,15 +94,3 @@ def _difference(values: list[float], full: list[float]) -> float:
     peak = max(abs(value) for value in full)
     rms = math.sqrt(statistics.fmean((a - b) ** 2 for a, b in zip(values, full, strict=True)))
     return rms / peak if peak else float(rms > 0)
-
-
-def _time(seconds: float) -> str:
-    for unit, scale in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= scale:
-            return f"{_number(seconds / scale, 2)} {unit}"
-    return f"{_number(1e6 * seconds, 2)} us"
-
-
-def _number(value: float, digits: int) -> str:
-    """To some digits, but without an exponent where none is needed."""
-    return f"{float(f'{value:.{digits}g}'):g}"

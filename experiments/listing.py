@@ -1,5 +1,10 @@
 """`python -m experiments list`: what there is, what goes with what, and what is missing."""
 
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
 from experiments.methods import METHODS
 from experiments.problems import catalogue
 from experiments.problems.network_task import NetworkTask
@@ -7,16 +12,23 @@ from experiments.problems.task import Task
 from experiments.reports.tables import table
 
 
-def list_() -> None:
-    """Print all tasks and methods, which methods can be run on which tasks, and what must be installed for the rest."""
-    print(listing())
+def list_(tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="TASK...")] = (), /) -> None:
+    """Print tasks and methods, which methods can be run on which tasks, and what must be installed for the rest.
+
+    Args:
+        tasks: only these, and the methods that can be run on one of them; everything if none is given.
+    """
+    print(listing(catalogue.chosen("TASK", tasks, list(catalogue.TASKS)) if tasks else None))
 
 
-def listing() -> str:
-    """Return tables of tasks, methods and combinations, and the reasons for those that cannot be run."""
+def listing(only: Sequence[str] | None = None) -> str:
+    """Return tables of tasks, methods and combinations, and the reasons for those that cannot be run.
+
+    only: names of tasks; methods that cannot be run on one of them are left out. Everything if None.
+    """
     tasks: dict[str, Task | NetworkTask] = {}
     lines: list[list[object]] = []
-    for name in catalogue.TASKS:
+    for name in only or catalogue.TASKS:
         task = _loaded(name)
         if isinstance(task, str):
             lines.append([name, "", task])
@@ -27,13 +39,15 @@ def listing() -> str:
     reasons = []
     for method in METHODS.values():
         why = {name: method.unusable(task) for name, task in tasks.items()}
-        marks.append([method.name, *("." if reason else "+" for reason in why.values()), method.title])
+        if only is None or None in why.values():
+            usable = ("." if reason else "+" for reason in why.values())
+            marks.append([method.name, *usable, method.uses, method.title])
         own = {name: why[name] for name, task in tasks.items() if method.is_for(task)}
         for reason in dict.fromkeys(filter(None, own.values())):
             names = [name for name, one in own.items() if one == reason]
             where = "anywhere" if len(names) == len(own) else f"on {', '.join(names)}"
             reasons.append(f"{method.name} not {where}: {reason}")
-    parts = [table(["task", "n", "what is sought"], lines), table(["method", *tasks, ""], marks)]
+    parts = [table(["task", "n", "what is sought"], lines), table(["method", *tasks, "uses", ""], marks)]
     return "\n\n".join([*parts, *(["\n".join(reasons)] if reasons else [])])
 
 

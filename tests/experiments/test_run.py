@@ -5,7 +5,7 @@ import shlex
 
 import pytest
 
-from experiments.listing import listing
+from experiments.listing import list_, listing
 from experiments.methods import METHODS
 from experiments.problems.catalogue import FITTING, load
 from experiments.reports.ensemble_page import page
@@ -18,6 +18,18 @@ def test_list_names_everything():
     text = listing()
     for name in (*FITTING, *METHODS, "cnn"):
         assert re.search(rf"^{name} ", text, re.MULTILINE), name
+
+
+def test_list_of_a_task_has_the_methods_that_can_be_run_on_it(capsys):
+    list_(("brdf",))
+    text = capsys.readouterr().out
+    rows = re.findall(r"^(\w+) +[+.]", text, re.MULTILINE)
+    assert rows == [name for name, method in METHODS.items() if method.unusable(load("brdf")) is None]
+    assert re.search(r"^dfo_ls +\+ +image +DFO-LS", text, re.MULTILINE)
+    assert "block_gauss_newton not anywhere: made for 100 parameters and more, the task has 7" in text
+    assert "texture" not in text
+    with pytest.raises(SystemExit, match=r"TASK must be some of .* got bird \(did you mean brdf"):
+        list_(("bird",))
 
 
 def test_list_says_what_is_missing(monkeypatch):

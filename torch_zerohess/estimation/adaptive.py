@@ -2,13 +2,17 @@
 
 import math
 from collections.abc import Callable
+from typing import Literal, get_args
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.estimation.sums import Sums
 from torch_zerohess.smoothing import Smoothing
 
+Derivative = Literal["gradient", "hessian_diagonal", "hessian"]
+"""Derivatives whose error may end the drawing."""
 MOST = 100_000
 """Evaluations that a tolerance may take where no other number is given."""
+_NAMES = {"gradient": "gradient", "hessian_diagonal": "diagonal of the Hessian", "hessian": "Hessian"}
 _STEP = 0x9E3779B97F4A7C15  # from the seed of a batch to the seed of the next
 
 
@@ -19,6 +23,7 @@ def draw_until(
     cost: Callable[[Smoothing], int],
     seed: int,
     tolerance: float,
+    of: Derivative,
     max_evaluations: int,
 ) -> tuple[list[Sums], str]:
     """Draw batches, each as large as all before it together, until `error` of them is at most the tolerance.
@@ -30,6 +35,7 @@ def draw_until(
         cost: evaluations of a batch.
         seed: of the first batch.
         tolerance: positive.
+        of: the derivative whose error it is.
         max_evaluations: limit of all batches together.
 
     Returns:
@@ -51,20 +57,24 @@ def draw_until(
         used, multiple = used + cost(own), multiple + following
         found = error(batches)
         if found <= tolerance:
-            return batches, f"tolerance: the relative error of the gradient is {found:.2g}, at most {tolerance:g}"
+            return batches, f"tolerance: the relative error of the {_NAMES[of]} is {found:.2g}, at most {tolerance:g}"
     if not batches:
         raise ValueError(
             f"max_evaluations must be at least {cost(smoothing)}, one batch of the smoothing, got {max_evaluations}"
         )
     return batches, (
         f"max_evaluations: {used} of {max_evaluations} are used, another batch does not fit; the relative error of the "
-        f"gradient is {found:.2g}, above the tolerance {tolerance:g}"
+        f"{_NAMES[of]} is {found:.2g}, above the tolerance {tolerance:g}"
     )
 
 
-def check_limits(tolerance: float | None, max_evaluations: int | None) -> None:
-    """Raise ValueError or TypeError for limits out of their ranges, or for the second one without the first."""
+def check_limits(tolerance: float | None, of: Derivative, max_evaluations: int | None) -> None:
+    """Raise ValueError or TypeError for limits out of their ranges, or for another argument without a tolerance."""
+    if of not in get_args(Derivative):
+        raise ValueError(f"tolerance_of must be one of {', '.join(map(repr, get_args(Derivative)))}, got {of!r}")
     if tolerance is None:
+        if of != "gradient":
+            raise ValueError(f"tolerance_of says whose error a tolerance is: give tolerance too, got {of!r} alone")
         if max_evaluations is not None:
             raise ValueError(
                 f"max_evaluations is the limit of a tolerance: give tolerance too, got {max_evaluations} alone"

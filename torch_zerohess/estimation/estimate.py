@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.adaptive import MOST, check_limits, draw_until
+from torch_zerohess.estimation.adaptive import MOST, Derivative, check_limits, draw_until
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate
 from torch_zerohess.estimation.head import Head
@@ -36,15 +36,16 @@ def estimate(
     on_nonfinite: str | float = "raise",
     joint: bool = False,
     tolerance: float | None = None,
+    tolerance_of: Derivative = "gradient",
     max_evaluations: int | None = None,
 ) -> Estimate:
     """Estimate value and derivatives of fn, convolved with a Gaussian, at x: one batch of evaluations, no autograd.
 
     With a tolerance, further batches follow, each as large as all before it together, until the relative error of the
-    gradient is at most the tolerance. That error is |e| / |g| in units of sigma, over the outputs and parameters of one
-    batch element, the largest of the batch; e are half widths of 68 % intervals, which are standard errors where there
-    are many draws. Stopping when the error looks small is slightly too early on average. `Estimate.reason` says what
-    ended it.
+    gradient, or of `tolerance_of`, is at most the tolerance. That error is |e| / |g| in units of sigma, over the
+    outputs and entries of one batch element, the largest of the batch; e are half widths of 68 % intervals, which are
+    standard errors where there are many draws. Stopping when the error looks small is slightly too early on average.
+    `Estimate.reason` says what ended it.
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out]; it may use NumPy or anything else. Without aux if there is a head.
@@ -67,7 +68,8 @@ def estimate(
             parts of a scene changes a loss of its own, such as the pixels near it: K evaluations then tell the
             derivatives of B small functions. Each function is smoothed over the perturbations of the other parts, too.
             These have the density of the samples, which is the Gaussian with proposal "gaussian".
-        tolerance: relative error of the gradient at which to stop; None for one batch.
+        tolerance: relative error at which to stop; None for one batch.
+        tolerance_of: whose relative error: "gradient", "hessian_diagonal" or "hessian".
         max_evaluations: of fn, over all of x, f(x) in every batch included: where to stop in any case; 100 000 if None.
 
     Raises:
@@ -81,7 +83,7 @@ def estimate(
     if not isinstance(smoothing, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
     call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head, joint)
-    check_limits(tolerance, max_evaluations)
+    check_limits(tolerance, tolerance_of, max_evaluations)
     _check_memory(call, memory, tolerance)
     x = checked_input(x).detach().clone()
     if joint and (x.ndim != 2 or head is not None or memory is not None):
@@ -124,11 +126,12 @@ def estimate(
     center = value == "center" or smoothing.baseline == "center"
     batches, reason = draw_until(
         draw,
-        _relative_error,
+        lambda batches: _relative_error(batches, tolerance_of),
         smoothing,
         lambda own: (1 if joint else B) * own.evaluations(n, center=center),
         smoothing.drawn_seed(),
         float(tolerance),
+        tolerance_of,
         MOST if max_evaluations is None else max_evaluations,
     )
     return made(batches, reason)
@@ -144,10 +147,10 @@ def _check_memory(call: BlackBoxCall, memory: Memory | None, tolerance: float | 
         )
 
 
-def _relative_error(batches: list[Sums]) -> float:
+def _relative_error(batches: list[Sums], of: Derivative) -> float:
     """Largest |e| / |g| over the elements of a batch, e the half widths of intervals of one standard deviation."""
-    g = combined(batches, lambda one: one.stein.gradient(one.a)).flatten(1)
-    error, degrees = combined_spread(batches, "gradient", None)
+    g = combined(batches, lambda one: one.stein.sums(of, one.a, None)).flatten(1)
+    error, degrees = combined_spread(batches, of, None)
     e = (error * student_factor(_ONE_SIGMA, degrees)).flatten(1)
     size = torch.maximum(g.abs(), e).amax(1, keepdim=True)
     size = torch.where(size > 0, size, 1.0)

@@ -11,7 +11,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from torch_zerohess import Smoothing, estimate
+from torch_zerohess import Estimate, Smoothing, estimate
+from torch_zerohess.estimation.adaptive import Derivative
 from torch_zerohess.estimation.student import student_factor
 from truths import Exponential, Image, PlaneWave, Quadratic, spread, vector
 
@@ -227,6 +228,26 @@ def test_drawing_up_to_a_tolerance(proposal: str, sampler: str) -> None:
     assert [(one - 1) // (calls[0] - 1) for one in calls[:4]] == [1, 1, 2, 4]
 
 
+@pytest.mark.parametrize(
+    ("quantity", "name"),
+    [("gradient", "gradient"), ("hessian_diagonal", "diagonal of the Hessian"), ("hessian", "Hessian")],
+)
+def test_a_tolerance_is_of_the_derivative_that_is_named(quantity: Derivative, name: str) -> None:
+    def relative_error(got: Estimate) -> float:
+        units = SIGMA[:, None] * SIGMA if quantity == "hessian" else SIGMA * (1 if quantity == "gradient" else SIGMA)
+        found = got.gradient if quantity == "gradient" else getattr(got, quantity)()
+        return float((got.standard_error(quantity) * units).norm() / (found * units).norm())
+
+    settings = {"tolerance": 0.05, "tolerance_of": quantity}
+    smoothing = Smoothing(sigma=SIGMA, samples=64, proposal="gaussian", seed=4)
+    got = estimate(SLOPE, X, smoothing, **settings)
+    assert f"tolerance: the relative error of the {name} is 0.0" in got.reason
+    assert relative_error(got) <= 0.05
+    fewer = estimate(SLOPE, X, smoothing, **settings, max_evaluations=got.evaluations // 2 + 1)
+    assert f"the relative error of the {name} is 0.0" in fewer.reason
+    assert relative_error(fewer) > 0.05
+
+
 def test_the_limit_of_evaluations_ends_the_drawing() -> None:
     smoothing = Smoothing(sigma=SIGMA, samples=8, seed=4)
     x = X.expand(3, 2)
@@ -258,6 +279,8 @@ def test_intervals_of_several_batches_contain_the_truth() -> None:
 
 LIMITS = [
     ({"max_evaluations": 100}, ValueError, "give tolerance too, got 100 alone"),
+    ({"tolerance_of": "hessian"}, ValueError, "give tolerance too, got 'hessian' alone"),
+    ({"tolerance": 0.1, "tolerance_of": "hvp"}, ValueError, "tolerance_of must be one of 'gradient', .*got 'hvp'"),
     ({"tolerance": 0.0}, ValueError, r"tolerance must be positive and finite, .*got 0\.0"),
     ({"tolerance": math.nan}, ValueError, "tolerance must be a number, got nan"),
     ({"tolerance": "1 %"}, TypeError, "tolerance must be a number, got '1 %'"),

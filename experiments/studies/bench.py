@@ -87,7 +87,8 @@ def bench(
         large: parameters of the gradient and the product that draw their perturbations again.
         remembered: evaluations in the memory of a layer, timed against renders of MUG; 0 leaves it out.
         out: JSON file to write.
-        store: name of a table of the times to keep under experiments/results, for the documents.
+        store: name of the table of times that is kept under experiments/results, for the documents; the comparison
+            with the machine is kept as NAME_ratios.
     """
     smallest = min((number for pair in sizes for number in pair), default=0)
     given = {"repeats": repeats, "sizes": smallest, "memory_samples": memory_samples, "memory_n": memory_n}
@@ -124,6 +125,8 @@ def bench(
         out.write_text(json.dumps({"timings": rows, "memory": memories, "ratios": against}, indent=1))
     if store is not None:
         print(keep(*_table(report), store))
+        if compared:
+            print(keep(*_compared(report), f"{store}_ratios"))
     return report
 
 
@@ -243,16 +246,22 @@ def _table(report: BenchReport) -> tuple[list[str], list[list[object]]]:
     return headers, [[t.operation, t.n, t.samples, micro(t.extension), micro(t.torch), t.ratio] for t in report.timings]
 
 
+def _compared(report: BenchReport) -> tuple[list[str], list[list[object]]]:
+    """Return headers and rows of what the package does against what the machine can do."""
+    headers = ["operation", "parameters", "samples", "package [us]", "compared [us]", "ratio", "goal"]
+    rows: list[list[object]] = [
+        [r.operation, r.n, r.samples, round(1e6 * r.seconds, 1), round(1e6 * r.compared, 1), r.ratio, r.goal]
+        for r in report.ratios
+    ]
+    return headers, rows
+
+
 def _print(report: BenchReport) -> None:
     print("Median microseconds without the black box, one thread\n")
     print(table(*_table(report)))
     if report.ratios:
         print("\nAgainst what the machine can do: microseconds, and how many times faster the package is\n")
-        rows = [
-            [r.operation, r.n, r.samples, round(1e6 * r.seconds, 1), round(1e6 * r.compared, 1), r.ratio, r.goal]
-            for r in report.ratios
-        ]
-        print(table(["operation", "parameters", "samples", "package [us]", "compared [us]", "ratio", "goal"], rows))
+        print(table(*_compared(report)))
     if report.memory:
         print("\nMiB of a layer: kept by its graph, and peak of forward, backward and one HVP (float32 points)\n")
         memory = [[m.perturbations, m.n, m.samples, round(m.kept), round(m.peak)] for m in report.memory]

@@ -13,15 +13,17 @@ rounds them, plus 4 eps' |truth|, eps' of the dtype of x, because the result has
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 import torch_zerohess as zh
 from experiments.reports.progress import progress
+from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.coverage import coverage
 from experiments.studies.stability_cases import Case, cases
@@ -50,7 +52,13 @@ class Accuracy:
 
 
 def stability(
-    *, seed: int = 0, largest: int = 1_000_000, repeats: int = 2000, runs: int = 5, out: Path | None = None
+    *,
+    seed: int = 0,
+    largest: int = 1_000_000,
+    repeats: int = 2000,
+    runs: int = 5,
+    out: Path | None = None,
+    store: str | None = None,
 ) -> list[Accuracy]:
     """Check value, gradient, Hessian diagonal, HVP and Hessian against closed forms on stiff and extreme cases.
 
@@ -60,29 +68,51 @@ def stability(
         repeats: of every setting whose intervals are counted.
         runs: of every search on every hard case; 0 leaves them out.
         out: JSON file to write.
+        store: name of the table of cases that is kept under experiments/results, for the documents; intervals and
+            searches are kept as NAME_intervals and NAME_searches.
 
     Raises:
         SystemExit: with status 1, if something is wrong.
     """
+    if store is not None:
+        may_keep(store)
     rows = [row for case in progress(cases(largest), "cases") for row in _rows(case, seed)]
     shares = coverage(seed=seed, repeats=repeats)
-    headers = ["case", "quantity", "relative error", "standard errors", "seconds", "verdict"]
-    print(table(headers, [list(asdict(row).values()) for row in rows]))
+    wrong = [row for row in rows if row.verdict.startswith("WRONG")]
+    found = searches(runs=runs, seed=seed) if runs else []
+    made = {
+        "": (["case", "quantity", "relative error", "standard errors", "seconds", "verdict"], _cells(rows)),
+        "_intervals": (
+            ["intervals", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"],
+            [one.cells() for one in shares],
+        ),
+        "_searches": (
+            ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"],
+            _cells(found),
+        ),
+    }
+    titles = (
+        f"{len(rows) - len(wrong)} of {len(rows)} right",
+        f"Shares of {repeats} intervals that contain the truth",
+        f"Searches, {runs} runs each",
+    )
+    for title, (headers, cells) in zip(titles, made.values(), strict=True):
+        print(f"{title}\n\n{table(headers, cells)}\n")
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(json.dumps([asdict(row) for row in rows], indent=1))
-    wrong = [row for row in rows if row.verdict.startswith("WRONG")]
-    print(f"\n{len(rows) - len(wrong)} of {len(rows)} right\n")
-    headers = [f"{repeats} intervals of", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
-    print(table(headers, [one.cells() for one in shares]))
-    found = searches(runs=runs, seed=seed) if runs else []
-    headers = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
-    print(f"\nSearches, {runs} runs each\n\n{table(headers, [list(asdict(one).values()) for one in found])}")
+    if store is not None:
+        for suffix, (headers, cells) in made.items():
+            print(keep(headers, cells, store + suffix))
     outside = [one for one in shares if one.verdict.startswith("WRONG")]
     false = [one for one in found if one.verdict.startswith("WRONG")]
     if wrong or outside or false:
         raise SystemExit(1)
     return rows
+
+
+def _cells(rows: Sequence[Any]) -> list[list[object]]:
+    return [list(asdict(row).values()) for row in rows]
 
 
 def _rows(case: Case, seed: int) -> list[Accuracy]:

@@ -98,7 +98,8 @@ def variance(
         side: pixels along the image side of the BOX tasks.
         sizes: numbers of parameters of the comparison with other packages.
         rivals: its runs; 0 leaves it out.
-        store: name of a table to keep under experiments/results, for the documents.
+        store: name of the table that is kept under experiments/results, for the documents; the comparison with other
+            packages is kept as NAME_rivals.
     """
     smallest = min(budgets, default=0)
     for argument, value, least in (
@@ -139,6 +140,8 @@ def variance(
     if rivals:
         beside = compare(sizes=sizes, runs=rivals, seed=seed)
         print(f"\nErrors of auto settings and of other packages, geometric means\n\n{table(*summary(beside))}")
+        if store is not None:
+            print(keep(*summary(beside), f"{store}_rivals"))
         (out / "rivals.json").write_text(json.dumps([asdict(row) for row in beside], indent=1))
     return report
 

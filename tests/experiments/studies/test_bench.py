@@ -30,16 +30,23 @@ def test_wrong_arguments_of_bench_are_named(wrong, message) -> None:
 def costs(tmp_path_factory) -> BenchReport:
     out = tmp_path_factory.mktemp("bench") / "bench.json"
     before, threads = extension.available, torch.get_num_threads()
-    result = bench(
-        repeats=2,
-        sizes=((2, 8), (256, 32)),
-        memory_n=100_000,
-        memory_samples=32,
-        wide=(96,),
-        large=5_000,
-        remembered=30,
-        out=out,
-    )
+    kept = {}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("experiments.studies.bench.may_keep", lambda name: None)
+        patched.setattr("experiments.studies.bench.keep", lambda headers, rows, name: kept.update({name: rows}))
+        result = bench(
+            repeats=2,
+            sizes=((2, 8), (256, 32)),
+            memory_n=100_000,
+            memory_samples=32,
+            wide=(96,),
+            large=5_000,
+            remembered=30,
+            out=out,
+            store="times",
+        )
+    assert [row[0] for row in kept["times"]] == [one.operation for one in result.timings]
+    assert [row[5] for row in kept["times_ratios"]] == [one.ratio for one in result.ratios]
     assert (extension.available, torch.get_num_threads()) == (before, threads)
     written = json.loads(out.read_text())
     assert len(written["timings"]) == len(result.timings)

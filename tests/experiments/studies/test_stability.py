@@ -23,6 +23,20 @@ def test_every_case_of_stability_is_right(tmp_path, capsys, monkeypatch) -> None
     assert "WRONG" not in capsys.readouterr().out
 
 
+def test_stability_keeps_its_three_tables(monkeypatch) -> None:
+    kept = {}
+    monkeypatch.setattr("experiments.studies.stability.may_keep", lambda name: None)
+    monkeypatch.setattr("experiments.studies.stability.keep", lambda headers, rows, name: kept.update({name: rows}))
+    case = next(case for case in cases(1) if case.name == "sigma 1e+00, float64")
+    monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [case])
+    interval = Coverage("aggregate, random", 16, 0.95, {"value": (0.9, 0.91)}, "right")
+    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [interval])
+    rows = stability(runs=0, store="extreme")
+    assert [row[:2] for row in kept["extreme"]] == [[case.name, row.quantity] for row in rows]
+    assert kept["extreme_intervals"] == [interval.cells()]
+    assert kept["extreme_searches"] == []
+
+
 class Twice(ClosedForm):
     """A wave whose closed form is wrong by a factor of two."""
 

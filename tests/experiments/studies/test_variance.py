@@ -102,10 +102,14 @@ def test_wrong_arguments_are_named(tmp_path, wrong, message) -> None:
         variance(**{"runs": 2, "rivals": 0, "out": tmp_path, **wrong})
 
 
-def test_problems_have_lower_case_names_too(tmp_path, no_figures) -> None:
-    found = variance(
-        runs=2, budgets=(32,), problems=("wave10", "WAVE10"), methods=(OURS,), out=tmp_path, sizes=(1,), rivals=2
-    )
+def test_problems_have_lower_case_names_too_and_both_tables_are_kept(tmp_path, no_figures, monkeypatch) -> None:
+    kept = {}
+    monkeypatch.setattr("experiments.studies.variance.may_keep", lambda name: None)
+    monkeypatch.setattr("experiments.studies.variance.keep", lambda headers, rows, name: kept.update({name: rows}))
+    names, chosen = ("wave10", "WAVE10"), {"methods": (OURS,), "sizes": (1,)}
+    found = variance(runs=2, budgets=(32,), problems=names, **chosen, out=tmp_path, rivals=2, store="estimators")
+    assert [row[:3] for row in kept["estimators"]] == [["WAVE10", OURS, 32]]
+    assert {tuple(row[:2]) for row in kept["estimators_rivals"]} == {("gradient", 1), ("hvp", 1)}
     assert {m.problem for m in found.measurements} == {"WAVE10"}
     compared = json.loads((tmp_path / "rivals.json").read_text())
     assert len(compared) == 8 * len(BUDGETS) * 2  # functions, budgets, gradient and product

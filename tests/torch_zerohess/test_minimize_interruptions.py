@@ -15,6 +15,7 @@ from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.finished import finished_values, keep_finished
 from torch_zerohess.search.noise import reserved
 from torch_zerohess.search.protocol import AskTell
+from truths import vector
 
 SETTINGS = {"sigma": 2.0, "seed": 0, "vectorized": False, "max_evaluations": 20}
 
@@ -186,12 +187,8 @@ def test_evaluators_keep_them_by_number():
     assert numbers[:2] == [0, 1]
     assert values.tolist() == [float(k) for k in numbers]
     batch = Batch(points, 0, most=2)
-    batch.came(batch.take(), vector_of(0, 1))
+    batch.came(batch.take(), vector(0.0, 1.0))
     assert {k: float(one) for k, one in batch.known.items()} == {0: 0.0, 1: 1.0}
-
-
-def vector_of(*numbers):
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 def test_only_the_values_of_the_own_call_are_taken():

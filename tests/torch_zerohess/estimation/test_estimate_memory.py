@@ -192,7 +192,7 @@ def test_a_head_gets_aux_by_views() -> None:
         return image(*given)
 
     got = estimate(fn, X.expand(3, 2), SMOOTHING, references, head=head)
-    assert shapes == [[[3 * got.evaluations // 3, 2]]], "fn gets points alone"
+    assert shapes == [[[got.evaluations, 2]]], "fn gets points alone"
     assert {one.untyped_storage().data_ptr() for one in seen} == {references.untyped_storage().data_ptr()}
     same = estimate(lambda z, r: (image(z) - r).square().mean(1), X.expand(3, 2), SMOOTHING, references)
     torch.testing.assert_close(got.gradient, same.gradient)

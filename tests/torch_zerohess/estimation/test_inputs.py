@@ -13,9 +13,6 @@ from torch import Tensor
 from torch_zerohess import BlackBox, Smoothing, estimate, smooth
 from truths import spread, vector
 
-# torch's own forward mode compiles decompositions with its deprecated torch.jit.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
-
 S = Smoothing(sigma=0.5, samples=3, seed=1)
 ONE = S.replace(samples=1)
 X = vector(0.1, 0.2)

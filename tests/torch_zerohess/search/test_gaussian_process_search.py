@@ -7,11 +7,7 @@ import torch
 from searches import bar, bump, misfit, spiral, waves
 
 from torch_zerohess.optim import GaussianProcessSearch
-from truths import vector
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal, vector
 
 
 @pytest.mark.parametrize("seed", range(5))

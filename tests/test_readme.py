@@ -188,3 +188,12 @@ def test_tests_that_are_named_exist():
     }
     assert len(named) > 90
     assert named <= defined
+
+
+def test_constants_that_are_named_exist():
+    """The prose before the list of constants names those without a row."""
+    named = set(re.findall(r"`(_?[A-Z][A-Z_]+)`", TEXTS["tests/README.md"].partition("The library:")[0]))
+    sources = "\n".join(path.read_text() for path in (ROOT / "torch_zerohess").rglob("*.py"))
+    assigned = {name for line in re.findall(r"^([A-Z_, ]+) = ", sources, re.MULTILINE) for name in line.split(", ")}
+    assert len(named) > 20
+    assert named <= assigned

@@ -241,6 +241,8 @@ def test_errors():
             zh.optim.NewtonCG([x], **settings)
     with pytest.raises(ValueError, match="one group"):
         zh.optim.NewtonCG([{"params": [x]}, {"params": [torch.ones(1, requires_grad=True)]}])
+    with pytest.raises(ValueError, match="one group"):
+        zh.optim.NewtonCG([x]).add_param_group({"params": [torch.ones(1, requires_grad=True)]})
     with pytest.raises(ValueError, match="not finite"):
         zh.optim.NewtonCG([x]).step(lambda: (x * float("nan")).sum())
     assert torch.equal(x.detach(), torch.ones(2))

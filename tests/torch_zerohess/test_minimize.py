@@ -215,7 +215,18 @@ def test_a_plot_shows_every_evaluation_and_the_lowest_so_far(deviation):
     assert list(every) == fit.values.tolist()
     assert list(lowest) == fit.values.cummin(0).values.tolist()
     assert len(axes.containers) == int(deviation > 0)  # the value with its standard error
+    assert axes.get_yscale() == ("log" if bool((fit.values > 0).all()) else "linear")
     assert fit.plot(axes) is axes
+
+
+def test_a_plot_passes_over_values_that_are_not_numbers():
+    fit = zh.minimize(
+        lambda z: torch.where(z[:, 0] > 2, math.nan, tilted(z)), zeros(2), sigma=2.0, seed=0, max_evaluations=20
+    )
+    assert bool(fit.values.isnan().any())
+    axes = fit.plot()
+    assert axes.lines[1].get_ydata()[-1] == fit.value
+    assert axes.get_yscale() == "linear"
 
 
 def test_starts_of_lists_and_arrays():

@@ -205,6 +205,20 @@ def test_curvature_that_is_noise_is_not_divided_by():
     assert float(step.s) == -100.0
 
 
+def test_a_second_direction_whose_curvature_is_noise_is_not_followed():
+    """Along the first axis the curvature is 10; along the second one it is zero but for its error."""
+    images = torch.tensor([1.0, -1.0, 2.0, -2.1], dtype=torch.float64)
+
+    def product(v):
+        return torch.stack([10.0 * v[0].expand(4), images * v[1]], 1)
+
+    g = torch.tensor([1.0, 0.1], dtype=torch.float64)
+    step = steihaug(product, g.expand(4, 2), 100.0, iterations=5, tolerance=1e-6, noise=2.0)
+    length = float(g @ g) / float(g @ product(g).mean(0))  # of the exact line search along the first direction
+    assert step.exit == "noise"
+    torch.testing.assert_close(step.s, -length * g)
+
+
 def test_noise_of_a_sampled_black_box():
     """At the minimum of a bowl with a flat direction, sampled with outliers: steps stay short."""
     scales = torch.tensor([10.0, 1e-5], dtype=torch.float64)

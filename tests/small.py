@@ -7,9 +7,10 @@ from pathlib import Path
 
 import torch
 
-from experiments.methods import Method
+from experiments.methods import METHODS, Method
 from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.task import Output, Picture, Task, Truth
+from experiments.runs.attempt import attempt
 
 GATE, BEFORE = "TESTS_GATE", 8
 """An environment variable, and the calls of a gated black box that a process may make before it waits there."""
@@ -201,6 +202,14 @@ def shift(trial, settings):
                 loss = trial.loss(x + step, image[None])
                 bias += step.sign() * (0.5 - loss)
             trial.report(sigma=0.01, loss=loss, image_error=float(loss))
+
+
+def trained(method, task=BUMP, number=0, **settings):
+    """Train by a method of METHODS until its evaluations are used up: the outcome and the trial."""
+    trials = []
+    outcome = attempt(task, method, number, lambda trial: (trials.append(trial), METHODS[method](trial, settings))[1])
+    assert outcome.status == "stopped", outcome.traceback
+    return outcome, trials[0]
 
 
 SHIFT = Method("shift", "moves the last bias", train=shift)

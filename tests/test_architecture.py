@@ -1,6 +1,7 @@
 """The direction of imports in both trees, what importing loads, and the size of modules, read from the source."""
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -50,10 +51,15 @@ def name(tree: str, path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@functools.cache
+def names_of(tree: str) -> set[str]:
+    return {name(tree, module) for module in MODULES[tree]}
+
+
+@functools.cache
 def imported(tree: str, path: Path) -> set[str]:
     """Modules of the tree that a file imports, anywhere in it."""
-    known = {name(tree, module) for module in MODULES[tree]}
-    found = set()
+    known, found = names_of(tree), set()
     for node in ast.walk(ast.parse(path.read_text())):
         names: list[str] = []
         if isinstance(node, ast.Import):

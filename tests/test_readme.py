@@ -136,13 +136,12 @@ def test_tables_are_those_that_are_stored(name):
     assert differences(TEXTS[name]) == [], "run `python -m experiments readme`"
 
 
-LINKS = {name: re.findall(r"\]\(([^)\s]+)\)", prose(text)) for name, text in TEXTS.items()}
+LINKS = {name: re.findall(r"\]\((?![a-z]+:)([^)\s]+)\)", prose(text)) for name, text in TEXTS.items()}
+"""To files and headings of the repository."""
 
 
 @pytest.mark.parametrize(("name", "link"), params(LINKS))
 def test_links_lead_somewhere(name, link):
-    if re.match(r"[a-z]+:", link):
-        return
     path, _, heading = link.partition("#")
     target = (ROOT / name).parent / path if path else ROOT / name
     assert target.exists(), f"{name} links to {link}"
@@ -151,16 +150,22 @@ def test_links_lead_somewhere(name, link):
         assert heading in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-NAMED = {name: sorted(set(FILE.findall(" ".join(re.findall(r"`([^`\n]+)`", prose(t)))))) for name, t in TEXTS.items()}
 MADE = {"errors.png", "predictions.png", "report.html", "index.html"}
 """What a command writes into a folder of results."""
+
+
+def files(text: str) -> list[str]:
+    """Names of files in the prose, but of those that a command writes or a reader chooses."""
+    named = FILE.findall(" ".join(re.findall(r"`([^`\n]+)`", prose(text))))
+    return sorted({one for one in named if one not in MADE and "NAME" not in one})
+
+
+NAMED = {name: files(text) for name, text in TEXTS.items()}
 
 
 @pytest.mark.parametrize(("name", "file"), params(NAMED))
 def test_named_files_exist(name, file):
     """A path is from the root or from the document; a bare name is the name of a file anywhere in the tree."""
-    if file in MADE or "NAME" in file:
-        return
     found = [(ROOT / file).exists(), ((ROOT / name).parent / file).exists()]
     if "/" not in file:
         found += [any((ROOT / top).rglob(file)) for top in ("torch_zerohess", "experiments", "tests", "csrc")]
@@ -183,3 +188,12 @@ def test_tests_that_are_named_exist():
     }
     assert len(named) > 90
     assert named <= defined
+
+
+def test_constants_that_are_named_exist():
+    """The prose before the list of constants names those without a row."""
+    named = set(re.findall(r"`(_?[A-Z][A-Z_]+)`", TEXTS["tests/README.md"].partition("The library:")[0]))
+    sources = "\n".join(path.read_text() for path in (ROOT / "torch_zerohess").rglob("*.py"))
+    assigned = {name for line in re.findall(r"^([A-Z_, ]+) = ", sources, re.MULTILINE) for name in line.split(", ")}
+    assert len(named) > 20
+    assert named <= assigned

@@ -1,4 +1,4 @@
-"""What tests compare with: closed forms in n dimensions, and deviations in standard errors."""
+"""What tests compare with: closed forms in n dimensions, deviations in standard errors, and numbers to start from."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from experiments.problems.closed_forms import Bump, ClosedForm, Exponential, Pla
 
 __all__ = [
     *("Bump", "ClosedForm", "Exponential", "Image", "PlaneWave", "Quadratic", "Step"),
-    *("deviation", "spread", "truths", "vector"),
+    *("deviation", "normal", "spread", "truths", "vector"),
 ]
 
 
@@ -29,6 +29,11 @@ class Image(ClosedForm):
 
 def vector(*numbers: float) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    """Return standard normal numbers of this shape, in float64."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def spread(n: int, low: float, high: float) -> Tensor:

@@ -165,21 +165,6 @@ def test_the_function_may_write_to_its_points():
     assert torch.equal(fit.points, plain.points)
 
 
-def test_bounds_are_kept():
-    seen = []
-
-    def f(z):
-        seen.append(z)
-        return tilted(z)
-
-    fit = zh.minimize(f, zeros(2), sigma=2.0, bounds=(-0.5, 1.0), seed=0, max_evaluations=60)
-    every = torch.cat(seen)
-    assert float(every.min()) >= -0.5
-    assert float(every.max()) <= 1.0
-    # With z_0 at 1 the rest is 2.5 (z_1 + 1)^2 - 1.2 (z_1 + 1), lowest at z_1 = -0.76, below the bound of -0.5.
-    torch.testing.assert_close(fit.x, vector(1.0, -0.5), rtol=0, atol=1e-3)
-
-
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
 def test_the_engine_is_chosen_and_may_be_given(bounds):
     settings = {"bounds": bounds, "sigma": 2.0, "seed": 0, "max_evaluations": 15}
@@ -230,7 +215,18 @@ def test_a_plot_shows_every_evaluation_and_the_lowest_so_far(deviation):
     assert list(every) == fit.values.tolist()
     assert list(lowest) == fit.values.cummin(0).values.tolist()
     assert len(axes.containers) == int(deviation > 0)  # the value with its standard error
+    assert axes.get_yscale() == ("log" if bool((fit.values > 0).all()) else "linear")
     assert fit.plot(axes) is axes
+
+
+def test_a_plot_passes_over_values_that_are_not_numbers():
+    fit = zh.minimize(
+        lambda z: torch.where(z[:, 0] > 2, math.nan, tilted(z)), zeros(2), sigma=2.0, seed=0, max_evaluations=20
+    )
+    assert bool(fit.values.isnan().any())
+    axes = fit.plot()
+    assert axes.lines[1].get_ydata()[-1] == fit.value
+    assert axes.get_yscale() == "linear"
 
 
 def test_starts_of_lists_and_arrays():

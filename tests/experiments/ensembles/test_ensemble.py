@@ -27,18 +27,14 @@ from small import (
     TASK,
     search,
 )
+from written_runs import rows
 
 from experiments.ensembles.ensemble import Ensemble
 from experiments.ensembles.provenance import register
 from experiments.methods import METHODS
 from experiments.runs.attempt import attempt
 from experiments.runs.journal import Journal
-from experiments.runs.records import Files, read
-
-
-def rows(path):
-    """Records of a log without their times."""
-    return [replace(record, seconds=0.0) for record in read(path)]
+from experiments.runs.records import Files
 
 
 def solve(trial):

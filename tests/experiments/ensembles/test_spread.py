@@ -1,16 +1,15 @@
 """Runs whose black box is in worker processes: the same rows, from black boxes that are called elsewhere."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import torch
 from small import BUMP, GIVE_UP, SEARCH, SHIFT, TASK, Bump
+from written_runs import rows
 
 from experiments.ensembles import workers
 from experiments.ensembles.ensemble import Ensemble
 from experiments.ensembles.spread import BlackBoxOf, spread
 from experiments.runs.attempt import attempt
-from experiments.runs.records import read
 from torch_zerohess.evaluators import Factory
 
 
@@ -62,9 +61,8 @@ def test_runs_of_a_task_make_its_black_box_once(monkeypatch, tmp_path):
     assert [one.closed for one in pools] == [True, False]
 
 
-def rows(folder):
-    files = sorted(folder.glob("*/*/*.jsonl"))
-    return {path.parent.name: [replace(one, seconds=0.0) for one in read(path)] for path in files}
+def logs(folder):
+    return {path.parent.name: rows(path) for path in sorted(folder.glob("*/*/*.jsonl"))}
 
 
 def test_rows_do_not_depend_on_workers(tmp_path):
@@ -74,6 +72,6 @@ def test_rows_do_not_depend_on_workers(tmp_path):
     outcomes = ensemble.run(ensemble.plan([TASK, BUMP], [SEARCH, SHIFT]))
     assert [one.settings["workers"] for one in outcomes] == [2, 2]
     assert {one.status for one in outcomes} <= {"finished", "stopped"}
-    found = rows(tmp_path / "two")
-    assert found == rows(tmp_path / "alone")
+    found = logs(tmp_path / "two")
+    assert found == logs(tmp_path / "alone")
     assert len(found) == 2

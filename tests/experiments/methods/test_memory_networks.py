@@ -3,18 +3,22 @@
 from dataclasses import replace
 
 import pytest
-from small import BUMP
-
-from experiments.methods import METHODS
-from experiments.runs.attempt import attempt
+from small import SIZE, Bump, trained
 
 
-@pytest.mark.parametrize("method", ["memory_newton", "memory_adam"])
-def test_uses_its_evaluations_and_reduces_the_error(method):
-    trials = []
-    task = BUMP.__class__(replace(BUMP.size, evaluations=60))
-    outcome = attempt(task, method, 0, lambda trial: (trials.append(trial), METHODS[method](trial, {}))[1])
-    assert outcome.status != "failed", outcome.traceback
-    assert outcome.evaluations == 60
-    rows = trials[0].rows
-    assert rows[-1].parameter_error < rows[0].parameter_error
+@pytest.mark.parametrize(
+    ("method", "evaluations", "most", "left"),
+    [
+        ("memory_newton", 60, None, 0.8),  # Newton steps on the weights
+        ("memory_adam", 60, None, 0.6),
+        ("memory_newton", 117, 0, 0.8),  # more outputs than `MOST`: Newton targets, to which Adam fits the weights
+        ("memory_newton", 60, 0, 0.1),  # all evaluations are used before the first step
+    ],
+)
+def test_uses_its_evaluations_and_reduces_the_error(method, evaluations, most, left, monkeypatch):
+    if most is not None:
+        monkeypatch.setattr("experiments.methods.memory_networks.MOST", most)
+        monkeypatch.setattr("experiments.methods.memory_networks._STEPS_ALONE", 40)
+    outcome, trial = trained(method, Bump(replace(SIZE, evaluations=evaluations)))
+    assert outcome.evaluations == evaluations
+    assert trial.rows[-1].parameter_error < left * trial.rows[0].parameter_error

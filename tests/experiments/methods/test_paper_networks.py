@@ -1,4 +1,4 @@
-"""The source's methods on network tasks: costs, annealing, repetition, and that they learn."""
+"""The source's methods on network tasks: costs, annealing, repetition, and that they learn; costs of all others too."""
 
 import itertools
 import math
@@ -6,31 +6,25 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small import BUMP, SIZE, Bump
+from small import BUMP, SIZE, Bump, trained
 
 import torch_zerohess as zh
 from experiments.methods import METHODS
 from experiments.methods.paper_networks import hessian_by_differences
 from experiments.problems import catalogue
 from experiments.problems.network_task import Size
-from experiments.runs.attempt import attempt
 from experiments.runs.network_trial import NetworkTrial
 
-RENDERS = {"fr22": 2 * 3, "our_g": 2 * 3, "our_h": 4 * 7, "our_hvp": 4 * 7, "our_hvpa": 4 * 3}
-"""Of a step: images of a batch, times pairs of samples (two renders each; those of our_h for gradient, Hessian and
-value, of our_hvp for three gradients) and f(x)."""
-
-
-def run(name, task=BUMP, number=0, settings=None):
-    trials = []
-    outcome = attempt(task, name, number, lambda trial: (trials.append(trial), METHODS[name](trial, settings or {}))[1])
-    assert outcome.status == "stopped", outcome.traceback
-    return outcome, trials[0]
+PAPER = {"fr22": 2 * 3, "our_g": 2 * 3, "our_h": 4 * 7, "our_hvp": 4 * 7, "our_hvpa": 4 * 3}
+"""Renders of a step: images of a batch, times pairs of samples (two renders each; those of our_h for gradient, Hessian
+and value, of our_hvp for three gradients) and f(x)."""
+RENDERS = {**PAPER, "zerograds": 4 * 2, "relax": 4 * 2}
+"""The last two: images of a batch, times samples."""
 
 
 @pytest.mark.parametrize("name", RENDERS)
 def test_every_method_trains_within_its_budget(name):
-    outcome, trial = run(name)
+    outcome, trial = trained(name)
     assert [row.evaluations for row in trial.rows] == list(range(0, SIZE.evaluations + 1, RENDERS[name]))
     assert outcome.evaluations == trial.rows[-1].evaluations
     assert SIZE.evaluations - outcome.evaluations < RENDERS[name]
@@ -44,7 +38,7 @@ def test_every_method_trains_within_its_budget(name):
 
 @pytest.mark.parametrize("name", RENDERS)
 def test_a_run_repeats_itself(name):
-    first, second = ([replace(row, seconds=0.0) for row in run(name, number=3)[1].rows] for _ in range(2))
+    first, second = ([replace(row, seconds=0.0) for row in trained(name, number=3)[1].rows] for _ in range(2))
     assert first == second
 
 
@@ -58,7 +52,7 @@ def test_sigma_and_the_step_go_down():
             weights.append(torch.cat([p.detach().flatten().clone() for p in encoder.parameters()]))
             return super().parameter_error(encoder)
 
-    _, trial = run("our_g", Noted(size), settings={"batch": 1, "rate": (1e-3, 1e-5)})
+    _, trial = trained("our_g", Noted(size), batch=1, rate=(1e-3, 1e-5))
     sigmas = [row.sigma for row in trial.rows[1:]]
     assert sigmas[0] == Bump.sigma[0]
     assert sigmas[90:] == pytest.approx([Bump.sigma[1]] * 10)
@@ -70,7 +64,7 @@ def test_sigma_and_the_step_go_down():
 
 
 def test_the_image_error_of_a_row_is_the_mean_of_the_last_twentieth():
-    _, trial = run("our_g", Bump(replace(SIZE, evaluations=6 * 60)))
+    _, trial = trained("our_g", Bump(replace(SIZE, evaluations=6 * 60)))
     losses = [row.loss for row in trial.rows[1:]]
     assert [row.image_error for row in trial.rows[3:]] == pytest.approx([sum(losses[k : k + 3]) / 3 for k in range(58)])
 
@@ -79,7 +73,7 @@ def test_the_image_error_of_a_row_is_the_mean_of_the_last_twentieth():
 def test_methods_learn(name):
     """Each divides the parameter error by ten."""
     task = Bump(Size(16, 1, 2, evaluations=1500, images=256, held_out=32))
-    _, trial = run(name, task)
+    _, trial = trained(name, task)
     assert task.parameter_error(trial.encoder) < 0.1 * trial.rows[0].parameter_error
     assert task.image_error(trial.encoder) < 0.2 * trial.rows[0].image_error
 
@@ -106,10 +100,10 @@ def test_a_hessian_of_several_parameters_by_differences():
 
 def test_where_methods_apply():
     known = {
-        name: [method for method in RENDERS if METHODS[method].unusable(catalogue.load(name)) is None]
+        name: [method for method in PAPER if METHODS[method].unusable(catalogue.load(name)) is None]
         for name in catalogue.NETWORKS
     }
-    most = list(RENDERS)
+    most = list(PAPER)
     assert known == {
         "cnn": most,
         "cnn_wide": most,

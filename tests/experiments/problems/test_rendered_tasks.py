@@ -12,14 +12,11 @@ from experiments.problems.rendered import RenderedTask
 from experiments.problems.scenes import shadow as shad
 from experiments.problems.scenes.bunny import IN_MIRRORS, SEEN_AT, in_mirrors
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Transform
+from truths import vector
 
 NAMES = tuple(catalogue.RENDERED)
 SOLUTIONS = {"mug": [0.0], "shad": [-1.5, 1.0], "bunny": [0.0] * 3, "mirror": [0.0] * 3}
 TASKS = {name: catalogue.load(name, "fast", "scalar_rgb") for name in NAMES}
-
-
-def vector(*numbers) -> torch.Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 @pytest.fixture(params=NAMES)

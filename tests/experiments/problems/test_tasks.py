@@ -1,6 +1,5 @@
 """Fitting tasks: the black box, its start, its errors and its closed forms must be what the task says."""
 
-from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import torch
 from skimage import data
 
+import torch_zerohess as zh
 from experiments.problems import catalogue
 from experiments.problems.task import Task
 from experiments.problems.tasks import brdf, nonpsd
@@ -43,16 +43,21 @@ def vector(numbers) -> torch.Tensor:
 
 
 @pytest.fixture(params=NAMES)
-def task(request) -> Task:
-    return TASKS[request.param]
+def name(request) -> str:
+    return request.param
+
+
+@pytest.fixture
+def task(name) -> Task:
+    return TASKS[name]
 
 
 def starts(task: Task, count: int = 20) -> torch.Tensor:
     return torch.stack([task.start(run) for run in range(count)])
 
 
-def test_every_task_says_what_it_is(task) -> None:
-    assert (task.name, task.n) == (task.name.lower(), len(SOLUTIONS[task.name]))
+def test_every_task_says_what_it_is(task, name) -> None:
+    assert (task.name, task.n) == (name, len(SOLUTIONS[name]))
     assert task.title
     assert task.parameters
     assert task.needs
@@ -133,7 +138,7 @@ def squares(x: np.ndarray, side: int) -> np.ndarray:
 )
 def test_boxes_are_soft_squares(name, preset, side) -> None:
     task, target = catalogue.load(name, preset), squares(np.array(SOLUTIONS[name]), side)
-    for x in starts(task, 3):
+    for x in (*starts(task, 2), 3 * task.start(2) - 1):  # squares of the last one are kept within the image
         image = squares(x.numpy(), side)
         torch.testing.assert_close(task.output.image(x[None])[0], torch.from_numpy(image))
         assert float(task.loss(x[None])[0]) == pytest.approx(np.mean((image - target) ** 2))
@@ -150,6 +155,13 @@ def test_box2_starts_on_a_plateau() -> None:
     torch.testing.assert_close(losses, torch.full_like(losses, energy), rtol=0.02, atol=0)
     near = task.loss(vector([[0.3, 0.32], [0.3, 0.4]]))
     assert float(near[0]) < float(near[1]) < 0.9 * energy
+
+
+def test_smoothing_gives_the_plateau_of_box2_a_slope() -> None:
+    task = TASKS["box2"]
+    x = vector([0.575, 0.575]).requires_grad_()
+    zh.smooth(task.loss, zh.Smoothing(sigma=task.sigma, samples=2000, seed=0))(x).backward()
+    assert bool((x.grad > 0).all())  # down is towards (0.3, 0.3)
 
 
 def test_squares_of_box10_are_interchangeable() -> None:
@@ -245,10 +257,8 @@ def test_nonpsd_starts_cover_the_square() -> None:
     axis = torch.linspace(-3, 3, 20, dtype=torch.float64).tolist()
     assert {tuple(x) for x in found.tolist()} == {(a, b) for a in axis for b in axis}
     assert bool((TASKS["nonpsd"].start(1000) != TASKS["nonpsd"].start(1001)).any())
-    hessian = torch.func.hessian(lambda x: TASKS["nonpsd"].loss(x[None])[0])
-    for x in found:
-        least = float(torch.linalg.eigvalsh(hessian(x))[0])
-        assert (least < 0) == (float(x.norm()) > nonpsd.S1)
+    hessians = torch.func.vmap(torch.func.hessian(lambda x: TASKS["nonpsd"].loss(x[None])[0]))(found)
+    assert torch.equal(torch.linalg.eigvalsh(hessians)[:, 0] < 0, found.norm(dim=1) > nonpsd.S1)
     truth = TASKS["nonpsd"].truth
     assert truth.parameter_error(vector([0.006, 0.008])) == pytest.approx(truth.precision)
 
@@ -265,7 +275,3 @@ def test_error_of_the_hessian_of_nonpsd(capsys) -> None:
     assert [name for name in READINGS if getattr(error, name) > 0.01] == []
     with pytest.raises(SystemExit, match="samples must be even"):
         nonpsd_error(samples=99)
-
-
-def test_tasks_are_data() -> None:
-    assert replace(TASKS["quad"], evaluations=7).evaluations == 7

@@ -1,16 +1,16 @@
 """Runs of network tasks: counts, logs, how runs end, their weights, and that a kill changes nothing."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from small import BUMP, FAIL_TO_TRAIN, SHIFT, SIZE, Bump
+from written_runs import rows
 
 from experiments.methods import METHODS
 from experiments.runs.attempt import attempt
 from experiments.runs.network_trial import NetworkTrial
-from experiments.runs.records import Files, read
+from experiments.runs.records import Files
 from experiments.runs.run import Finished
 
 METHOD_NAMES = ["our_g", "our_hvpa", "shift"]
@@ -18,10 +18,6 @@ METHOD_NAMES = ["our_g", "our_hvpa", "shift"]
 
 def method(name):
     return SHIFT if name == "shift" else METHODS[name]
-
-
-def rows(path):
-    return [replace(row, seconds=0.0) for row in read(path)]
 
 
 class Counted(Bump):

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from small import FAIL, GIVE_UP, HALVE, TARGET, TASK, search
+from written_runs import rows
 
 from experiments.runs import journal
 from experiments.runs.attempt import attempt
@@ -17,11 +18,6 @@ from experiments.runs.journal import BusyError, Journal
 from experiments.runs.records import Files, read, read_outcome
 from experiments.runs.run import Finished
 from experiments.runs.trial import Trial
-
-
-def rows(path):
-    """Records of a log without their times."""
-    return [replace(record, seconds=0.0) for record in read(path)]
 
 
 def solve(trial):

@@ -26,12 +26,9 @@ from experiments.reports.animation import (
 )
 from experiments.runs.records import Outcome, Record
 from experiments.studies.gallery import gallery, trace
+from truths import vector
 
 ENDED = Outcome("t", "m", 0, "stopped", "", 1.0, 1.0, 10, 0, [])
-
-
-def vector(*numbers):
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 def made(points, evaluations=None, task=small.TASK):

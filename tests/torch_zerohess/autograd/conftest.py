@@ -1,6 +1,7 @@
-"""A fixture that two test files of the layer share."""
+"""Fixtures that several test files of the layer share."""
 
 import pytest
+import torch
 from layers import N
 
 from torch_zerohess.estimation import perturbations
@@ -13,3 +14,9 @@ def memory(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
     if request.param == "redrawn":
         monkeypatch.setattr(perturbations, "STORED", 0)
         monkeypatch.setattr(kernels, "_CHUNK", 2 * N)  # a row or two at a time
+
+
+@pytest.fixture
+def fresh_compiler() -> None:
+    """Nothing of what other tests have compiled."""
+    torch.compiler.reset()

@@ -11,9 +11,6 @@ from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels
 from truths import spread, vector
 
-# torch's own forward mode compiles decompositions with its deprecated torch.jit.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
-
 
 @BOTH
 @EVERY

@@ -11,6 +11,8 @@ from torch import Tensor
 from torch_zerohess import BlackBox, Memory, Smoothing, estimate
 from torch_zerohess.estimation import perturbations
 
+pytestmark = pytest.mark.usefixtures("fresh_compiler")
+
 COMPILED = {
     "aggregate": AGGREGATE,
     "optimal": SETTINGS["optimal"],
@@ -19,11 +21,6 @@ COMPILED = {
     "auto": SETTINGS["auto"],
     "auto, random": Smoothing.auto(sigma=AGGREGATE.sigma, samples=3, seed=12),
 }
-
-
-@pytest.fixture(autouse=True)
-def fresh_compiler() -> None:
-    torch.compiler.reset()
 
 
 @pytest.mark.parametrize("value", ["center", "smoothed"])

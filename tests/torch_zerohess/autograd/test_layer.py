@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels
 from truths import spread, vector
@@ -139,9 +140,12 @@ def test_a_layer_behind_autocast() -> None:
 
 
 @BOTH
+@pytest.mark.parametrize("graph", ["closed form", "general"])
 def test_a_forward_pass_makes_no_pass_over_the_samples_and_a_gradient_makes_one(
-    monkeypatch: pytest.MonkeyPatch,
+    graph: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if graph == "general":
+        monkeypatch.setattr(transforms, "forward_mode_active", lambda: True)
     passes: list[str] = []
     for name in ("project", "accumulate"):
         original = getattr(kernels, name)

@@ -8,8 +8,7 @@ from torch_zerohess import BlackBox, Smoothing, estimate
 from torch_zerohess.autograd.limit import limited
 from truths import spread, truths, vector
 
-# torch's own forward mode compiles decompositions with its deprecated torch.jit.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
+pytestmark = pytest.mark.usefixtures("fresh_compiler")
 
 N = 3
 F, X, V = truths(N)["wave"].f, spread(N, -0.6, 0.7), spread(N, -1.0, 1.0)
@@ -23,11 +22,6 @@ SECOND = {
     "jacfwd of jacfwd": lambda f: func.jacfwd(func.jacfwd(f)),
     "jacrev of jacfwd": lambda f: func.jacrev(func.jacfwd(f)),
 }
-
-
-@pytest.fixture(autouse=True)
-def fresh_compiler() -> None:
-    torch.compiler.reset()
 
 
 def compiled(f):

@@ -12,18 +12,12 @@ from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import extension, proposals
 from truths import spread, truths
 
-# torch's own forward mode compiles decompositions with its deprecated torch.jit.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
+pytestmark = pytest.mark.usefixtures("fresh_compiler")
 
 N = 3
 F, X, BATCH = truths(N)["wave"].f, spread(N, -0.6, 0.7), spread(4 * N, -1.0, 1.0).view(4, N)
 S = Smoothing(sigma=0.5, samples=6, seed=12)
 ops = torch.ops.torch_zerohess
-
-
-@pytest.fixture(autouse=True)
-def fresh_compiler() -> None:
-    torch.compiler.reset()
 
 
 @pytest.fixture(params=["stored", "redrawn"])

@@ -121,12 +121,12 @@ def test_a_fitted_surrogate_reduces_error_and_its_intervals_hold() -> None:
     estimated(memory, 1000, batch=1)  # tells the coefficient
     assert memory.coefficient > 0.9
     held = dict.fromkeys(QUANTITIES, 0.0)
-    for seed in SEEDS[:5]:
+    for seed in SEEDS[:3]:
         with_memory, plain = estimated(memory, seed, batch=4), estimated(None, seed, batch=4)
         for quantity, truth in closed_form().items():
             v = V if quantity == "hvp" else None
             low, high = with_memory.confidence_interval(quantity, v)
-            held[quantity] += float(((low <= truth) & (truth <= high)).double().mean()) / 5
+            held[quantity] += float(((low <= truth) & (truth <= high)).double().mean()) / 3
             error, without = (one.standard_error(quantity, v).mean() for one in (with_memory, plain))
             assert error < 0.5 * without, quantity
     assert min(held.values()) > 0.8, held
@@ -192,7 +192,7 @@ def test_a_head_gets_aux_by_views() -> None:
         return image(*given)
 
     got = estimate(fn, X.expand(3, 2), SMOOTHING, references, head=head)
-    assert shapes == [[[3 * got.evaluations // 3, 2]]], "fn gets points alone"
+    assert shapes == [[[got.evaluations, 2]]], "fn gets points alone"
     assert {one.untyped_storage().data_ptr() for one in seen} == {references.untyped_storage().data_ptr()}
     same = estimate(lambda z, r: (image(z) - r).square().mean(1), X.expand(3, 2), SMOOTHING, references)
     torch.testing.assert_close(got.gradient, same.gradient)

@@ -13,9 +13,6 @@ from torch import Tensor
 from torch_zerohess import BlackBox, Smoothing, estimate, smooth
 from truths import spread, vector
 
-# torch's own forward mode compiles decompositions with its deprecated torch.jit.
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
-
 S = Smoothing(sigma=0.5, samples=3, seed=1)
 ONE = S.replace(samples=1)
 X = vector(0.1, 0.2)
@@ -294,14 +291,10 @@ def test_optimal_sampling_stops_at_a_million_evaluations() -> None:
 FIRST_ORDER = "first derivatives only .*use Smoothing\\(proposal='aggregate', order=2\\)"
 
 
-@pytest.mark.parametrize("changes", [{"proposal": "fr22"}, {"proposal": "optimal", "order": 1}, {"order": 1}])
+@pytest.mark.parametrize("changes", [{"proposal": "fr22"}, {"proposal": "optimal", "order": 1}])
 def test_first_order_samples_have_no_hessian(changes: dict) -> None:
     smoothing = S.replace(**changes)
     e, layer, x = estimate(f, X, smoothing), smooth(f, smoothing), X.clone().requires_grad_()
-    if changes == {"order": 1}:
-        # The first-order mixture has no hole where the Hessian's kernel lives: it stays unbiased, only noisier.
-        assert torch.isfinite(e.hessian()).all()
-        return
 
     def double_backward() -> None:
         (gradient,) = torch.autograd.grad(layer(x), x, create_graph=True)

@@ -9,14 +9,11 @@ import pytest
 import torch
 
 import torch_zerohess as zh
+from truths import normal
 
 SIDE = 10
 N = SIDE**2
 SCALES = 1.0 + torch.arange(N).double() / N
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def scaled(z):

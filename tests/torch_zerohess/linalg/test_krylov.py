@@ -4,10 +4,7 @@ import pytest
 import torch
 
 from torch_zerohess.linalg.krylov import krylov_steps
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal
 
 
 @pytest.mark.parametrize("radius", [0.01, 0.3, 2.0])

@@ -4,15 +4,11 @@ import math
 
 import pytest
 import torch
-from subproblems import random_problem
+from subproblems import random_problem, rosenbrock
 
 import torch_zerohess as zh
 from torch_zerohess.linalg.subproblem import diagonal_step
 from truths import Quadratic, vector
-
-
-def rosenbrock(x):
-    return (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2
 
 
 def best_on_a_grid(w, a, radius):
@@ -111,40 +107,6 @@ def test_gauss_newton_with_the_white_box_named():
     for _ in range(10):
         optimizer.step(closure)
     assert float(w.detach().abs().max()) < 1e-8
-
-
-def test_a_step_to_where_the_loss_is_not_finite_is_shortened():
-    x = vector(4.0).requires_grad_()
-    optimizer = zh.optim.Newton([x], radius=100.0)
-    for _ in range(30):
-        optimizer.step(lambda: (x - 1e-3 * x.log()).sum())  # minimum at 1e-3, nothing below zero
-    assert float(x.detach()) == pytest.approx(1e-3)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("optimizer", [zh.optim.Newton, zh.optim.NewtonCG])
-def test_the_radius_outlives_convergence(optimizer, dtype):
-    x, goal = torch.zeros(3, dtype=dtype, requires_grad=True), torch.ones(3, dtype=dtype)
-    steps = optimizer([x], radius=2.0)
-
-    def loss():
-        return 5 + (x - goal).square().sum() + 0.1 * (x - goal).pow(4).sum()
-
-    for _ in range(15):
-        steps.step(loss)
-    goal = goal + 1  # as a sigma that is annealed, or new data, would have it
-    for _ in range(4):
-        steps.step(loss)
-    torch.testing.assert_close(x.detach(), goal, rtol=0, atol=1e-3)
-
-
-def test_where_the_loss_is_finite_nowhere_else():
-    x = vector(1.0, 1.0).requires_grad_()
-    optimizer = zh.optim.Newton([x], radius=2.0)
-    with pytest.raises(ValueError, match="not finite at the end of a step, even after it was shortened"):
-        optimizer.step(lambda: torch.where(x[0] == 1.0, x.sum(), torch.inf))
-    assert x.tolist() == [1.0, 1.0]
-    assert optimizer.param_groups[0]["radius"] == 2.0
 
 
 def test_errors():

@@ -56,10 +56,37 @@ def test_a_step_is_shortened_to_a_quarter_nine_times(optimizer) -> None:
         tried.append(float(x.detach()))
         return torch.where(x > 0.0, math.nan, -x).sum() if tried[1:] else (-x).sum()
 
-    with pytest.raises(ValueError, match="even after it was shortened"):
-        optimizer([x], radius=1.0).step(closure)
+    steps = optimizer([x], radius=1.0)
+    with pytest.raises(ValueError, match="not finite at the end of a step, even after it was shortened"):
+        steps.step(closure)
     assert tried == [0.0] + [0.25**k for k in range(10)]
-    assert float(x.detach()) == 0.0
+    assert (float(x.detach()), steps.param_groups[0]["radius"]) == (0.0, 1.0)
+
+
+@BOTH
+def test_a_step_to_where_the_loss_is_not_finite_is_shortened(optimizer) -> None:
+    x = vector(4.0).requires_grad_()
+    steps = optimizer([x], radius=100.0)
+    for _ in range(30):
+        steps.step(lambda: (x - 1e-3 * x.log()).sum())  # minimum at 1e-3, nothing below zero
+    assert float(x.detach()) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@BOTH
+def test_the_radius_outlives_convergence(optimizer, dtype) -> None:
+    x, goal = torch.zeros(3, dtype=dtype, requires_grad=True), torch.ones(3, dtype=dtype)
+    steps = optimizer([x], radius=2.0)
+
+    def loss() -> torch.Tensor:
+        return 5 + (x - goal).square().sum() + 0.1 * (x - goal).pow(4).sum()
+
+    for _ in range(15):
+        steps.step(loss)
+    goal = goal + 1  # as a sigma that is annealed, or new data, would have it
+    for _ in range(4):
+        steps.step(loss)
+    torch.testing.assert_close(x.detach(), goal, rtol=0, atol=1e-3)
 
 
 @BOTH

@@ -4,15 +4,11 @@ import copy
 
 import pytest
 import torch
-from subproblems import random_problem
+from subproblems import random_problem, rosenbrock
 
 import torch_zerohess as zh
 from torch_zerohess.optim import NonlinearCG
 from truths import vector
-
-
-def rosenbrock(x):
-    return (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -1,10 +1,10 @@
 """Several points at once: what `ask(batch)` adds, that it changes nothing else, and that it saves rounds."""
 
-import io
 import math
 
 import pytest
 import torch
+from every_search import saved
 from searches import bowl, misfit, rays, rays_loss, rosenbrock, spiral, waves, well, zeros
 
 import torch_zerohess as zh
@@ -71,23 +71,12 @@ def test_a_batch_survives_a_restart(name):
     search, f = make(name), SEARCHES[name][2]
     for _ in range(4):
         points = search.ask(6)
-        file = io.BytesIO()
-        torch.save(search.state_dict(), file)
-        file.seek(0)
         resumed = make(name, seed=5)
-        resumed.load_state_dict(torch.load(file, weights_only=True))
+        resumed.load_state_dict(saved(search.state_dict()))
         resumed.tell(f(points))
         search.tell(f(points))
         assert torch.equal(resumed.ask(), search.ask())
         assert resumed.value == search.value
-
-
-def saved(search):
-    """The state after it was written to a file and read."""
-    file = io.BytesIO()
-    torch.save(search.state_dict(), file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
 
 
 @pytest.mark.parametrize("name", ["process of the output", "process of the loss"])
@@ -102,7 +91,7 @@ def test_a_process_is_fitted_once_for_a_step_and_the_points_around_it(name, monk
         points = search.ask(4)
         assert len(fits) == told > 0
         other = make(name)
-        other.load_state_dict(saved(search))
+        other.load_state_dict(saved(search.state_dict()))
         assert torch.equal(other.ask(4), points)
         assert len(fits) == told + 1
 
@@ -118,13 +107,13 @@ def test_points_that_are_out_stay_out_until_all_are_told(name):
         for batch in (1, 8, 6):
             assert torch.equal(search.ask(batch), points)
         assert search.missing == [0, 2, 3]
-        state, search = saved(search), make(name, seed=5)
+        state, search = saved(search.state_dict()), make(name, seed=5)
         search.load_state_dict(state)
         assert search.missing == [0, 2, 3]
         assert torch.equal(search.ask(), points)
         search.tell(values[[0, 2, 3]])
         other.ask(8, limit=5)
-        state = saved(other)
+        state = saved(other.state_dict())
         other = make(name, seed=6)
         other.load_state_dict(state)
         other.tell(values)  # without asking again

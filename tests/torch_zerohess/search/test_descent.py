@@ -55,15 +55,15 @@ def test_an_output_and_a_loss(n, evaluations, seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_noise(seed):
-    """Noise of 0.1 on a bowl, told so: where it goes is within a few times the noise of the minimum."""
+def test_noise_does_not_lead_it_astray(seed):
+    """Noise of 0.1 on a bowl, told so: the loss where it ends is higher than the lowest by less than the noise."""
     generator = torch.Generator().manual_seed(seed)
 
     def f(z):
         return bowl(z) + 0.1 * torch.randn(len(z), generator=generator, dtype=torch.float64)
 
     search = run(Descent(zeros(2), sigma=2.0, noise=0.1, seed=seed), f, 150)
-    assert float(bowl(search.x[None])) < 0.5
+    assert float(bowl(search.x[None])) < 0.1
 
 
 def test_the_first_round_ends_by_itself():

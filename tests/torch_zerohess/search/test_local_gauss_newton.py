@@ -10,13 +10,10 @@ from searches import run
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
 from torch_zerohess.search.gauss_newton import LENGTHS
+from truths import normal
 
 SIDE = 12
 N = SIDE**2
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def square(target):

@@ -6,11 +6,7 @@ from searches import waves
 
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.surrogates.gaussian_process import GaussianProcess
-from truths import vector
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal, vector
 
 
 @pytest.mark.parametrize("optimism", [0.0, 0.3, 2.0])

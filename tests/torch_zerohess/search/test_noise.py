@@ -189,6 +189,20 @@ def test_a_belief_is_of_a_point_that_was_evaluated_and_not_of_the_luckiest_draw(
     assert float(vector(*lowest).mean()) < -1.0 * 0.5
 
 
+def test_a_belief_is_of_the_nearest_hundred_evaluations_whatever_their_distance():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(100, 2, generator=generator, dtype=torch.float64)
+    losses = points.square().sum(1) + 0.5 * torch.randn(100, generator=generator, dtype=torch.float64)
+    x, value, error = believed(points, losses, zeros(2), vector(1.0, 1.0), 0.5)
+    far = torch.cat([points, 100.0 + points[:50]]), torch.cat([losses, -9.0 * torch.ones(50).double()])
+    again = believed(*far, zeros(2), vector(1.0, 1.0), 0.5)
+    assert torch.equal(again.x, x)
+    assert again[1:] == (value, error)
+    wide = believed(1e3 * points, losses, zeros(2), vector(1.0, 1.0), 0.5)
+    assert torch.equal(wide.x, 1e3 * x)
+    assert wide[1:] == pytest.approx((value, error))
+
+
 def test_what_one_point_or_equal_losses_say_is_their_mean():
     losses = vector(1.0, 3.0, math.nan)
     x, value, error = believed(TARGET.expand(3, -1), losses, zeros(2), torch.ones(2), 0.4)

@@ -63,7 +63,7 @@ def test_a_model_is_one_around_the_point_that_is_given(name):
         assert abs(found[0].value - value) < abs(found[0].value - search.value)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     st.integers(1, 4),
     st.integers(0, 10**6),

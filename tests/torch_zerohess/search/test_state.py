@@ -1,6 +1,7 @@
 """The state of every search: saved, loaded and told late, it changes nothing."""
 
 import random
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,12 +12,18 @@ from torch_zerohess.optim import (
     Descent,
     TrustRegion,
 )
+from torch_zerohess.search.state import Best, Evaluated, Progress, agreeing
+from truths import vector
 
 
 @every_search
 def test_it_resumes_bit_by_bit_at_every_step(name):
+    """In 40 steps, and until the first round has ended."""
     search, f = make(name, seed=3, tolerance=0.2), black_box(name)
-    for _ in range(120):
+    steps = 0
+    while steps < 40 or search.rounds == 0:
+        steps += 1
+        assert steps <= 120
         copy = make(name, seed=99, tolerance=0.2)
         copy.load_state_dict(saved(search.state_dict()))
         assert same(copy.state_dict(), search.state_dict())
@@ -30,7 +37,6 @@ def test_it_resumes_bit_by_bit_at_every_step(name):
         assert torch.equal(copy.center, search.center)
         for number in ("value", "sigma", "evaluations", "iterations", "rounds", "done", "message"):
             assert getattr(copy, number) == getattr(search, number)
-    assert search.rounds > 0  # at an arrival, too
 
 
 def test_points_may_be_evaluated_before_the_search_is_loaded():
@@ -101,6 +107,21 @@ def test_the_settings_stay_those_of_the_search_that_loads():
     copy.load_state_dict(search.state_dict())
     copy.tell(bowl(copy.ask()))
     assert len(copy.state_dict()["progress"]["pool"]["values"]) == 5
+
+
+def test_rounds_agree_that_arrive_at_one_point_which_is_the_best_one():
+    """Within 0.05 of each parameter, root mean square."""
+    first = agreeing(Progress(best=Best(vector(1.0, 0.0)), center=zeros(2)), vector(1.0, 0.0), 0.05)
+    second = agreeing(first, vector(1.07, 0.0), 0.05)
+    assert (first.agreed, second.agreed) == (1, 2)
+    assert agreeing(second, vector(1.08, 0.0), 0.05).agreed == 0
+    moved = agreeing(replace(second, best=Best(vector(3.0, 0.0))), vector(3.0, 0.0), 0.05)
+    assert (moved.agreed, moved.place.tolist()) == (1, [3.0, 0.0])
+
+
+def test_an_output_that_is_not_finite_is_no_value_whatever_its_loss():
+    outputs = torch.tensor([[1.0, torch.nan], [1.0, 2.0], [1.0, 2.0]])
+    assert Evaluated(zeros(3)[:, None], vector(1.0, 1.0, torch.inf), outputs).finite.tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(

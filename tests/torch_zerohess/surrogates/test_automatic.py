@@ -5,10 +5,7 @@ import torch
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.process import ProcessSurrogate
-
-
-def normal(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal
 
 
 def test_many_parameters_get_an_affine_map() -> None:

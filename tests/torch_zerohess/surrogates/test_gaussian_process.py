@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from searches import bar, waves
 from torch.distributions import MultivariateNormal
 
 from torch_zerohess.surrogates import lengths
@@ -19,22 +20,7 @@ from torch_zerohess.surrogates.gaussian_process import (
 )
 from torch_zerohess.surrogates.lengths import log_evidence, most_likely
 from torch_zerohess.surrogates.process import ProcessSurrogate
-from truths import vector
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def waves(x):
-    """Smooth outputs [K, 5] of points [K, n]."""
-    k = torch.arange(1, 6, dtype=torch.float64)
-    return torch.sin(0.4 * k * x.sum(1, keepdim=True)) + 0.2 * k * x[:, :1]
-
-
-def bar(z):
-    """A picture [K, 40] with hard edges: a bar that is where z [K, 1] says, and nothing beyond the picture."""
-    return ((torch.linspace(-6, 6, 40, dtype=torch.float64) - z[:, :1]).abs() < 1.0).double()
+from truths import normal, vector
 
 
 def by_hand(kernel, a, b):

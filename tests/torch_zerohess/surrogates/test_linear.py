@@ -4,11 +4,7 @@ import pytest
 import torch
 
 from torch_zerohess.surrogates.linear import LinearSurrogate
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
+from truths import normal
 
 SLOPE, OFFSET = normal(6, 10, seed=1), normal(10, seed=2)
 

@@ -6,10 +6,7 @@ import pytest
 import torch
 
 from torch_zerohess.surrogates.local_fit import quadratic_around
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal
 
 
 def scattered(x, count):

@@ -6,10 +6,7 @@ import torch
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
 from torch_zerohess.surrogates.process import ProcessSurrogate
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal
 
 
 def of_rank(rank, P=30, seed=0):

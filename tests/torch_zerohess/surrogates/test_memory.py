@@ -6,10 +6,7 @@ from torch import nn
 
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.memory import Memory
-
-
-def normal(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal
 
 
 class Counting(LinearSurrogate):

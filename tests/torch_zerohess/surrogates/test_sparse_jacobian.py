@@ -9,10 +9,7 @@ import torch
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, largest, spaced, thresholds
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from truths import normal
 
 
 def sparse_map(m, n, s, seed=0):
@@ -109,14 +106,8 @@ def test_held_out_samples_are_not_used():
     A, u, v = sparse_map(200, 300, 3), normal(80, 300, seed=1), normal(200, 300, seed=2)
     noise = 3.0 * normal(280, 200, seed=3)
     J = fit_sparse(u, u @ A.mT + noise[:80], torch.Size([200]), SparseSettings(8))
-
-    def share(directions, changes):
-        """Of the changes, less their mean, that the Jacobian predicts."""
-        d, predicted = changes - changes.mean(0), (directions - directions.mean(0)) @ J.dense().mT
-        return 1.0 - float((d - predicted).square().sum() / d.square().sum())
-
-    assert J.explained == pytest.approx(share(v, v @ A.mT + noise[80:]), abs=0.1)
-    assert share(u, u @ A.mT + noise[:80]) > J.explained + 0.15
+    assert J.explained == pytest.approx(explained_by(J, v, v @ A.mT + noise[80:]), abs=0.1)
+    assert explained_by(J, u, u @ A.mT + noise[:80]) > J.explained + 0.15
 
 
 def test_an_old_jacobian_is_support_and_prior():

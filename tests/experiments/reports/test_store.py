@@ -191,6 +191,20 @@ def test_tasks_are_added_to_a_table_of_the_same_protocol(folder, results, tmp_pa
         store(other, name="bowls", add=True)
 
 
+def test_runs_without_a_limit_go_together(tmp_path, results):
+    for task in ("bowl", "dish"):
+        write(tmp_path / task, task, "fr22", 3, [100.0, 0.5], each=2, settings={"limit": None})
+        store(tmp_path / task, name="bowls", add=task == "dish")
+    assert {(one["task"], one["limit"]) for one in rows(results, "bowls")} == {("bowl", ""), ("dish", "")}
+
+
+def test_a_run_whose_process_died_does_not_hide_the_number_of_parameters(folder, results):
+    files = Files(folder / "bowl" / "fr22", 3)
+    write_outcome(replace(read_outcome(files.outcome), status="failed", x=[]), files)
+    store(folder, name="bowls")
+    assert {one["n"] for one in rows(results, "bowls")} == {"2"}
+
+
 @pytest.mark.parametrize(
     ("settings", "clock"),
     [({}, "processor"), ({"threads": 1}, "processor"), ({"threads": None}, "wall"), ({"workers": 1}, "wall")],

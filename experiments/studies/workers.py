@@ -26,7 +26,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -104,7 +103,7 @@ def workers(
 
     Args:
         count: workers.
-        task: whose images are made in the workers; none if empty.
+        task: a fitting task whose images are made in the workers; none if empty.
         points: of a call for images.
         repeats: timings of which the median is reported; 0 leaves them out.
         evaluations: that are disturbed; 0 leaves them out.
@@ -121,6 +120,8 @@ def workers(
     for name, (value, smallest) in (least | {"kills": (kills, 0), "hangs": (hangs, 0)}).items():
         if value < smallest:
             raise SystemExit(f"{name} must be at least {smallest}, got {value}")
+    if task:
+        (task,) = catalogue.chosen("task", [task], list(catalogue.FITTING))
     costs = _costs(count, task, points, repeats) if repeats else []
     faults = disturb(count, evaluations, kills, hangs, seed) if evaluations else None
     if costs:
@@ -151,7 +152,7 @@ def image(x: Tensor) -> Tensor:
 
 def images_of(name: str) -> Callable[[Tensor], Tensor]:
     """Load a task, and return the function that makes its images, or its losses."""
-    task: Any = catalogue.load(name, "fast", "auto", 1)
+    task = catalogue.fitting(name)
     made: Callable[[Tensor], Tensor] = task.loss if task.output is None else task.output.image
     return made
 

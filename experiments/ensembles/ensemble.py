@@ -69,10 +69,7 @@ class Ensemble:
         jobs = [job for task in tasks for job in self._jobs(task, methods)]
         if not jobs:
             raise SystemExit("no method of this command can be run on these tasks")
-        table: dict[str, dict[str, Any]] = {}
-        for job in jobs:
-            table.setdefault(job.task_name, {})[job.method_name] = job.settings
-        register(self.folder, table)
+        register(self.folder, settings_by_method(jobs))
         return ordered(jobs)
 
     def _jobs(self, task: str | Task | NetworkTask, methods: Sequence[str | Method] | None) -> list[Job]:
@@ -145,6 +142,14 @@ class _Progress:
         if time.monotonic() - self._drawn > self._interval:
             self._bar.refresh()
             self._drawn = time.monotonic()
+
+
+def settings_by_method(jobs: Iterable[Job]) -> dict[str, dict[str, Any]]:
+    """Return the settings of jobs by task and method, as `register` takes them."""
+    found: dict[str, dict[str, Any]] = {}
+    for job in jobs:
+        found.setdefault(job.task_name, {})[job.method_name] = job.settings
+    return found
 
 
 def ordered(jobs: Iterable[Job]) -> list[Job]:

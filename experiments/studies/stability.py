@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -59,7 +60,7 @@ def stability(
         largest: parameters of the largest case.
         repeats: of every setting whose intervals are counted.
         runs: of every search on every hard case; 0 leaves them out.
-        out: JSON file to write.
+        out: JSON file to write, with all three tables.
 
     Raises:
         SystemExit: with status 1, if something is wrong.
@@ -68,9 +69,6 @@ def stability(
     shares = coverage(seed=seed, repeats=repeats)
     headers = ["case", "quantity", "relative error", "standard errors", "seconds", "verdict"]
     print(table(headers, [list(asdict(row).values()) for row in rows]))
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps([asdict(row) for row in rows], indent=1))
     wrong = [row for row in rows if row.verdict.startswith("WRONG")]
     print(f"\n{len(rows) - len(wrong)} of {len(rows)} right\n")
     headers = [f"{repeats} intervals of", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
@@ -78,6 +76,10 @@ def stability(
     found = searches(runs=runs, seed=seed) if runs else []
     headers = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
     print(f"\nSearches, {runs} runs each\n\n{table(headers, [list(asdict(one).values()) for one in found])}")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        tables: dict[str, list[Any]] = {"accuracy": rows, "coverage": shares, "searches": found}
+        out.write_text(json.dumps({name: [asdict(one) for one in part] for name, part in tables.items()}, indent=1))
     outside = [one for one in shares if one.verdict.startswith("WRONG")]
     false = [one for one in found if one.verdict.startswith("WRONG")]
     if wrong or outside or false:
@@ -114,7 +116,7 @@ def _rows(case: Case, seed: int) -> list[Accuracy]:
     noise = _EPS[torch.float32 if case.single_values else torch.float64]
 
     def row(
-        quantity: str, found: Callable[[], Tensor], spread: Callable[[], Tensor], true: Tensor, scale: Tensor
+        quantity: str, found: Callable[[], Tensor], spread: Callable[[], Tensor], true: Tensor, scale: Any
     ) -> Accuracy:
         begin = time.perf_counter()
         if case.refused == "Hessian" and quantity.startswith("Hessian"):
@@ -126,45 +128,21 @@ def _rows(case: Case, seed: int) -> list[Accuracy]:
         allowance = 4 * noise * largest + 4 * _EPS[x.dtype] * true.abs()
         return _judge(case.name, quantity, result, reported, true, allowance, seconds)
 
-    one = torch.ones((), dtype=torch.float64)
+    def spread(quantity: Any, v: Tensor | None = None) -> Callable[[], Tensor]:
+        return lambda: estimate.standard_error(quantity, v)
+
+    form, value = case.form, case.form.value(x, sigma) + case.offset
     rows = [
-        row(
-            "value",
-            lambda: estimate.value,
-            lambda: estimate.standard_error("value"),
-            case.form.value(x, sigma) + case.offset,
-            one,
-        ),
-        row(
-            "gradient",
-            lambda: estimate.gradient,
-            lambda: estimate.standard_error("gradient"),
-            case.form.gradient(x, sigma),
-            sigma,
-        ),
-        row(
-            "HVP",
-            lambda: estimate.hvp(used),
-            lambda: estimate.standard_error("hvp", used),
-            case.form.hvp(x, sigma, used),
-            sigma,
-        ),
+        row("value", lambda: estimate.value, spread("value"), value, 1.0),
+        row("gradient", lambda: estimate.gradient, spread("gradient"), form.gradient(x, sigma), sigma),
+        row("HVP", lambda: estimate.hvp(used), spread("hvp", used), form.hvp(x, sigma, used), sigma),
     ]
     if n <= _FEW:
-        hessian = case.form.hessian(x, sigma)
-        rows.append(
-            row(
-                "Hessian diagonal",
-                estimate.hessian_diagonal,
-                lambda: estimate.standard_error("hessian_diagonal"),
-                hessian.diagonal(),
-                sigma**2,
-            )
-        )
-        if n <= _FULL:
-            scale = torch.outer(sigma, sigma)
-            spread = lambda: estimate.standard_error("hessian")  # noqa: E731
-            rows.append(row("Hessian", estimate.hessian, spread, hessian, scale))
+        hessian = form.hessian(x, sigma)
+        diagonal = spread("hessian_diagonal")
+        rows.append(row("Hessian diagonal", estimate.hessian_diagonal, diagonal, hessian.diagonal(), sigma**2))
+    if n <= _FULL:
+        rows.append(row("Hessian", estimate.hessian, spread("hessian"), hessian, torch.outer(sigma, sigma)))
     return rows
 
 

@@ -14,12 +14,14 @@ from experiments.studies.stability_optimizers import ENDLESS, _row, hard_cases, 
 
 
 def test_every_case_of_stability_is_right(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [])
+    told = Coverage("aggregate, random", 16, 0.95, {"value": (0.9, 0.91)}, "right")
+    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [told])
     rows = stability(largest=1000, runs=0, out=tmp_path / "stability.json")  # a wrong row would raise SystemExit
     assert {row.verdict for row in rows} == {"right", "right: refused"}
     # Far from zero twice, sigma 1e308, and a Hessian of order 1e320 and its diagonal.
     assert sum(row.verdict == "right: refused" for row in rows) == 5
-    assert len(json.loads((tmp_path / "stability.json").read_text())) == len(rows)
+    written = json.loads((tmp_path / "stability.json").read_text())
+    assert [len(written[name]) for name in ("accuracy", "coverage", "searches")] == [len(rows), 1, 0]
     assert "WRONG" not in capsys.readouterr().out
 
 

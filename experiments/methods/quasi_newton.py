@@ -103,7 +103,8 @@ def _strong_wolfe(
             known[key] = f, g.numpy()
         return known[key]
 
-    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # that it found none
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that it found none
         length = line_search(
             lambda point: at(point)[0], lambda point: at(point)[1], x.numpy(), direction, gradient.numpy(), value
         )[0]

@@ -368,6 +368,7 @@ def test_wrong_marks_are_named(folder, mark, message):
         ("bowls speed task=bowl", "must name a column and one row"),
         ("bowls seconds taste=sweet", "columns are task, .*got taste"),
         ("bowls seconds method=ours", "no row of the table"),
+        ("bowls seconds n=two", "no row of the table"),
     ],
 )
 def test_wrong_values_are_named(folder, mark, message):

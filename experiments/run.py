@@ -10,8 +10,9 @@ import tyro
 from experiments.ensembles.ensemble import Ensemble
 from experiments.methods import METHODS
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, NETWORKS, TASKS, Preset, chosen
+from experiments.problems.catalogue import FITTING, NETWORKS, TASKS, chosen
 from experiments.problems.network_task import NetworkTask
+from experiments.problems.task import Preset
 from experiments.reports.results import load
 from experiments.reports.summary import as_text, summarize
 from experiments.runs.records import Outcome, read_outcome

@@ -15,9 +15,8 @@ from experiments.ensembles.workers import Job, Message, Trouble, run_jobs
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings as settings_of
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from experiments.runs.records import Outcome, Preparation, Record, read_outcome
 from experiments.runs.trial import LEVELS, LIMIT
 

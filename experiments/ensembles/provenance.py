@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.problems.catalogue import Preset
+from experiments.problems.task import Preset
 from experiments.runs.records import write
 
 _ROOT = Path(__file__).parents[2]

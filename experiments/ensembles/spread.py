@@ -4,9 +4,8 @@ import torch
 from torch import Tensor
 
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from torch_zerohess.evaluators import Factory, ProcessPool
 
 

@@ -16,9 +16,8 @@ import torch
 from experiments.ensembles.spread import BlackBoxOf, spread
 from experiments.methods import METHODS, Method
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
 from torch_zerohess.evaluators import Factory, ProcessPool

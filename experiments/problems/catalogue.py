@@ -6,14 +6,12 @@ import importlib.util
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 from torch import Tensor
 
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
-
-Preset = Literal["fast", "paper"]
+from experiments.problems.task import Preset, Task
 
 FITTING = {
     name: f"experiments.problems.tasks.{name}"

@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import Reference, RenderedTask, Setting
 from experiments.problems.scenes.meshes import to_srgb
-from experiments.problems.task import Output, Task
+from experiments.problems.task import Output, Preset, Task
 
 Noise = Literal["fixed", "other", "call", "point"]
 """Seed of the renders: the seed of the reference, another one, a new one for every call, or one for every point."""

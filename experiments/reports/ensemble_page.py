@@ -14,8 +14,8 @@ from torch import Tensor
 
 from experiments.ensembles.provenance import flat, preset_and_variant, read_command
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, Preset
-from experiments.problems.task import Task
+from experiments.problems.catalogue import FITTING
+from experiments.problems.task import Preset, Task
 from experiments.reports import error_curves
 from experiments.reports.animation import pixels
 from experiments.reports.html_page import html_page, html_table, html_text

@@ -6,7 +6,7 @@ which depends on the angle, and its photons are random.
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from experiments.problems.scenes.caustic import COEFFICIENTS, INDEX, basis
 from experiments.problems.scenes.meshes import grid, mi_mesh
+from experiments.problems.task import Preset
 from experiments.problems.tasks import caustic
 from experiments.runs.records import Files, read_outcome
 from torch_zerohess.adapters.mitsuba_variants import select_variant
@@ -33,7 +34,7 @@ def check_caustic(
     /,
     method: str = "block_gauss_newton",
     run: int = 0,
-    preset: Literal["fast", "paper"] = "fast",
+    preset: Preset = "fast",
     spp: int = 1000,
     variant: str = "auto",
 ) -> float:

@@ -26,8 +26,9 @@ import tyro
 from experiments.ensembles.ensemble import Ensemble
 from experiments.methods import METHODS
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset, chosen
+from experiments.problems.catalogue import chosen
 from experiments.problems.network_task import NetworkTask
+from experiments.problems.task import Preset
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Trace, finer
 from experiments.reports.medians import medians, objects, reached

@@ -23,8 +23,8 @@ from experiments.ensembles.provenance import machine
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, Preset, chosen
-from experiments.problems.task import Task
+from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, chosen
+from experiments.problems.task import Preset, Task
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
 from experiments.reports.html_page import html_page, html_table, html_text

@@ -25,9 +25,9 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.ensembles.kept_parts import KeptParts
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import RenderedTask
 from experiments.problems.scenes.adjoint import resolved
+from experiments.problems.task import Preset
 from experiments.reports.progress import progress
 from experiments.reports.tables import Printer
 

@@ -20,7 +20,8 @@ from experiments.ensembles.provenance import register
 from experiments.ensembles.workers import Job
 from experiments.methods import METHODS
 from experiments.methods.settings import settings as settings_of
-from experiments.problems.catalogue import FITTING, Preset, chosen
+from experiments.problems.catalogue import FITTING, chosen
+from experiments.problems.task import Preset
 from experiments.problems.variations import Change
 from experiments.problems.variations import load as load_varied
 from experiments.reports import robustness_curves

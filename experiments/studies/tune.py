@@ -17,8 +17,7 @@ import tyro
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings, space
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from experiments.reports.progress import progress
 from experiments.reports.results import Run
 from experiments.reports.tables import table

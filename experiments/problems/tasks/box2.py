@@ -10,16 +10,15 @@ to be smooth; the `paper` preset the source's 500x500.
 """
 
 from collections.abc import Callable
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from experiments.problems.soft_squares import BoxTask, box2
-from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
+from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     side = {"fast": 128, "paper": 500}[preset]
     box = box2(side)
     return fitting(

@@ -9,13 +9,12 @@ Direct light is enough: light that the bunny reflects to the wall changes the lo
 """
 
 from functools import partial
-from typing import Literal
 
 import torch
 
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.scenes.bunny import OVER_WALL, as_mesh, over_wall
-from experiments.problems.task import Task, around
+from experiments.problems.task import Preset, Task, around
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((64, 64), 32, 6)
@@ -35,7 +34,7 @@ def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
     )
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
     return rendered(
         name="bunny",
         title="position and rotation of the Stanford bunny over a wall",

@@ -10,13 +10,12 @@ samples.
 """
 
 from functools import partial
-from typing import Literal
 
 import torch
 
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.scenes.bunny import IN_MIRRORS, SEEN_AT, as_mesh, in_mirrors
-from experiments.problems.task import Task, around
+from experiments.problems.task import Preset, Task, around
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((64, 64), 32, 6)
@@ -36,7 +35,7 @@ def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
     )
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
     return rendered(
         name="mirror",
         title="position and rotation of the Stanford bunny in two mirrors",

@@ -8,14 +8,12 @@ Direct light is enough: with longer paths the loss has the same minimum and plat
 preset has a quarter of the source's film and samples, the `paper` preset all of it.
 """
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.scenes.mug import DEGREES, MESH_ROTATION, ROTATION, mug_scene
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Preset, Task, uniform
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 TURN = 360.0 / DEGREES
@@ -41,7 +39,7 @@ def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
     )
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
     return rendered(
         name="mug",
         title="the rotation of a mug whose handle is hidden on the way",

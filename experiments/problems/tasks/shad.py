@@ -10,13 +10,12 @@ source's film and samples, the `paper` preset all of it.
 """
 
 from functools import partial
-from typing import Literal
 
 import torch
 
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.scenes.shadow import POSITION, shadow
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Preset, Task, uniform
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((256, 192), 32, 6)
@@ -36,7 +35,7 @@ def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
     )
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
     start = torch.tensor([-0.5, 2.5]).double()
     return rendered(
         name="shad",

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from experiments.problems import catalogue
 from experiments.problems.rendered import Reference, RenderedTask, Setting
-from experiments.problems.scenes.meshes import to_srgb
+from experiments.problems.srgb import from_srgb, to_srgb
 from experiments.problems.task import Output, Preset, Task
 
 Noise = Literal["fixed", "other", "call", "point"]
@@ -169,7 +169,7 @@ class Seen(Reference):
         noise: Noise = "fixed",
         change: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
-        super().__init__(lambda: task.scene(setting), task.solution, setting.depth, lambda: task.moving(setting))
+        super().__init__(task.scene, task.moving, setting, task.solution)
         self._noise, self._change = noise, change
 
     @cached_property
@@ -201,9 +201,3 @@ def jpeg(image: Tensor, quality: int) -> Tensor:
     file = io.BytesIO()
     Image.fromarray(to_srgb(image)).save(file, "JPEG", quality=quality)
     return from_srgb(torch.from_numpy(np.array(Image.open(file))))
-
-
-def from_srgb(image: Tensor) -> Tensor:
-    """Return the linear image, float64, of an 8-bit sRGB one; the inverse of `to_srgb`."""
-    curved = image.double() / 255
-    return torch.where(curved <= 0.04045, curved / 12.92, ((curved + 0.055) / 1.055) ** 2.4)

@@ -87,7 +87,7 @@ def finer(task: Task, seen: Look) -> Look:
     scale = max(1, -(-_FINE // height))
     film, spp = (scale * width, scale * height), max(_SAMPLES, task.setting.spp)
     setting = dataclasses.replace(task.setting, film=film, spp=spp)
-    picture = Reference(lambda: task.scene(setting), task.solution, setting.depth, lambda: task.moving(setting)).picture
+    picture = Reference(task.scene, task.moving, setting, task.solution).picture
     return Look(picture, picture(task.solution))
 
 

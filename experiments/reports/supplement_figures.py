@@ -14,10 +14,10 @@ import matplotlib as mpl
 import torch
 from torch import Tensor
 
-from experiments.problems.rendered import shown
 from experiments.problems.scenes.bunny import IN_MIRRORS, in_mirrors
 from experiments.problems.scenes.caustic import COEFFICIENTS, basis
-from experiments.problems.scenes.meshes import rgb
+from experiments.problems.scenes.parts import rgb
+from experiments.problems.srgb import shown
 from experiments.reports.animation import Look, Trace, pixels
 from experiments.reports.error_curves import AXES, band, plain_ticks
 from experiments.reports.results import Run

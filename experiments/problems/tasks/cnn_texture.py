@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from experiments.problems.network_task import NetworkTask, Size
-from experiments.problems.scenes.meshes import to_srgb
 from experiments.problems.scenes.mug import LABEL, LABEL_SIDE, mug_scene
+from experiments.problems.srgb import to_srgb
 from experiments.problems.task import Preset
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 

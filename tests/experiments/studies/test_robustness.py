@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from experiments.problems.rendered import Setting, rendered
-from experiments.problems.scenes.meshes import to_srgb
+from experiments.problems.srgb import from_srgb, to_srgb
 from experiments.problems.task import uniform
 from experiments.problems.tasks import mug
-from experiments.problems.variations import Change, from_srgb, jpeg, varied
+from experiments.problems.variations import Change, jpeg, varied
 from experiments.problems.variations import load as load_varied
 from experiments.reports.results import Run, load
 from experiments.reports.summary import summarize

@@ -1,5 +1,7 @@
 """The black box of a task in worker processes: a run with them has the rows of a run without."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -58,4 +60,4 @@ def spread(task: Task | NetworkTask, pool: ProcessPool, fn: Factory) -> Task | N
         return pool(fn, x, torch.zeros(len(x), dtype=torch.bool))
 
     loss(task.start(0).double().expand(pool.workers, -1))
-    return catalogue.evaluated_by(task, loss, image)
+    return replace(task, loss=loss, output=task.output and replace(task.output, image=image))

@@ -147,12 +147,12 @@ def _train(
     steps = max(1, trial.task.evaluations // (batch * renders))
     optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=rate[0])
     losses = deque[float](maxlen=max(1, steps // 20))
-    (first, last), images = trial.task.sigma, trial.images
+    first, last = trial.task.sigma
     for step in range(steps):
         share = min(step / (ANNEALED * steps), 1.0)
         sigma = first + share * (last - first)
         optimizer.param_groups[0]["lr"] = rate[0] + share * (rate[1] - rate[0])
-        chosen = images[torch.arange(batch * step, batch * (step + 1)) % len(images)]
+        chosen = trial.batch(step, batch)
         y = trial.encoder(chosen)
         direction, loss = gradient(y.detach(), chosen, sigma)
         optimizer.zero_grad()

@@ -19,9 +19,8 @@ from experiments.problems.scenes.caustic import COEFFICIENTS, basis
 from experiments.problems.scenes.parts import rgb
 from experiments.problems.srgb import shown
 from experiments.reports.animation import Look, Trace, pixels
-from experiments.reports.error_curves import AXES, band, plain_ticks
+from experiments.reports.error_curves import AXES, band, levels, plain_ticks
 from experiments.reports.results import Run
-from experiments.runs.trial import LEVELS
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 mpl.use("Agg")
@@ -211,10 +210,8 @@ def _errors(axis: Any, runs: Sequence[Trace]) -> None:
         rows = [(record.evaluations, error) for record, error in zip(one.records, one.error, strict=True)][1:]
         if rows:
             axis.step(*zip(*rows, strict=True), where="post", label=one.method)
-    for level in LEVELS:
-        axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
+    levels(axis)
     axis.set(xscale="log", yscale="log", xlabel="evaluations", ylabel="image error / at the start")
-    axis.grid(which="major", alpha=0.3)
     if axis.get_legend_handles_labels()[0]:
         axis.legend(fontsize=8, frameon=False)
     plain_ticks(axis)

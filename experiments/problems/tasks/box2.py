@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from experiments.problems.soft_squares import BoxTask, box2
+from experiments.problems.soft_squares import HALF_WIDTH, BoxTask, box2
 from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
 
 
@@ -52,7 +52,7 @@ def fitting(
         sigma=box.sigma,
         evaluations=evaluations,
         truth=Truth(lambda x: float(squares(x[None])[0]), parameter_error),
-        bounds=(torch.full_like(box.start, squares.half_width), torch.full_like(box.start, 1 - squares.half_width)),
+        bounds=(torch.full_like(box.start, HALF_WIDTH), torch.full_like(box.start, 1 - HALF_WIDTH)),
         output=least_squares(squares.image, residuals),
         picture=Picture(lambda x: squares.image(x[None])[0], lambda: reference),
     )

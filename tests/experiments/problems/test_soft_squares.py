@@ -6,12 +6,13 @@ import pytest
 import torch
 
 import torch_zerohess as zh
+from experiments.problems import catalogue
 from experiments.problems.soft_squares import box2, box10
 
 
 @pytest.mark.parametrize("task", [box2(), box10()], ids=["BOX2", "BOX10"])
 def test_soft_squares(task) -> None:
-    side, loss = 64, task.loss
+    side, loss, made = 64, task.loss, catalogue.fitting(task.name.lower())
     assert loss(loss.target[None]).item() == 0
     points = task.start + task.sigma * torch.randn(20, len(task.start), generator=torch.Generator().manual_seed(0))
     pixels = (torch.arange(side) + 0.5).double() / side
@@ -20,7 +21,7 @@ def test_soft_squares(task) -> None:
         x, y = (((pixels - p[:, axis, None]) / 0.1).abs() ** 10 for axis in (0, 1))
         image += (1 - 2 * (y[:, :, None] + x[:, None, :])).clamp(0, 1)
     torch.testing.assert_close(loss.image(points.double()), image.clamp(max=1), rtol=1e-12, atol=1e-12)
-    starts = task.starts(1000)
+    starts = torch.stack([made.start(run) for run in range(1000)])
     assert (starts - task.start).abs().max() <= task.half_range
     assert starts.mean(0).sub(task.start).abs().max() < 5 * task.half_range / math.sqrt(3 * 1000)
 

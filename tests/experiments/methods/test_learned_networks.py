@@ -11,6 +11,7 @@ from torch import nn
 from experiments.methods import METHODS, learned_networks
 from experiments.methods.learned_networks import Surrogate
 from experiments.problems.network_task import Size
+from experiments.problems.tasks import cnn_throw
 from experiments.runs.attempt import attempt
 from experiments.runs.network_trial import NetworkTrial
 
@@ -41,6 +42,15 @@ def test_every_method_trains_within_its_budget(name):
     start = BUMP.encoders(0)[1]
     for a, b in zip(trial.encoder.parameters(), start.parameters(), strict=True):
         assert not torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", RENDERS)
+def test_targets_that_are_no_images(name):
+    """The places on the floor at which CNN-THROW aims."""
+    task = cnn_throw.Throw(Size(16, 1, 1, evaluations=16, images=4, held_out=1), threads=1)
+    outcome, trial = run(name, task)
+    assert outcome.evaluations == 16
+    assert all(math.isfinite(row.image_error) for row in trial.rows)
 
 
 @pytest.mark.parametrize("name", RENDERS)

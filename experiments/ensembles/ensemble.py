@@ -10,8 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.ensembles.processes import Job, Message, Trouble, run_jobs
 from experiments.ensembles.provenance import register
-from experiments.ensembles.workers import Job, Message, Trouble, run_jobs
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings as settings_of
 from experiments.problems import catalogue

@@ -5,7 +5,6 @@ says what differs, run and logged as any other, so that `table`, `plot` and `rep
 same in several sweeps is run once. Errors are measured on the unchanged task, see `experiments.problems.variations`.
 """
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -16,8 +15,8 @@ import pandas as pd
 import tyro
 
 from experiments.ensembles.ensemble import Ensemble, ordered, settings_by_method
+from experiments.ensembles.processes import Job
 from experiments.ensembles.provenance import register
-from experiments.ensembles.workers import Job
 from experiments.methods import METHODS
 from experiments.methods.settings import settings as settings_of
 from experiments.problems.catalogue import FITTING, chosen
@@ -164,7 +163,7 @@ def robustness(
     found = {cell: _runs(results, cell, ensemble.runs) for cell in cells}
     rows = [row(cell, runs) for cell, runs in found.items() if runs]
     print("\n" + as_text(rows))
-    write_csv(rows, out / "robustness.csv")
+    pd.DataFrame(rows).to_csv(out / "robustness.csv", index=False, lineterminator="\n")
     print(f"\n{out / 'robustness.csv'}")
     for name in names:
         mine = [(cell.method, cell.sweep, cell.value, runs) for cell, runs in found.items() if cell.task == name]
@@ -294,10 +293,3 @@ def as_text(rows: Sequence[Row]) -> str:
         ]
         parts.append(f"{task}, {SWEEPS[sweep].title}\n{table(headers, cells)}")
     return "\n\n".join(parts)
-
-
-def write_csv(rows: Sequence[Row], path: Path) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(Row.__dataclass_fields__), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(asdict(one) for one in rows)

@@ -1,7 +1,7 @@
 """Accuracy against closed forms where arithmetic is hard: extreme scales, offsets, rounding, conditioning, sizes.
 
 A second table has the shares of confidence intervals that contain the truth: see `coverage`. A third one has searches
-on hard functions: see `stability_optimizers`.
+on hard functions: see `stability_searches`.
 
 Errors are dimensionless (gradients times sigma, Hessians times sigma squared) and in units of the standard error that
 the estimate itself reports. What exceeds five of them plus the rounding allowance is wrong; for more than a hundred
@@ -24,9 +24,10 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.reports.progress import progress
 from experiments.reports.tables import table
+from experiments.runs.records import write
 from experiments.studies.coverage import coverage
 from experiments.studies.stability_cases import Case, cases
-from experiments.studies.stability_optimizers import searches
+from experiments.studies.stability_searches import searches
 
 _MOST_STANDARD_ERRORS = 5.0
 _MOST_RMS_STANDARD_ERRORS = 2.0
@@ -77,9 +78,8 @@ def stability(
     headers = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
     print(f"\nSearches, {runs} runs each\n\n{table(headers, [list(asdict(one).values()) for one in found])}")
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         tables: dict[str, list[Any]] = {"accuracy": rows, "coverage": shares, "searches": found}
-        out.write_text(json.dumps({name: [asdict(one) for one in part] for name, part in tables.items()}, indent=1))
+        write(out, json.dumps({name: [asdict(one) for one in part] for name, part in tables.items()}, indent=1))
     outside = [one for one in shares if one.verdict.startswith("WRONG")]
     false = [one for one in found if one.verdict.startswith("WRONG")]
     if wrong or outside or false:

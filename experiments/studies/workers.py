@@ -33,6 +33,7 @@ from torch import Tensor
 from experiments.problems import catalogue
 from experiments.reports.progress import progress
 from experiments.reports.tables import table
+from experiments.runs.records import write
 from experiments.studies.bench_ratios import in_turn
 from experiments.studies.scaling import scaling as scaling_of
 from torch_zerohess.evaluators import Factory, Inline, ProcessPool
@@ -130,9 +131,8 @@ def workers(
     if faults:
         print(table(list(asdict(faults)), [list(asdict(faults).values())]))
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         written = {"costs": [asdict(one) for one in costs], "faults": None if faults is None else asdict(faults)}
-        out.write_text(json.dumps(written, indent=1))
+        write(out, json.dumps(written, indent=1))
     if scaling is not None:
         scaling_of(count, scaling)
     if faults and not faults.right:

@@ -198,7 +198,7 @@ def table(
     /,
     format: Literal["text", "csv", "json", "table_2"] = "text",
     reference: str | None = None,
-    methods: str | None = None,
+    methods: str = "all",
 ) -> None:
     """Print how many evaluations and seconds every method took, with ratios to the reference and failed runs.
 
@@ -211,7 +211,7 @@ def table(
     """
     results = load(folder)
     there = sorted({method for runs in results.runs.values() for method in runs})
-    wanted = chosen("methods", methods.split(","), there) if methods is not None else there
+    wanted = there if methods.strip() == "all" else chosen("methods", methods.split(","), there)
     if reference is not None:
         (reference,) = chosen("reference", [reference], wanted)
     summary = summarize(results, reference, wanted)

@@ -3,6 +3,7 @@
 import csv
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -342,6 +343,8 @@ def test_documents_are_written_and_checked(folder, tmp_path, capsys):
     with pytest.raises(SystemExit, match="value: bowls"):
         readme((path,), check=True)
     assert "as it should be" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="FILE must be a Markdown file, got nowhere"):
+        readme((Path("nowhere.md"),))
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def varied(task: Task, change: Change) -> Task:
     if change.start != 1.0:
         task = _moved(task, change.start)
     if change.rendered:
-        task = _seen(task, change)
+        task = _rendered_otherwise(task, change)
     return dataclasses.replace(task, name=name)
 
 
@@ -120,12 +120,12 @@ def _moved(task: Task, factor: float) -> Task:
     return dataclasses.replace(task, start=lambda run: torch.lerp(solution, start(run), factor))
 
 
-def _seen(task: Task, change: Change) -> Task:
+def _rendered_otherwise(task: Task, change: Change) -> Task:
     made = _rendered(task, "it is not rendered")
     spp = max(1, round(change.spp * made.setting.spp))
     setting = dataclasses.replace(made.setting, spp=spp)
     compress = None if change.jpeg is None else lambda image: jpeg(image, change.jpeg or 0)
-    reference = Seen(made, setting, change.noise, compress)
+    reference = VariedReference(made, setting, change.noise, compress)
 
     def prepare() -> None:
         reference.prepare()
@@ -152,7 +152,7 @@ def _rendered(task: Task, reason: str) -> RenderedTask:
     return task
 
 
-class Seen(Reference):
+class VariedReference(Reference):
     """A reference that differs from a render of the solution: by noise, by samples, or by compression.
 
     Args:

@@ -82,19 +82,19 @@ def _band(figure: Any, shown: Sequence[Column], across: int, method: str | None)
 
 
 def descents(groups: Mapping[str, Sequence[Trace]], path: Path) -> None:
-    """Draw figures 7 and 8: errors of an ensemble, and where a task has two parameters the ways of its runs from above.
+    """Draw figures 7 and 8: errors of an ensemble and, where a task has two parameters, trajectories over its loss.
 
     groups: runs on one task, by what they have in common; dashed where the name begins with "first".
     """
     task = next(iter(groups.values()))[0].task
-    ways = list(groups) if task.n == 2 else []
-    figure = plt.figure(figsize=(3.1 * len(ways) + 9, 3.6), layout="constrained")
-    axes: Any = figure.subplots(1, len(ways) + 2, width_ratios=[1.0] * len(ways) + [1.4, 1.4], squeeze=False)[0]
+    planes = list(groups) if task.n == 2 else []
+    figure = plt.figure(figsize=(3.1 * len(planes) + 9, 3.6), layout="constrained")
+    axes: Any = figure.subplots(1, len(planes) + 2, width_ratios=[1.0] * len(planes) + [1.4, 1.4], squeeze=False)[0]
     colors = {name: f"C{k}" for k, name in enumerate(groups)}
-    for axis, name in zip(axes, ways, strict=False):
-        _ways(axis, groups[name], colors[name])
+    for axis, name in zip(axes, planes, strict=False):
+        _trajectories(axis, groups[name], colors[name])
         axis.set_title(name, fontsize=9)
-    for axis, (against, label) in zip(axes[len(ways) :], AXES.items(), strict=True):
+    for axis, (against, label) in zip(axes[len(planes) :], AXES.items(), strict=True):
         axis.set(xscale="log", yscale="log", xlabel=label, ylabel="error / at the start: median, quartiles")
         for name, found in groups.items():
             style = {"color": colors[name], "linestyle": "--" if name.startswith("first") else "-"}
@@ -106,8 +106,8 @@ def descents(groups: Mapping[str, Sequence[Trace]], path: Path) -> None:
     save_small(figure, path)
 
 
-def _ways(axis: Any, found: Sequence[Trace], color: str) -> None:
-    """Draw the ways of runs over the bands of the loss."""
+def _trajectories(axis: Any, found: Sequence[Trace], color: str) -> None:
+    """Draw the trajectories of runs over contours of the loss."""
     task = found[0].task
     places = torch.cat([torch.stack(one.points) for one in found])
     low, high = task.bounds or (places.amin(0), places.amax(0))

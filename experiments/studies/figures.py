@@ -4,7 +4,7 @@
 |---|---|
 | 6 | densities and inverse CDFs of all lobes, with histograms of draws |
 | 7 | BRDF: first and second order, with exact and with sampled derivatives |
-| 8 | NONPSD: the same, and the ways of the runs |
+| 8 | NONPSD: the same, and the trajectories of the runs |
 | 9 | all tasks: start, end, target; networks are trained with few renders |
 | 10 | robustness on MUG: pairs, samples per pixel, JPEG quality |
 | 11 | variance of uniform, aggregate and optimal sampling against samples per element, and against evaluations |

@@ -136,4 +136,4 @@ def _needs(name: str, error: ImportError) -> str:
     """Say what to install; tasks and adapters say so themselves."""
     if "pip install" in str(error) or error.name is None:
         return str(error)
-    return f"{name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'"
+    return f"{name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments,rivals]'"

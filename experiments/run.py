@@ -10,8 +10,9 @@ import tyro
 from experiments.ensembles.ensemble import Ensemble
 from experiments.methods import METHODS
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, NETWORKS, TASKS, Preset, chosen
+from experiments.problems.catalogue import FITTING, NETWORKS, TASKS, chosen
 from experiments.problems.network_task import NetworkTask
+from experiments.problems.task import Preset
 from experiments.reports.results import load
 from experiments.reports.summary import as_text, summarize
 from experiments.runs.records import Outcome, read_outcome
@@ -74,16 +75,22 @@ def _run(ensemble: Ensemble, tasks: Sequence[str], methods: Sequence[str] | None
 
 
 def _report(ensemble: Ensemble, tasks: Sequence[str], outcomes: Sequence[Outcome]) -> None:
-    """Print tables; for networks also write pictures and the encoder."""
+    """Print tables; for networks also write pictures and the encoder. SystemExit names networks without a result."""
     by_task = {name: [one for one in outcomes if one.task == name] for name in tasks}
     fitted = [name for name, mine in by_task.items() if mine and name in FITTING]
     if fitted:
         print("\n" + as_text(summarize(load(ensemble.folder, fitted))))
         quoted = shlex.quote(str(ensemble.folder))
         print(f"\nfigures: python -m experiments plot {quoted}\npage: python -m experiments report {quoted}")
+    without = []
     for name in [name for name, mine in by_task.items() if mine and name in NETWORKS]:
         from experiments.reports.networks import conclude  # matplotlib, which nothing else here needs
 
         task = catalogue.load(name, ensemble.preset, ensemble.variant, ensemble.threads)
         assert isinstance(task, NetworkTask)
-        conclude(task, by_task[name], ensemble.folder)
+        try:
+            conclude(task, by_task[name], ensemble.folder)
+        except SystemExit as error:  # all of its runs failed: the other tasks have results to write
+            without.append(str(error))
+    if without:
+        raise SystemExit("\n".join(without))

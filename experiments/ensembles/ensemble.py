@@ -10,14 +10,13 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.ensembles.processes import Job, Message, Trouble, run_jobs
 from experiments.ensembles.provenance import register
-from experiments.ensembles.workers import Job, Message, Trouble, run_jobs
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings as settings_of
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from experiments.runs.records import Outcome, Preparation, Record, read_outcome
 from experiments.runs.trial import LEVELS, LIMIT
 
@@ -69,10 +68,7 @@ class Ensemble:
         jobs = [job for task in tasks for job in self._jobs(task, methods)]
         if not jobs:
             raise SystemExit("no method of this command can be run on these tasks")
-        table: dict[str, dict[str, Any]] = {}
-        for job in jobs:
-            table.setdefault(job.task_name, {})[job.method_name] = job.settings
-        register(self.folder, table)
+        register(self.folder, settings_by_method(jobs))
         return ordered(jobs)
 
     def _jobs(self, task: str | Task | NetworkTask, methods: Sequence[str | Method] | None) -> list[Job]:
@@ -145,6 +141,14 @@ class _Progress:
         if time.monotonic() - self._drawn > self._interval:
             self._bar.refresh()
             self._drawn = time.monotonic()
+
+
+def settings_by_method(jobs: Iterable[Job]) -> dict[str, dict[str, Any]]:
+    """Return the settings of jobs by task and method, as `register` takes them."""
+    found: dict[str, dict[str, Any]] = {}
+    for job in jobs:
+        found.setdefault(job.task_name, {})[job.method_name] = job.settings
+    return found
 
 
 def ordered(jobs: Iterable[Job]) -> list[Job]:

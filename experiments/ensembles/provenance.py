@@ -13,13 +13,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.problems.catalogue import Preset
+from experiments.problems.task import Preset
 from experiments.runs.records import write
 
 _ROOT = Path(__file__).parents[2]
 _CODE = ("experiments", "torch_zerohess", "csrc", "setup.py", "pyproject.toml", ":(exclude)experiments/results")
 """What results depend on. Tables stored under `experiments/results` are made from results."""
-_PACKAGES = ("torch", "torch_zerohess", "numpy", "scipy", "cma", "DFO-LS", "mitsuba")
+_PACKAGES = (
+    *("torch", "torch_zerohess", "numpy", "scipy", "mitsuba", "mujoco", "scikit-learn"),
+    *("cma", "DFO-LS", "Py-BOBYQA", "botorch", "gpytorch", "coco-experiment"),
+)
+"""Whose versions are noted: what results can depend on."""
 NAME = "command.json"
 SHARED = ("preset", "variant", "threads", "workers")
 """Settings that all methods of a task must have in common."""

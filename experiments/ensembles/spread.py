@@ -1,12 +1,13 @@
 """The black box of a task in worker processes: a run with them has the rows of a run without."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from torch_zerohess.evaluators import Factory, ProcessPool
 
 
@@ -59,4 +60,4 @@ def spread(task: Task | NetworkTask, pool: ProcessPool, fn: Factory) -> Task | N
         return pool(fn, x, torch.zeros(len(x), dtype=torch.bool))
 
     loss(task.start(0).double().expand(pool.workers, -1))
-    return catalogue.evaluated_by(task, loss, image)
+    return replace(task, loss=loss, output=task.output and replace(task.output, image=image))

@@ -140,7 +140,7 @@ def _forward(function: Function, x: Tensor, length: float) -> tuple[float, Array
 
 
 def _armijo(function: Function, x: Tensor, value: float, direction: Array, slope: float, noise: float) -> float | None:
-    """Return a step length that lowers the function by more than it should and less than the noise, or None."""
+    """Return the first of 1, 1/2, 1/4, ... that meets the relaxed Armijo condition, None if no step does."""
     if not np.isfinite(direction).all():
         return None
     length, along = 1.0, torch.from_numpy(direction)

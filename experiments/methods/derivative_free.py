@@ -87,7 +87,7 @@ def cobyqa(trial: Trial, *, scale: float = 1.0) -> None:
         "final_tr_radius": 1e-8 * scale * trial.task.sigma,
     }
     for start in starts(trial):
-        minimize(evaluate, start.numpy(), method="COBYQA", bounds=_bounds(trial.task), options=options)
+        minimize(evaluate, start.numpy(), method="COBYQA", bounds=scipy_bounds(trial.task), options=options)
 
 
 def dfo_ls(trial: Trial, *, scale: float = 1.0) -> None:
@@ -153,7 +153,8 @@ def _one_by_one(trial: Trial) -> Callable[[Array], float]:
     return evaluate
 
 
-def _bounds(task: Task) -> Bounds | None:
+def scipy_bounds(task: Task) -> Bounds | None:
+    """Return the bounds of a task as SciPy takes them."""
     return None if task.bounds is None else Bounds(*(one.numpy() for one in task.bounds))
 
 

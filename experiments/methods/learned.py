@@ -36,13 +36,12 @@ class Scaled:
 
     def __init__(self, trial: Trial) -> None:
         self._trial, self._unit = trial, trial.task.sigma
-        first = float(trial.loss(trial.start[None]))
-        self._first = abs(first) if first else 1.0
-        self._offset = first
+        self._first = float(trial.loss(trial.start[None]))
+        self._scale = abs(self._first) or 1.0
 
     def loss(self, w: Tensor) -> Tensor:
         """Return the loss [K] at w [K, n], 0 at the start."""
-        return (self._trial.loss(self.outside(w)) - self._offset) / self._first
+        return (self._trial.loss(self.outside(w)) - self._first) / self._scale
 
     def outside(self, w: Tensor) -> Tensor:
         """Return the points [..., n] of the task at w [..., n]."""
@@ -50,7 +49,7 @@ class Scaled:
 
     def report(self, w: Tensor, sigma: float, loss: Tensor) -> None:
         """End an iteration at w [n] with the mean of the losses [K] of its samples."""
-        mean = self._offset + self._first * float(loss.mean())
+        mean = self._first + self._scale * float(loss.mean())
         self._trial.report(self.outside(w), sigma=self._unit * sigma, loss=mean)
 
 

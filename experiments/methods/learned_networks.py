@@ -1,11 +1,13 @@
 """ZeroGrads and RELAX on network tasks: the surrogate sees the parameters and the image that they are to explain.
 
 The loss of a prediction depends on the image that it is for, so one surrogate h(z, r) serves all images r: a network of
-the parameters z and of r at 8x8 pixels. ZeroGrads fits it to the losses of the latest batch, RELAX makes it a control
-variate of their score function (see `experiments.methods.learned`). The gradient at the predictions goes on through the
-encoder to its weights, which Adam moves. Neither paper has an encoder with a black box after it. ZeroGrads trains a
-network by taking its 35 000 weights for the parameters of the black box; here these would be 268 000, and the encoder,
-which is a white box, would be sampled as well.
+the parameters z and of r at 8x8 pixels. The targets of CNN-THROW are places, not images; the surrogate sees them as
+they are. ZeroGrads fits the surrogate to the losses of the latest batch. RELAX makes it a control variate of the score
+function (see `experiments.methods.learned`). The gradient at the predictions goes on through the encoder to its
+weights, which Adam moves.
+
+Neither paper has an encoder with a black box after it. ZeroGrads trains a network by taking its 35 000 weights for the
+parameters of the black box; here these would be 268 000, and the encoder, which is a white box, would be sampled too.
 
 Both methods see the losses and the training images, but no render, no bounds, no derivative of the black box. The first
 sigma is the sigma of the task. Sigma and the learning rate of the encoder go down linearly over nine tenths of the
@@ -39,11 +41,12 @@ class Surrogate:
         self._trial, self._unit, self._scale = trial, trial.task.sigma[0], 0.0
         with torch.no_grad():
             self._centre = trial.encoder(trial.images[:16]).mean(0)
-        self.network = network(trial.task.n + 3 * SIDE**2, hidden, activation, trial.seed).float()
+        inputs = trial.task.n + _seen(trial.images[:1]).shape[1]
+        self.network = network(inputs, hidden, activation, trial.seed).float()
 
     def of(self, images: Tensor) -> Function:
-        """Return h(z) for parameters z [K, n] of images [K, 3, h, w], one each."""
-        seen = nn.functional.adaptive_avg_pool2d(images, SIDE).flatten(1)
+        """Return h(z) for parameters z [K, n] of images [K, *out], one each."""
+        seen = _seen(images)
         return lambda z: self.network(torch.cat([(z - self._centre) / self._unit, seen], 1))
 
     def loss(self, z: Tensor, images: Tensor) -> tuple[Tensor, float]:
@@ -51,6 +54,16 @@ class Surrogate:
         losses = self._trial.loss(z, images).float()
         self._scale = self._scale or float(losses.mean()) or 1.0
         return losses / self._scale, float(losses.mean())
+
+
+def _seen(images: Tensor) -> Tensor:
+    """Return what a surrogate sees of images [K, *out]: 8x8 pixels [K, 192], or outputs that are no images as given."""
+    return nn.functional.adaptive_avg_pool2d(images, SIDE).flatten(1) if images.ndim == 4 else images.flatten(1)
+
+
+def _repeated(images: Tensor, count: int) -> Tensor:
+    """Return images [K, *out] one batch after the other, [count * K, *out]."""
+    return images.repeat(count, *(1 for _ in images.shape[1:]))
 
 
 def zerograds(
@@ -80,7 +93,7 @@ def zerograds(
     fitted = torch.optim.Adam(surrogate.network.parameters(), lr=fit_rate)
 
     def gradient(y: Tensor, images: Tensor, sigma: float) -> tuple[Tensor, float]:
-        centres, seen = y.repeat(2 * pairs, 1), images.repeat(2 * pairs, 1, 1, 1)
+        centres, seen = y.repeat(2 * pairs, 1), _repeated(images, 2 * pairs)
         u = torch.randn(pairs * len(y), y.shape[1])
         z = centres + sigma * torch.cat([u, -u])
         f, mean = surrogate.loss(z + inner * sigma * torch.randn_like(z), seen)
@@ -113,7 +126,7 @@ def relax(
     tuned = torch.optim.Adam(surrogate.network.parameters(), lr=fit_rate)
 
     def gradient(y: Tensor, images: Tensor, sigma: float) -> tuple[Tensor, float]:
-        centres, seen = y.repeat(samples, 1), images.repeat(samples, 1, 1, 1)
+        centres, seen = y.repeat(samples, 1), _repeated(images, samples)
         u = torch.randn_like(centres)
         f, mean = surrogate.loss(centres + sigma * u, seen)
         gradients = lax(f, surrogate.of(seen), centres, u, sigma)
@@ -147,12 +160,12 @@ def _train(
     steps = max(1, trial.task.evaluations // (batch * renders))
     optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=rate[0])
     losses = deque[float](maxlen=max(1, steps // 20))
-    (first, last), images = trial.task.sigma, trial.images
+    first, last = trial.task.sigma
     for step in range(steps):
         share = min(step / (ANNEALED * steps), 1.0)
         sigma = first + share * (last - first)
         optimizer.param_groups[0]["lr"] = rate[0] + share * (rate[1] - rate[0])
-        chosen = images[torch.arange(batch * step, batch * (step + 1)) % len(images)]
+        chosen = trial.batch(step, batch)
         y = trial.encoder(chosen)
         direction, loss = gradient(y.detach(), chosen, sigma)
         optimizer.zero_grad()

@@ -55,7 +55,7 @@ def through_memory(
         damping: of "newton".
         temperature: of the local entropy, over the mean loss.
     """
-    task, network, images = trial.task, trial.encoder, trial.images
+    task, network = trial.task, trial.encoder
     first = min(max(task.evaluations // 10, 20), 64) if task.n <= MOST else min(task.evaluations, task.n + 76)
     fresh = max(1, round((task.evaluations - first) / (2 * _STEPS)))
     total = (task.evaluations - first) // (2 * fresh)
@@ -69,7 +69,7 @@ def through_memory(
         value="smoothed",
     )
     with torch.no_grad():
-        x = network(images[torch.arange(first) % len(images)])
+        x = network(trial.batch(0, first))
         x = x + task.sigma[0] * torch.randn_like(x)
     memory.add(x, trial.image(x))
     if not total:  # everything is known that may be known
@@ -84,7 +84,7 @@ def through_memory(
         sigma = task.sigma[0] * (task.sigma[1] / task.sigma[0]) ** share
         layer.smoothing = layer.smoothing.replace(sigma=sigma)
         group[name] = start * (end / start) ** share
-        chosen = images[torch.arange(step * batch, (step + 1) * batch) % len(images)]
+        chosen = trial.batch(step, batch)
 
         def closure(chosen: torch.Tensor = chosen) -> tuple[torch.Tensor, torch.Tensor, zh.optim.SampleJacobian]:
             y = network(chosen)

@@ -63,32 +63,19 @@ def _differentiable(task: Task) -> str | None:
     return task.renderer.no_adjoint()
 
 
-METHODS = (
+METHODS = tuple(
     Method(
-        "mitsuba",
-        "Mitsuba's own derivative (prb), Adam",
-        with_settings(adjoint_adam, integrator="prb"),
+        name,
+        f"Mitsuba's own derivative {title}, Adam",
+        with_settings(adjoint_adam, integrator=integrator),
         _differentiable,
         ("mitsuba",),
         another_scene=True,
         uses="loss, its derivative by the renderer",
-    ),
-    Method(
-        "mitsuba_path",
-        "Mitsuba's own derivative (path), Adam",
-        with_settings(adjoint_adam, integrator="path"),
-        _differentiable,
-        ("mitsuba",),
-        another_scene=True,
-        uses="loss, its derivative by the renderer",
-    ),
-    Method(
-        "mitsuba_projective",
-        "Mitsuba's own derivative with samples on silhouettes, Adam",
-        with_settings(adjoint_adam, integrator="projective"),
-        _differentiable,
-        ("mitsuba",),
-        another_scene=True,
-        uses="loss, its derivative by the renderer",
-    ),
+    )
+    for name, title, integrator in (
+        ("mitsuba", "(prb)", "prb"),
+        ("mitsuba_path", "(path)", "path"),
+        ("mitsuba_projective", "with samples on silhouettes", "projective"),
+    )
 )

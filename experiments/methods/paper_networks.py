@@ -16,7 +16,7 @@ trust radius) go down linearly over nine tenths of the evaluations. Step sizes a
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -127,11 +127,11 @@ def _train(
     steps = max(1, trial.task.evaluations // (batch * renders))
     name, (first, last) = size
     sigma = zh.LinearSigma(layer, *trial.task.sigma, steps=max(1, int(ANNEALED * steps)))
-    batches, losses = _batches(trial.images, batch), deque[float](maxlen=max(1, steps // 20))
+    losses = deque[float](maxlen=max(1, steps // 20))
     for iteration in range(steps):
         optimizer.param_groups[0][name] = first + min(iteration / (ANNEALED * steps), 1.0) * (last - first)
         current = layer.smoothing.sigma
-        losses.append(step(next(batches)))
+        losses.append(step(trial.batch(iteration, batch)))
         sigma.step()
         trial.report(sigma=float(current), loss=losses[-1], image_error=sum(losses) / len(losses))
 
@@ -161,14 +161,6 @@ def hessian_by_differences(fn: Callable[..., Tensor], y: Tensor, smoothing: zh.S
     products = [zh.finite_difference_hvp(fn, y, unit, pairs, images, common=False) for unit in units]
     columns = torch.stack(products, -1)
     return 0.5 * (columns + columns.mT)
-
-
-def _batches(images: Tensor, size: int) -> Iterator[Tensor]:
-    position = 0
-    while True:
-        index = torch.arange(position, position + size) % len(images)
-        yield images[index]
-        position += size
 
 
 def has_curvature(task: NetworkTask) -> str | None:

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import BFGS, Bounds, OptimizeResult, line_search, minimize
+from scipy.optimize import BFGS, OptimizeResult, line_search, minimize
 from torch import Tensor
 
 from experiments.methods.adaptive_differences import bfgs_adaptive_fd
+from experiments.methods.derivative_free import scipy_bounds
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.restarts import starts
@@ -103,7 +104,8 @@ def _strong_wolfe(
             known[key] = f, g.numpy()
         return known[key]
 
-    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # that it found none
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that it found none
         length = line_search(
             lambda point: at(point)[0], lambda point: at(point)[1], x.numpy(), direction, gradient.numpy(), value
         )[0]
@@ -169,8 +171,7 @@ def _scipy(trial: Trial, method: str, options: dict[str, Any]) -> None:
     def callback(intermediate_result: OptimizeResult) -> None:
         trial.report(torch.tensor(intermediate_result.x), loss=float(intermediate_result.fun))
 
-    bounds = trial.task.bounds if method == "L-BFGS-B" else None
-    within = None if bounds is None else Bounds(*(one.numpy() for one in bounds))
+    within = scipy_bounds(trial.task) if method == "L-BFGS-B" else None
     for start in starts(trial):
         minimize(loss, start.numpy(), method=method, bounds=within, callback=callback, options=options)
 

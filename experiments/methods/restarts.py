@@ -19,10 +19,11 @@ def starts(trial: Trial) -> Iterator[Tensor]:
     """
     yield trial.start
     bounds = trial.task.bounds
-    within = bounds is not None and bool(torch.isfinite(torch.stack(bounds)).all())
+    if bounds is not None and not bool(torch.isfinite(torch.stack(bounds)).all()):
+        bounds = None
     for again in itertools.count(1):
         before, number = trial.evaluations, _OTHERS * again + trial.run
-        if within and bounds is not None:
+        if bounds is not None:
             lower, upper = bounds
             drawn = torch.rand(trial.task.n, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
             yield lower + (upper - lower) * drawn

@@ -37,7 +37,7 @@ def task(function: int, instance: int, n: int, evaluations: int) -> Task:
     if function not in FUNCTIONS:
         raise ValueError(f"function must be from 1 to {len(FUNCTIONS)}, got {function}")
     problem = _suite(instance, n)[function - 1]
-    with _somewhere() as folder:
+    with _in_temporary_folder() as folder:
         problem._best_parameter("print")
         problem.free()
         minimum = np.loadtxt(os.path.join(folder, "._bbob_problem_best_parameter.txt"))
@@ -76,8 +76,8 @@ def _suite(instance: int, n: int) -> Any:
 
 
 @contextmanager
-def _somewhere() -> Iterator[str]:
-    """Change to a temporary folder: the platform writes its file where it is."""
+def _in_temporary_folder() -> Iterator[str]:
+    """Change to a temporary folder, because the platform writes its file to the current one."""
     before = os.getcwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)

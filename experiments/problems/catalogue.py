@@ -3,17 +3,13 @@
 import difflib
 import importlib
 import importlib.util
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Literal
-
-from torch import Tensor
+from typing import Any
 
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
-
-Preset = Literal["fast", "paper"]
+from experiments.problems.task import Preset, Task
 
 FITTING = {
     name: f"experiments.problems.tasks.{name}"
@@ -65,11 +61,6 @@ def budgeted(task: Task | NetworkTask, evaluations: int | None) -> Task | Networ
         task.size = replace(task.size, evaluations=evaluations)
         return task
     return replace(task, evaluations=evaluations)
-
-
-def evaluated_by(task: Task, loss: Callable[[Tensor], Tensor], image: Callable[[Tensor], Tensor]) -> Task:
-    """Return a task with another way to its black box: `Task.loss` and `Output.image`."""
-    return replace(task, loss=loss, output=task.output and replace(task.output, image=image))
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from experiments.problems.scenes.meshes import to_srgb
+from experiments.problems.srgb import to_srgb
 
 Progress = Callable[[int, int], None]
 """Gets how many images are rendered, and of how many."""

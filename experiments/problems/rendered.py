@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from experiments.problems.scenes.adjoint import ADJOINTS, unavailable, value_and_gradient
-from experiments.problems.scenes.meshes import to_srgb
+from experiments.problems.srgb import shown
 from experiments.problems.task import Output, Picture, Renderer, Task, Truth
-from torch_zerohess.adapters.mitsuba import MitsubaScene
+from torch_zerohess.adapters.mitsuba import MitsubaScene, Parameter
 
 _REMEMBERED = 256
 
@@ -49,26 +48,30 @@ class Reference:
     """A scene, the image of the solution, and the mean squared differences to it.
 
     Args:
-        make: loads the scene.
+        scene: loads the scene in a setting.
+        moving: the same for derivatives, see `value_and_gradient`.
+        setting: of the renders.
         solution: [n].
-        depth: longest path.
-        moving: loads the scene for derivatives, see `value_and_gradient`.
     """
 
     def __init__(
-        self, make: Callable[[], MitsubaScene], solution: Tensor, depth: int, moving: Callable[[], MitsubaScene]
+        self,
+        scene: Callable[[Setting], MitsubaScene],
+        moving: Callable[[Setting], MitsubaScene],
+        setting: Setting,
+        solution: Tensor,
     ) -> None:
-        self._make, self.solution = make, solution
-        self._depth, self._make_moving = depth, moving
+        self._load, self._load_moving = scene, moving
+        self.setting, self.solution = setting, solution
         self._known: OrderedDict[bytes, float] = OrderedDict()
 
     @cached_property
     def scene(self) -> MitsubaScene:
-        return self._make()
+        return self._load(self.setting)
 
     @cached_property
     def moving(self) -> MitsubaScene:
-        return self._make_moving()
+        return self._load_moving(self.setting)
 
     @cached_property
     def target(self) -> Tensor:
@@ -112,8 +115,23 @@ class Reference:
     def adjoint(self, x: Tensor, integrator: str, seed: int) -> tuple[Tensor, Tensor]:
         """See `Renderer.adjoint`."""
         return value_and_gradient(
-            self.scene, x, integrator, self.loss_of, depth=self._depth, moving=self.moving, seed=seed
+            self.scene, x, integrator, self.loss_of, depth=self.setting.depth, moving=self.moving, seed=seed
         )
+
+
+def load_scene(
+    description: Callable[[Any], dict[str, Any]], parameter: Parameter, setting: Setting, variant: str
+) -> MitsubaScene:
+    """Return a scene with one parameter in a setting, rendered by one thread; `description` is for `MitsubaScene`."""
+    return MitsubaScene(
+        description,
+        [parameter],
+        film=setting.film,
+        spp=setting.spp,
+        depth=setting.depth,
+        variant=variant,
+        threads=1,
+    )
 
 
 def rendered(
@@ -143,7 +161,7 @@ def rendered(
         parameter_error: of x [n]; the mean squared difference to the solution if None.
         facts: `name`, `title`, `parameters`, `start`, `sigma`, `bounds` and `evaluations` of the task.
     """
-    reference = Reference(lambda: scene(setting), solution, setting.depth, lambda: moving(setting))
+    reference = Reference(scene, moving, setting, solution)
 
     def whole() -> RenderedTask:
         return rendered(
@@ -179,11 +197,6 @@ def rendered(
             full=None if setting == full else whole,
         ),
     )
-
-
-def shown(image: Tensor) -> Tensor:
-    """Linear image as sRGB in [0, 1]."""
-    return torch.from_numpy(to_srgb(image)).double() / 255
 
 
 def _key(x: Tensor) -> bytes:

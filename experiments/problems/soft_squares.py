@@ -6,6 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+HALF_WIDTH = 0.1
+"""Of a square, in units of the image side."""
+EXPONENT = 10
+"""Sharpness of the edge of a square."""
 _CHUNK = 1 << 16  # pixels rendered at a time: they stay in the cache
 
 
@@ -16,28 +20,24 @@ class SoftSquares:
     width w; the image is the sum of all squares, clamped to 1. Centres are clamped so that squares stay inside. Where
     no square overlaps one of the target's, the loss is constant: a plateau.
 
+    w is `HALF_WIDTH` and e is `EXPONENT`.
+
     Args:
-        target: [2 count], x and y of every square, in units of the image side.
+        target: [2 count], x and y of every square, in units of the image side; float64.
         side: pixels along the image side.
-        exponent: e, the sharpness of the edge.
-        half_width: w, in units of the image side.
     """
 
-    def __init__(self, target: Tensor, *, side: int = 64, exponent: int = 10, half_width: float = 0.1) -> None:
-        if target.dim() != 1 or len(target) % 2:
-            raise ValueError(f"target must be x and y of every square, [2 count], got {list(target.shape)}")
-        self.side, self.exponent, self.half_width = side, exponent, half_width
-        self.target = target.double()
-        self.count = len(target) // 2
+    def __init__(self, target: Tensor, side: int) -> None:
+        self.side, self.target = side, target
         self._reference = self.image(self.target[None]).flatten()
 
     def image(self, points: Tensor) -> Tensor:
         """Return the images [K, side, side] (row is y) of points [K, 2 count], in their type."""
-        K, w, side = len(points), self.half_width, self.side
+        K, w, side = len(points), HALF_WIDTH, self.side
         center = points.reshape(K, -1, 2).clamp(w, 1 - w)[..., None]
         # Only the pixels around each square are computed; of these, pixels outside of the image have intensity zero.
         pixel = ((center - w) * side).floor() + torch.arange(math.ceil(2 * w * side) + 1, device=points.device)
-        power = (((pixel + 0.5) / side - center) / w).abs() ** self.exponent
+        power = (((pixel + 0.5) / side - center) / w).abs() ** EXPONENT
         square = (1 - 2 * (power[:, :, 1, :, None] + power[:, :, 0, None, :])).clamp_(0, 1)
         index = pixel.long().clamp_(0, side - 1)
         index = index[:, :, 1, :, None] * side + index[:, :, 0, None, :]
@@ -64,23 +64,17 @@ class BoxTask:
     half_range: float
     sigma: float
 
-    def starts(self, count: int, seed: int = 0) -> Tensor:
-        """Return random starts, [count, n]."""
-        generator = torch.Generator().manual_seed(seed)
-        uniform = torch.rand(count, len(self.start), generator=generator, dtype=torch.float64)
-        return self.start + self.half_range * (2 * uniform - 1)
-
 
 def box2(side: int = 64) -> BoxTask:
     """One square: target (.3, .3), starts U(.43, .72)^2, sigma a fifth of the side."""
-    return BoxTask("BOX2", SoftSquares(_vector(0.3, 0.3), side=side), _vector(0.575, 0.575), 0.145, 1 / 5)
+    return BoxTask("BOX2", SoftSquares(_vector(0.3, 0.3), side), _vector(0.575, 0.575), 0.145, 1 / 5)
 
 
 def box10(side: int = 64) -> BoxTask:
     """Five squares that overlap at the start and must spread; sigma a sixth of the side."""
     target = _vector(0.21, 0.21, 0.5, 0.5, 0.79, 0.79, 0.21, 0.79, 0.79, 0.21)
     start = _vector(0.41, 0.41, 0.5, 0.5, 0.59, 0.59, 0.41, 0.59, 0.59, 0.41)
-    return BoxTask("BOX10", SoftSquares(target, side=side), start, 0.025, 1 / 6)
+    return BoxTask("BOX10", SoftSquares(target, side), start, 0.025, 1 / 6)
 
 
 def _vector(*numbers: float) -> Tensor:

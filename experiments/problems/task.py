@@ -5,13 +5,17 @@ Tensors are float64. Points come in batches: x is [K, n], or [n] where one point
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
     from experiments.problems.scenes.fitted_mesh import FittedMesh
+
+
+Preset = Literal["fast", "paper"]
+"""Size of a task: "fast" takes minutes, "paper" has the sizes of the source."""
 
 
 def _nothing(*_: int) -> None:

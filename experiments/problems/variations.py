@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import Reference, RenderedTask, Setting
-from experiments.problems.scenes.meshes import to_srgb
-from experiments.problems.task import Output, Task
+from experiments.problems.srgb import from_srgb, to_srgb
+from experiments.problems.task import Output, Preset, Task
 
 Noise = Literal["fixed", "other", "call", "point"]
 """Seed of the renders: the seed of the reference, another one, a new one for every call, or one for every point."""
@@ -112,7 +111,7 @@ def varied(task: Task, change: Change) -> Task:
     if change.start != 1.0:
         task = _moved(task, change.start)
     if change.rendered:
-        task = _seen(task, change)
+        task = _rendered_otherwise(task, change)
     return dataclasses.replace(task, name=name)
 
 
@@ -121,12 +120,12 @@ def _moved(task: Task, factor: float) -> Task:
     return dataclasses.replace(task, start=lambda run: torch.lerp(solution, start(run), factor))
 
 
-def _seen(task: Task, change: Change) -> Task:
+def _rendered_otherwise(task: Task, change: Change) -> Task:
     made = _rendered(task, "it is not rendered")
     spp = max(1, round(change.spp * made.setting.spp))
     setting = dataclasses.replace(made.setting, spp=spp)
     compress = None if change.jpeg is None else lambda image: jpeg(image, change.jpeg or 0)
-    reference = Seen(made, setting, change.noise, compress)
+    reference = VariedReference(made, setting, change.noise, compress)
 
     def prepare() -> None:
         reference.prepare()
@@ -153,7 +152,7 @@ def _rendered(task: Task, reason: str) -> RenderedTask:
     return task
 
 
-class Seen(Reference):
+class VariedReference(Reference):
     """A reference that differs from a render of the solution: by noise, by samples, or by compression.
 
     Args:
@@ -170,7 +169,7 @@ class Seen(Reference):
         noise: Noise = "fixed",
         change: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
-        super().__init__(lambda: task.scene(setting), task.solution, setting.depth, lambda: task.moving(setting))
+        super().__init__(task.scene, task.moving, setting, task.solution)
         self._noise, self._change = noise, change
 
     @cached_property
@@ -202,9 +201,3 @@ def jpeg(image: Tensor, quality: int) -> Tensor:
     file = io.BytesIO()
     Image.fromarray(to_srgb(image)).save(file, "JPEG", quality=quality)
     return from_srgb(torch.from_numpy(np.array(Image.open(file))))
-
-
-def from_srgb(image: Tensor) -> Tensor:
-    """Return the linear image, float64, of an 8-bit sRGB one; the inverse of `to_srgb`."""
-    curved = image.double() / 255
-    return torch.where(curved <= 0.04045, curved / 12.92, ((curved + 0.055) / 1.055) ** 2.4)

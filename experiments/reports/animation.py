@@ -1,6 +1,7 @@
 """One optimisation as it looks: the point after every iteration, and an animation of the pictures of these points."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -41,8 +42,8 @@ class Trace:
 
     @property
     def error(self) -> list[float]:
-        """Image error over that at the start, by row."""
-        errors = [0.0 if one.image_error is None else one.image_error for one in self.records]
+        """Image error over that at the start, by row; NaN where it was not finite."""
+        errors = [math.nan if one.image_error is None else one.image_error for one in self.records]
         return [one / (errors[0] or 1.0) for one in errors]
 
     def caption(self, row: int) -> str:
@@ -54,9 +55,11 @@ def percent(error: float) -> str:
     """Return a share as text.
 
     Example:
-        >>> percent(1.0), percent(0.0123), percent(2e-7), percent(0.0)
-        ('100 %', '1.2 %', '< 0.001 %', '0 %')
+        >>> percent(1.0), percent(0.0123), percent(2e-7), percent(0.0), percent(math.nan)
+        ('100 %', '1.2 %', '< 0.001 %', '0 %', 'not finite')
     """
+    if math.isnan(error):
+        return "not finite"
     return "< 0.001 %" if 0 < error < 1e-5 else f"{float(f'{100 * error:.2g}'):g} %"
 
 
@@ -84,7 +87,7 @@ def finer(task: Task, seen: Look) -> Look:
     scale = max(1, -(-_FINE // height))
     film, spp = (scale * width, scale * height), max(_SAMPLES, task.setting.spp)
     setting = dataclasses.replace(task.setting, film=film, spp=spp)
-    picture = Reference(lambda: task.scene(setting), task.solution, setting.depth, lambda: task.moving(setting)).picture
+    picture = Reference(task.scene, task.moving, setting, task.solution).picture
     return Look(picture, picture(task.solution))
 
 

@@ -114,7 +114,7 @@ def _where(table: pd.DataFrame, query: Query) -> pd.DataFrame:
             raise SystemExit(f"columns are {', '.join(map(str, table))}, got {column}")
         same = table[column].astype(str) == value
         if pd.api.types.is_numeric_dtype(table[column]):
-            same = table[column] == float(value)
+            same = table[column] == pd.to_numeric(value, errors="coerce")  # NaN, which equals nothing, for a word
         table = table[same]
     query.options = {}
     if table.empty:

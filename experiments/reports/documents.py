@@ -45,6 +45,8 @@ def readme(
     paths = documents or tuple(path for name in DOCUMENTS if (path := ROOT / name).exists())
     wrong = []
     for path in paths:
+        if not path.is_file():
+            raise SystemExit(f"FILE must be a Markdown file, got {path}")
         text = path.read_text(encoding="utf-8")
         new = filled(text)
         if new == text:

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,8 +14,8 @@ from torch import Tensor
 
 from experiments.ensembles.provenance import flat, preset_and_variant, read_command
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, Preset
-from experiments.problems.task import Task
+from experiments.problems.catalogue import FITTING
+from experiments.problems.task import Preset, Task
 from experiments.reports import error_curves
 from experiments.reports.animation import pixels
 from experiments.reports.html_page import html_page, html_table, html_text
@@ -150,7 +151,10 @@ def _left_out(task: Task, folder: Path) -> str:
     """Say what the setting of the task saves over the source's."""
     if task.renderer is None or task.renderer.full is None:
         return ""
-    found = kept_saving(folder / task.name) or f"not measured: python -m experiments full_setting {folder}"
+    found = (
+        kept_saving(folder / task.name)
+        or f"not measured: python -m experiments full_setting {shlex.quote(str(folder))}"
+    )
     used = f"Used: {task.needs}. Against the full setting of the source: {found}."
     return f"<h3>Left out</h3><p>{html_text(used)}</p>"
 

@@ -69,9 +69,7 @@ def curves(
             axis.set(xscale="log", yscale="log")
             for name, runs in methods.items():
                 band(axis, runs, metric, against, f"{name} ({len(runs)})", chosen[name])
-            for level in LEVELS:
-                axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
-            axis.grid(which="major", alpha=0.3)
+            levels(axis)
         row[0].set_ylabel(f"{metric} error / error at the start")
     for axis, label in zip(axes[1], AXES.values(), strict=True):
         axis.set_xlabel(label)
@@ -105,6 +103,13 @@ def band(axis: Any, runs: Iterable[Run], metric: str, against: str, label: str, 
     grid, (low, middle, high) = quartiles(lines)
     axis.step(grid, middle, where="post", label=label, **style)
     axis.fill_between(grid, low, high, step="post", color=style["color"], alpha=0.12, linewidth=0)
+
+
+def levels(axis: Any) -> None:
+    """Draw a grid, and a line at every error that tables count to."""
+    for level in LEVELS:
+        axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
+    axis.grid(which="major", alpha=0.3)
 
 
 def plain_ticks(axis: Any) -> None:

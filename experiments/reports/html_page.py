@@ -3,6 +3,8 @@
 import html
 from collections.abc import Sequence
 
+from experiments.reports.tables import cell_text
+
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .15em .8em; border-bottom: 1px solid #ddd }
@@ -27,7 +29,5 @@ def html_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def html_text(value: object) -> str:
-    """Return a value, escaped: numbers to three digits, None as a dash."""
-    if value is None:
-        return "-"
-    return html.escape(f"{value:.3g}" if isinstance(value, float) else str(value), quote=True)
+    """Return a value, escaped, as `tables` shows it."""
+    return html.escape(cell_text(value), quote=True)

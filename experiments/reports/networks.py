@@ -4,14 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-import torch
 
 from experiments.problems.network_task import NetworkTask
 from experiments.reports import error_curves, onnx_export, predictions
 from experiments.reports.results import METRICS, load
 from experiments.reports.tables import table
-from experiments.reports.trained_network import Result
-from experiments.runs.records import Files, Outcome, write
+from experiments.reports.trained_network import Result, encoders_of
+from experiments.runs.records import Outcome, write
 
 REDUCTION = 100.0
 """A run succeeds if it divides the held-out parameter error by this."""
@@ -38,10 +37,10 @@ def conclude(task: NetworkTask, outcomes: Sequence[Outcome], out: Path) -> list[
         raise SystemExit(f"no run of {task.name} succeeded")
     print(f"\n{task.name}: {task.size}; rendering what the networks predict", flush=True)
     task.prepare(ended[0].run)
-    results = [_trained(task, one, Files(folder / one.method, one.run).weights) for one in ended]
+    results = [_trained(task, one, out) for one in ended]
     _remember(held_out(task.name, results), folder / HELD_OUT)
     shown = {result.method for result in results}
-    runs = {name: mine for name, mine in load(out).runs[task.name].items() if name in shown}
+    runs = {name: mine for name, mine in load(out, {task.name}).runs[task.name].items() if name in shown}
     error_curves.curves(task.name, runs, folder / "errors.png")
     first = [result for result in results if result.run == results[0].run]
     predictions.draw(task, first, folder / "predictions.png")
@@ -56,10 +55,9 @@ def conclude(task: NetworkTask, outcomes: Sequence[Outcome], out: Path) -> list[
     return results
 
 
-def _trained(task: NetworkTask, outcome: Outcome, weights: Path) -> Result:
-    """Return the result of a run that has ended, from its outcome and the weights of its encoder."""
-    encoder, start = task.encoders(outcome.run)
-    encoder.load_state_dict(torch.load(weights, weights_only=True))
+def _trained(task: NetworkTask, outcome: Outcome, out: Path) -> Result:
+    """Return the result of a run that has ended."""
+    encoder, start = encoders_of(task, outcome, out)
     # Of the held-out images, each before and after training.
     image, parameter = ((error(start), error(encoder)) for error in (task.image_error, task.parameter_error))
     return Result(outcome.method, outcome.run, encoder, start, outcome.seconds, outcome.evaluations, image, parameter)

@@ -41,7 +41,7 @@ def export(encoder: nn.Module, images: Tensor, path: Path) -> float:
             verbose=False,
             input_names=["image"],
             output_names=["parameters"],
-            dynamic_shapes={"image": {0: torch.export.Dim("batch")}},
+            dynamic_shapes=({0: torch.export.Dim("batch")},),
         )
         expected = encoder(images)
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])

@@ -9,7 +9,7 @@ from experiments.problems.network_task import NetworkTask
 from experiments.reports.networks import HELD_OUT
 from experiments.reports.results import load
 from experiments.reports.supplement_figures import Column
-from experiments.runs.records import Files
+from experiments.reports.trained_network import encoders_of, weights_of
 
 PREFERRED = "memory_newton"
 """The method that is shown where several have trained a network."""
@@ -30,17 +30,13 @@ def network_column(folder: Path, name: str, variant: str = "auto") -> Column | N
     if not (folder / name / HELD_OUT).is_file():
         return None
     runs = [run.outcome for mine in load(folder, {name}).runs[name].values() for run in mine]
-    there = [
-        one for one in runs if one.status != "failed" and Files(folder / name / one.method, one.run).weights.exists()
-    ]
+    there = [one for one in runs if one.status != "failed" and weights_of(one, folder).exists()]
     if not there:
         return None
     shown = min(there, key=lambda one: one.method != PREFERRED)  # the first of the preferred method, or of all
     task = catalogue.load(name, shown.settings.get("preset", "fast"), variant)
     assert isinstance(task, NetworkTask)
-    encoder, start = task.encoders(shown.run)
-    weights = Files(folder / name / shown.method, shown.run).weights
-    encoder.load_state_dict(torch.load(weights, weights_only=True))
+    encoder, start = encoders_of(task, shown, folder)
     x = task.parameters(1, torch.Generator().manual_seed(_SEED), held_out=True)
     target = task.image(x)
     with torch.no_grad():

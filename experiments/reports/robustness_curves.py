@@ -7,12 +7,10 @@ import matplotlib as mpl
 
 from experiments.reports import error_curves
 from experiments.reports.results import Run
-from experiments.runs.trial import LEVELS
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 
-_LABELS = {"seconds": "run time [s]", "evaluations": "evaluations"}
 _LINES = ("-", "--", ":", "-.")
 
 
@@ -41,7 +39,7 @@ def draw(
             axis.set_title(titles[sweep], fontsize=9)
         line[0].set_ylabel(f"{method}\nimage error / at the start", fontsize=9)
     for axis in axes[-1]:
-        axis.set_xlabel(_LABELS[against])
+        axis.set_xlabel(error_curves.AXES[against])
     figure.suptitle(f"{task}: median and quartiles")
     figure.savefig(path, dpi=90)
     plt.close(figure)
@@ -55,9 +53,7 @@ def _axis(axis: mpl.axes.Axes, values: Sequence[tuple[str, list[Run]]], against:
         error_curves.band(axis, runs, "image", against, value, style)
     if values:
         error_curves.plain_ticks(axis)
-    for level in LEVELS:
-        axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
-    axis.grid(which="major", alpha=0.3)
+    error_curves.levels(axis)
     if values:
         axis.legend(fontsize=7, frameon=False, loc="lower left")
     else:

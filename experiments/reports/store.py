@@ -63,12 +63,14 @@ def _added(table: pd.DataFrame, name: str) -> pd.DataFrame:
     for one in _ALIKE:
         values = dict.fromkeys(_plain(value) for part in (old, table) for value in part[one])
         if len(values) > 1:
-            raise SystemExit(f"rows of one table must have one {one}, got {', '.join(values)}")
+            raise SystemExit(f"rows of one table must have one {one}, got {', '.join(one or 'none' for one in values)}")
     return pd.concat([old, table], ignore_index=True)
 
 
 def _plain(value: object) -> str:
-    """Return a value as it is in a file: 15 for 15.0."""
+    """Return a value as it is in a file: 15 for 15.0, nothing where there is none."""
+    if pd.isna(value):
+        return ""
     return f"{value:g}" if isinstance(value, Number) else str(value)
 
 
@@ -151,7 +153,7 @@ def _about(task: str, method: str, runs: Sequence[Run]) -> dict[str, Any]:
     known = METHODS.get(method)
     return {
         "task": task,
-        "n": len(runs[0].outcome.x) or None,
+        "n": max(len(run.outcome.x) for run in runs) or None,  # a run whose process died has no point
         "method": method,
         "title": known.title if known else "",
         "uses": known.uses if known else "",

@@ -4,8 +4,6 @@ A run that failed, stopped or ran out of time before it got there has not got th
 `share`. Medians are over the runs that got there, and there is none if these are fewer than half.
 """
 
-import csv
-import io
 import json
 import statistics
 from collections import Counter
@@ -128,12 +126,8 @@ def as_json(summary: Summary) -> str:
 
 
 def as_csv(summary: Summary) -> str:
-    out = io.StringIO()
-    rows = [asdict(row) for row in summary.rows]
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return out.getvalue().rstrip("\n")
+    text: str = pd.DataFrame(summary.rows).to_csv(index=False, lineterminator="\n")
+    return text.rstrip("\n")
 
 
 def as_table_2(summary: Summary) -> str:
@@ -204,7 +198,7 @@ def table(
     /,
     format: Literal["text", "csv", "json", "table_2"] = "text",
     reference: str | None = None,
-    methods: str | None = None,
+    methods: str = "all",
 ) -> None:
     """Print how many evaluations and seconds every method took, with ratios to the reference and failed runs.
 
@@ -217,7 +211,7 @@ def table(
     """
     results = load(folder)
     there = sorted({method for runs in results.runs.values() for method in runs})
-    wanted = chosen("methods", methods.split(","), there) if methods is not None else there
+    wanted = there if methods.strip() == "all" else chosen("methods", methods.split(","), there)
     if reference is not None:
         (reference,) = chosen("reference", [reference], wanted)
     summary = summarize(results, reference, wanted)

@@ -14,14 +14,13 @@ import matplotlib as mpl
 import torch
 from torch import Tensor
 
-from experiments.problems.rendered import shown
 from experiments.problems.scenes.bunny import IN_MIRRORS, in_mirrors
 from experiments.problems.scenes.caustic import COEFFICIENTS, basis
-from experiments.problems.scenes.meshes import rgb
+from experiments.problems.scenes.parts import rgb
+from experiments.problems.srgb import shown
 from experiments.reports.animation import Look, Trace, pixels
-from experiments.reports.error_curves import AXES, band, plain_ticks
+from experiments.reports.error_curves import AXES, band, levels, plain_ticks
 from experiments.reports.results import Run
-from experiments.runs.trial import LEVELS
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 mpl.use("Agg")
@@ -83,19 +82,19 @@ def _band(figure: Any, shown: Sequence[Column], across: int, method: str | None)
 
 
 def descents(groups: Mapping[str, Sequence[Trace]], path: Path) -> None:
-    """Draw figures 7 and 8: errors of an ensemble, and where a task has two parameters the ways of its runs from above.
+    """Draw figures 7 and 8: errors of an ensemble and, where a task has two parameters, trajectories over its loss.
 
     groups: runs on one task, by what they have in common; dashed where the name begins with "first".
     """
     task = next(iter(groups.values()))[0].task
-    ways = list(groups) if task.n == 2 else []
-    figure = plt.figure(figsize=(3.1 * len(ways) + 9, 3.6), layout="constrained")
-    axes: Any = figure.subplots(1, len(ways) + 2, width_ratios=[1.0] * len(ways) + [1.4, 1.4], squeeze=False)[0]
+    planes = list(groups) if task.n == 2 else []
+    figure = plt.figure(figsize=(3.1 * len(planes) + 9, 3.6), layout="constrained")
+    axes: Any = figure.subplots(1, len(planes) + 2, width_ratios=[1.0] * len(planes) + [1.4, 1.4], squeeze=False)[0]
     colors = {name: f"C{k}" for k, name in enumerate(groups)}
-    for axis, name in zip(axes, ways, strict=False):
-        _ways(axis, groups[name], colors[name])
+    for axis, name in zip(axes, planes, strict=False):
+        _trajectories(axis, groups[name], colors[name])
         axis.set_title(name, fontsize=9)
-    for axis, (against, label) in zip(axes[len(ways) :], AXES.items(), strict=True):
+    for axis, (against, label) in zip(axes[len(planes) :], AXES.items(), strict=True):
         axis.set(xscale="log", yscale="log", xlabel=label, ylabel="error / at the start: median, quartiles")
         for name, found in groups.items():
             style = {"color": colors[name], "linestyle": "--" if name.startswith("first") else "-"}
@@ -107,8 +106,8 @@ def descents(groups: Mapping[str, Sequence[Trace]], path: Path) -> None:
     save_small(figure, path)
 
 
-def _ways(axis: Any, found: Sequence[Trace], color: str) -> None:
-    """Draw the ways of runs over the bands of the loss."""
+def _trajectories(axis: Any, found: Sequence[Trace], color: str) -> None:
+    """Draw the trajectories of runs over contours of the loss."""
     task = found[0].task
     places = torch.cat([torch.stack(one.points) for one in found])
     low, high = task.bounds or (places.amin(0), places.amax(0))
@@ -211,10 +210,8 @@ def _errors(axis: Any, runs: Sequence[Trace]) -> None:
         rows = [(record.evaluations, error) for record, error in zip(one.records, one.error, strict=True)][1:]
         if rows:
             axis.step(*zip(*rows, strict=True), where="post", label=one.method)
-    for level in LEVELS:
-        axis.axhline(1 - level, color="grey", linewidth=0.8, linestyle=":")
+    levels(axis)
     axis.set(xscale="log", yscale="log", xlabel="evaluations", ylabel="image error / at the start")
-    axis.grid(which="major", alpha=0.3)
     if axis.get_legend_handles_labels()[0]:
         axis.legend(fontsize=8, frameon=False)
     plain_ticks(axis)

@@ -16,7 +16,7 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
         plane wave    0.123
         step              -
     """
-    cells = [[_text(value) for value in row] for row in rows]
+    cells = [[cell_text(value) for value in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(headers, *cells, strict=True)]
     right = [all(not isinstance(row[i], str) for row in rows) for i in range(len(headers))]
     lines = [list(headers), ["-" * width for width in widths], *cells]
@@ -44,7 +44,7 @@ class Printer:
 
     def __call__(self, row: Sequence[object]) -> None:
         """Print a row; the first one comes with title and headers."""
-        for line in (*self._lines, self._line([_text(value) for value in row])):
+        for line in (*self._lines, self._line([cell_text(value) for value in row])):
             tqdm.write(line)
         sys.stdout.flush()
         self._lines = []
@@ -53,7 +53,8 @@ class Printer:
         return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True)).rstrip()
 
 
-def _text(value: object) -> str:
+def cell_text(value: object) -> str:
+    """Return a value as a table shows it: numbers to three digits, thousands without an exponent, `None` as a dash."""
     if value is None:
         return "-"
     if isinstance(value, float):

@@ -5,6 +5,7 @@ returns, or goes on until `trial.loss` or `trial.image` raise `Finished`. It has
 
     trial.encoder                 network, images [B, 3, h, w] -> parameters [B, n], with the weights of this run
     trial.images                  training images [N, 3, h, w], in the order of use
+    trial.batch(step, count)      the images of a step: the next so many, from the first again after the last
     trial.loss(x, images)         black box with the loss after it: [K, n], [K, 3, h, w] -> [K], for K evaluations
     trial.image(x)                the black box alone: [K, n] -> [K, 3, h, w], for K evaluations
     trial.remaining               evaluations left; a call that needs more ends the run
@@ -22,6 +23,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from experiments.problems.network_task import NetworkTask
@@ -54,6 +56,10 @@ class NetworkTrial(Run):
         """[N, 3, h, w]."""
         self.encoder, _ = task.encoders(run)
         self._row(lambda: (task.image_error(self.encoder), task.parameter_error(self.encoder)), None, None)
+
+    def batch(self, step: int, count: int) -> Tensor:
+        """Return the images [count, 3, h, w] of a step: all steps together go through the images in turn."""
+        return self.images[torch.arange(step * count, (step + 1) * count) % len(self.images)]
 
     def loss(self, x: Tensor, images: Tensor) -> Tensor:
         """Return the losses [K] of predictions [K, n] for images [K, 3, h, w], for K evaluations."""

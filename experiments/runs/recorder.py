@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.runs.journal import DivergedError, Entry, Journal
+from experiments.runs.journal import DivergedError, Journal
 from experiments.runs.records import Files, Log, Record
 
 
@@ -57,7 +57,7 @@ class Recorder:
     def evaluate(self, fn: Callable[..., Tensor], x: Tensor, *aux: Tensor) -> Tensor:
         """Return fn(x [K, n], *aux) without derivatives: K evaluations."""
         self._clock.start()
-        entry = self._replayed(x)
+        entry = self._journal.replay(x) if self._journal else None
         if entry is None:
             if self._skip and any(self._missed):
                 self._skip(*self._missed)
@@ -109,10 +109,6 @@ class Recorder:
         self._clock.start()
         return record
 
-    def stop(self) -> None:
-        """Stop the clock: what follows is not counted, up to the next evaluation."""
-        self._clock.stop()
-
     def close(self, *, ended: bool) -> None:
         """Close the files; the journal of a run that has ended is not needed any more."""
         self._clock.stop()
@@ -120,9 +116,6 @@ class Recorder:
             self._log.close()
         if self._journal:
             (self._journal.delete if ended else self._journal.close)()
-
-    def _replayed(self, x: Tensor) -> Entry | None:
-        return self._journal.replay(x) if self._journal else None
 
 
 class Clock:

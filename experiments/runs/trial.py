@@ -69,7 +69,7 @@ class Trial(Run):
         adjoint = renderer.adjoint
         if adjoint is None or integrator not in renderer.adjoints:
             known = ", ".join(renderer.adjoints) or "none"
-            raise ValueError(f"integrator must be one of {self.task.name}, {known}, got {integrator}")
+            raise ValueError(f"integrator must be one that {self.task.name} has ({known}), got {integrator}")
 
         def both(points: Tensor) -> Tensor:
             value, gradient = adjoint(points[0], integrator, seed)

@@ -20,6 +20,7 @@ import torch_zerohess as zh
 from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
+from experiments.runs.records import write
 from experiments.studies.bench_memory import memory_ratios
 from experiments.studies.bench_ratios import Ratio, ratios
 from torch_zerohess.estimation import perturbations
@@ -118,11 +119,10 @@ def bench(
     report = BenchReport(timings, memory, compared)
     _print(report)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         rows = [{**asdict(t), "ratio": t.ratio} for t in timings]
         against = [{**asdict(r), "ratio": r.ratio} for r in compared]
         memories = [asdict(m) for m in memory]
-        out.write_text(json.dumps({"timings": rows, "memory": memories, "ratios": against}, indent=1))
+        write(out, json.dumps({"timings": rows, "memory": memories, "ratios": against}, indent=1))
     if store is not None:
         print(keep(*_table(report), store))
         if compared:

@@ -5,6 +5,7 @@ evaluations. The black box is an affine map onto the pixels of MUG, which takes 
 """
 
 import time
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -32,7 +33,7 @@ def memory_ratios(evaluations: int, repeats: int) -> list[Ratio]:
     return [row for n in SIZES for row in _rows(n, evaluations, repeats, lambda: mug.loss(x))]
 
 
-def _rows(n: int, evaluations: int, repeats: int, render: object) -> list[Ratio]:
+def _rows(n: int, evaluations: int, repeats: int, render: Callable[[], object]) -> list[Ratio]:
     generator = torch.Generator().manual_seed(0)
     slope = torch.randn(n, *_PIXELS, generator=generator) / n**0.5
 
@@ -58,7 +59,6 @@ def _rows(n: int, evaluations: int, repeats: int, render: object) -> list[Ratio]
     def without() -> object:
         return torch.autograd.grad(plain(x[:_FRESH], references[:_FRESH]).mean(), x)
 
-    assert callable(render)
     longer, shorter = in_turn(with_memory, without, repeats)
     one, _ = in_turn(render, without, repeats)
     added = max(longer - shorter, 1e-9)

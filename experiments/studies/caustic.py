@@ -6,7 +6,7 @@ which depends on the angle, and its photons are random.
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,9 @@ import tyro
 from torch import Tensor
 
 from experiments.problems.scenes.caustic import COEFFICIENTS, INDEX, basis
-from experiments.problems.scenes.meshes import grid, mi_mesh
+from experiments.problems.scenes.meshes import Surface, grid
+from experiments.problems.scenes.parts import mi_mesh, rgb
+from experiments.problems.task import Preset
 from experiments.problems.tasks import caustic
 from experiments.runs.records import Files, read_outcome
 from torch_zerohess.adapters.mitsuba_variants import select_variant
@@ -33,7 +35,7 @@ def check_caustic(
     /,
     method: str = "block_gauss_newton",
     run: int = 0,
-    preset: Literal["fast", "paper"] = "fast",
+    preset: Preset = "fast",
     spp: int = 1000,
     variant: str = "auto",
 ) -> float:
@@ -103,18 +105,18 @@ def description(mi: Any, x: Tensor, side: int) -> dict[str, Any]:
         "beam": {
             "type": "rectangle",
             "to_world": place().translate([0.5, 0.5, beneath]) @ place().scale([0.5, 0.5, 1]),
-            "emitter": {"type": "directionalarea", "radiance": {"type": "rgb", "value": float(np.pi)}},
+            "emitter": {"type": "directionalarea", "radiance": rgb(float(np.pi))},
         },
         "surface": mi_mesh(mi, "surface", surface(x), glass),
         "screen": {
             "type": "rectangle",
             "to_world": place().translate(middle) @ place().rotate([1, 0, 0], 180) @ place().scale([0.5, 0.5, 1]),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
+            "bsdf": {"type": "diffuse", "reflectance": rgb(1.0)},
         },
     }
 
 
-def surface(x: Tensor, patches: int = 8) -> tuple[Array, Array, npt.NDArray[np.uint32]]:
+def surface(x: Tensor, patches: int = 8) -> Surface:
     """Return vertices, exact normals and triangles of the surface of a slab of coefficients x [1024], facing along z.
 
     Every patch of the spline is cut into `patches`^2 squares.

@@ -53,9 +53,7 @@ def coverage(*, seed: int = 0, repeats: int = 2000) -> list[Coverage]:
             for baseline in ("center", "mean", "none"):
                 for antithetic in (True, False):
                     for draws in (4, 16):
-                        settings = dict(
-                            zip(("proposal", "sampler", "baseline"), (proposal, sampler, baseline), strict=True)
-                        )
+                        settings = {"proposal": proposal, "sampler": sampler, "baseline": baseline}
                         rows += _rows(settings, antithetic, draws, seed, repeats)
     return rows
 

@@ -4,14 +4,15 @@
 |---|---|
 | 6 | densities and inverse CDFs of all lobes, with histograms of draws |
 | 7 | BRDF: first and second order, with exact and with sampled derivatives |
-| 8 | NONPSD: the same, and the ways of the runs |
+| 8 | NONPSD: the same, and the trajectories of the runs |
 | 9 | all tasks: start, end, target; networks are trained with few renders |
 | 10 | robustness on MUG: pairs, samples per pixel, JPEG quality |
 | 11 | variance of uniform, aggregate and optimal sampling against samples per element, and against evaluations |
 | 12 | CAUSTIC |
 | 13 | MIRROR |
 
-Figures 9, 12 and 13 come from `gallery`, figure 10 from `robustness`. Runs of 7 and 8 have 20 starts.
+Figure 9 comes from `gallery`, which draws figures 12 and 13 too, and figure 10 from `robustness`. Runs of 7 and 8 have
+20 starts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,10 +26,11 @@ import tyro
 from experiments.ensembles.ensemble import Ensemble
 from experiments.methods import METHODS
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, Preset, chosen
+from experiments.problems.catalogue import chosen
 from experiments.problems.network_task import NetworkTask
+from experiments.problems.task import Preset
 from experiments.reports import supplement_figures
-from experiments.reports.animation import Trace
+from experiments.reports.animation import Trace, finer
 from experiments.reports.medians import medians, objects, reached
 from experiments.reports.networks import conclude
 from experiments.reports.progress import progress
@@ -38,7 +40,7 @@ from experiments.runs.trial import LEVELS
 from experiments.studies import lobes
 from experiments.studies.estimator_curves import draw_operators, orders
 from experiments.studies.estimators import FIRST_ORDER, OPERATORS
-from experiments.studies.gallery import gallery, trace
+from experiments.studies.gallery import figure_of, gallery, runs_of, trace, traces
 from experiments.studies.robustness import robustness
 from experiments.studies.variance import variance
 
@@ -153,24 +155,26 @@ def _tasks(setting: Setting) -> None:
         task = catalogue.load(name, setting.preset, setting.variant, 1)
         assert isinstance(task, NetworkTask)
         conclude(task, outcomes, folder)
-    _gallery(setting, folder=folder)
-
-
-def _gallery_of(name: str) -> Callable[[Setting], None]:
-    return lambda setting: _gallery(setting, (name,))
-
-
-def _gallery(setting: Setting, tasks: tuple[str, ...] = tuple(FITTING), folder: Path | None = None) -> None:
-    folder = folder or setting.out
     gallery(
         folder,
-        tasks=tasks,
         run=setting.seed,
         limit=setting.limit,
         preset=setting.preset,
         out=setting.out,
         variant=setting.variant,
     )
+
+
+def _alone(name: str) -> Callable[[Setting], None]:
+    """Return what draws the figure of one task, and leaves the overview of all tasks as it is."""
+
+    def draw(setting: Setting) -> None:
+        for found, seen in traces([name], None, setting.seed, setting.limit, setting.preset, setting.variant):
+            still = finer(found.task, seen)
+            paths = figure_of(found, still, setting.out, setting.limit, setting.variant)
+            print(table(*runs_of([(found, seen)])), *paths, sep="\n")
+
+    return draw
 
 
 def _robustness(setting: Setting) -> None:
@@ -208,6 +212,6 @@ FIGURES: Mapping[str, Callable[[Setting], None]] = {
     "9": _tasks,
     "10": _robustness,
     "11": _variance,
-    "12": _gallery_of("caustic"),
-    "13": _gallery_of("mirror"),
+    "12": _alone("caustic"),
+    "13": _alone("mirror"),
 }

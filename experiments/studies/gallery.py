@@ -23,8 +23,8 @@ from experiments.ensembles.provenance import machine
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, Preset, chosen
-from experiments.problems.task import Task
+from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, chosen
+from experiments.problems.task import Preset, Task
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
 from experiments.reports.html_page import html_page, html_table, html_text
@@ -100,7 +100,7 @@ def gallery(
     ]
     page = out / "index.html"
     page.write_text(_page(shown, files), encoding="utf-8")
-    print("\n" + table(*_table(shown)))
+    print("\n" + table(*runs_of(shown)))
     print("\n" + "\n".join(f"{path} {path.stat().st_size / 1000:.0f} kB" for path in [*files, page]))
     return [found for found, _ in shown]
 
@@ -108,6 +108,7 @@ def gallery(
 def traces(
     names: Sequence[str], method: str | None, run: int, limit: float, preset: Preset, variant: str
 ) -> list[Shown]:
+    """Run the recommended method, or another one, on every task that can be shown; a line names those left out."""
     shown = []
     bar = progress(names, "tasks")
     for name in bar:
@@ -166,18 +167,25 @@ def _figures(shown: Sequence[Shown], trained: Sequence[Column], out: Path, limit
     stills = [(found, finer(found.task, seen)) for found, seen in progress(shown, "stills")]
     supplement_figures.overview([*(Column.of(*one) for one in stills), *trained], files[0])
     for found, seen in stills:
-        if found.task.name == "caustic":
-            other = METHODS[OTHER]
-            more = None
-            if other.name != found.method and not other.unusable(found.task):
-                with tqdm(desc=f"caustic {OTHER}", bar_format="{desc}: [{elapsed}{postfix}]") as bar:
-                    more = trace(found.task, other, found.outcome.run, limit, _watch(bar))
-            files.append(out / "figure12.png")
-            supplement_figures.caustic(found, seen, more, files[-1])
-        if found.task.name == "mirror":
-            files.append(out / "figure13.png")
-            supplement_figures.mirrors(found, seen, supplement_figures.mirrors_from_outside(variant), files[-1])
+        files += figure_of(found, seen, out, limit, variant)
     return files
+
+
+def figure_of(found: Trace, seen: Look, out: Path, limit: float, variant: str) -> list[Path]:
+    """Write the figure that shows one task alone: 12 of CAUSTIC, 13 of MIRROR, none of any other task."""
+    if found.task.name == "caustic":
+        other = METHODS[OTHER]
+        more = None
+        if other.name != found.method and not other.unusable(found.task):
+            with tqdm(desc=f"caustic {OTHER}", bar_format="{desc}: [{elapsed}{postfix}]") as bar:
+                more = trace(found.task, other, found.outcome.run, limit, _watch(bar))
+        supplement_figures.caustic(found, seen, more, out / "figure12.png")
+        return [out / "figure12.png"]
+    if found.task.name == "mirror":
+        outside = supplement_figures.mirrors_from_outside(variant)
+        supplement_figures.mirrors(found, seen, outside, out / "figure13.png")
+        return [out / "figure13.png"]
+    return []
 
 
 def _animations(shown: Sequence[Shown], out: Path, count: int) -> list[Path]:
@@ -204,7 +212,8 @@ def _predictions(folder: Path, out: Path) -> list[Path]:
     return files
 
 
-def _table(shown: Sequence[Shown]) -> tuple[list[str], list[list[object]]]:
+def runs_of(shown: Sequence[Shown]) -> tuple[list[str], list[list[object]]]:
+    """Return headers and a row per task: how its run ended."""
     headers = ["task", "n", "method", "evaluations", "seconds", "image error", "parameter error", "picture", "ended"]
     rows: list[list[object]] = []
     for found, seen in shown:
@@ -248,6 +257,6 @@ def _page(shown: Sequence[Shown], files: Sequence[Path]) -> str:
     about = ", ".join(f"{name} {value}" for name, value in machine().items())
     body = (
         f"{pictures}<h2>Runs</h2><p>Image errors are relative to the start, parameter errors root mean squares in the "
-        f"units of the task; seconds of one run on: {html_text(about)}.</p>{html_table(*_table(shown))}"
+        f"units of the task; seconds of one run on: {html_text(about)}.</p>{html_table(*runs_of(shown))}"
     )
     return html_page("Gallery", _STYLE, body)

@@ -1,9 +1,10 @@
 """`python -m experiments gradients`: derivatives by the renderer and by sampling, against the truth.
 
 Truth is a narrow central difference of renders with many samples per pixel, whose noise is the same on both sides.
-Each gradient is of the task's own render with few samples; its cosine to the truth, its relative error and its cosine
-to the way from the solution (1: a step against it leads straight to the solution) are medians over repetitions with
-other seeds. A gradient that is exactly zero has no direction: its cosine is 0.
+Each gradient is of the task's own render with few samples. Three measures of it are medians over repetitions with
+other seeds: its cosine to the truth, its relative error, and its cosine to x - solution ("way"). If the cosine to x -
+solution is 1, a step against the gradient leads straight to the solution. A gradient that is exactly zero has no
+direction: its cosine is 0.
 
 The loss may have ripples, on MUG one per degree from the facets of the handle. The exact derivative then leads astray.
 A sampled derivative is the derivative of the smoothed loss. It is not the exact one, and may lead to the solution.
@@ -25,9 +26,9 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.ensembles.kept_parts import KeptParts
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.rendered import RenderedTask
 from experiments.problems.scenes.adjoint import resolved
+from experiments.problems.task import Preset
 from experiments.reports.progress import progress
 from experiments.reports.tables import Printer
 
@@ -51,7 +52,7 @@ class GradientError:
     error: float
     """Relative."""
     way: float
-    """Cosine to the way from the solution."""
+    """Cosine to x - solution."""
     milliseconds: float
 
 

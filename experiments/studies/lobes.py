@@ -83,36 +83,23 @@ def _mean(*densities: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
 
 
 def _points(
-    count: int, seed: int, n: int, proposal: Literal["aggregate", "gaussian", "fr22", "uniform"], order: int = 2
+    count: int,
+    seed: int,
+    n: int,
+    proposal: Literal["aggregate", "fr22", "optimal", "uniform"],
+    order: Literal[1, 2] = 2,
 ) -> Tensor:
-    """Perturbations [count, n] of an estimate at 0 with sigma 1."""
+    """Perturbations [sets * count, n] of an estimate at 0 with sigma 1; only "optimal" has more than one set."""
     smoothing = zh.Smoothing(
-        sigma=1.0,
-        samples=count,
-        proposal=proposal,
-        antithetic=False,
-        baseline="none",
-        order=1 if order == 1 else 2,
-        seed=seed,
+        sigma=1.0, samples=count, proposal=proposal, antithetic=False, baseline="none", order=order, seed=seed
     )
-    return _drawn(smoothing, n)
-
-
-def _drawn(smoothing: zh.Smoothing, n: int) -> Tensor:
     x = torch.zeros(n, dtype=torch.float64)
     return zh.estimate(lambda z: z.sum(1), x, smoothing, value="smoothed").points.reshape(-1, n)
 
 
 def _of_element(number: int) -> Callable[[int, int], Tensor]:
     """Draw from the set of samples of one element of optimal sampling for two parameters, [count, 2]."""
-
-    def draw(count: int, seed: int) -> Tensor:
-        smoothing = zh.Smoothing(
-            sigma=1.0, samples=count, proposal="optimal", antithetic=False, baseline="none", order=2, seed=seed
-        )
-        return _drawn(smoothing, 2).reshape(_SETS, count, 2)[number]
-
-    return draw
+    return lambda count, seed: _points(count, seed, 2, "optimal").reshape(_SETS, count, 2)[number]
 
 
 def _first(draw: Callable[[int, int], Tensor]) -> Callable[[int, int], Tensor]:

@@ -1,10 +1,10 @@
 """The smoothed objectives of `losses` along the line from the solution of a task through its start."""
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -75,12 +75,13 @@ def _fall(values: Sequence[float]) -> float:
 
 def write_csv(biases: Sequence[Bias], path: Path) -> None:
     """Write a row per position of every curve."""
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["task", "sigma", "loss", "form", "position", "value"])
-        for bias in biases:
-            for position, value in zip(POSITIONS, bias.values, strict=True):
-                rows.writerow([bias.task, bias.sigma, bias.loss, bias.form, position, value])
+    rows = [
+        (bias.task, bias.sigma, bias.loss, bias.form, position, value)
+        for bias in biases
+        for position, value in zip(POSITIONS, bias.values, strict=True)
+    ]
+    columns = ["task", "sigma", "loss", "form", "position", "value"]
+    pd.DataFrame(rows, columns=columns).to_csv(path, index=False, lineterminator="\n")
 
 
 def draw(biases: Sequence[Bias], path: Path) -> None:

@@ -93,6 +93,8 @@ def optimizers(
         out: folder; runs that the same code has made there are not made again.
         store: name under which the table is kept for the documents, as experiments/results/NAME.csv.
     """
+    if runs < 1 or budget < 1 or not limit > 0:
+        raise SystemExit(f"runs and budget must be at least 1, limit positive, got {runs}, {budget} and {limit:g}")
     if store is not None:
         may_keep(store)
     torch.set_num_threads(1)
@@ -148,11 +150,11 @@ def _again(trial: Trial, method: Method) -> None:
 
 def report(done: Mapping[Job, Reached]) -> str:
     """Return the table of shares as text."""
-    return table(HEADERS, [[one if isinstance(one, str) else f"{one:.3g}" for one in row] for row in rows(done)])
+    return table(HEADERS, rows(done))
 
 
 def rows(done: Mapping[Job, Reached]) -> list[list[object]]:
-    """Return the rows of the table of shares, a row per number of parameters and method."""
+    """Return a row per number of parameters and method; None for more evaluations than the runs could use."""
     groups: dict[tuple[int, str], list[tuple[Job, Reached]]] = defaultdict(list)
     for job, result in done.items():
         groups[job.n, job.method].append((job, result))
@@ -168,7 +170,11 @@ def _named(n: int, method: str) -> str:
 
 def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[object]]:
     for (n, method), group in groups.items():
-        shares = [sum(one.share(min(budget, job.budget) * n) for job, one in group) / len(group) for budget in BUDGETS]
+        most = group[0][0].budget
+        shares = [
+            sum(one.share(budget * n) for _, one in group) / len(group) if budget <= most else None
+            for budget in BUDGETS
+        ]
         # A run that has reached the finest target has ended there.
         used = sum(
             one.evaluations[-1] if len(one.evaluations) == len(bbob.TARGETS) else job.budget * n for job, one in group

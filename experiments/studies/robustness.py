@@ -5,7 +5,6 @@ says what differs, run and logged as any other, so that `table`, `plot` and `rep
 same in several sweeps is run once. Errors are measured on the unchanged task, see `experiments.problems.variations`.
 """
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -15,12 +14,13 @@ from typing import Annotated, Any
 import pandas as pd
 import tyro
 
-from experiments.ensembles.ensemble import Ensemble, ordered
+from experiments.ensembles.ensemble import Ensemble, ordered, settings_by_method
+from experiments.ensembles.processes import Job
 from experiments.ensembles.provenance import register
-from experiments.ensembles.workers import Job
 from experiments.methods import METHODS
 from experiments.methods.settings import settings as settings_of
-from experiments.problems.catalogue import FITTING, Preset, chosen
+from experiments.problems.catalogue import FITTING, chosen
+from experiments.problems.task import Preset
 from experiments.problems.variations import Change
 from experiments.problems.variations import load as load_varied
 from experiments.reports import robustness_curves
@@ -152,7 +152,7 @@ def robustness(
         if not planned:
             raise SystemExit("no sweep of this command applies to these tasks and methods")
         todo = {(one.varied, one.method, job.run): job for one, many in planned for job in many}
-        register(out, _settings(list(todo.values())))
+        register(out, settings_by_method(todo.values()))
         ensemble.run(ordered(todo.values()))
     except ImportError as error:
         raise SystemExit(str(error)) from None
@@ -163,7 +163,7 @@ def robustness(
     found = {cell: _runs(results, cell, ensemble.runs) for cell in cells}
     rows = [row(cell, runs) for cell, runs in found.items() if runs]
     print("\n" + as_text(rows))
-    write_csv(rows, out / "robustness.csv")
+    pd.DataFrame(rows).to_csv(out / "robustness.csv", index=False, lineterminator="\n")
     print(f"\n{out / 'robustness.csv'}")
     for name in names:
         mine = [(cell.method, cell.sweep, cell.value, runs) for cell, runs in found.items() if cell.task == name]
@@ -227,6 +227,7 @@ def _jobs(
     own = own if change.pairs is None else {**own, "samples": change.pairs}
     settings = {
         "preset": ensemble.preset,
+        "variant": ensemble.variant,
         "level": LEVELS[-1],
         "limit": ensemble.limit,
         "evaluations": task.evaluations,
@@ -236,13 +237,6 @@ def _jobs(
     }
     given = (ensemble.preset, ensemble.variant, ensemble.limit, settings, own, task.evaluations)
     return [Job(task, method, run, ensemble.folder, *given) for run in ensemble.runs]
-
-
-def _settings(jobs: Sequence[Job]) -> dict[str, dict[str, dict[str, Any]]]:
-    found: dict[str, dict[str, dict[str, Any]]] = {}
-    for job in jobs:
-        found.setdefault(job.task_name, {})[job.method_name] = job.settings
-    return found
 
 
 def _runs(results: Results, cell: Cell, numbers: range) -> list[Run]:
@@ -260,7 +254,11 @@ def row(cell: Cell, runs: Sequence[Run]) -> Row:
     """Return the medians of the runs of a cell."""
     there = medians(reached([((), runs)], ()), ("metric", "level"))
     first, second = objects(there[(there["metric"] == "image") & there["level"].isin([LEVELS[0], LEVEL])])
-    ends = [(run.error("image")[-1], run.records[-1].parameter_error) for run in runs if run.records]
+    ends = [
+        (_at_end(run.error("image")), _at_end([record.parameter_error for record in run.records]))
+        for run in runs
+        if run.records
+    ]
     errors = pd.DataFrame(ends, columns=["image", "parameter"], dtype=float)
     image, parameter = errors["image"].median(), errors["parameter"].pow(0.5).median()
     evaluations, seconds = ([second[f"{name}{end}"] for end in ("", "_low", "_high")] for name in MEASURES)
@@ -270,6 +268,13 @@ def row(cell: Cell, runs: Sequence[Run]) -> Row:
         None if math.isnan(image) else float(image),
         None if math.isnan(parameter) else float(parameter),
     )
+
+
+def _at_end(errors: Sequence[float | None]) -> float:
+    """Return the last error: infinite for a run that diverged, NaN where the task has no such error."""
+    if errors[0] is None:
+        return math.nan
+    return math.inf if errors[-1] is None else errors[-1]
 
 
 def as_text(rows: Sequence[Row]) -> str:
@@ -288,10 +293,3 @@ def as_text(rows: Sequence[Row]) -> str:
         ]
         parts.append(f"{task}, {SWEEPS[sweep].title}\n{table(headers, cells)}")
     return "\n\n".join(parts)
-
-
-def write_csv(rows: Sequence[Row], path: Path) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(Row.__dataclass_fields__), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(asdict(one) for one in rows)

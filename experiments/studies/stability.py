@@ -1,7 +1,7 @@
 """Accuracy against closed forms where arithmetic is hard: extreme scales, offsets, rounding, conditioning, sizes.
 
 A second table has the shares of confidence intervals that contain the truth: see `coverage`. A third one has searches
-on hard functions: see `stability_optimizers`.
+on hard functions: see `stability_searches`.
 
 Errors are dimensionless (gradients times sigma, Hessians times sigma squared) and in units of the standard error that
 the estimate itself reports. What exceeds five of them plus the rounding allowance is wrong; for more than a hundred
@@ -25,9 +25,10 @@ import torch_zerohess as zh
 from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
+from experiments.runs.records import write
 from experiments.studies.coverage import coverage
 from experiments.studies.stability_cases import Case, cases
-from experiments.studies.stability_optimizers import searches
+from experiments.studies.stability_searches import searches
 
 _MOST_STANDARD_ERRORS = 5.0
 _MOST_RMS_STANDARD_ERRORS = 2.0
@@ -67,9 +68,13 @@ def stability(
         largest: parameters of the largest case.
         repeats: of every setting whose intervals are counted.
         runs: of every search on every hard case; 0 leaves them out.
+<<<<<<< HEAD
         out: JSON file to write.
         store: name of the table of cases that is kept under experiments/results, for the documents; intervals and
             searches are kept as NAME_intervals and NAME_searches.
+=======
+        out: JSON file to write, with all three tables.
+>>>>>>> wt6-exp
 
     Raises:
         SystemExit: with status 1, if something is wrong.
@@ -78,6 +83,7 @@ def stability(
         may_keep(store)
     rows = [row for case in progress(cases(largest), "cases") for row in _rows(case, seed)]
     shares = coverage(seed=seed, repeats=repeats)
+<<<<<<< HEAD
     wrong = [row for row in rows if row.verdict.startswith("WRONG")]
     found = searches(runs=runs, seed=seed) if runs else []
     made = {
@@ -104,6 +110,20 @@ def stability(
     if store is not None:
         for suffix, (headers, cells) in made.items():
             print(keep(headers, cells, store + suffix))
+=======
+    headers = ["case", "quantity", "relative error", "standard errors", "seconds", "verdict"]
+    print(table(headers, [list(asdict(row).values()) for row in rows]))
+    wrong = [row for row in rows if row.verdict.startswith("WRONG")]
+    print(f"\n{len(rows) - len(wrong)} of {len(rows)} right\n")
+    headers = [f"{repeats} intervals of", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
+    print(table(headers, [one.cells() for one in shares]))
+    found = searches(runs=runs, seed=seed) if runs else []
+    headers = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
+    print(f"\nSearches, {runs} runs each\n\n{table(headers, [list(asdict(one).values()) for one in found])}")
+    if out is not None:
+        tables: dict[str, list[Any]] = {"accuracy": rows, "coverage": shares, "searches": found}
+        write(out, json.dumps({name: [asdict(one) for one in part] for name, part in tables.items()}, indent=1))
+>>>>>>> wt6-exp
     outside = [one for one in shares if one.verdict.startswith("WRONG")]
     false = [one for one in found if one.verdict.startswith("WRONG")]
     if wrong or outside or false:
@@ -144,7 +164,7 @@ def _rows(case: Case, seed: int) -> list[Accuracy]:
     noise = _EPS[torch.float32 if case.single_values else torch.float64]
 
     def row(
-        quantity: str, found: Callable[[], Tensor], spread: Callable[[], Tensor], true: Tensor, scale: Tensor
+        quantity: str, found: Callable[[], Tensor], spread: Callable[[], Tensor], true: Tensor, scale: Any
     ) -> Accuracy:
         begin = time.perf_counter()
         if case.refused == "Hessian" and quantity.startswith("Hessian"):
@@ -156,45 +176,21 @@ def _rows(case: Case, seed: int) -> list[Accuracy]:
         allowance = 4 * noise * largest + 4 * _EPS[x.dtype] * true.abs()
         return _judge(case.name, quantity, result, reported, true, allowance, seconds)
 
-    one = torch.ones((), dtype=torch.float64)
+    def spread(quantity: Any, v: Tensor | None = None) -> Callable[[], Tensor]:
+        return lambda: estimate.standard_error(quantity, v)
+
+    form, value = case.form, case.form.value(x, sigma) + case.offset
     rows = [
-        row(
-            "value",
-            lambda: estimate.value,
-            lambda: estimate.standard_error("value"),
-            case.form.value(x, sigma) + case.offset,
-            one,
-        ),
-        row(
-            "gradient",
-            lambda: estimate.gradient,
-            lambda: estimate.standard_error("gradient"),
-            case.form.gradient(x, sigma),
-            sigma,
-        ),
-        row(
-            "HVP",
-            lambda: estimate.hvp(used),
-            lambda: estimate.standard_error("hvp", used),
-            case.form.hvp(x, sigma, used),
-            sigma,
-        ),
+        row("value", lambda: estimate.value, spread("value"), value, 1.0),
+        row("gradient", lambda: estimate.gradient, spread("gradient"), form.gradient(x, sigma), sigma),
+        row("HVP", lambda: estimate.hvp(used), spread("hvp", used), form.hvp(x, sigma, used), sigma),
     ]
     if n <= _FEW:
-        hessian = case.form.hessian(x, sigma)
-        rows.append(
-            row(
-                "Hessian diagonal",
-                estimate.hessian_diagonal,
-                lambda: estimate.standard_error("hessian_diagonal"),
-                hessian.diagonal(),
-                sigma**2,
-            )
-        )
-        if n <= _FULL:
-            scale = torch.outer(sigma, sigma)
-            spread = lambda: estimate.standard_error("hessian")  # noqa: E731
-            rows.append(row("Hessian", estimate.hessian, spread, hessian, scale))
+        hessian = form.hessian(x, sigma)
+        diagonal = spread("hessian_diagonal")
+        rows.append(row("Hessian diagonal", estimate.hessian_diagonal, diagonal, hessian.diagonal(), sigma**2))
+    if n <= _FULL:
+        rows.append(row("Hessian", estimate.hessian, spread("hessian"), hessian, torch.outer(sigma, sigma)))
     return rows
 
 

@@ -17,13 +17,13 @@ import tyro
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings, space
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from experiments.reports.progress import progress
 from experiments.reports.results import Run
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Record
+from experiments.runs.trial import LEVELS
 
 TUNING = 1000
 """Runs from this number upward are for tuning; tables report those below."""
@@ -79,7 +79,7 @@ def tune(
         trials: settings drawn; all of them if there are no more.
         seed: of the draw.
         first: number of the first start, at least 1000: those below are for the tables.
-        level: reduction of the image error that counts.
+        level: reduction of the image error that counts, at most 0.999: runs end there.
         evaluations: of a run, at most; the number of the task if not given.
         preset: fast or paper.
         over: settings to vary and their choices, `samples=4,8 sigma=(0.2,0.1),(0.2,0.01)`; the others stay as they are
@@ -91,8 +91,8 @@ def tune(
     for name, value in (("runs", runs), ("trials", trials), ("evaluations", 1 if evaluations is None else evaluations)):
         if value < 1:
             raise SystemExit(f"{name} must be at least 1, got {value}")
-    if not 0.0 < level < 1.0:
-        raise SystemExit(f"level must be between 0 and 1, got {level}")
+    if not 0.0 < level <= LEVELS[-1]:
+        raise SystemExit(f"level must be above 0 and at most {LEVELS[-1]:g}, where runs end, got {level}")
     torch.set_num_threads(1)
     (name,) = catalogue.chosen("task", [task], list(catalogue.FITTING))
     loaded = catalogue.fitting(name, preset)

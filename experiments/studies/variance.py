@@ -34,7 +34,7 @@ from experiments.reports.progress import progress
 from experiments.reports.stored import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_choice import SIZES, compare, summary
-from experiments.studies.estimator_curves import AXES, Measurement, curve, draw, slope
+from experiments.studies.estimator_curves import AXES, Measurement, draw
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
 from experiments.studies.estimators import ALONE, ESTIMATORS, NAMES, OURS, Estimator
 
@@ -62,15 +62,6 @@ class VarianceReport:
     measurements: list[Measurement]
     ratios: list[Ratio]
     truth_error: dict[str, dict[str, float]]
-
-    def get(self, problem: str, method: str, budget: int, quantity: str) -> Measurement:
-        """Return the one measurement of these."""
-        wanted = (problem, method, budget, quantity)
-        return next(m for m in self.measurements if (m.problem, m.method, m.budget, m.quantity) == wanted)
-
-    def slope(self, problem: str, method: str, quantity: str, *, against: str = "evaluations") -> float:
-        """Slope of the straight line through log error over log evaluations; NaN with fewer than two."""
-        return slope(*curve(self.measurements, problem, method, quantity, against))
 
 
 def variance(

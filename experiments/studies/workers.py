@@ -26,7 +26,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,6 +33,7 @@ from torch import Tensor
 from experiments.problems import catalogue
 from experiments.reports.progress import progress
 from experiments.reports.tables import table
+from experiments.runs.records import write
 from experiments.studies.bench_ratios import in_turn
 from experiments.studies.scaling import scaling as scaling_of
 from torch_zerohess.evaluators import Factory, Inline, ProcessPool
@@ -104,7 +104,7 @@ def workers(
 
     Args:
         count: workers.
-        task: whose images are made in the workers; none if empty.
+        task: a fitting task whose images are made in the workers; none if empty.
         points: of a call for images.
         repeats: timings of which the median is reported; 0 leaves them out.
         evaluations: that are disturbed; 0 leaves them out.
@@ -121,6 +121,8 @@ def workers(
     for name, (value, smallest) in (least | {"kills": (kills, 0), "hangs": (hangs, 0)}).items():
         if value < smallest:
             raise SystemExit(f"{name} must be at least {smallest}, got {value}")
+    if task:
+        (task,) = catalogue.chosen("task", [task], list(catalogue.FITTING))
     costs = _costs(count, task, points, repeats) if repeats else []
     faults = disturb(count, evaluations, kills, hangs, seed) if evaluations else None
     if costs:
@@ -129,9 +131,8 @@ def workers(
     if faults:
         print(table(list(asdict(faults)), [list(asdict(faults).values())]))
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         written = {"costs": [asdict(one) for one in costs], "faults": None if faults is None else asdict(faults)}
-        out.write_text(json.dumps(written, indent=1))
+        write(out, json.dumps(written, indent=1))
     if scaling is not None:
         scaling_of(count, scaling)
     if faults and not faults.right:
@@ -151,7 +152,7 @@ def image(x: Tensor) -> Tensor:
 
 def images_of(name: str) -> Callable[[Tensor], Tensor]:
     """Load a task, and return the function that makes its images, or its losses."""
-    task: Any = catalogue.load(name, "fast", "auto", 1)
+    task = catalogue.fitting(name)
     made: Callable[[Tensor], Tensor] = task.loss if task.output is None else task.output.image
     return made
 

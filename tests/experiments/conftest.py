@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 from written_runs import write
 
-from experiments.ensembles import workers
+from experiments.ensembles import processes
 from experiments.runs.records import Files
 
 
@@ -16,7 +16,7 @@ def one_process(monkeypatch):
     def run_jobs(jobs, count):
         for job in jobs:
             messages = []
-            end = workers._execute(job, SimpleNamespace(send=messages.append))
+            end = processes._execute(job, SimpleNamespace(send=messages.append))
             yield from ((job, message) for message in [*messages, end])
 
     monkeypatch.setattr("experiments.ensembles.ensemble.run_jobs", run_jobs)

@@ -12,6 +12,7 @@ from experiments.reports.ensemble_page import page
 from experiments.reports.results import load as load_results
 from experiments.reports.summary import as_text, summarize
 from experiments.run import run
+from experiments.runs.records import Outcome
 
 
 def test_list_names_everything():
@@ -92,6 +93,25 @@ def test_networks_and_fits_are_run_by_one_command(tmp_path, capsys, monkeypatch)
         (range(20), range(1), None, ["quad", "cnn"], ["our_g"]),
         (range(2, 5), range(2, 5), 4, ["quad", "cnn"], ["our_g"]),
     ]
+
+
+def test_a_network_whose_runs_all_failed_does_not_hide_the_others(tmp_path, monkeypatch):
+    concluded = []
+
+    def conclude(task, outcomes, folder):
+        concluded.append(task.name)
+        if task.name == "cnn":
+            raise SystemExit("no run of cnn succeeded")
+
+    def ended(ensemble, jobs):
+        return [Outcome(name, "our_g", 0, "stopped", "", 1.0, 1.0, 1, 1, []) for name in ("cnn", "cnn_wide")]
+
+    monkeypatch.setattr("experiments.reports.networks.conclude", conclude)
+    monkeypatch.setattr("experiments.ensembles.ensemble.Ensemble.plan", lambda *_: [])
+    monkeypatch.setattr("experiments.ensembles.ensemble.Ensemble.run", ended)
+    with pytest.raises(SystemExit, match="no run of cnn succeeded"):
+        run(("cnn", "cnn_wide"), methods="our_g", out=tmp_path)
+    assert concluded == ["cnn", "cnn_wide"]
 
 
 def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path, one_process):

@@ -42,7 +42,6 @@ def value_and_gradient(
     depth: int,
     moving: MitsubaScene | None = None,
     seed: int = 0,
-    spp: int | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return loss [] and gradient [n] at x [n], float64.
 
@@ -55,13 +54,12 @@ def value_and_gradient(
         moving: the same scene with shapes in place of instances, of which Mitsuba does not sample the silhouettes; the
             scene itself if None.
         seed: of the adjoint pass, at least 0.
-        spp: its samples per pixel; the number of the scene if None.
     """
     image = scene(x[None])[0].double().requires_grad_()
     with torch.enable_grad():
         value = loss(image)
     (cotangent,) = torch.autograd.grad(value, image)
-    return value.detach(), pull_back(moving or scene, x, cotangent, integrator, depth=depth, seed=seed, spp=spp)
+    return value.detach(), pull_back(moving or scene, x, cotangent, integrator, depth=depth, seed=seed)
 
 
 def pull_back(
@@ -71,8 +69,7 @@ def pull_back(
     integrator: str,
     *,
     depth: int,
-    seed: int = 0,
-    spp: int | None = None,
+    seed: int,
 ) -> Tensor:
     """Return sum_pixels cotangent [h, w, 3] * d image / d x [n], by Mitsuba.
 
@@ -99,7 +96,7 @@ def pull_back(
             params=scene.values,
             integrator=integrator_of(scene.variant, integrator, depth),
             seed=seed,  # of an image that is never evaluated: only the adjoint pass runs, with a seed made of this one
-            spp=spp or scene.spp or 0,
+            spp=scene.spp or 0,
         )
         drjit.backward(drjit.sum(image * mi.TensorXf(cotangent.detach().float().numpy()), axis=None))
     return torch.from_numpy(np.array(drjit.grad(columns), dtype=np.float64))

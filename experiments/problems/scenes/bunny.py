@@ -6,7 +6,7 @@ Lengths are in units of the source, where the bunny is about one unit high; y is
 from dataclasses import replace
 from typing import Any
 
-from experiments.problems.scenes.meshes import instance, mi_mesh, rgb
+from experiments.problems.scenes.parts import camera, instance, mi_mesh, rgb
 from experiments.problems.scenes.stanford import bunny_surface
 from torch_zerohess.adapters.mitsuba import Transform
 
@@ -70,8 +70,6 @@ def in_mirrors(mi: Any, instances: bool = True) -> dict[str, Any]:
 
 def _scene(mi: Any, view: Any, field_of_view: float, at: tuple[float, ...], instances: bool) -> dict[str, Any]:
     """Camera and bunny, an instance or, for derivatives, a mesh of the same name."""
-    film = {"type": "hdrfilm", "width": 64, "height": 64, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-    sensor = {"type": "perspective", "fov": field_of_view, "fov_axis": "x", "to_world": view, "film": film}
     (vertices, normals, faces), _ = bunny_surface()
     fur = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": rgb(*FUR)}}
     mesh = mi_mesh(mi, "bunny", (vertices if instances else vertices + at, normals, faces), fur)
@@ -79,6 +77,6 @@ def _scene(mi: Any, view: Any, field_of_view: float, at: tuple[float, ...], inst
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 6, "rr_depth": 6},
-        "sensor": sensor,
+        "sensor": camera(view, field_of_view, (64, 64)),
         **(instance("bunny", "group", mesh, pose) if instances else {"bunny": mesh}),
     }

@@ -92,7 +92,7 @@ class Caustic:
         return image[1:-1, 1:-1].double() * (side / self.photons) ** 2
 
 
-def refraction(square: Tensor, index: float = INDEX) -> Tensor:
+def refraction(square: Tensor) -> Tensor:
     """Return how far light along z goes sideways per length along z behind a surface, per slope.
 
     `square` is q = |grad h|^2, and the light leaves along (m grad h, 1); m is returned. Snell's law for the direction
@@ -101,9 +101,9 @@ def refraction(square: Tensor, index: float = INDEX) -> Tensor:
     k = (i cos a - cos b)/sqrt(1 + q) this is along (k grad h, i - k), so that m = k/(i - k). Beyond the critical angle,
     q > 1/(i^2 - 1), the light stays in the glass; it is sent to `FAR`.
     """
-    bent = 1 - (index**2 - 1) * square
-    k = (index - bent.clamp_min(0).sqrt()) / (1 + square)
-    return torch.where(bent < 0, FAR, k / (index - k))
+    bent = 1 - (INDEX**2 - 1) * square
+    k = (INDEX - bent.clamp_min(0).sqrt()) / (1 + square)
+    return torch.where(bent < 0, FAR, k / (INDEX - k))
 
 
 def basis(places: Tensor, derivative: int = 0) -> Tensor:

@@ -50,16 +50,6 @@ def split(faces: Index, count: int) -> tuple[Index, Index]:
     return np.concatenate([np.stack(three, -1) for three in corners]), ends
 
 
-def vertex_normals(vertices: Array, faces: npt.NDArray[np.integer]) -> Array:
-    """Unit normals [m, 3]: the mean of the adjacent triangles' normals, weighted by area."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cross(b - a, c - a)
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], area)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-
-
 def _icosahedron() -> tuple[Array, Index]:
     """Three golden rectangles; its triangles are the triples of vertices that are neighbours of each other."""
     golden = (1 + math.sqrt(5)) / 2

@@ -1,6 +1,4 @@
-"""Meshes as arrays, and what becomes of them in Mitsuba."""
-
-from typing import Any
+"""Triangle meshes as arrays."""
 
 import numpy as np
 import numpy.typing as npt
@@ -8,38 +6,6 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Surface = tuple[Array, Array, npt.NDArray[np.uint32]]
 """Vertices [m, 3], unit normals [m, 3], triangles [k, 3]."""
-
-
-def mi_mesh(mi: Any, name: str, surface: Surface, bsdf: dict[str, Any], uv: Array | None = None) -> Any:
-    """Return a ``mi.Mesh`` with texture coordinates uv [m, 2], filled in the one way that all variants share."""
-    vertices, normals, faces = surface
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh(
-        name, len(vertices), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=uv is not None
-    )
-    params = mi.traverse(mesh)
-    arrays: dict[str, npt.NDArray[Any]] = {"vertex_positions": vertices, "vertex_normals": normals, "faces": faces}
-    if uv is not None:
-        arrays["vertex_texcoords"] = uv
-    for key, values in arrays.items():
-        params[key] = type(params[key])(values.astype(np.uint32 if key == "faces" else np.float32).ravel())
-    params.update()
-    return mesh
-
-
-def instance(name: str, group: str, shape: Any, pose: Any = None) -> dict[str, Any]:
-    """Parts of a scene: the group `group` of one shape and its instance `name`, which moves fast.
-
-    Mitsuba differentiates through an instance, but does not sample its silhouette.
-    """
-    of: dict[str, Any] = {"type": "instance", "group": {"type": "ref", "id": group}}
-    return {group: {"type": "shapegroup", "mesh": shape}, name: of if pose is None else {**of, "to_world": pose}}
-
-
-def rgb(*color: float) -> dict[str, Any]:
-    """Colour or grey as a dictionary of Mitsuba."""
-    return {"type": "rgb", "value": list(color) if len(color) > 1 else color[0]}
 
 
 def grid(vertices: Array, normals: Array) -> Surface:
@@ -57,8 +23,11 @@ def grid(vertices: Array, normals: Array) -> Surface:
     return vertices, normals, faces[np.linalg.norm(area, axis=-1) > 1e-12].astype(np.uint32)
 
 
-def to_srgb(image: npt.ArrayLike) -> npt.NDArray[np.uint8]:
-    """8-bit sRGB of a linear RGB image, for pictures; values outside [0, 1] are clipped."""
-    linear = np.clip(np.asarray(image, np.float64), 0.0, 1.0)
-    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * curved).astype(np.uint8)
+def vertex_normals(vertices: Array, faces: npt.NDArray[np.integer]) -> Array:
+    """Unit normals [m, 3]: the mean of the adjacent triangles' normals, weighted by area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], area)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)

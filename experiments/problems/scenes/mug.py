@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.problems.scenes.meshes import Array, Surface, grid, instance, mi_mesh, rgb
+from experiments.problems.scenes.meshes import Array, Surface, grid
+from experiments.problems.scenes.parts import camera, instance, mi_mesh, rgb
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Parameter, Transform, Value
 
 DEGREES = 20.0
@@ -72,19 +73,13 @@ def mug_scene(
 def mug(mi: Any, label: bool = False, instances: bool = True) -> dict[str, Any]:
     """Return the scene for `mitsuba.load_dict`, the handle at 0 degrees; without instances `handle` is a mesh."""
     turn = mi.ScalarTransform4f().translate(list(CAMERA)).rotate([0, 0, 1], -180.0)
+    view = turn.rotate([0, 1, 0], -80.0).rotate([1, 0, 0], -172.0)
     matte = {"type": "diffuse", "reflectance": rgb(*BACKDROP_COLOR)}
     glaze = {"type": "roughplastic", "alpha": 0.15, "nonlinear": True, "diffuse_reflectance": rgb(*MUG_COLOR)}
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 6, "rr_depth": 6},
-        "sensor": {
-            "type": "perspective",
-            "fov": FIELD_OF_VIEW,
-            "fov_axis": "x",
-            "to_world": turn.rotate([0, 1, 0], -80.0).rotate([1, 0, 0], -172.0),
-            "near_clip": 0.01,
-            "film": {"type": "hdrfilm", "width": 256, "height": 192, "pixel_format": "rgb", "rfilter": {"type": "box"}},
-        },
+        "sensor": {**camera(view, FIELD_OF_VIEW, (256, 192)), "near_clip": 0.01},
     }
     meshes = [
         ("still", "room", mi_mesh(mi, "backdrop", backdrop(), matte)),

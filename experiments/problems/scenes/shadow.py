@@ -6,7 +6,7 @@ no derivative to a renderer that does not sample it.
 
 from typing import Any
 
-from experiments.problems.scenes.meshes import instance, rgb
+from experiments.problems.scenes.parts import camera, instance, rgb
 from torch_zerohess.adapters.mitsuba import Transform
 
 POSITION = Transform("ball.to_world", move=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
@@ -31,13 +31,7 @@ def shadow(mi: Any, instances: bool = True) -> dict[str, Any]:
     return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 6, "rr_depth": 6},
-        "sensor": {
-            "type": "perspective",
-            "fov": FIELD_OF_VIEW,
-            "fov_axis": "x",
-            "to_world": view,
-            "film": {"type": "hdrfilm", "width": 256, "height": 192, "pixel_format": "rgb", "rfilter": {"type": "box"}},
-        },
+        "sensor": camera(view, FIELD_OF_VIEW, (256, 192)),
         "wall": {
             "type": "rectangle",
             "to_world": transform().look_at(origin=[0, 0, 0], target=[1, 0, 0], up=[0, 0, 1]).scale(20),

@@ -12,11 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from experiments.problems.scenes.blobs import Ellipsoid, blend
-from experiments.problems.scenes.icosphere import vertex_normals
+from experiments.problems.scenes.icosphere import Index
+from experiments.problems.scenes.meshes import Array, Surface, vertex_normals
 
-Array = npt.NDArray[np.float64]
-Faces = npt.NDArray[np.uint32]
-Surface = tuple[Array, Array, Faces]  # vertices [m, 3], unit normals [m, 3], triangles [k, 3]
 Source = Literal["pymeshfix", "procedural"]
 
 CELL = 1 / 40
@@ -53,7 +51,7 @@ def _unit_height(vertices: Array) -> Array:
     return centred
 
 
-def read_ply(path: Path) -> tuple[Array, npt.NDArray[np.int64]]:
+def read_ply(path: Path) -> tuple[Array, Index]:
     """Return vertices [m, 3] and triangles [k, 3] of a PLY file, in the order of the file.
 
     Read by trimesh, because Mitsuba's reader refuses the header of the scan (`obj_info`).
@@ -64,7 +62,7 @@ def read_ply(path: Path) -> tuple[Array, npt.NDArray[np.int64]]:
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
-def cluster(vertices: Array, faces: npt.NDArray[np.integer], cell: float) -> tuple[Array, npt.NDArray[np.int64]]:
+def cluster(vertices: Array, faces: npt.NDArray[np.integer], cell: float) -> tuple[Array, Index]:
     """Merge the vertices of every grid cell of side `cell` into their mean; collapsed and double triangles go.
 
     Triangles that this turns over are wound the other way, to face along the normals of the vertices that were merged.

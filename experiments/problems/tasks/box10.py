@@ -10,18 +10,16 @@ One channel is enough, as the squares are grey. The `fast` preset has 64x64 pixe
 500x500.
 """
 
-from typing import Literal
-
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from experiments.problems.soft_squares import box10
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from experiments.problems.tasks.box2 import fitting
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     box = box10({"fast": 64, "paper": 500}[preset])
     places = box.loss.target.view(-1, 2)
 

@@ -10,16 +10,15 @@ to be smooth; the `paper` preset the source's 500x500.
 """
 
 from collections.abc import Callable
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from experiments.problems.soft_squares import BoxTask, box2
-from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
+from experiments.problems.soft_squares import HALF_WIDTH, BoxTask, box2
+from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     side = {"fast": 128, "paper": 500}[preset]
     box = box2(side)
     return fitting(
@@ -53,7 +52,7 @@ def fitting(
         sigma=box.sigma,
         evaluations=evaluations,
         truth=Truth(lambda x: float(squares(x[None])[0]), parameter_error),
-        bounds=(torch.full_like(box.start, squares.half_width), torch.full_like(box.start, 1 - squares.half_width)),
+        bounds=(torch.full_like(box.start, HALF_WIDTH), torch.full_like(box.start, 1 - HALF_WIDTH)),
         output=least_squares(squares.image, residuals),
         picture=Picture(lambda x: squares.image(x[None])[0], lambda: reference),
     )

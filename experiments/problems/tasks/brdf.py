@@ -19,13 +19,11 @@ The convolution of the loss with a Gaussian is known: it is quadratic in the alb
 alone is left, here by Gauss-Hermite quadrature.
 """
 
-from typing import Literal
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
+from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
 
 TARGET = (0.6, 0.25, 0.15, 0.5, 0.5, 0.4, 0.7)
 START = ((0.0,) * 7, (0.5,) * 6 + (0.3,))
@@ -74,7 +72,7 @@ class PhongSphere:
         return picture
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     sphere = PhongSphere({"fast": 64, "paper": 256}[preset])
     target = torch.tensor(TARGET, dtype=torch.float64)
     reference = sphere(target[None])[0]

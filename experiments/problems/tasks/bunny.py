@@ -9,40 +9,30 @@ Direct light is enough: light that the bunny reflects to the wall changes the lo
 """
 
 from functools import partial
-from typing import Literal
 
 import torch
 
-from experiments.problems.rendered import Setting, rendered
+from experiments.problems.rendered import Setting, load_scene, rendered
 from experiments.problems.scenes.bunny import OVER_WALL, as_mesh, over_wall
-from experiments.problems.task import Task, around
+from experiments.problems.task import Preset, Task, around
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((64, 64), 32, 6)
 PRESETS = {"fast": Setting((48, 48), 8, 2), "paper": FULL}
 
 
-def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
-    """The scene in a setting; without instances its bunny is a mesh."""
-    return MitsubaScene(
-        partial(over_wall, instances=instances),
-        [OVER_WALL if instances else as_mesh(OVER_WALL, (0.0, 0.0, 0.0))],
-        film=setting.film,
-        spp=setting.spp,
-        depth=setting.depth,
-        variant=variant,
-        threads=1,
-    )
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
+    def scene(setting: Setting, *, instances: bool = True) -> MitsubaScene:
+        pose = OVER_WALL if instances else as_mesh(OVER_WALL, (0.0, 0.0, 0.0))
+        return load_scene(partial(over_wall, instances=instances), pose, setting, variant)
 
-
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
     return rendered(
         name="bunny",
         title="position and rotation of the Stanford bunny over a wall",
         parameters="x, z in scene lengths, rotation in units of 100 degrees, all -1 to 1; "
         "starts +-.25 +- .1, solution 0",
-        scene=lambda one: load(one, True, variant),
-        moving=lambda one: load(one, False, variant),
+        scene=scene,
+        moving=partial(scene, instances=False),
         variant=variant,
         setting=PRESETS[preset],
         full=FULL,

@@ -16,14 +16,13 @@ angles, is left out. The `fast` preset has 64x64 pixels and 128x128 photons, the
 """
 
 import math
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from experiments.problems.scenes.caustic import COEFFICIENTS, Caustic
-from experiments.problems.task import Picture, Renderer, Task, Truth, least_squares
+from experiments.problems.task import Picture, Preset, Renderer, Task, Truth, least_squares
 
 TEXT = ("ZERO", "HESS")
 BACKGROUND = 0.3
@@ -41,7 +40,7 @@ SIZES = {"fast": (64, 128), "paper": (128, 512)}
 """Pixels along the side of the screen, photons along the side of the slab."""
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     side, photons = SIZES[preset]
     caustic, n = Caustic(side, photons, DISTANCE, UNIT), COEFFICIENTS**2
     target = text(side)

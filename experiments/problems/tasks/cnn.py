@@ -5,13 +5,14 @@ the output is 4.5 + 18 sigmoid. The scene needs no more than direct light at a s
 preset has the source's film, samples and depth.
 """
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.scenes.mug import DEGREES, mug_scene
+from experiments.problems.task import Preset
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 ANGLES = (11.5, 15.5)
@@ -55,5 +56,5 @@ class Rotation(NetworkTask):
         return f"{DEGREES * float(x[0]):.1f}°"
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
     return Rotation(SIZES[preset], variant, threads)

@@ -6,13 +6,13 @@ the handle in 20 degrees, diffuse reflectance (r, g, b) in 0.1. The network is t
 """
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from experiments.problems.network_task import Encoder, NetworkTask
 from experiments.problems.scenes.mug import COLOR, DEGREES, POSE, mug_scene
+from experiments.problems.task import Preset
 from experiments.problems.tasks.cnn import SIZES
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
@@ -58,5 +58,5 @@ class PoseAndColor(NetworkTask):
         return f"{position:.2f} cm, {DEGREES * rotation:.0f}°"
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
     return PoseAndColor(SIZES[preset], variant, threads)

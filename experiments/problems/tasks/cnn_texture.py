@@ -8,7 +8,6 @@ pixels at the sides least, since they are seen at a slant.
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +16,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from experiments.problems.network_task import NetworkTask, Size
-from experiments.problems.scenes.meshes import to_srgb
 from experiments.problems.scenes.mug import LABEL, LABEL_SIDE, mug_scene
+from experiments.problems.srgb import to_srgb
+from experiments.problems.task import Preset
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 TRAINING = ("camera", "chelsea", "brick", "gravel", "coins", "moon", "rocket", "page")
@@ -109,5 +109,5 @@ def _picture(name: str) -> Tensor:
     return torch.from_numpy(color.rgb2gray(picture[..., :3]) if picture.ndim == 3 else picture).float()
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
     return Texture(SIZES[preset], variant, threads)

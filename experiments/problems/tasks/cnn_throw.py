@@ -8,8 +8,6 @@ throws at the wall, where the loss is a plateau with ripples.
 Many launches reach a target, so there is no parameter error: both errors are the mean squared distance on the floor.
 """
 
-from typing import Literal
-
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -17,6 +15,7 @@ from torch import Tensor, nn
 
 from experiments.problems.network_task import Encoder, NetworkTask, Size
 from experiments.problems.scenes.thrown_cube import LOWER, UPPER, ThrownCube
+from experiments.problems.task import Preset
 
 FLOOR = ((0.0, 8.0), (-4.0, 4.0))
 """Range of the picture along x and y [m]."""
@@ -88,5 +87,5 @@ class Throw(NetworkTask):
         return (255.0 * spots.movedim(1, 3)).round().to(torch.uint8).numpy()
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
     return Throw(SIZES[preset], variant, threads)

@@ -5,9 +5,8 @@ disappears on the other; in between, from 40 to 120 degrees, the image does not 
 3.5 + 18.5 sigmoid, the whole circle, so that a network can collapse into the plateau.
 """
 
-from typing import Literal
-
 from experiments.problems.network_task import NetworkTask
+from experiments.problems.task import Preset
 from experiments.problems.tasks.cnn import SIZES, Rotation
 
 ANGLES = (6.5, 19.0)
@@ -25,5 +24,5 @@ class WideRotation(Rotation):
     angles, output = ANGLES, OUTPUT
 
 
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
     return WideRotation(SIZES[preset], variant, threads)

@@ -21,7 +21,6 @@ over union of the pixels that mesh and target cover, for every view.
 """
 
 import math
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +31,7 @@ from torch import Tensor
 from experiments.problems.scenes.fitted_mesh import FittedMesh
 from experiments.problems.scenes.mesh_targets import TARGETS, Target
 from experiments.problems.scenes.raster import Cameras, render
-from experiments.problems.task import Picture, Task, Truth, least_squares
+from experiments.problems.task import Picture, Preset, Task, Truth, least_squares
 
 VIEWS = 8
 ELEVATIONS = (30.0, -10.0)
@@ -129,7 +128,7 @@ class MeshFit:
 _SIDES = {"fast": 64, "paper": 256}
 
 
-def fitted_to(name: str, preset: Literal["fast", "paper"]) -> Task:
+def fitted_to(name: str, preset: Preset) -> Task:
     """Return the task of fitting an icosphere to one of `TARGETS`."""
     target = TARGETS[name]()
     colored = target.colors is not None
@@ -142,7 +141,7 @@ def fitted_to(name: str, preset: Literal["fast", "paper"]) -> Task:
     )
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     return fitted_to("meshfit", preset)
 
 

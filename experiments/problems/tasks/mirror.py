@@ -10,40 +10,30 @@ samples.
 """
 
 from functools import partial
-from typing import Literal
 
 import torch
 
-from experiments.problems.rendered import Setting, rendered
+from experiments.problems.rendered import Setting, load_scene, rendered
 from experiments.problems.scenes.bunny import IN_MIRRORS, SEEN_AT, as_mesh, in_mirrors
-from experiments.problems.task import Task, around
+from experiments.problems.task import Preset, Task, around
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((64, 64), 32, 6)
 PRESETS = {"fast": Setting((48, 48), 8, 4), "paper": FULL}
 
 
-def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
-    """The scene in a setting; without instances its bunny is a mesh."""
-    return MitsubaScene(
-        partial(in_mirrors, instances=instances),
-        [IN_MIRRORS if instances else as_mesh(IN_MIRRORS, SEEN_AT)],
-        film=setting.film,
-        spp=setting.spp,
-        depth=setting.depth,
-        variant=variant,
-        threads=1,
-    )
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
+    def scene(setting: Setting, *, instances: bool = True) -> MitsubaScene:
+        pose = IN_MIRRORS if instances else as_mesh(IN_MIRRORS, SEEN_AT)
+        return load_scene(partial(in_mirrors, instances=instances), pose, setting, variant)
 
-
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
     return rendered(
         name="mirror",
         title="position and rotation of the Stanford bunny in two mirrors",
         parameters="x, y in scene lengths, rotation in units of 100 degrees, all -1 to 1; "
         "starts +-.25 +- .1, solution 0",
-        scene=lambda one: load(one, True, variant),
-        moving=lambda one: load(one, False, variant),
+        scene=scene,
+        moving=partial(scene, instances=False),
         variant=variant,
         setting=PRESETS[preset],
         full=FULL,

@@ -8,14 +8,14 @@ Direct light is enough: with longer paths the loss has the same minimum and plat
 preset has a quarter of the source's film and samples, the `paper` preset all of it.
 """
 
-from typing import Literal
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.scenes.mug import DEGREES, MESH_ROTATION, ROTATION, mug_scene
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Preset, Task, uniform
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 TURN = 360.0 / DEGREES
@@ -28,26 +28,25 @@ def parameter_error(x: Tensor) -> float:
     return float((torch.remainder(x + TURN / 2, TURN) - TURN / 2).square().mean())
 
 
-def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
-    """The scene in a setting; without instances its handle is a mesh."""
-    return mug_scene(
-        (ROTATION if instances else MESH_ROTATION,),
-        film=setting.film,
-        spp=setting.spp,
-        depth=setting.depth,
-        instances=instances,
-        variant=variant,
-        threads=1,
-    )
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
+    def scene(setting: Setting, *, instances: bool = True) -> MitsubaScene:
+        rotation = ROTATION if instances else MESH_ROTATION
+        return mug_scene(
+            (rotation,),
+            film=setting.film,
+            spp=setting.spp,
+            depth=setting.depth,
+            instances=instances,
+            variant=variant,
+            threads=1,
+        )
 
-
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
     return rendered(
         name="mug",
         title="the rotation of a mug whose handle is hidden on the way",
         parameters="rotation in units of 20 degrees, -4 to 14; starts U(9, 10), solution 0",
-        scene=lambda one: load(one, True, variant),
-        moving=lambda one: load(one, False, variant),
+        scene=scene,
+        moving=partial(scene, instances=False),
         variant=variant,
         setting=PRESETS[preset],
         full=FULL,

@@ -13,12 +13,11 @@ Both presets are the same.
 """
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Task, Truth, uniform
+from experiments.problems.task import Preset, Task, Truth, uniform
 
 S1 = 1.0
 GRID = 20
@@ -44,7 +43,7 @@ def start(run: int) -> Tensor:
     return torch.cartesian_prod(axis, axis)[order[run]]
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     least = loss(torch.zeros(1, 2).double())[0]
     return Task(
         name="nonpsd",

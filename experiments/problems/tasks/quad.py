@@ -7,12 +7,10 @@ the loss. Sigma: 500, of the order of the distance to the solution; the source s
 Both presets are the same.
 """
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
-from experiments.problems.task import Task, Truth, uniform
+from experiments.problems.task import Preset, Task, Truth, uniform
 
 A, B, C = 5.0, 5.0, 7.5
 
@@ -27,7 +25,7 @@ def analytic(x: Tensor, sigma: float) -> Tensor:
     return loss(x[None])[0] + (A + B) * sigma**2
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     return Task(
         name="quad",
         title="the minimum of a quadratic",

@@ -10,41 +10,30 @@ source's film and samples, the `paper` preset all of it.
 """
 
 from functools import partial
-from typing import Literal
 
 import torch
 
-from experiments.problems.rendered import Setting, rendered
+from experiments.problems.rendered import Setting, load_scene, rendered
 from experiments.problems.scenes.shadow import POSITION, shadow
-from experiments.problems.task import Task, uniform
+from experiments.problems.task import Preset, Task, uniform
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 FULL = Setting((256, 192), 32, 6)
 PRESETS = {"fast": Setting((64, 48), 8, 2), "paper": FULL}
 
 
-def load(setting: Setting, instances: bool, variant: str) -> MitsubaScene:
-    """The scene in a setting; without instances its ball is a shape of its own."""
-    return MitsubaScene(
-        partial(shadow, instances=instances),
-        [POSITION],
-        film=setting.film,
-        spp=setting.spp,
-        depth=setting.depth,
-        variant=variant,
-        threads=1,
-    )
+def task(preset: Preset = "fast", variant: str = "auto") -> Task:
+    def scene(setting: Setting, *, instances: bool = True) -> MitsubaScene:
+        return load_scene(partial(shadow, instances=instances), POSITION, setting, variant)
 
-
-def task(preset: Literal["fast", "paper"] = "fast", variant: str = "auto") -> Task:
     start = torch.tensor([-0.5, 2.5]).double()
     return rendered(
         name="shad",
         title="the position of a sphere out of view, from its shadow",
         parameters="y, z of the sphere in scene lengths, (-3.25, 1) and (.25, 3.75); starts (-.5, 2.5) +- .1, "
         "solution (-1.5, 1)",
-        scene=lambda one: load(one, True, variant),
-        moving=lambda one: load(one, False, variant),
+        scene=scene,
+        moving=partial(scene, instances=False),
         variant=variant,
         setting=PRESETS[preset],
         full=FULL,

@@ -9,18 +9,16 @@ The render is the texture itself, as nothing else in an image of it would depend
 film. Both presets are the same.
 """
 
-from typing import Literal
-
 import torch
 from skimage import data
 from torch import Tensor
 
-from experiments.problems.task import Picture, Task, Truth, least_squares, uniform
+from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
 
 SIDE = 32
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     photograph = torch.tensor(data.camera() / 255.0)
     reference = photograph.unflatten(0, (SIDE, -1)).unflatten(2, (SIDE, -1)).mean((1, 3))
     target, n = reference.flatten(), SIDE**2

@@ -6,13 +6,12 @@ that do. Many launches reach the target, so there is no parameter error.
 """
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from experiments.problems.scenes.thrown_cube import LOWER, UPPER, ThrownCube
-from experiments.problems.task import Task, Truth, least_squares, uniform
+from experiments.problems.task import Preset, Task, Truth, least_squares, uniform
 
 TARGET = (5.0, 0.5)
 """x and y [m]."""
@@ -20,7 +19,7 @@ START = ((4.0, -1.0, 2.0, -1.0, -1.0), (6.0, 1.0, 5.0, 1.0, 1.0))
 """Between these launches the cube bounces off the wall."""
 
 
-def task(preset: Literal["fast", "paper"] = "fast") -> Task:
+def task(preset: Preset = "fast") -> Task:
     throw, target = ThrownCube(), torch.tensor(TARGET, dtype=torch.float64)
 
     def loss(x: Tensor) -> Tensor:

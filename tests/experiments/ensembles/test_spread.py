@@ -6,7 +6,7 @@ import torch
 from small import BUMP, GIVE_UP, SEARCH, SHIFT, TASK, Bump
 from written_runs import rows
 
-from experiments.ensembles import workers
+from experiments.ensembles import processes
 from experiments.ensembles.ensemble import Ensemble
 from experiments.ensembles.spread import BlackBoxOf, spread
 from experiments.runs.attempt import attempt
@@ -49,13 +49,13 @@ def test_the_black_box_is_called_in_the_pool():
 def test_runs_of_a_task_make_its_black_box_once(monkeypatch, tmp_path):
     """A pool knows a black box by its identity."""
     pools = []
-    monkeypatch.setattr(workers, "ProcessPool", lambda count: pools.append(Counting()) or pools[-1])
-    monkeypatch.setattr(workers, "_carriers", {})
+    monkeypatch.setattr(processes, "ProcessPool", lambda count: pools.append(Counting()) or pools[-1])
+    monkeypatch.setattr(processes, "_carriers", {})
     told = SimpleNamespace(send=lambda message: None)
     for task in ("quad", "box2"):
         (*jobs,) = Ensemble(tmp_path, range(2), workers=2, evaluations=3).plan([task], [GIVE_UP])
         for job in jobs:
-            assert workers._execute(job, told).evaluations == 1
+            assert processes._execute(job, told).evaluations == 1
     assert len(pools) == 2
     assert [len({id(fn) for fn in one.made}) for one in pools] == [1, 1]
     assert [one.closed for one in pools] == [True, False]

@@ -1,5 +1,7 @@
 """ZeroGrads and RELAX on network tasks: that they learn because of their surrogate, and what it sees."""
 
+import math
+
 import pytest
 import torch
 from small import BUMP, Bump, trained
@@ -8,6 +10,7 @@ from torch import nn
 from experiments.methods import learned_networks
 from experiments.methods.learned_networks import Surrogate
 from experiments.problems.network_task import Size
+from experiments.problems.tasks import cnn_throw
 from experiments.runs.network_trial import NetworkTrial
 
 LEARNING = Bump(Size(16, 1, 2, evaluations=1500, images=256, held_out=32))
@@ -17,6 +20,15 @@ def improvement(name, **settings) -> float:
     """Parameter error before over that after the training."""
     _, trial = trained(name, LEARNING, **settings)
     return trial.rows[0].parameter_error / LEARNING.parameter_error(trial.encoder)
+
+
+@pytest.mark.parametrize("name", ["zerograds", "relax"])
+def test_targets_that_are_no_images(name):
+    """The places on the floor at which CNN-THROW aims."""
+    task = cnn_throw.Throw(Size(16, 1, 1, evaluations=16, images=4, held_out=1), threads=1)
+    outcome, trial = trained(name, task)
+    assert outcome.evaluations == 16
+    assert all(math.isfinite(row.image_error) for row in trial.rows)
 
 
 def test_zerograds_learns_by_its_fit():

@@ -327,7 +327,7 @@ def test_tune_prints_the_settings_in_use_and_better_ones(capsys):
     for wrong, message in (
         ({"first": 0}, "first must be at least 1000"),
         ({"runs": 0}, "runs must be at least 1"),
-        ({"level": 1.0}, "level must be between 0 and 1"),
+        ({"level": 0.9999}, "level must be above 0 and at most 0.999, where runs end"),
         ({"over": ("speed=1",)}, "over must be NAME=VALUE,VALUE with a name among samples"),
         ({"method": "lbfgs_fd", "over": ("samples=4",)}, "a name among difference, got samples=4"),
         ({"method": "no_such_method"}, "method must be some of"),

@@ -11,7 +11,8 @@ from quads import TWO, quad
 from scipy.spatial import cKDTree
 
 from experiments.problems.scenes import mesh_targets, stanford
-from experiments.problems.scenes.icosphere import icosphere, split, vertex_normals
+from experiments.problems.scenes.icosphere import icosphere, split
+from experiments.problems.scenes.meshes import vertex_normals
 from experiments.problems.scenes.subdivision import bumps, smoothing, subdivision
 
 

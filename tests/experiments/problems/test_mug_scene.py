@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.problems.scenes.meshes import to_srgb
 from experiments.problems.scenes.mug import DEGREES, RADIUS, body, handle, mug_scene
+from experiments.problems.srgb import to_srgb
 
 HIDDEN = [50.0, 60.0, 70.0, 80.0, 90.0]
 FACING = 257.0

@@ -121,6 +121,8 @@ def test_formats_agree(folder, capsys):
     for name, expected in (("text", text), ("csv", as_csv(summary)), ("json", as_json(summary))):
         table(folder, format=name)
         assert capsys.readouterr().out == expected + "\n"
+    table(folder, methods="all")
+    assert capsys.readouterr().out == text + "\n"
 
 
 @pytest.mark.parametrize("command", [table, plot, report])

@@ -3,6 +3,7 @@
 import csv
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -191,6 +192,20 @@ def test_tasks_are_added_to_a_table_of_the_same_protocol(folder, results, tmp_pa
         store(other, name="bowls", add=True)
 
 
+def test_runs_without_a_limit_go_together(tmp_path, results):
+    for task in ("bowl", "dish"):
+        write(tmp_path / task, task, "fr22", 3, [100.0, 0.5], each=2, settings={"limit": None})
+        store(tmp_path / task, name="bowls", add=task == "dish")
+    assert {(one["task"], one["limit"]) for one in rows(results, "bowls")} == {("bowl", ""), ("dish", "")}
+
+
+def test_a_run_whose_process_died_does_not_hide_the_number_of_parameters(folder, results):
+    files = Files(folder / "bowl" / "fr22", 3)
+    write_outcome(replace(read_outcome(files.outcome), status="failed", x=[]), files)
+    store(folder, name="bowls")
+    assert {one["n"] for one in rows(results, "bowls")} == {"2"}
+
+
 @pytest.mark.parametrize(
     ("settings", "clock"),
     [({}, "processor"), ({"threads": 1}, "processor"), ({"threads": None}, "wall"), ({"workers": 1}, "wall")],
@@ -328,6 +343,8 @@ def test_documents_are_written_and_checked(folder, tmp_path, capsys):
     with pytest.raises(SystemExit, match="value: bowls"):
         readme((path,), check=True)
     assert "as it should be" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="FILE must be a Markdown file, got nowhere"):
+        readme((Path("nowhere.md"),))
 
 
 @pytest.mark.parametrize(
@@ -354,6 +371,7 @@ def test_wrong_marks_are_named(folder, mark, message):
         ("bowls speed task=bowl", "must name a column and one row"),
         ("bowls seconds taste=sweet", "columns are task, .*got taste"),
         ("bowls seconds method=ours", "no row of the table"),
+        ("bowls seconds n=two", "no row of the table"),
     ],
 )
 def test_wrong_values_are_named(folder, mark, message):

@@ -134,14 +134,23 @@ def test_command(tmp_path, capsys, monkeypatch) -> None:
     assert printed.count("2 of 2") == 4 * 3
     assert (tmp_path / "figure8.png").is_file()
     asked = []
-    monkeypatch.setattr("experiments.studies.figures.gallery", lambda folder, **more: asked.append(more["tasks"]))
-    figures(("12", "13"), out=tmp_path)
-    assert asked == [("caustic",), ("mirror",)]
     monkeypatch.setattr("experiments.studies.figures.variance", lambda **given: asked.append(given) or noted)
     noted = VarianceReport(2, (32,), [], [], {})
     monkeypatch.setattr("experiments.studies.figures.draw_operators", lambda *_: None)
     monkeypatch.setattr("experiments.studies.figures.orders", lambda *_: [])
     figures(("11",), out=tmp_path)
-    assert asked[2]["rivals"] == 0
-    assert set(asked[2]["methods"]) == {*OPERATORS, *(f"{one}, first order" for one in OPERATORS)}
+    assert asked[0]["rivals"] == 0
+    assert set(asked[0]["methods"]) == {*OPERATORS, *(f"{one}, first order" for one in OPERATORS)}
     assert list(FIGURES) == [str(k) for k in range(6, 14)]
+
+
+def test_the_figure_of_one_task_leaves_the_overview_of_all_tasks(tmp_path, monkeypatch, capsys) -> None:
+    (tmp_path / "figure9.png").write_bytes(b"all tasks")
+    monkeypatch.setattr("experiments.studies.gallery.OTHER", "block_gauss_newton")  # the method itself: no second run
+    monkeypatch.setattr(supplement_figures, "caustic", lambda found, seen, other, path: path.touch())
+    figures(("12",), out=tmp_path, limit=0.2)
+    assert (tmp_path / "figure9.png").read_bytes() == b"all tasks"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["figure12.png", "figure9.png"]
+    printed = capsys.readouterr().out
+    assert "caustic" in printed
+    assert str(tmp_path / "figure12.png") in printed

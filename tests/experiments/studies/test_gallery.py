@@ -56,6 +56,13 @@ def test_a_trace_has_a_point_for_every_row():
     assert found.outcome.status == "finished"
 
 
+def test_a_run_that_diverged_has_not_arrived():
+    found = made([vector(0, 0), vector(1, 0)])
+    found.records[:] = [replace(found.records[0], image_error=4.0), replace(found.records[1], image_error=None)]
+    assert found.caption(0) == "0 evaluations, error 100 %"
+    assert found.caption(1) == "2 evaluations, error not finite"
+
+
 def test_a_trace_of_a_failure_has_the_start():
     found = trace(small.TASK, small.FAIL, run=0)
     assert (len(found.points), found.outcome.status) == (1, "failed")

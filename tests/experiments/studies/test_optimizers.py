@@ -61,10 +61,14 @@ def test_the_table_has_shares():
     jobs = {Job(2, f, 11, 0, "ours", 100): Reached((5,) * count, 1.0) for f, count in ((1, 51), (2, 0))}
     assert rows(jobs) == [[2, "ours: gaussian_process", 0.5, 0.5, 0.5, pytest.approx(1e3 * 2 / 205), 2]]
     assert "0.5 " in report(jobs)
+    (short,) = rows({replace(job, budget=20): found for job, found in jobs.items()})
+    assert short[2:5] == [0.5, None, None]  # these runs could not use 30 n evaluations
 
 
 def test_what_is_not_on_the_platform_is_said(tmp_path):
     with pytest.raises(SystemExit, match="n must be one of"):
         optimizers(n=(4,), functions=(1,), methods="ours", out=tmp_path)
+    with pytest.raises(SystemExit, match="runs and budget must be at least 1"):
+        optimizers(n=(2,), budget=0, out=tmp_path)
     with pytest.raises(SystemExit, match="function must be from 1 to 24, got 25"):
         optimizers(n=(2,), functions=(25,), methods="ours", out=tmp_path)

@@ -1,6 +1,7 @@
 """Tasks in other circumstances, with a scene that knows its own noise, and the command that runs them."""
 
 import csv
+import math
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +10,10 @@ import pytest
 import torch
 
 from experiments.problems.rendered import Setting, rendered
-from experiments.problems.scenes.meshes import to_srgb
+from experiments.problems.srgb import from_srgb, to_srgb
 from experiments.problems.task import uniform
 from experiments.problems.tasks import mug
-from experiments.problems.variations import Change, from_srgb, jpeg, varied
+from experiments.problems.variations import Change, jpeg, varied
 from experiments.problems.variations import load as load_varied
 from experiments.reports.results import Run, load
 from experiments.reports.summary import summarize
@@ -240,6 +241,15 @@ def test_rows_count_runs_that_got_there():
     assert row(Cell("t", "spp", "1x", "m", "t"), runs[1:2]).evaluations_99 is None
 
 
+def test_runs_that_diverged_count_in_the_errors_at_the_end():
+    diverged = run_of([1.0, 0.5])
+    diverged.records.append(replace(diverged.records[-1], image_error=None, parameter_error=None))
+    found = row(Cell("t", "spp", "1x", "m", "t"), [run_of([1.0, 0.01]), diverged, diverged])
+    assert (found.image_error, found.parameter_error) == (math.inf, math.inf)
+    nowhere = row(Cell("t", "spp", "1x", "m", "t"), [run_of([1.0, 0.01], parameter=math.nan)])
+    assert nowhere.parameter_error is None  # the task has no true point
+
+
 def test_command(tmp_path: Path, one_process, capsys):
     def command():
         return robustness(
@@ -275,6 +285,8 @@ def test_command(tmp_path: Path, one_process, capsys):
     for against in ("evaluations", "seconds"):
         assert (tmp_path / f"box2-robustness-{against}.png").read_bytes().startswith(b"\x89PNG")
     assert command() == rows  # nothing is run again: seconds are the same
+    with pytest.raises(SystemExit, match=r"variant = auto \(now scalar_rgb\)"):
+        robustness(("box2",), methods="our_hvpa", over=("pairs=2",), runs=1, variant="scalar_rgb", out=tmp_path)
 
 
 @pytest.mark.parametrize("over", ["sp", "spp=", "spp=0", "jpeg=high", "noise=loud"])

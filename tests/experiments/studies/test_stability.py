@@ -10,16 +10,18 @@ from experiments.studies.coverage import Coverage
 from experiments.studies.coverage import _rows as _coverage_rows
 from experiments.studies.stability import _rows, stability
 from experiments.studies.stability_cases import Case, cases
-from experiments.studies.stability_optimizers import ENDLESS, _row, hard_cases, searches
+from experiments.studies.stability_searches import ENDLESS, _row, hard_cases, searches
 
 
 def test_every_case_of_stability_is_right(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [])
+    told = Coverage("aggregate, random", 16, 0.95, {"value": (0.9, 0.91)}, "right")
+    monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [told])
     rows = stability(largest=1000, runs=0, out=tmp_path / "stability.json")  # a wrong row would raise SystemExit
     assert {row.verdict for row in rows} == {"right", "right: refused"}
     # Far from zero twice, sigma 1e308, and a Hessian of order 1e320 and its diagonal.
     assert sum(row.verdict == "right: refused" for row in rows) == 5
-    assert len(json.loads((tmp_path / "stability.json").read_text())) == len(rows)
+    written = json.loads((tmp_path / "stability.json").read_text())
+    assert [len(written[name]) for name in ("accuracy", "coverage", "searches")] == [len(rows), 1, 0]
     assert "WRONG" not in capsys.readouterr().out
 
 
@@ -100,8 +102,8 @@ def test_every_hard_case_starts_at_one_and_false_claims_are_wrong(monkeypatch, c
     for case in hard_cases():
         assert float(case.fn(case.start[None])) == pytest.approx(1.0)
     easy = next(case for case in hard_cases() if case.name.startswith("stiff, condition 1e0,"))
-    monkeypatch.setattr("experiments.studies.stability_optimizers.hard_cases", lambda: [replace(easy, aim=-1.0)])
-    monkeypatch.setattr("experiments.studies.stability_optimizers.ENGINES", ("descent",))
+    monkeypatch.setattr("experiments.studies.stability_searches.hard_cases", lambda: [replace(easy, aim=-1.0)])
+    monkeypatch.setattr("experiments.studies.stability_searches.ENGINES", ("descent",))
     (row,) = searches(runs=1, max_evaluations=100)
     assert (row.successes, row.claims, row.verdict) == (0.0, 1, "WRONG: claims")
     monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [])

@@ -43,6 +43,9 @@ def test_a_wrong_value_is_noticed(monkeypatch) -> None:
 def test_wrong_arguments_are_named() -> None:
     with pytest.raises(SystemExit, match="kills must be at least 0, got -1"):
         study.workers(kills=-1)
+    for task in ("mugs", "cnn"):  # a name that is not known, and a network
+        with pytest.raises(SystemExit, match=f"task must be some of .*, got {task}"):
+            study.workers(task=task)
 
 
 def test_scaling_is_asked_for(monkeypatch, tmp_path) -> None:

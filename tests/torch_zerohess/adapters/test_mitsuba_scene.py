@@ -10,7 +10,7 @@ import torch
 from small_scenes import RADIANCE, REFLECTANCE, VARIANTS, WITHOUT_NOISE, camera, lamp, plane, rgb, screen
 
 import torch_zerohess as zh
-from experiments.problems.scenes.meshes import mi_mesh
+from experiments.problems.scenes.parts import mi_mesh
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Transform, Value
 
 

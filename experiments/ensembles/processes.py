@@ -16,9 +16,8 @@ import torch
 from experiments.ensembles.spread import BlackBoxOf, spread
 from experiments.methods import METHODS, Method
 from experiments.problems import catalogue
-from experiments.problems.catalogue import Preset
 from experiments.problems.network_task import NetworkTask
-from experiments.problems.task import Task
+from experiments.problems.task import Preset, Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
 from torch_zerohess.evaluators import Factory, ProcessPool
@@ -78,27 +77,27 @@ Message = Preparation | Record | Outcome | Trouble
 def run_jobs(jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Message]]:
     """Run jobs in `count` processes; yield their progress, and for each job an outcome or trouble at its end."""
     waiting = deque(jobs)
-    workers: list[_Worker] = []
+    processes: list[_Process] = []
     alone = all(job.workers is None for job in jobs)
     try:
-        while waiting or any(worker.job for worker in workers):
-            workers = [worker for worker in workers if worker.process.is_alive() or worker.job]
-            while waiting and len(workers) < count:
-                workers.append(_Worker(daemon=alone))
-            for worker in workers:
-                if worker.job is None and waiting:
-                    worker.give(waiting.popleft())
-            ready = wait([worker.connection for worker in workers if worker.job])
-            for worker in [worker for worker in workers if worker.connection in ready]:
-                yield from worker.messages()
+        while waiting or any(one.job for one in processes):
+            processes = [one for one in processes if one.process.is_alive() or one.job]
+            while waiting and len(processes) < count:
+                processes.append(_Process(daemon=alone))
+            for one in processes:
+                if one.job is None and waiting:
+                    one.give(waiting.popleft())
+            ready = wait([one.connection for one in processes if one.job])
+            for one in [one for one in processes if one.connection in ready]:
+                yield from one.messages()
     finally:
-        for worker in workers:
-            worker.process.kill()
-            worker.process.join()
+        for one in processes:
+            one.process.kill()
+            one.process.join()
 
 
-class _Worker:
-    """A process, the pipe to it and its job."""
+class _Process:
+    """A process, the pipe to it, and its job if it has one."""
 
     def __init__(self, daemon: bool) -> None:
         context = multiprocessing.get_context("spawn")
@@ -116,17 +115,17 @@ class _Worker:
             self.connection.send(job)
         except BrokenPipeError:
             self.process.join()
-            raise RuntimeError(f"a worker process ended with code {self.process.exitcode} between its jobs") from None
+            raise RuntimeError(f"a process for jobs ended with code {self.process.exitcode} between its jobs") from None
 
     def messages(self) -> Iterator[tuple[Job, Message]]:
-        """Yield what has arrived; the last message of a job frees the worker."""
+        """Yield what has arrived; the last message of a job leaves the process without one."""
         assert self.job is not None
         try:
             message: Message | None = self.connection.recv()
         except (EOFError, OSError):
             self.process.join()
             if not self._started:
-                raise RuntimeError(f"a worker process ended with code {self.process.exitcode} at its start") from None
+                raise RuntimeError(f"a process for jobs ended with code {self.process.exitcode} at its start") from None
             message = _death(self.job, self.process.exitcode or 0)
         if message is None:
             self._started = True

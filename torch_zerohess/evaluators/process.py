@@ -1,9 +1,11 @@
 """A worker process, as its caller sees it."""
 
 import multiprocessing
+import select
 import signal
 import threading
 import time
+from collections.abc import Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -116,6 +118,20 @@ class Process:
         self.process.join()
         self.messages.close()
         return ending(self.process.exitcode or 0)
+
+
+def ready(handles: Sequence[Any], seconds: float) -> set[Any]:
+    """Return which connections and sentinels are ready, as `multiprocessing.connection.wait`, whose setup takes longer.
+
+    Handles are numbers of files: see `Process.handles`.
+    """
+    if not hasattr(select, "poll"):  # Windows
+        return set(wait(handles, seconds))
+    poll = select.poll()
+    for one in handles:
+        poll.register(one, select.POLLIN)
+    found = {number for number, _ in poll.poll(1000 * seconds)}
+    return {one for one in handles if (one if isinstance(one, int) else one.fileno()) in found}
 
 
 def ending(code: int) -> str:

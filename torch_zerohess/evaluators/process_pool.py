@@ -217,7 +217,7 @@ class ProcessPool(Ahead):
     def _hear(self, one: Process, jobs: Sequence[Job]) -> None:
         job, chunk = one.job, one.chunk
         try:
-            kind, header, tensors = one.receive()
+            kind, header, parts = one.receive()
         except (EOFError, OSError):
             self._lose(one, jobs, None)
             return
@@ -239,7 +239,7 @@ class ProcessPool(Ahead):
             assert job is not None
             assert chunk is not None
             self._failed_starts = 0
-            job.batch.came(chunk, tensors[0])
+            job.batch.came(chunk, parts[0])
 
     def _too_large(self, one: Process) -> str:
         """Return that a worker takes too much memory, or nothing."""

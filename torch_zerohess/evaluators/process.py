@@ -118,17 +118,14 @@ class Process:
 
 
 def ready(handles: Sequence[Any], seconds: float) -> set[Any]:
-    """Return which connections and sentinels are ready, as `multiprocessing.connection.wait`, whose setup takes longer.
-
-    Handles are numbers of files: see `Process.handles`.
-    """
+    """Return which connections and sentinels are ready, as `multiprocessing.connection.wait`, which is slower."""
     if not hasattr(select, "poll"):  # Windows
         return set(wait(handles, seconds))
+    numbers = {one if isinstance(one, int) else one.fileno(): one for one in handles}
     poll = select.poll()
-    for one in handles:
-        poll.register(one, select.POLLIN)
-    found = {number for number, _ in poll.poll(1000 * seconds)}
-    return {one for one in handles if (one if isinstance(one, int) else one.fileno()) in found}
+    for number in numbers:
+        poll.register(number, select.POLLIN)
+    return {numbers[number] for number, _ in poll.poll(1000 * seconds)}
 
 
 def ending(code: int) -> str:

@@ -32,9 +32,12 @@ class Part(NamedTuple):
 
     @classmethod
     def of(cls, one: Tensor) -> "Part":
-        """Return a view of a tensor of `plain`, which must live longer. Without NumPy, torch makes none."""
+        """Return a tensor of `plain`, which must live longer: if it is large, the data are a view."""
         size = one.nbytes
-        data = memoryview((ctypes.c_char * size).from_address(one.data_ptr())) if size else b""
+        if size <= PIPE:
+            data: Any = ctypes.string_at(one.data_ptr(), size)
+        else:
+            data = memoryview((ctypes.c_char * size).from_address(one.data_ptr()))
         return cls(str(one.dtype), tuple(one.shape), data)
 
     def rows(self, start: int, stop: int) -> "Part":

@@ -79,6 +79,7 @@ def main(connection: "Connection[Any, Any]") -> None:
         except (EOFError, OSError):
             return
         values = None
+        torch.set_grad_enabled(kind == FUNCTION)  # it is made with gradients, and called without
         try:
             if kind == FUNCTION:
                 fn = None  # what it holds is given back before the next one is made
@@ -86,8 +87,7 @@ def main(connection: "Connection[Any, Any]") -> None:
                 built(fn)
             else:
                 tensors = [one.tensor() for one in parts]
-                with torch.no_grad():
-                    values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+                values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
         except BaseException as error:  # SystemExit too: it is the black box's, not this process's
             messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
         else:

@@ -130,6 +130,11 @@ def test_a_factory_is_called_once_in_every_worker(pool, tmp_path):
     assert (tmp_path / "made").read_text().split() == [*made, str(os.getpid())]
 
 
+def test_a_black_box_is_made_with_gradients_and_called_without(pool):
+    for _ in range(2):
+        assert pool(Factory(black_boxes.sloped), points(5)).tolist() == [0.0] * 5
+
+
 def test_an_error_comes_with_the_traceback_of_the_worker(pool):
     z = torch.tensor([[0.1], [0.2], [0.7], [0.1], [0.9]])
     with pytest.raises(ArithmeticError, match=r"got 0\.700") as raised:  # the first point's, whoever is faster

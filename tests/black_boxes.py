@@ -8,6 +8,8 @@ from pathlib import Path
 
 import torch
 
+from torch_zerohess.evaluators.transfer import packed, unpacked
+
 
 def waves(z, *aux):
     """[K, n] -> [K]; every row by itself has the same bits as in a batch."""
@@ -148,3 +150,22 @@ class Meeting:
                 raise TimeoutError("nobody came")
             time.sleep(0.01)
         return waves(z)
+
+
+def part(values):
+    """Values as they come from a worker."""
+    return unpacked(packed([values]))[0]
+
+
+def sloped():
+    """Make a black box with gradients; it returns whether it is called with them."""
+    x = torch.zeros(2, requires_grad=True)
+    x.sin().sum().backward()
+    return graded
+
+
+def graded(z):
+    """[K, n] -> [K]; it leaves gradients on."""
+    values = torch.full((len(z),), float(torch.is_grad_enabled()))
+    torch.set_grad_enabled(True)
+    return values

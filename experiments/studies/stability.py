@@ -68,13 +68,9 @@ def stability(
         largest: parameters of the largest case.
         repeats: of every setting whose intervals are counted.
         runs: of every search on every hard case; 0 leaves them out.
-<<<<<<< HEAD
-        out: JSON file to write.
+        out: JSON file to write, with all three tables.
         store: name of the table of cases that is kept under experiments/results, for the documents; intervals and
             searches are kept as NAME_intervals and NAME_searches.
-=======
-        out: JSON file to write, with all three tables.
->>>>>>> wt6-exp
 
     Raises:
         SystemExit: with status 1, if something is wrong.
@@ -83,7 +79,6 @@ def stability(
         may_keep(store)
     rows = [row for case in progress(cases(largest), "cases") for row in _rows(case, seed)]
     shares = coverage(seed=seed, repeats=repeats)
-<<<<<<< HEAD
     wrong = [row for row in rows if row.verdict.startswith("WRONG")]
     found = searches(runs=runs, seed=seed) if runs else []
     made = {
@@ -105,25 +100,11 @@ def stability(
     for title, (headers, cells) in zip(titles, made.values(), strict=True):
         print(f"{title}\n\n{table(headers, cells)}\n")
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+        tables: dict[str, list[Any]] = {"accuracy": rows, "coverage": shares, "searches": found}
+        write(out, json.dumps({name: [asdict(one) for one in part] for name, part in tables.items()}, indent=1))
     if store is not None:
         for suffix, (headers, cells) in made.items():
             print(keep(headers, cells, store + suffix))
-=======
-    headers = ["case", "quantity", "relative error", "standard errors", "seconds", "verdict"]
-    print(table(headers, [list(asdict(row).values()) for row in rows]))
-    wrong = [row for row in rows if row.verdict.startswith("WRONG")]
-    print(f"\n{len(rows) - len(wrong)} of {len(rows)} right\n")
-    headers = [f"{repeats} intervals of", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
-    print(table(headers, [one.cells() for one in shares]))
-    found = searches(runs=runs, seed=seed) if runs else []
-    headers = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
-    print(f"\nSearches, {runs} runs each\n\n{table(headers, [list(asdict(one).values()) for one in found])}")
-    if out is not None:
-        tables: dict[str, list[Any]] = {"accuracy": rows, "coverage": shares, "searches": found}
-        write(out, json.dumps({name: [asdict(one) for one in part] for name, part in tables.items()}, indent=1))
->>>>>>> wt6-exp
     outside = [one for one in shares if one.verdict.startswith("WRONG")]
     false = [one for one in found if one.verdict.startswith("WRONG")]
     if wrong or outside or false:

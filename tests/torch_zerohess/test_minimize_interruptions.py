@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from black_boxes import part
 from searches import raising, tilted, zeros
 
 import torch_zerohess as zh
@@ -194,7 +195,7 @@ def test_evaluators_keep_them_by_number():
     assert numbers[:2] == [0, 1]
     assert values.tolist() == [float(k) for k in numbers]
     batch = Batch(points, 0, most=2)
-    batch.came(batch.take(), vector(0.0, 1.0))
+    batch.came(batch.take(), part(vector(0.0, 1.0)))
     assert {k: float(one) for k, one in batch.known.items()} == {0: 0.0, 1: 1.0}
 
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.transfer import Part, joined
+
 MOST = 256
 """Chunks of a call."""
 
@@ -58,7 +60,7 @@ class Batch:
     """Where the chunks start that are being evaluated."""
     lost: dict[int, str] = field(default_factory=dict)
     """Points without a value, and why."""
-    _values: dict[int, Tensor] = field(default_factory=dict)
+    _values: dict[int, Part] = field(default_factory=dict)
     _error: tuple[int, BaseException] | None = None
 
     def __post_init__(self) -> None:
@@ -77,7 +79,7 @@ class Batch:
     @property
     def known(self) -> dict[int, Tensor]:
         """Values [*out] that have come, by the number of their point."""
-        return {start + k: one for start, values in list(self._values.items()) for k, one in enumerate(values)}
+        return {start + k: one for start, values in list(self._values.items()) for k, one in enumerate(values.tensor())}
 
     def take(self) -> Chunk:
         """Return the next chunk, which is busy from now on."""
@@ -85,7 +87,7 @@ class Batch:
         self.busy.add(chunk.start)
         return chunk
 
-    def came(self, chunk: Chunk, values: Tensor) -> None:
+    def came(self, chunk: Chunk, values: Part) -> None:
         """Keep the values of a chunk."""
         self.busy.discard(chunk.start)
         self._values[chunk.start] = values
@@ -133,13 +135,11 @@ class Batch:
                     f"fn must return values of one shape, got {list(first.shape[1:])} for point {parts[0][0]} and "
                     f"{list(values.shape[1:])} for point {start}, [{numbers(self.points[start])}]"
                 )
+        some = joined([values for _, values in parts])
         if not self.lost:
-            return first if len(parts) == 1 else torch.cat([values for _, values in parts])
-        dtype = torch.cat([values[:0] for _, values in parts]).dtype
-        result = torch.full((len(self.points), *first.shape[1:]), torch.nan, dtype=dtype, device=first.device)
-        for start, values in parts:
-            result[start : start + len(values)] = values
-        return result
+            return some
+        rows = torch.tensor([k for k in range(len(self.points)) if k not in self.lost], device="cpu")
+        return some.new_full((len(self.points), *some.shape[1:]), torch.nan).index_copy_(0, rows, some)
 
     def loss(self) -> LostEvaluationError:
         """Return the error that names the first lost point."""

@@ -121,7 +121,7 @@ def _known(tasks: Tasks) -> dict[int, Tensor]:
     """Return the values of the tasks that have succeeded, by the number of their point."""
     done = [(chunk, task) for chunk, task in tasks if task.done() and not task.cancelled() and not task.exception()]
     values = [(chunk, transfer.unpacked(task.result())[0]) for chunk, task in done]
-    return {chunk.start + k: one for chunk, rows in values for k, one in enumerate(rows)}
+    return {chunk.start + k: one for chunk, rows in values for k, one in enumerate(rows.tensor())}
 
 
 def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[[], object]) -> None:
@@ -151,7 +151,7 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes) -> bytes:
 
 def values_of(fn: Callable[..., Any], data: bytes) -> bytes:
     """Return the values of points and auxiliary inputs, all as bytes."""
-    tensors = transfer.unpacked(data)
+    tensors = [one.tensor() for one in transfer.unpacked(data)]
     with torch.no_grad():
         values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
     return transfer.packed([values])

@@ -1,15 +1,14 @@
 """A worker process, as its caller sees it."""
 
 import multiprocessing
+import select
 import signal
 import threading
 import time
+from collections.abc import Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
-
-import torch
-from torch import Tensor
 
 from torch_zerohess.evaluators import transfer, worker
 from torch_zerohess.evaluators.ahead import Job
@@ -54,30 +53,30 @@ class Process:
     def give_function(self, number: int, payload: bytes) -> None:
         """Send a black box."""
         self.ready, self.number = False, number
-        data = torch.frombuffer(bytearray(payload), dtype=torch.uint8)
-        self.messages.send(FUNCTION, None, (data,), shared=self._room((data,)))
+        parts = [transfer.Part("torch.uint8", (len(payload),), payload)]
+        self.messages.send(FUNCTION, None, parts, shared=self._room(parts))
 
     def give(self, job: Job, chunk: Chunk, timeout: float | None) -> None:
         """Send the points of a chunk."""
         self.ready, self.job, self.chunk = False, job, chunk
-        tensors = tuple(one[chunk.start : chunk.stop] for one in job.tensors)
-        self.messages.send(EVALUATE, None, tensors, shared=self._room(tensors))
+        parts = [one.rows(chunk.start, chunk.stop) for one in job.parts]
+        self.messages.send(EVALUATE, None, parts, shared=self._room(parts))
         self.deadline = None if timeout is None else time.monotonic() + timeout * len(chunk)
 
-    def receive(self) -> tuple[int, Any, list[Tensor]]:
+    def receive(self) -> tuple[int, Any, list[transfer.Part]]:
         """Return the next message; EOFError or OSError if the process has ended."""
-        kind, header, tensors = self.messages.receive()
+        kind, header, parts = self.messages.receive()
         if kind == ROOM:
             self._enlarge(header)
         elif kind != READY and self.chunk is not None:
             self.evaluations += len(self.chunk)
             self.chunk = self.job = self.deadline = None
         self.ready = kind != ROOM
-        return kind, header, tensors
+        return kind, header, parts
 
-    def _room(self, tensors: tuple[Tensor, ...]) -> bool:
-        """Make room in the memory for tensors; False if they are small enough for the pipe."""
-        _, size = transfer.specs(tensors)
+    def _room(self, parts: Sequence[transfer.Part]) -> bool:
+        """Make room in the memory for parts; False if they are small enough for the pipe."""
+        size = transfer.size(parts)
         if size <= transfer.PIPE or not transfer.can_share():
             return False
         if not self.messages.fits(size):
@@ -116,6 +115,17 @@ class Process:
         self.process.join()
         self.messages.close()
         return ending(self.process.exitcode or 0)
+
+
+def ready(handles: Sequence[Any], seconds: float) -> set[Any]:
+    """Return which connections and sentinels are ready, as `multiprocessing.connection.wait`, which is slower."""
+    if not hasattr(select, "poll"):  # Windows
+        return set(wait(handles, seconds))
+    numbers = {one if isinstance(one, int) else one.fileno(): one for one in handles}
+    poll = select.poll()
+    for number in numbers:
+        poll.register(number, select.POLLIN)
+    return {numbers[number] for number, _ in poll.poll(1000 * seconds)}
 
 
 def ending(code: int) -> str:

@@ -15,7 +15,7 @@ import sys
 import time
 import weakref
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from typing import Any
 
 from torch import Tensor
@@ -24,7 +24,7 @@ from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.payload import dumped, loaded_error
-from torch_zerohess.evaluators.process import Process
+from torch_zerohess.evaluators.process import Process, ready
 from torch_zerohess.evaluators.worker import ERROR, VALUES
 
 _STARTS = 25
@@ -200,14 +200,14 @@ class ProcessPool(Ahead):
             if one.deadline is not None:
                 seconds = min(seconds, max(0.0, one.deadline - time.monotonic()))
         handles = [handle for one in self._staffed for handle in one.handles]
-        ready = set(wait([*handles, self._bell[0]], seconds))
-        if self._bell[0] in ready:
+        found = ready([*handles, self._bell[0]], seconds)
+        if self._bell[0] in found:
             self._rung = False
             self._bell[0].recv_bytes()
         for one in list(self._staffed):
-            if one.connection in ready:
+            if one.connection in found:
                 self._hear(one, jobs)
-            elif one.process.sentinel in ready or (not ready and not one.process.is_alive()):
+            elif one.process.sentinel in found or (not found and not one.process.is_alive()):
                 self._lose(one, jobs, None)
             elif one.deadline is not None and time.monotonic() > one.deadline:
                 self._lose(one, jobs, f"the black box took longer than timeout={self.timeout:g} s per point")
@@ -217,7 +217,7 @@ class ProcessPool(Ahead):
     def _hear(self, one: Process, jobs: Sequence[Job]) -> None:
         job, chunk = one.job, one.chunk
         try:
-            kind, header, tensors = one.receive()
+            kind, header, parts = one.receive()
         except (EOFError, OSError):
             self._lose(one, jobs, None)
             return
@@ -239,7 +239,7 @@ class ProcessPool(Ahead):
             assert job is not None
             assert chunk is not None
             self._failed_starts = 0
-            job.batch.came(chunk, tensors[0])
+            job.batch.came(chunk, parts[0])
 
     def _too_large(self, one: Process) -> str:
         """Return that a worker takes too much memory, or nothing."""

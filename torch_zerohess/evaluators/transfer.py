@@ -3,74 +3,113 @@
 The memory is a file without a name: nothing is left of it when the processes have ended, however they end.
 """
 
+import ctypes
 import mmap
 import os
 import pickle
-import struct
 import tempfile
 from collections.abc import Sequence
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 PIPE = 1 << 15
 """Bytes of tensors that go through the pipe; more go through shared memory. A pipe takes as many without a reader."""
-_ALIGNED = 64
-_LENGTH = struct.Struct("<Q")
-
-Spec = tuple[torch.dtype, tuple[int, ...], int, int]
-"""Type, shape, first byte and number of bytes of a tensor."""
+_DTYPES = {str(one): one for one in vars(torch).values() if isinstance(one, torch.dtype)}
+"""By name: a name is pickled faster than a type."""
 
 
-def specs(tensors: Sequence[Tensor]) -> tuple[list[Spec], int]:
-    """Return where tensors lie one after the other, and how many bytes they take."""
-    found, offset = [], 0
-    for one in tensors:
-        size = one.numel() * one.element_size()
-        found.append((one.dtype, tuple(one.shape), offset, size))
-        offset += -(-size // _ALIGNED) * _ALIGNED
-    return found, offset
+class Part(NamedTuple):
+    """A tensor as what travels between processes."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    data: Any
+    """Its bytes, or a view of them."""
+
+    @classmethod
+    def of(cls, one: Tensor) -> "Part":
+        """Return a tensor of `plain`, which must live longer: if it is large, the data are a view."""
+        size = one.nbytes
+        if size <= PIPE:
+            data: Any = ctypes.string_at(one.data_ptr(), size)
+        else:
+            data = memoryview((ctypes.c_char * size).from_address(one.data_ptr()))
+        return cls(str(one.dtype), tuple(one.shape), data)
+
+    def rows(self, start: int, stop: int) -> "Part":
+        """Return `[start:stop]` of it."""
+        count, *each = self.shape
+        size = len(self.data) // max(1, count)
+        return Part(self.dtype, (min(stop, count) - min(start, count), *each), self.data[start * size : stop * size])
+
+    def tensor(self) -> Tensor:
+        """Return a copy."""
+        one = torch.empty(self.shape, dtype=_DTYPES[self.dtype], device="cpu")
+        ctypes.memmove(one.data_ptr(), bytes(self.data), len(self.data))
+        return one
 
 
-def write(tensors: Sequence[Tensor], where: Sequence[Spec], target: Any, start: int = 0) -> None:
-    """Copy tensors into a writable buffer."""
-    for one, (dtype, shape, offset, size) in zip(tensors, where, strict=True):
-        if size:
-            place = torch.frombuffer(target, dtype=dtype, count=one.numel(), offset=start + offset)
-            place.reshape(shape).copy_(one.detach())
+def plain(one: Tensor) -> Tensor:
+    """Return a tensor on the CPU whose bytes are its values in their order."""
+    return one.cpu().resolve_conj().resolve_neg().contiguous()
 
 
-def read(where: Sequence[Spec], source: Any, start: int = 0) -> list[Tensor]:
-    """Return copies of the tensors in a writable buffer."""
-    result = []
-    for dtype, shape, offset, size in where:
-        one = torch.empty(shape, dtype=dtype, device="cpu")
-        if size:
-            place = torch.frombuffer(source, dtype=dtype, count=one.numel(), offset=start + offset)
-            one.reshape(-1).copy_(place)
-        result.append(one)
+def joined(parts: Sequence[Part]) -> Tensor:
+    """Return parts of shape [k, *out], of one *out, as one tensor [K, *out]."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first.tensor()
+    if any(one.dtype != first.dtype for one in parts):
+        return torch.cat([one.tensor() for one in parts])
+    shape = sum(one.shape[0] for one in parts), *first.shape[1:]
+    result = torch.empty(shape, dtype=_DTYPES[first.dtype], device="cpu")
+    place = result.data_ptr()
+    for one in parts:
+        ctypes.memmove(place, bytes(one.data), len(one.data))
+        place += len(one.data)
     return result
+
+
+def size(parts: Sequence[Part]) -> int:
+    """Return how many bytes tensors take."""
+    return sum(len(one.data) for one in parts)
+
+
+def sent(parts: Sequence[Part], memory: "SharedMemory | None" = None) -> list[tuple[Any, ...]]:
+    """Return parts as what is pickled fast. With shared memory, it has their bytes, one after the other."""
+    if memory is None:
+        return [(dtype, shape, bytes(data)) for dtype, shape, data in parts]
+    start = 0
+    for one in parts:
+        memory.data[start : start + len(one.data)] = one.data
+        start += len(one.data)
+    return [(dtype, shape, len(data)) for dtype, shape, data in parts]
+
+
+def received(found: Sequence[tuple[Any, ...]], memory: "SharedMemory | None" = None) -> list[Part]:
+    """Return the parts of `sent`."""
+    if memory is None:
+        return [Part(*one) for one in found]
+    start, parts = 0, []
+    for dtype, shape, count in found:
+        parts.append(Part(dtype, shape, memory.data[start : start + count]))
+        start += count
+    return parts
 
 
 def packed(tensors: Sequence[Tensor]) -> bytes:
     """Return tensors as bytes, for carriers that know only objects that can be pickled."""
-    where, size = specs(tensors)
-    header = pickle.dumps(where)
-    message = bytearray(_LENGTH.size + len(header) + size)
-    message[: _LENGTH.size] = _LENGTH.pack(len(header))
-    message[_LENGTH.size : _LENGTH.size + len(header)] = header
-    write(tensors, where, message, _LENGTH.size + len(header))
-    return bytes(message)
+    each = [plain(one) for one in tensors]
+    return pickle.dumps(sent([Part.of(one) for one in each]))
 
 
-def unpacked(message: bytes) -> list[Tensor]:
+def unpacked(message: bytes) -> list[Part]:
     """Return the tensors of `packed`."""
-    data = bytearray(message)
-    (length,) = _LENGTH.unpack_from(data)
-    return read(pickle.loads(data[_LENGTH.size : _LENGTH.size + length]), data, _LENGTH.size + length)
+    return received(pickle.loads(message))
 
 
 def can_share() -> bool:

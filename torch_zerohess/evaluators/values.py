@@ -48,7 +48,7 @@ def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tens
         raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")
     if not values.is_floating_point():
         raise TypeError(f"fn must return real numbers, got {values.dtype}: return .real, .abs() or both parts")
-    if values.dim() == 0 or len(values) != len(points):
+    if values.dim() == 0 or values.shape[0] != points.shape[0]:
         raise ValueError(
             f"fn must return one value per point, [{len(points)}, *out] for points "
             f"{list(points.shape)}, got {list(values.shape)}"

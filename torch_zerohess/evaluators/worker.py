@@ -2,8 +2,8 @@
 
 import contextlib
 import pickle
-import struct
 import traceback
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -18,7 +18,6 @@ from torch_zerohess.evaluators.values import checked_values
 
 READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
 """Kinds of messages: see `Messages`."""
-_HEAD = struct.Struct("<BI")
 
 
 class Messages:
@@ -41,29 +40,15 @@ class Messages:
         self.connection = connection
         self.memory: transfer.SharedMemory | None = None
 
-    def send(self, kind: int, header: Any = None, tensors: tuple[Tensor, ...] = (), *, shared: bool = False) -> None:
+    def send(self, kind: int, header: Any = None, parts: Sequence[transfer.Part] = (), *, shared: bool = False) -> None:
         """Send a message; `shared` puts its tensors into the memory."""
-        where, size = transfer.specs(tensors)
-        text = pickle.dumps((header, where, shared))
-        message = bytearray(_HEAD.size + len(text) + (0 if shared else size))
-        _HEAD.pack_into(message, 0, kind, len(text))
-        message[_HEAD.size : _HEAD.size + len(text)] = text
-        if shared:
-            assert self.memory is not None
-            transfer.write(tensors, where, self.memory.data)
-        else:
-            transfer.write(tensors, where, message, _HEAD.size + len(text))
-        self.connection.send_bytes(message)
+        found = transfer.sent(parts, self.memory if shared else None)
+        self.connection.send_bytes(pickle.dumps((kind, header, found, shared)))
 
-    def receive(self) -> tuple[int, Any, list[Tensor]]:
+    def receive(self) -> tuple[int, Any, list[transfer.Part]]:
         """Return kind, header and tensors of the next message; EOFError or OSError if there is none."""
-        message = bytearray(self.connection.recv_bytes())
-        kind, length = _HEAD.unpack_from(message)
-        header, where, shared = pickle.loads(memoryview(message)[_HEAD.size : _HEAD.size + length])
-        if shared:
-            assert self.memory is not None
-            return kind, header, transfer.read(where, self.memory.data)
-        return kind, header, transfer.read(where, message, _HEAD.size + length)
+        kind, header, found, shared = pickle.loads(self.connection.recv_bytes())
+        return kind, header, transfer.received(found, self.memory if shared else None)
 
     def fits(self, size: int) -> bool:
         """Whether so many bytes fit into the memory."""
@@ -87,21 +72,22 @@ def main(connection: "Connection[Any, Any]") -> None:
         messages.send(READY)
     while True:
         try:
-            kind, header, tensors = messages.receive()
+            kind, header, parts = messages.receive()
             if kind == ROOM:
                 _map(messages, header)
                 continue
         except (EOFError, OSError):
             return
         values = None
+        torch.set_grad_enabled(kind == FUNCTION)  # it is made with gradients, and called without
         try:
             if kind == FUNCTION:
                 fn = None  # what it holds is given back before the next one is made
-                fn = pickle.loads(_data(tensors[0]))
+                fn = pickle.loads(parts[0].data)
                 built(fn)
             else:
-                with torch.no_grad():
-                    values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+                tensors = [one.tensor() for one in parts]
+                values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
         except BaseException as error:  # SystemExit too: it is the black box's, not this process's
             messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
         else:
@@ -112,25 +98,21 @@ def _answer(messages: Messages, values: Tensor | None) -> None:
     if values is None:
         messages.send(FUNCTION)
         return
-    _, size = transfer.specs([values])
+    values = transfer.plain(values)  # has the bytes until they are sent
+    parts = [transfer.Part.of(values)]
+    size = transfer.size(parts)
     shared = size > transfer.PIPE and transfer.can_share()
     if shared and not messages.fits(size):
         messages.send(ROOM, size)
         _, room, _ = messages.receive()
         _map(messages, room)
-    messages.send(VALUES, tensors=(values,), shared=shared)
+    messages.send(VALUES, parts=parts, shared=shared)
 
 
 def _map(messages: Messages, size: int) -> None:
     if messages.memory is not None:
         messages.memory.close()
     messages.memory = transfer.SharedMemory.receive(messages.connection, size)
-
-
-def _data(one: Tensor) -> memoryview:
-    data = bytearray(one.numel())
-    transfer.write([one], transfer.specs([one])[0], data)
-    return memoryview(data)
 
 
 def _leave_no_core() -> None:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import black_boxes
 import pytest
 import torch
-from black_boxes import points
+from black_boxes import part, points
 
 from torch_zerohess.evaluators import ProcessPool
 from torch_zerohess.evaluators.ahead import Ahead, Function, Job
@@ -36,7 +36,7 @@ class Stepping(Ahead):
         job = next((job for job in jobs if job.waiting), None)
         if job and job.begin():
             chunk = job.batch.take()
-            job.batch.came(chunk, job.function.fn(job.tensors[0][chunk.start : chunk.stop]))
+            job.batch.came(chunk, part(job.function.fn(job.tensors[0][chunk.start : chunk.stop])))
 
     def _give_up(self, jobs):
         pass
@@ -112,7 +112,7 @@ def job(fn=black_boxes.waves, device="cpu"):
 
 def test_values_that_cannot_go_to_their_device_are_an_error_of_their_call():
     one = job(device="cuda:99")
-    one.batch.came(one.batch.take(), torch.zeros(1))
+    one.batch.came(one.batch.take(), part(torch.zeros(1)))
     one.settle()
     assert one.future.exception(0) is not None
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import black_boxes
 import pytest
 import torch
-from black_boxes import points
+from black_boxes import part, points
 
 import torch_zerohess as zh
 from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
@@ -55,6 +55,35 @@ def test_large_values_and_points_go_through_shared_memory(pool):
     assert any(one.messages.memory is not None for one in pool._staffed)
     wide = points(3, 20_000)
     assert torch.equal(pool(black_boxes.waves, wide), black_boxes.waves(wide))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        torch.arange(6.0).reshape(2, 3).T,
+        torch.tensor([1.0]).expand(3),
+        torch.tensor([1 + 2j, 3 - 4j]).conj(),
+        torch.tensor([1 + 2j, 3 - 4j]).conj().imag,  # its bytes have the other sign
+        torch.tensor([True, False]),
+        torch.tensor([1.5, math.nan], dtype=torch.bfloat16),
+        torch.zeros(2, 0),
+        torch.arange(10)[3::2],
+        torch.ones(2, requires_grad=True),
+    ],
+)
+def test_tensors_of_any_kind_arrive_as_they_were(values):
+    found = part(values)
+    torch.testing.assert_close(found.tensor(), values.detach(), rtol=0, atol=0, equal_nan=True)
+    for rows in (slice(0, 1), slice(1, 9)):
+        one = found.rows(rows.start, rows.stop).tensor()
+        torch.testing.assert_close(one, values.detach()[rows], rtol=0, atol=0, equal_nan=True)
+
+
+def test_chunks_with_values_of_two_types_have_the_wider_one():
+    batch = Batch(torch.zeros(2, 1), retries=0)
+    for dtype in (torch.float32, torch.float64):
+        batch.came(batch.take(), part(torch.ones(1, 3, dtype=dtype)))
+    assert torch.equal(batch.result(), torch.ones(2, 3, dtype=torch.float64))
 
 
 def test_workers_are_other_processes_with_one_thread(pool):
@@ -99,6 +128,11 @@ def test_a_factory_is_called_once_in_every_worker(pool, tmp_path):
     assert torch.equal(Inline()(fn, z), black_boxes.waves(z))
     assert torch.equal(Inline()(fn, z), black_boxes.waves(z))
     assert (tmp_path / "made").read_text().split() == [*made, str(os.getpid())]
+
+
+def test_a_black_box_is_made_with_gradients_and_called_without(pool):
+    for _ in range(2):
+        assert pool(Factory(black_boxes.sloped), points(5)).tolist() == [0.0] * 5
 
 
 def test_an_error_comes_with_the_traceback_of_the_worker(pool):
@@ -199,11 +233,11 @@ def test_chunks_are_tried_again_and_then_cut():
         assert (chunk.start, chunk.stop, chunk.tries) == (0, 3, tries)
         batch.failed(chunk, "why")
     assert [(one.start, one.stop) for one in batch.waiting] == [(0, 1), (1, 2), (2, 3)]
-    batch.came(batch.take(), torch.tensor([0.5]))
+    batch.came(batch.take(), part(torch.tensor([0.5])))
     for _ in range(2):
         batch.failed(batch.take(), "why")
     assert not batch.finished
-    batch.came(batch.take(), torch.tensor([2.5]))
+    batch.came(batch.take(), part(torch.tensor([2.5])))
     assert batch.finished
     assert batch.lost == {1: "why in each of 2 tries"}
     torch.testing.assert_close(batch.result(), torch.tensor([0.5, math.nan, 2.5]), equal_nan=True)

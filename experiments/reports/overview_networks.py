@@ -11,8 +11,8 @@ from experiments.reports.results import load
 from experiments.reports.supplement_figures import Column
 from experiments.reports.trained_network import encoders_of, weights_of
 
-PREFERRED = "memory_newton"
-"""The method that is shown where several have trained a network."""
+PREFERRED = ("memory_newton", "memory_targets")
+"""The methods that are shown where several have trained a network, the first one that there is."""
 _SEED = 2**30
 """Of the input that is shown, which no network was trained on."""
 
@@ -33,7 +33,8 @@ def network_column(folder: Path, name: str, variant: str = "auto") -> Column | N
     there = [one for one in runs if one.status != "failed" and weights_of(one, folder).exists()]
     if not there:
         return None
-    shown = min(there, key=lambda one: one.method != PREFERRED)  # the first of the preferred method, or of all
+    order = [*PREFERRED, *(one.method for one in there)]
+    shown = min(there, key=lambda one: order.index(one.method))
     task = catalogue.load(name, shown.settings.get("preset", "fast"), variant)
     assert isinstance(task, NetworkTask)
     encoder, start = encoders_of(task, shown, folder)

@@ -33,6 +33,7 @@ from experiments.reports import supplement_figures
 from experiments.reports.animation import Trace, finer
 from experiments.reports.medians import medians, objects, reached
 from experiments.reports.networks import conclude
+from experiments.reports.overview_networks import PREFERRED
 from experiments.reports.progress import progress
 from experiments.reports.results import Run
 from experiments.reports.tables import table
@@ -148,12 +149,13 @@ def _tasks(setting: Setting) -> None:
             ensemble = Ensemble(
                 folder, runs, setting.preset, variant=setting.variant, threads=1, evaluations=evaluations
             )
-            outcomes = ensemble.run(ensemble.plan([name], ["memory_newton"]))
+            task = catalogue.load(name, setting.preset, setting.variant, 1)
+            assert isinstance(task, NetworkTask)
+            method = next(one for one in PREFERRED if METHODS[one].unusable(task) is None)
+            outcomes = ensemble.run(ensemble.plan([name], [method]))
         except ImportError as error:
             print(error)
             continue
-        task = catalogue.load(name, setting.preset, setting.variant, 1)
-        assert isinstance(task, NetworkTask)
         conclude(task, outcomes, folder)
     gallery(
         folder,

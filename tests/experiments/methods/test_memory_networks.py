@@ -11,8 +11,9 @@ from small import SIZE, Bump, trained
     [
         ("memory_newton", 60, None, 0.8),  # Newton steps on the weights
         ("memory_adam", 60, None, 0.6),
-        ("memory_newton", 117, 0, 0.8),  # more outputs than `MOST`: Newton targets, to which Adam fits the weights
-        ("memory_newton", 60, 0, 0.1),  # all evaluations are used before the first step
+        ("memory_targets", 117, None, 0.1),
+        ("memory_targets", 157, 0, 0.8),  # more outputs than `MOST`: so many renders come first
+        ("memory_targets", 60, 0, 0.1),  # all evaluations are used before the first step
     ],
 )
 def test_uses_its_evaluations_and_reduces_the_error(method, evaluations, most, left, monkeypatch):

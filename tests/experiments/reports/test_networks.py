@@ -8,6 +8,7 @@ import torch
 from small import BUMP, FAIL_TO_TRAIN, SHIFT, SIZE
 
 from experiments.ensembles.ensemble import Ensemble
+from experiments.problems import catalogue
 from experiments.problems.network_task import Size
 from experiments.problems.tasks import cnn
 from experiments.reports import onnx_export, overview_networks
@@ -60,7 +61,7 @@ def test_a_trained_network_has_a_column_in_the_overview(tmp_path, one_process, m
     (tmp_path / "bump" / HELD_OUT).touch()  # what `conclude` writes
     monkeypatch.setattr(overview_networks.catalogue, "load", lambda *_: BUMP)
     for preferred in ("our_g", "shift"):
-        monkeypatch.setattr(overview_networks, "PREFERRED", preferred)
+        monkeypatch.setattr(overview_networks, "PREFERRED", (preferred,))
         found = network_column(tmp_path, "bump")
         assert (found.task, found.method) == ("bump", preferred)
         assert found.start.shape == found.end.shape == found.target.shape
@@ -95,9 +96,12 @@ def test_the_table_has_medians_and_shares():
     assert row.split() == ["m", "20", "2", "2", "0.2", "100", "4", "10", "2", "2", "of", "3"]
 
 
-def test_onnx_predicts_the_same(tmp_path):
+@pytest.mark.parametrize("name", ["cnn", "cnn_texture", "cnn_throw"])
+def test_onnx_predicts_the_same(name, tmp_path):
     torch.manual_seed(0)
-    difference = onnx_export.export(BUMP.encoder(), torch.rand(5, 3, SIZE.film, SIZE.film), tmp_path / "encoder.onnx")
+    task = catalogue.load(name)
+    images = 4 * torch.rand(5, 2) if name == "cnn_throw" else torch.rand(5, 3, task.size.film, task.size.film)
+    difference = onnx_export.export(task.encoder(), images, tmp_path / "encoder.onnx")
     assert 0 <= difference < 1e-4
 
 

@@ -11,7 +11,7 @@ from small import SIZE, Bump, trained
     [
         ("memory_newton", 60, None, 0.8),  # Newton steps on the weights
         ("memory_adam", 60, None, 0.6),
-        ("memory_targets", 117, None, 0.1),
+        ("memory_targets", 116, None, 0.1),
         ("memory_targets", 157, 0, 0.8),  # more outputs than `MOST`: so many renders come first
         ("memory_targets", 60, 0, 0.1),  # all evaluations are used before the first step
     ],

@@ -5,7 +5,7 @@ import json
 import matplotlib.image
 import pytest
 import torch
-from small import BUMP, FAIL_TO_TRAIN, SHIFT, SIZE
+from small import BUMP, FAIL_TO_TRAIN, SHIFT
 
 from experiments.ensembles.ensemble import Ensemble
 from experiments.problems import catalogue

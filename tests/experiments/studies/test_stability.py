@@ -3,9 +3,11 @@
 import json
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 
 from experiments.problems.closed_forms import ClosedForm, PlaneWave
+from experiments.reports import stored
 from experiments.studies.coverage import Coverage
 from experiments.studies.coverage import _rows as _coverage_rows
 from experiments.studies.stability import _rows, stability
@@ -37,6 +39,11 @@ def test_stability_keeps_its_three_tables(monkeypatch) -> None:
     assert [row[:2] for row in kept["extreme"]] == [[case.name, row.quantity] for row in rows]
     assert kept["extreme_intervals"] == [interval.cells()]
     assert kept["extreme_searches"] == []
+
+
+def test_what_is_stored_is_right() -> None:
+    verdicts = pd.concat([stored.read(f"stability{part}")["verdict"] for part in ("", "_intervals", "_searches")])
+    assert set(verdicts) == {"right", "right: refused", "few or skewed draws"}
 
 
 class Twice(ClosedForm):

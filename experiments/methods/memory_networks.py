@@ -3,12 +3,13 @@
 The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory`). New renders are made for few images
 of a batch. The loss is the local entropy, which leaves plateaus where the mean does not. This is what a user would
 write: everything comes from the public names of the library. All tasks have the same settings, the defaults below. They
-were chosen on runs 100 to 104 of CNN and CNN wide, run 100 of CNN-TEXTURE, and runs 100 and 101 of CNN-THROW, which no
+were chosen on runs 100 to 104 of CNN and CNN wide, run 100 of CNN-TEXTURE, and runs 100 to 107 of CNN-THROW, which no
 table reports.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
-ends Adam fits the network ("targets"). Steps on the weights need fewest renders where the surrogate is good, as of CNN.
-Steps on the outputs also suit outputs that jump, as of CNN-THROW, and many outputs, as of CNN-TEXTURE.
+ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the
+weights need fewest renders where the surrogate is good, as of CNN. Steps on the outputs also suit black boxes that
+jump, as of CNN-THROW, and many outputs, as of CNN-TEXTURE.
 """
 
 from collections.abc import Callable
@@ -45,8 +46,11 @@ def through_memory(
     radius: tuple[float, float] = (0.07, 0.003),
     damping: float = 3e-4,
     rate: tuple[float, float] = (3e-3, 3e-4),
-    target_rate: tuple[float, float] = (6e-3, 3e-4),
     target_damping: float = 1e-2,
+    target_radius: float = 0.5,
+    fit_damping: float = 0.3,
+    many_damping: float = 3e-4,
+    many_rate: tuple[float, float] = (6e-3, 3e-4),
     temperature: float = 0.15,
 ) -> None:
     """Train until the evaluations are used.
@@ -57,14 +61,16 @@ def through_memory(
 
     Args:
         trial: the run.
-        steps: "newton" on the weights, "targets" on the outputs, to whose ends Adam fits the network, or "adam".
+        steps: "newton" on the weights, "targets" on the outputs, to whose ends the network is fitted, or "adam".
         batch: images of a step.
         radius: first and last trust radius of "newton", in the weights.
         damping: of "newton".
         rate: first and last learning rate of "adam".
-        target_rate: first and last learning rate of Adam with "targets".
-        target_damping: of the Newton steps on the outputs. They are at most sigma long, as a root mean square over
-            the parameters.
+        target_damping: of the Newton steps on up to 10 outputs.
+        target_radius: longest Newton step on up to 10 outputs, over sigma.
+        fit_damping: of the steps on the weights that follow them.
+        many_damping: of the Newton steps on more outputs.
+        many_rate: first and last learning rate of Adam, which follows them.
         temperature: of the local entropy, over the mean loss.
     """
     task, network = trial.task, trial.encoder
@@ -87,7 +93,9 @@ def through_memory(
         memory.fresh, total = 0, _STEPS_ALONE
     update = {
         "newton": partial(_newton, network, layer, radius, damping),
-        "targets": partial(_targets, network, layer, target_rate, target_damping),
+        "targets": partial(_targets, network, layer, target_damping, target_radius, fit_damping)
+        if task.n <= MOST
+        else partial(_many_targets, network, layer, many_damping, many_rate),
         "adam": partial(_adam, network, layer, rate),
     }[steps]()
     for step in range(total):
@@ -122,16 +130,28 @@ def _newton(network: nn.Module, layer: zh.BlackBox, radius: tuple[float, float],
     return update
 
 
-def _targets(network: nn.Module, layer: zh.BlackBox, rate: tuple[float, float], damping: float) -> Update:
-    optimizer, targets = torch.optim.Adam(network.parameters()), zh.optim.NewtonTargets(damping=damping)
+def _targets(network: nn.Module, layer: zh.BlackBox, damping: float, radius: float, fit: float) -> Update:
+    newton = zh.optim.NewtonTargets(damping=damping)
+
+    def update(images: Tensor, share: float, sigma: float) -> Tensor:
+        y = network(images).detach()
+        newton.radius = radius * sigma
+        zh.optim.move_outputs(network, images, newton(lambda at: layer(at, images), y) - y, damping=fit)
+        assert newton.losses is not None
+        return newton.losses.mean()
+
+    return update
+
+
+def _many_targets(network: nn.Module, layer: zh.BlackBox, damping: float, rate: tuple[float, float]) -> Update:
+    optimizer, newton = torch.optim.Adam(network.parameters()), zh.optim.NewtonTargets(damping=damping)
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         y = network(images)
-        targets.radius = sigma * y.shape[1] ** 0.5
-        ends = targets(lambda at: layer(at, images), y)
+        ends = newton(lambda at: layer(at, images), y)
         _step(optimizer, _annealed(rate, share), (y - ends).square().mean())
-        assert targets.losses is not None
-        return targets.losses.mean()
+        assert newton.losses is not None
+        return newton.losses.mean()
 
     return update
 
@@ -176,7 +196,7 @@ METHODS = (
     ),
     Method(
         "memory_targets",
-        "ours: Newton steps on the outputs, to which Adam fits the network, through a layer that remembers its renders",
+        "ours: Newton steps on the outputs, to which the network is fitted, through a layer that remembers its renders",
         train=with_settings(through_memory, steps="targets"),
         uses="image",
     ),

@@ -1,0 +1,79 @@
+"""The step on the weights that moves outputs, against dense least squares."""
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import torch_zerohess as zh
+
+
+def made() -> tuple[nn.Module, Tensor, Tensor]:
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(4, 6), nn.Tanh(), nn.Linear(6, 2)).double()
+    return network, torch.randn(3, 4).double(), torch.randn(3, 2).double()
+
+
+def weights(network: nn.Module) -> Tensor:
+    return torch.cat([one.detach().flatten() for one in network.parameters() if one.requires_grad])
+
+
+@pytest.mark.parametrize("damping", [1e-6, 0.3, 10.0])
+def test_the_step_is_the_least_squares_solution(damping: float) -> None:
+    network, x, change = made()
+    parameters = list(network.parameters())
+    rows = [torch.autograd.grad(y, parameters, retain_graph=True) for y in network(x).flatten()]
+    J = torch.stack([torch.cat([one.flatten() for one in row]) for row in rows])
+    h = J.square().sum(1).mean()
+    # The normal equations of all weights, where the library solves those of all outputs.
+    expected = torch.linalg.solve(J.T @ J + damping * h * torch.eye(J.shape[1]).double(), J.T @ change.flatten())
+    before = weights(network)
+    zh.optim.move_outputs(network, x, change, damping=damping)
+    torch.testing.assert_close(weights(network) - before, expected, rtol=1e-8, atol=1e-10)
+
+
+def test_the_scale_of_the_weights_does_not_matter() -> None:
+    """A network whose last layer has a hundredth of the weights, behind a factor of a hundred."""
+    network, x, change = made()
+    other = copy.deepcopy(network)
+    with torch.no_grad():
+        for one in other.parameters():
+            one.requires_grad_(False)
+        for network_ in (network, other):
+            network_[0].requires_grad_(False)
+        other[2].weight.mul_(0.01)
+        other[2].bias.mul_(0.01)
+    other[2].requires_grad_(True)
+    scaled = nn.Sequential(other, nn.Linear(2, 2, bias=False).double())
+    with torch.no_grad():
+        scaled[1].weight.copy_(100.0 * torch.eye(2))
+    scaled[1].requires_grad_(False)
+    for one in (network, scaled):
+        zh.optim.move_outputs(one, x, change)
+    torch.testing.assert_close(scaled(x), network(x))
+
+
+def test_parameters_that_do_not_require_grad_stay() -> None:
+    network, x, change = made()
+    network[0].requires_grad_(False)
+    before = network[0].weight.clone()
+    zh.optim.move_outputs(network, x, change)
+    assert torch.equal(network[0].weight, before)
+    assert all(one.grad is None for one in network.parameters())
+
+
+def test_what_cannot_be_moved_is_said() -> None:
+    network, x, change = made()
+    before = weights(network)
+    with pytest.raises(ValueError, match=r"change must be \[3, 2\], one for each output, got \[2, 3\]"):
+        zh.optim.move_outputs(network, x, change.mT)
+    with pytest.raises(ValueError, match="change must be finite"):
+        zh.optim.move_outputs(network, x, change / 0.0)
+    with pytest.raises(ValueError, match="damping must be positive, got 0"):
+        zh.optim.move_outputs(network, x, change, damping=0.0)
+    with pytest.raises(ValueError, match="outputs of the network do not change with its weights"):
+        zh.optim.move_outputs(nn.Sequential(nn.Linear(4, 2), nn.Hardtanh()), 1e9 * torch.ones(1, 4), torch.ones(1, 2))
+    assert torch.equal(weights(network), before)
+    with pytest.raises(ValueError, match="network must have weights that require grad, got none"):
+        zh.optim.move_outputs(network.requires_grad_(False), x, change)

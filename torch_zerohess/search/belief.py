@@ -51,8 +51,8 @@ def believed(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise
         noise: standard deviation of repeated losses at one point; evaluations that differ by more count as well.
     """
     finite = torch.isfinite(losses)
-    points, losses = points[finite], losses[finite]
-    z = (points - around).to(unit) / unit
+    points, losses, unit = points[finite], losses[finite], unit.double()
+    z = (points.double() - around.double()) / unit
     distance, order = z.square().mean(1).sqrt().sort(stable=True)
     near = order[:_MOST]
     points, values, z = points[near], losses[near].to(unit), z[near]

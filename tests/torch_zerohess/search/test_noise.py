@@ -201,6 +201,10 @@ def test_a_belief_is_of_the_nearest_hundred_evaluations_whatever_their_distance(
     wide = believed(1e3 * points, losses, zeros(2), vector(1.0, 1.0), 0.5)
     assert torch.equal(wide.x, 1e3 * x)
     assert wide[1:] == pytest.approx((value, error))
+    single = points.float()
+    same = believed(single, losses, zeros(2).float(), torch.ones(2), 0.5)
+    assert torch.equal(same.x, single[(points == x).all(1)][0])
+    assert same[1:] == pytest.approx((value, error), rel=1e-4)
 
 
 def test_what_one_point_or_equal_losses_say_is_their_mean():

@@ -17,7 +17,7 @@ from experiments.methods.settings.spaces import SPACES, space
 from experiments.methods.settings.table_3 import IN_TABLE_3, TABLE_3, table_3
 
 CHANGES: tuple[Mapping[str, Mapping[str, Mapping[str, Any]]], ...] = (
-    *(paper.CHOSEN, paper.RETUNED, ours.SEARCH, ours.LOCAL, rivals.TUNED),
+    *(paper.CHOSEN, paper.RETUNED, ours.SEARCH, ours.LOCAL, ours.NETWORKS, rivals.TUNED),
 )
 """By task and method, in the order in which they replace Table 3."""
 

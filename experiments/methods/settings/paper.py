@@ -84,6 +84,13 @@ RETUNED: dict[str, dict[str, Settings]] = {
             "steps": 50,
         },
     },
+    # By hand on runs 100 to 102 with 1 000 simulations: eight pairs of rate and batch of our_g, and the same for fr22;
+    # six pairs of radii of our_hvpa.
+    "cnn_throw": {
+        "fr22": {"rate": (2e-3, 2e-4)},
+        "our_g": {"rate": (2e-3, 2e-4)},
+        "our_hvpa": {"radius": (0.3, 0.01)},
+    },
     # The rendered tasks: eight to twenty-four settings of each method on three starts. Table 3 gives up the plateau of
     # SHAD and spends most of its steps on the way elsewhere; it does not have MIRROR. What no setting brings to the
     # solution (our_hvp on MIRROR) keeps its own.

@@ -2,9 +2,9 @@
 
 The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory`). New renders are made for few images
 of a batch. The loss is the local entropy, which leaves plateaus where the mean does not. This is what a user would
-write: everything comes from the public names of the library. All tasks have the same settings, the defaults below. They
-were chosen on runs 100 to 104 of CNN and CNN wide, run 100 of CNN-TEXTURE, and runs 100 to 107 of CNN-THROW, which no
-table reports.
+write: everything comes from the public names of the library. All tasks have the same settings, the defaults below, but
+for the radius of `memory_newton` on CNN-THROW. They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of
+CNN-TEXTURE, and on runs 100 to 107 of CNN-THROW, which no table reports.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the

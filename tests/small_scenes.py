@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from experiments.problems.scenes import parts
 from torch_zerohess.adapters.mitsuba_variants import variants
 
 VARIANTS = [name for name, probe in variants().items() if probe.works]
@@ -18,18 +19,8 @@ def rgb(*value):
 
 def camera(mi, width=4, height=4):
     """At (0, 0, 3), looking at the origin: x to the right, y up; the square of half side 1 fills the image."""
-    return {
-        "type": "perspective",
-        "fov": 2 * math.degrees(math.atan(1 / 3)),
-        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0]),
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "pixel_format": "rgb",
-            "rfilter": {"type": "box"},
-        },
-    }
+    view = mi.ScalarTransform4f().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0])
+    return parts.camera(view, 2 * math.degrees(math.atan(1 / 3)), (width, height))
 
 
 def lamp(mi):

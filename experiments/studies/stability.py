@@ -81,29 +81,26 @@ def stability(
     shares = coverage(seed=seed, repeats=repeats)
     wrong = [row for row in rows if row.verdict.startswith("WRONG")]
     found = searches(runs=runs, seed=seed) if runs else []
-    made = {
-        "": (["case", "quantity", "relative error", "standard errors", "seconds", "verdict"], _cells(rows)),
-        "_intervals": (
-            ["intervals", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"],
+    accuracy = ["case", "quantity", "relative error", "standard errors", "seconds", "verdict"]
+    intervals = ["intervals", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
+    searched = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
+    parts = [
+        ("", f"{len(rows) - len(wrong)} of {len(rows)} right", accuracy, _cells(rows)),
+        (
+            "_intervals",
+            f"Shares of {repeats} intervals that contain the truth",
+            intervals,
             [one.cells() for one in shares],
         ),
-        "_searches": (
-            ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"],
-            _cells(found),
-        ),
-    }
-    titles = (
-        f"{len(rows) - len(wrong)} of {len(rows)} right",
-        f"Shares of {repeats} intervals that contain the truth",
-        f"Searches, {runs} runs each",
-    )
-    for title, (headers, cells) in zip(titles, made.values(), strict=True):
+        ("_searches", f"Searches, {runs} runs each", searched, _cells(found)),
+    ]
+    for _, title, headers, cells in parts:
         print(f"{title}\n\n{table(headers, cells)}\n")
     if out is not None:
         tables: dict[str, list[Any]] = {"accuracy": rows, "coverage": shares, "searches": found}
         write(out, json.dumps({name: [asdict(one) for one in part] for name, part in tables.items()}, indent=1))
     if store is not None:
-        for suffix, (headers, cells) in made.items():
+        for suffix, _, headers, cells in parts:
             print(keep(headers, cells, store + suffix))
     outside = [one for one in shares if one.verdict.startswith("WRONG")]
     false = [one for one in found if one.verdict.startswith("WRONG")]

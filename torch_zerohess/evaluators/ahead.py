@@ -13,16 +13,17 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.factory import same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation
+from torch_zerohess.evaluators.transfer import Part
 from torch_zerohess.evaluators.values import checked_values
 
 
@@ -43,7 +44,7 @@ class Job:
 
     function: Function
     tensors: tuple[Tensor, ...]
-    """Points [K, n] and aux [K, ...], of `transfer.plain`."""
+    """Points [K, n] and aux [K, ...], on the CPU."""
     device: torch.device
     batch: Batch
     future: Evaluation = field(default_factory=Evaluation)
@@ -54,7 +55,11 @@ class Job:
 
     def __post_init__(self) -> None:
         self.future.lost = self.batch.lost
-        self.parts = [transfer.Part.of(one) for one in self.tensors]
+
+    @cached_property
+    def parts(self) -> list[Part]:
+        """The tensors as bytes."""
+        return [Part.of(one) for one in self.tensors]
 
     @property
     def waiting(self) -> bool:
@@ -191,7 +196,7 @@ class Ahead(Closing, ABC):
             if self._function is None or not same(self._function.fn, fn):
                 self._function = Function(fn, self._sent(fn))
             function = self._function
-        tensors = tuple(transfer.plain(one) for one in (points, *aux))
+        tensors = tuple(one.detach().cpu() for one in (points, *aux))
         return Job(function, tensors, points.device, self._batch(tensors[0]))
 
     def _queue(self, job: Job) -> None:

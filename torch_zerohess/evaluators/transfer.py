@@ -23,22 +23,22 @@ _DTYPES = {str(one): one for one in vars(torch).values() if isinstance(one, torc
 
 
 class Part(NamedTuple):
-    """A tensor as what travels between processes."""
+    """A tensor as bytes, with its type and shape."""
 
     dtype: str
     shape: tuple[int, ...]
     data: Any
-    """Its bytes, or a view of them."""
+    """The bytes, or a view of them."""
 
     @classmethod
     def of(cls, one: Tensor) -> "Part":
-        """Return a tensor of `plain`, which must live longer: if it is large, the data are a view."""
-        size = one.nbytes
-        if size <= PIPE:
-            data: Any = ctypes.string_at(one.data_ptr(), size)
-        else:
-            data = memoryview((ctypes.c_char * size).from_address(one.data_ptr()))
-        return cls(str(one.dtype), tuple(one.shape), data)
+        """Return a tensor: a copy of its bytes, or a view of them if they are more than `PIPE`."""
+        one = one.detach().cpu().resolve_conj().resolve_neg().contiguous()
+        if one.nbytes <= PIPE:
+            return cls(str(one.dtype), tuple(one.shape), ctypes.string_at(one.data_ptr(), one.nbytes))
+        array: Any = (ctypes.c_char * one.nbytes).from_address(one.data_ptr())
+        array.tensor = one  # lives as long as a view of its bytes
+        return cls(str(one.dtype), tuple(one.shape), memoryview(array))
 
     def rows(self, start: int, stop: int) -> "Part":
         """Return `[start:stop]` of it."""
@@ -47,31 +47,19 @@ class Part(NamedTuple):
         return Part(self.dtype, (min(stop, count) - min(start, count), *each), self.data[start * size : stop * size])
 
     def tensor(self) -> Tensor:
-        """Return a copy."""
-        one = torch.empty(self.shape, dtype=_DTYPES[self.dtype], device="cpu")
-        ctypes.memmove(one.data_ptr(), bytes(self.data), len(self.data))
-        return one
-
-
-def plain(one: Tensor) -> Tensor:
-    """Return a tensor on the CPU whose bytes are its values in their order."""
-    return one.cpu().resolve_conj().resolve_neg().contiguous()
+        """Return a tensor with a copy of the bytes."""
+        if not len(self.data):
+            return torch.empty(self.shape, dtype=_DTYPES[self.dtype], device="cpu")
+        return torch.frombuffer(bytearray(self.data), dtype=_DTYPES[self.dtype]).view(self.shape)
 
 
 def joined(parts: Sequence[Part]) -> Tensor:
-    """Return parts of shape [k, *out], of one *out, as one tensor [K, *out]."""
+    """Return parts of shape [k, *out], of one *out, as one tensor [K, *out], of the wider type if they have two."""
     first = parts[0]
-    if len(parts) == 1:
-        return first.tensor()
-    if any(one.dtype != first.dtype for one in parts):
+    if any((one.dtype, one.shape[1:]) != (first.dtype, first.shape[1:]) for one in parts):
         return torch.cat([one.tensor() for one in parts])
-    shape = sum(one.shape[0] for one in parts), *first.shape[1:]
-    result = torch.empty(shape, dtype=_DTYPES[first.dtype], device="cpu")
-    place = result.data_ptr()
-    for one in parts:
-        ctypes.memmove(place, bytes(one.data), len(one.data))
-        place += len(one.data)
-    return result
+    count = sum(one.shape[0] for one in parts)
+    return Part(first.dtype, (count, *first.shape[1:]), b"".join(one.data for one in parts)).tensor()
 
 
 def size(parts: Sequence[Part]) -> int:
@@ -80,7 +68,7 @@ def size(parts: Sequence[Part]) -> int:
 
 
 def sent(parts: Sequence[Part], memory: "SharedMemory | None" = None) -> list[tuple[Any, ...]]:
-    """Return parts as what is pickled fast. With shared memory, it has their bytes, one after the other."""
+    """Return parts as tuples to pickle. Shared memory, if there is one, gets their bytes, one after the other."""
     if memory is None:
         return [(dtype, shape, bytes(data)) for dtype, shape, data in parts]
     start = 0
@@ -91,7 +79,7 @@ def sent(parts: Sequence[Part], memory: "SharedMemory | None" = None) -> list[tu
 
 
 def received(found: Sequence[tuple[Any, ...]], memory: "SharedMemory | None" = None) -> list[Part]:
-    """Return the parts of `sent`."""
+    """Return the parts that `sent` got."""
     if memory is None:
         return [Part(*one) for one in found]
     start, parts = 0, []
@@ -103,12 +91,11 @@ def received(found: Sequence[tuple[Any, ...]], memory: "SharedMemory | None" = N
 
 def packed(tensors: Sequence[Tensor]) -> bytes:
     """Return tensors as bytes, for carriers that know only objects that can be pickled."""
-    each = [plain(one) for one in tensors]
-    return pickle.dumps(sent([Part.of(one) for one in each]))
+    return pickle.dumps(sent([Part.of(one) for one in tensors]))
 
 
 def unpacked(message: bytes) -> list[Part]:
-    """Return the tensors of `packed`."""
+    """Return the tensors that `packed` got."""
     return received(pickle.loads(message))
 
 

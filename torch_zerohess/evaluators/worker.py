@@ -98,7 +98,6 @@ def _answer(messages: Messages, values: Tensor | None) -> None:
     if values is None:
         messages.send(FUNCTION)
         return
-    values = transfer.plain(values)  # has the bytes until they are sent
     parts = [transfer.Part.of(values)]
     size = transfer.size(parts)
     shared = size > transfer.PIPE and transfer.can_share()

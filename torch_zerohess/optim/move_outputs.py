@@ -1,5 +1,6 @@
 """A step on the weights of a network that moves its outputs by what is asked for."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -16,19 +17,19 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
 
         step = argmin |J step - change|^2 + damping * h |step|^2,    h = mean of the diagonal of J J^T
 
-    A change between two points, such as `NewtonTargets(...)(losses, y) - y`, is a length in the outputs. So it is no
-    matter how the network is scaled, where the length of a step of an optimizer is one in the weights. The system has
-    as many equations as the batch has outputs.
+    `NewtonTargets(...)(losses, y) - y` is such a change. Its length is in units of the outputs, so the scale of the
+    weights does not matter, as it does for a trust radius on the weights. The system that is solved has as many
+    equations as the batch has outputs.
 
     Args:
         network: samples [B, ...] -> outputs [B, n], each of its own sample.
         samples: [B, ...]
         change: of the outputs [B, n].
-        damping: relative to h; positive. The noisier the change, the larger: outputs of other samples then move less.
+        damping: relative to h; positive. With more damping one noisy change moves the outputs less.
 
     Raises:
-        ValueError: a change of a wrong shape or that is not finite, a damping that is not positive, or a network whose
-            outputs do not depend on its weights.
+        ValueError: a change of a wrong shape or that is not finite, a damping that is not positive, no samples, or a
+            network whose outputs do not change with its weights or whose Jacobian is not finite.
 
     Example:
         >>> network, x = torch.nn.Linear(3, 2), torch.eye(3)[:2]
@@ -41,6 +42,8 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
     weights = [one for one in network.parameters() if one.requires_grad]
     if not weights:
         raise ValueError("network must have weights that require grad, got none")
+    if not len(samples):
+        raise ValueError("samples must be at least one, got none")
     J = SampleJacobian(network, samples)(weights)
     shape = [len(samples), len(J) // len(samples)]
     if list(change.shape) != shape:
@@ -49,7 +52,9 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
         raise ValueError("change must be finite")
     gram = (J @ J.mT).double()
     h = float(gram.diagonal().mean())
-    if not h > 0.0:
+    if not math.isfinite(h):
+        raise ValueError("the Jacobian of the network is not finite")
+    if h == 0.0:
         raise ValueError("the outputs of the network do not change with its weights: all are saturated")
     gram.diagonal().add_(damping * h)
     step = J.mT @ torch.linalg.solve(gram, change.detach().reshape(-1).double()).to(J)

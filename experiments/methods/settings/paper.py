@@ -84,8 +84,8 @@ RETUNED: dict[str, dict[str, Settings]] = {
             "steps": 50,
         },
     },
-    # By hand on runs 100 to 102 with 1 000 simulations: eight pairs of rate and batch of our_g, and the same for fr22;
-    # six pairs of radii of our_hvpa.
+    # By hand on runs 100 to 102 with 1 000 simulations: eight combinations of rate and batch of our_g, whose best one
+    # fr22 has too; six ranges of the radius of our_hvpa.
     "cnn_throw": {
         "fr22": {"rate": (2e-3, 2e-4)},
         "our_g": {"rate": (2e-3, 2e-4)},

@@ -34,21 +34,15 @@ def test_the_step_is_the_least_squares_solution(damping: float) -> None:
 
 
 def test_the_scale_of_the_weights_does_not_matter() -> None:
-    """A network whose last layer has a hundredth of the weights, behind a factor of a hundred."""
+    """The same function: a last layer with a hundredth of the weights, and a factor of a hundred after it."""
     network, x, change = made()
-    other = copy.deepcopy(network)
+    network[0].requires_grad_(False)
+    small = copy.deepcopy(network)
     with torch.no_grad():
-        for one in other.parameters():
-            one.requires_grad_(False)
-        for network_ in (network, other):
-            network_[0].requires_grad_(False)
-        other[2].weight.mul_(0.01)
-        other[2].bias.mul_(0.01)
-    other[2].requires_grad_(True)
-    scaled = nn.Sequential(other, nn.Linear(2, 2, bias=False).double())
-    with torch.no_grad():
-        scaled[1].weight.copy_(100.0 * torch.eye(2))
-    scaled[1].requires_grad_(False)
+        for one in small[2].parameters():
+            one.mul_(0.01)
+    scaled = nn.Sequential(small, nn.Linear(2, 2, bias=False).double().requires_grad_(False))
+    scaled[1].weight.copy_(100.0 * torch.eye(2))
     for one in (network, scaled):
         zh.optim.move_outputs(one, x, change)
     torch.testing.assert_close(scaled(x), network(x))
@@ -70,6 +64,10 @@ def test_what_cannot_be_moved_is_said() -> None:
         zh.optim.move_outputs(network, x, change.mT)
     with pytest.raises(ValueError, match="change must be finite"):
         zh.optim.move_outputs(network, x, change / 0.0)
+    with pytest.raises(ValueError, match="samples must be at least one, got none"):
+        zh.optim.move_outputs(network, x[:0], change[:0])
+    with pytest.raises(ValueError, match="the Jacobian of the network is not finite"):
+        zh.optim.move_outputs(network, x * torch.nan, change)
     with pytest.raises(ValueError, match="damping must be positive, got 0"):
         zh.optim.move_outputs(network, x, change, damping=0.0)
     with pytest.raises(ValueError, match="outputs of the network do not change with its weights"):

@@ -26,7 +26,7 @@ LAYERS = {
             "autograd",
             "linalg",
         ),
-        *("search", "optim", "minimize", "adapters", "doctor"),
+        *("search", "optim", "minimization", "minimize", "adapters", "doctor"),
     ],
     "experiments": [
         *("problems", "runs", "methods", "ensembles", "reports", "studies", "listing", "run", "commands", "__main__"),

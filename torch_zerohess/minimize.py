@@ -16,8 +16,8 @@ from torch_zerohess.estimation.inputs import working
 from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
-from torch_zerohess.search.minimum import Iterate, Minimum, Observation, Status
-from torch_zerohess.search.running import Running
+from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation, Status
+from torch_zerohess.minimization.running import Running
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 from torch_zerohess.surrogates.memory import Memory, check_memory

@@ -14,7 +14,7 @@ from torch_zerohess.evaluators import Executor
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.finished import finished_values, keep_finished
-from torch_zerohess.search.noise import reserved
+from torch_zerohess.minimization.noise import reserved
 from torch_zerohess.search.protocol import AskTell
 from truths import vector
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.noise import distinct, lowest_mean
+from torch_zerohess.minimization.noise import distinct, lowest_mean
 
 _OTHERS = 2
 """Points with low values, besides the best one and where the search is, that may be best in noise."""

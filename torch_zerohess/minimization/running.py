@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.belief import Belief, believed, lowest
-from torch_zerohess.search.decision import Decision, decide
-from torch_zerohess.search.minimum import Iterate, Minimum, Status
-from torch_zerohess.search.noise import REPEATED, deviation, differs, reserved
-from torch_zerohess.search.record import Call, Record
+from torch_zerohess.minimization.belief import Belief, believed, lowest
+from torch_zerohess.minimization.decision import Decision, decide
+from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
+from torch_zerohess.minimization.noise import REPEATED, deviation, differs, reserved
+from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.quadratic import LocalModel

@@ -7,8 +7,8 @@ import torch
 from searches import TARGET, bowl, zeros
 
 import torch_zerohess as zh
-from torch_zerohess.search.belief import believed
-from torch_zerohess.search.noise import differs, distinct, lowest_mean, reserved
+from torch_zerohess.minimization.belief import believed
+from torch_zerohess.minimization.noise import differs, distinct, lowest_mean, reserved
 from truths import vector
 
 

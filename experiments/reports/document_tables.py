@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.reports import source_table, stored
+from experiments.reports import result_files, source_table
 from experiments.reports.speed_ups import HEADERS, speed_ups, with_ratios
 
 SPEED_UP = "speed_up"
@@ -63,12 +63,12 @@ def _made(name: str, query: Query) -> tuple[str, pd.DataFrame, str]:
         return _speed_up(query)
     if name == TABLE_2:
         return _table_2(query)
-    table = stored.read(name)
+    table = result_files.read(name)
     if {"metric", "level"} <= set(table):
         return _fitted(table, query)
     if "parameter_divided" in table:
         return _trained(table, query)
-    columns = query.names("columns", [one for one in table if one not in stored.ORIGIN])
+    columns = query.names("columns", [one for one in table if one not in result_files.ORIGIN])
     rows = _where(table, query)
     return markdown(columns, rows[columns].to_numpy().tolist()), rows, ""
 
@@ -79,7 +79,7 @@ def rows_of(name: str, query: Query) -> pd.DataFrame:
         method = query.take("method", "all")
         table = _ratios(query)
         return table[table["method"] == method]
-    return _where(stored.read(name), query)
+    return _where(result_files.read(name), query)
 
 
 def markdown(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -221,7 +221,7 @@ def _fits(kind: str, query: Query) -> pd.DataFrame:
     names = query.take("of", "")
     if not names:
         raise SystemExit(f"{kind} must have of=NAME,NAME: tables of fits")
-    return pd.concat([stored.read(name) for name in names.split(",")], ignore_index=True)
+    return pd.concat([result_files.read(name) for name in names.split(",")], ignore_index=True)
 
 
 def _table_2(query: Query) -> tuple[str, pd.DataFrame, str]:
@@ -247,7 +247,7 @@ def _ratios(query: Query) -> pd.DataFrame:
     table, *_ = _selected(table, query)
     query.end()
     found = pd.DataFrame(speed_ups(with_ratios(table, reference), reference))
-    return found.assign(reference=reference, **{one: _only(table, one) for one in stored.ORIGIN if one in table})
+    return found.assign(reference=reference, **{one: _only(table, one) for one in result_files.ORIGIN if one in table})
 
 
 def _only(table: pd.DataFrame, column: str) -> str:

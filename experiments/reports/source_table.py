@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from experiments.reports import stored
+from experiments.reports import result_files
 from experiments.reports.speed_ups import CASE, with_ratios
 
 NAME = "source_table_2"
@@ -30,7 +30,7 @@ LEVELS = (90.0, 99.0, 99.9)
 
 def printed() -> pd.DataFrame:
     """Return the source's ratios, a row per task, method, metric and level in percent; NaN where it prints none."""
-    table = stored.read(NAME)
+    table = result_files.read(NAME)
     columns = [name for name in table if name.partition("_")[0] in ("image", "param")]
     long = table.melt(["task", "method"], columns, "cell", "printed")
     metric = long["cell"].str.startswith("image").map({True: "image", False: "parameter"})

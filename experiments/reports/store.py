@@ -12,7 +12,7 @@ import tyro
 from experiments.ensembles.provenance import read_command
 from experiments.methods import METHODS
 from experiments.problems.catalogue import NETWORKS, chosen
-from experiments.reports import stored
+from experiments.reports import result_files
 from experiments.reports.medians import medians, reached
 from experiments.reports.networks import HELD_OUT, per_method
 from experiments.reports.results import Results, Run, load
@@ -48,17 +48,17 @@ def store(
     if count := results.unfinished.total():
         raise SystemExit(f"{count} runs in {folder} are unfinished: the same `run` goes on with them")
     known = read_command(folder)
-    whence = stored.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
+    whence = result_files.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
     table = (trained(results) if networks else fitted(results)).assign(**whence)
-    table = table[[*(one for one in table if one not in stored.ORIGIN), *stored.ORIGIN]]
-    print(stored.write(_added(table, name) if add else table, name))
+    table = table[[*(one for one in table if one not in result_files.ORIGIN), *result_files.ORIGIN]]
+    print(result_files.write(_added(table, name) if add else table, name))
     if left := [task for task in there.runs if task not in wanted]:
         print(f"left out, although the command ran them: {', '.join(left)}")
 
 
 def _added(table: pd.DataFrame, name: str) -> pd.DataFrame:
     """Return the rows of a stored table that are of other tasks, and then a table; SystemExit if they do not fit."""
-    old = stored.read(name)
+    old = result_files.read(name)
     old = old[~old["task"].isin(table["task"])]
     for one in _ALIKE:
         values = dict.fromkeys(_plain(value) for part in (old, table) for value in part[one])

@@ -12,9 +12,9 @@ import torch
 
 from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
+from experiments.runs.base_trial import SEEDS, Ending, ending
 from experiments.runs.network_trial import NetworkTrial
 from experiments.runs.records import Outcome, Preparation, Record, write, write_outcome
-from experiments.runs.run import SEEDS, Ending, ending
 from experiments.runs.trial import LIMIT, Trial
 
 

@@ -27,15 +27,15 @@ import torch
 from torch import Tensor
 
 from experiments.problems.network_task import NetworkTask
+from experiments.runs.base_trial import BaseTrial, number
 from experiments.runs.records import Record
-from experiments.runs.run import Run, number
 
 
-class NetworkTrial(Run):
+class NetworkTrial(BaseTrial):
     """What a method of network tasks gets, see above.
 
     Both errors of the first row are of the held-out images, before the training. The run ends when its evaluations or
-    the seconds of `limit` are used up, or when the method returns. See `Run` for `folder`.
+    the seconds of `limit` are used up, or when the method returns. See `BaseTrial` for `folder`.
     """
 
     def __init__(

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from experiments.problems.task import Renderer, Task
+from experiments.runs.base_trial import BaseTrial, number
 from experiments.runs.records import Record
-from experiments.runs.run import Run, number
 
 LEVELS = (0.9, 0.99, 0.999)
 """Reductions of an error that the tables are about; a run ends when both errors have the last one."""
@@ -16,12 +16,12 @@ LIMIT = 600.0
 """Seconds that a run may take."""
 
 
-class Trial(Run):
+class Trial(BaseTrial):
     """What a method gets: a start, a counted black box, and `report` for the end of every iteration.
 
     A run ends when both errors are below a thousandth of those at the start (and, where the task asks for more, the
     parameter error below its `precision`), when the evaluations of the task or the seconds of `limit` are used up, or
-    when the method returns. See `Run` for `folder`.
+    when the method returns. See `BaseTrial` for `folder`.
 
     Example:
         >>> from experiments.problems.tasks import quad

@@ -34,8 +34,8 @@ from experiments.reports.progress import progress
 from experiments.reports.results import METRICS, Run
 from experiments.reports.tables import Printer
 from experiments.runs.attempt import attempt
+from experiments.runs.base_trial import Finished
 from experiments.runs.records import Record
-from experiments.runs.run import Finished
 from experiments.runs.trial import Trial, reduced
 from experiments.studies.loss_objectives import FORMS, Moments, Pictures, normal, pictures_of
 from experiments.studies.loss_sweeps import (

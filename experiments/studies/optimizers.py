@@ -29,7 +29,7 @@ from experiments.problems import bbob
 from experiments.problems.catalogue import chosen
 from experiments.problems.task import Task
 from experiments.reports.progress import progress
-from experiments.reports.stored import keep, may_keep
+from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
 from experiments.runs.trial import Trial

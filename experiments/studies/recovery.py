@@ -21,7 +21,7 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.problems import catalogue
 from experiments.problems.task import Task
-from experiments.reports import stored
+from experiments.reports import result_files
 from experiments.reports.tables import table
 
 mpl.use("Agg")
@@ -79,7 +79,7 @@ def recovery(
     if not n or not pairs or min(n) <= entries or min(pairs) < 16 or entries < 1:
         raise SystemExit(f"n must exceed entries, and pairs be at least 16, got {n}, {entries} and {pairs}")
     if store:
-        stored.may_keep(store)
+        result_files.may_keep(store)
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     rows = [row for size in n for count in pairs for row in compared(size, entries, count, seed, lasso)]
@@ -92,7 +92,7 @@ def recovery(
     for path in (_draw_curves(rows, out / "recovery.png"), drawn):
         print(path)
     if store:
-        print(stored.keep(HEADERS, [list(astuple(row)) for row in rows], store))
+        print(result_files.keep(HEADERS, [list(astuple(row)) for row in rows], store))
     return rows
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 import torch_zerohess as zh
 from experiments.reports.progress import progress
-from experiments.reports.stored import keep, may_keep
+from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
 from experiments.runs.records import write
 from experiments.studies.coverage import coverage

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from experiments.problems.catalogue import chosen
 from experiments.reports.progress import progress
-from experiments.reports.stored import keep, may_keep
+from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
 from experiments.studies.estimator_choice import SIZES, compare, summary
 from experiments.studies.estimator_curves import AXES, Measurement, draw

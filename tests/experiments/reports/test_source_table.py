@@ -5,7 +5,7 @@ import math
 import pandas as pd
 import pytest
 
-from experiments.reports import source_table, stored
+from experiments.reports import result_files, source_table
 from experiments.reports.document_tables import Query, table_of
 from experiments.reports.summary import Row, Summary, as_table_2
 
@@ -78,4 +78,4 @@ def test_table_of_a_document() -> None:
         table_of("table_2", Query.of([]))
     with pytest.raises(SystemExit, match=r"tasks must be some of quad, .* got throw"):
         table_of("table_2", Query.of(["of=fitting", "tasks=throw"]))
-    assert stored.read(source_table.NAME)["source"].str.contains("Table 2").all()
+    assert result_files.read(source_table.NAME)["source"].str.contains("Table 2").all()

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import binomtest
 
 from experiments.ensembles import provenance
-from experiments.reports import stored
+from experiments.reports import result_files
 from experiments.reports.document_tables import SPEED_UP, Query, number, table_of
 from experiments.reports.documents import filled, readme
 from experiments.reports.networks import HELD_OUT, _remember, held_out
@@ -27,7 +27,7 @@ COMMIT = "0123456789abcdef"
 @pytest.fixture(autouse=True)
 def results(tmp_path, monkeypatch):
     """An empty folder for stored tables, and code without changes to its commit."""
-    monkeypatch.setattr(stored, "RESULTS", tmp_path / "stored")
+    monkeypatch.setattr(result_files, "RESULTS", tmp_path / "stored")
     monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": True})
     own = ["--out", "/home/somebody/a folder", "--jobs=2"]  # of this machine: not to be stored
     monkeypatch.setattr("sys.argv", ["experiments", "run", "bowl", *own, "--limit", "15"])
@@ -284,7 +284,7 @@ def test_the_table_of_speed_ups(folder):
 
 
 def test_studies_are_kept_as_they_are(results):
-    stored.keep(["problem", "error", "repeats"], [["A", 0.123456, 2], ["B", 2000.0, 3]], "study")
+    result_files.keep(["problem", "error", "repeats"], [["A", 0.123456, 2], ["B", 2000.0, 3]], "study")
     text = table_of("study", Query.of(["columns=problem,error", "problem=B"]))
     assert text.splitlines()[:3] == ["| problem | error |", "| --- | --- |", "| B | 2 000 |"]
     assert "Commit `012345678`" in text

@@ -9,9 +9,9 @@ from written_runs import rows
 
 from experiments.methods import METHODS
 from experiments.runs.attempt import attempt
+from experiments.runs.base_trial import Finished
 from experiments.runs.network_trial import NetworkTrial
 from experiments.runs.records import Files
-from experiments.runs.run import Finished
 
 METHOD_NAMES = ["our_g", "our_hvpa", "shift"]
 

@@ -14,9 +14,9 @@ from written_runs import rows
 
 from experiments.runs import journal
 from experiments.runs.attempt import attempt
+from experiments.runs.base_trial import Finished
 from experiments.runs.journal import BusyError, Journal
 from experiments.runs.records import Files, read, read_outcome
-from experiments.runs.run import Finished
 from experiments.runs.trial import Trial
 
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments.problems.closed_forms import ClosedForm, PlaneWave
-from experiments.reports import stored
+from experiments.reports import result_files
 from experiments.studies.coverage import Coverage
 from experiments.studies.coverage import _rows as _coverage_rows
 from experiments.studies.stability import _rows, stability
@@ -42,7 +42,7 @@ def test_stability_keeps_its_three_tables(monkeypatch) -> None:
 
 
 def test_what_is_stored_is_right() -> None:
-    verdicts = pd.concat([stored.read(f"stability{part}")["verdict"] for part in ("", "_intervals", "_searches")])
+    verdicts = pd.concat([result_files.read(f"stability{part}")["verdict"] for part in ("", "_intervals", "_searches")])
     assert set(verdicts) == {"right", "right: refused", "few or skewed draws"}
 
 

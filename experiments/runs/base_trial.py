@@ -28,7 +28,7 @@ class Finished(Exception):
         self.status = status
 
 
-class Run:
+class BaseTrial:
     """A run that may use so many evaluations and seconds. What ends it is raised again at every later call.
 
     With a `folder` (of the ensemble) the run is logged and can be killed and started again, see `Recorder`; without one

@@ -5,7 +5,7 @@ point whose value is within the precision of the minimum. The table has the shar
 100 n evaluations. Every method gets the same starts, the same box and the same size of the first step. A method that
 ends by itself starts again from a random point of the box.
 
-Instances 11 to 15 are for tuning, 1 to 5 for tables.
+Instances 11 to 15 are for tuning, 1 to 5 for tables. `--over` compares settings of a method.
 """
 
 import itertools
@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,14 +26,18 @@ from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.ours import search
 from experiments.methods.restarts import starts
+from experiments.methods.settings import space
+from experiments.methods.settings.rivals import ON_BBOB
 from experiments.problems import bbob
 from experiments.problems.catalogue import chosen
 from experiments.problems.task import Task
+from experiments.reports import data_profiles
 from experiments.reports.progress import progress
 from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
 from experiments.runs.trial import Trial
+from experiments.studies.tune import choices_of
 from torch_zerohess.optim import TrustRegion
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search, output=False))
@@ -53,6 +58,8 @@ class Job:
     method: str
     budget: int
     """Evaluations over n."""
+    settings: tuple[tuple[str, Any], ...] = ()
+    """Of the method, where they are not its defaults."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +83,11 @@ def optimizers(
     runs: int = 1,
     budget: int = BUDGETS[-1],
     limit: float = 600.0,
+    over: tuple[str, ...] = (),
     out: Path = Path("results/optimizers"),
     store: str | None = None,
 ) -> None:
-    """Print shares of (function, precision) pairs reached; called again it goes on where it was.
+    """Print and draw shares of (function, precision) pairs reached; called again it goes on where it was.
 
     Args:
         n: numbers of parameters, among 2, 3, 5, 10, 20 and 40.
@@ -90,6 +98,7 @@ def optimizers(
         runs: starts for every function.
         budget: evaluations over n that a run may use.
         limit: seconds that a run may take.
+        over: settings of the one method in `methods` to compare, each with a row: `scale=0.25,0.5,1`.
         out: folder; runs that the same code has made there are not made again.
         store: name under which the table is kept for the documents, as experiments/results/NAME.csv.
     """
@@ -104,13 +113,30 @@ def optimizers(
     for name in wanted:
         if known[name].missing():
             raise SystemExit(f"{name} needs pip install {' '.join(known[name].missing())}")
-    jobs = [Job(*one, budget) for one in itertools.product(n, functions, instances, range(runs), wanted)]
+    each = itertools.product(n, functions, instances, range(runs), _with_settings(wanted, over))
+    jobs = [
+        Job(count, function, instance, run, name, budget, tuple(settings.items()))
+        for count, function, instance, run, (name, settings) in each
+    ]
     parts, done = KeptParts(out), dict[Job, Reached]()
     for job in progress(jobs, "runs"):
         (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, known[job.method], limit))
     print(report(done))
+    path = out / "profiles.png"
+    data_profiles.draw(profiles(done), budget, path)
+    print(path)
     if store is not None:
         print(keep(HEADERS, rows(done), store))
+
+
+def _with_settings(names: Sequence[str], over: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
+    """Return methods with their settings on BBOB; a single method with all combinations of `over`, if there are any."""
+    if not over:
+        return [(name, dict(ON_BBOB.get(name, {}))) for name in names]
+    if len(names) != 1:
+        raise SystemExit(f"over compares settings of one method, got methods {','.join(names)}")
+    choices = dict(choices_of(one, list(space(names[0], bbob.SIGMA))) for one in over)
+    return [(names[0], dict(zip(choices, one, strict=True))) for one in itertools.product(*choices.values())]
 
 
 def _run(job: Job, method: Method, limit: float) -> list[Reached]:
@@ -118,10 +144,12 @@ def _run(job: Job, method: Method, limit: float) -> list[Reached]:
         task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
     except (ImportError, ValueError) as error:
         raise SystemExit(str(error)) from error
-    return [reached(task, method, job.run, limit)]
+    return [reached(task, method, job.run, limit, dict(job.settings))]
 
 
-def reached(task: Task, method: Method, run: int, limit: float = 600.0) -> Reached:
+def reached(
+    task: Task, method: Method, run: int, limit: float = 600.0, settings: Mapping[str, Any] | None = None
+) -> Reached:
     """Run a method until the evaluations of the task are used up or the finest target is reached."""
     hits: list[int] = []
     count = 0
@@ -137,15 +165,15 @@ def reached(task: Task, method: Method, run: int, limit: float = 600.0) -> Reach
 
     counted = replace(task, loss=loss)
     begun = time.process_time()
-    attempt(counted, method.name, run, lambda trial: _again(trial, method), limit=limit)
+    attempt(counted, method.name, run, lambda trial: _again(trial, method, settings), limit=limit)
     return Reached(tuple(hits), time.process_time() - begun)
 
 
-def _again(trial: Trial, method: Method) -> None:
+def _again(trial: Trial, method: Method, settings: Mapping[str, Any] | None) -> None:
     """Start a method again where it ends by itself, from a random point of the box."""
     for start in starts(trial):
         trial.start = start
-        method(trial, None)
+        method(trial, settings)
 
 
 def report(done: Mapping[Job, Reached]) -> str:
@@ -155,21 +183,34 @@ def report(done: Mapping[Job, Reached]) -> str:
 
 def rows(done: Mapping[Job, Reached]) -> list[list[object]]:
     """Return a row per number of parameters and method; None for more evaluations than the runs could use."""
+    return list(_rows(_groups(done)))
+
+
+def profiles(done: Mapping[Job, Reached]) -> dict[int, dict[str, tuple[list[float], int]]]:
+    """Return, by number of parameters n and method, evaluations over n of all pairs reached, and the count of pairs."""
+    found: dict[int, dict[str, tuple[list[float], int]]] = defaultdict(dict)
+    for (n, name), group in _groups(done).items():
+        counts = [count / n for _, one in group for count in one.evaluations]
+        found[n][name] = counts, len(group) * len(bbob.TARGETS)
+    return found
+
+
+def _groups(done: Mapping[Job, Reached]) -> dict[tuple[int, str], list[tuple[Job, Reached]]]:
     groups: dict[tuple[int, str], list[tuple[Job, Reached]]] = defaultdict(list)
     for job, result in done.items():
-        groups[job.n, job.method].append((job, result))
-    return list(_rows(groups))
+        groups[job.n, _named(job)].append((job, result))
+    return groups
 
 
-def _named(n: int, method: str) -> str:
-    """Name of a method in the table; ours with the engine that it chooses."""
-    if method != OURS.name:
-        return method
-    return f"{method}: {TrustRegion(torch.zeros(n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
+def _named(job: Job) -> str:
+    """Name of a row: the method with its settings; ours with the engine that it chooses."""
+    if job.method == OURS.name:
+        return f"{job.method}: {TrustRegion(torch.zeros(job.n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
+    return " ".join([job.method, *(f"{name}={value}" for name, value in job.settings)])
 
 
 def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[object]]:
-    for (n, method), group in groups.items():
+    for (n, name), group in groups.items():
         most = group[0][0].budget
         shares = [
             sum(one.share(budget * n) for _, one in group) / len(group) if budget <= most else None
@@ -179,4 +220,4 @@ def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> It
         used = sum(
             one.evaluations[-1] if len(one.evaluations) == len(bbob.TARGETS) else job.budget * n for job, one in group
         )
-        yield [n, _named(n, method), *shares, 1e3 * sum(one.seconds for _, one in group) / used, len(group)]
+        yield [n, name, *shares, 1e3 * sum(one.seconds for _, one in group) / used, len(group)]

@@ -104,7 +104,7 @@ def tune(
         raise SystemExit(f"method must be one that can be run on {name}, got {chosen}: {reason}")
     current = settings(chosen, name)
     choices = space(chosen, loaded.sigma)
-    free = dict(_choices(one, list(choices)) for one in over) or choices
+    free = dict(choices_of(one, list(choices)) for one in over) or choices
     candidates = [current, *({**current, **one} for one in draw(free, trials, seed))]
     bar = progress(candidates, f"settings of {chosen} on {name}")
     scores: list[Score] = []
@@ -119,7 +119,7 @@ def tune(
     print(report(scores, list(choices), level, best))
 
 
-def _choices(text: str, names: Sequence[str]) -> tuple[str, tuple[Any, ...]]:
+def choices_of(text: str, names: Sequence[str]) -> tuple[str, tuple[Any, ...]]:
     """Return a name and its choices from `name=value,value`; values are numbers, tuples of numbers or words."""
     name, _, values = text.partition("=")
     if name not in names or not values:

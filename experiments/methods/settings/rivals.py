@@ -141,3 +141,7 @@ TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     },
 }
 """Settings by task and method."""
+
+ON_BBOB: Mapping[str, Mapping[str, Any]] = {
+    "lbfgs_fd": {"difference": 1e-8},
+}

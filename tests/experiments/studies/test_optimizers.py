@@ -7,7 +7,7 @@ import torch
 
 from experiments.methods import METHODS
 from experiments.problems import bbob
-from experiments.studies.optimizers import OURS, Job, Reached, optimizers, reached, report, rows
+from experiments.studies.optimizers import OURS, Job, Reached, optimizers, profiles, reached, report, rows
 
 
 @pytest.mark.parametrize("function", [1, 10, 24])
@@ -55,12 +55,33 @@ def test_the_command_goes_on_where_it_was(tmp_path, capsys):
     assert parts.read_text().startswith(before)
     assert len(parts.read_text().splitlines()) == 2
     assert "lbfgs_fd" in capsys.readouterr().out
+    assert (out / "profiles.png").stat().st_size > 0
+
+
+def test_settings_of_a_method_are_compared(tmp_path, capsys):
+    """Differences of 2 are no gradient of a sphere to 1e-8; differences of 2e-8 are."""
+    settings = {"n": (2,), "functions": (1,), "instances": (11,), "budget": 30, "out": tmp_path}
+    optimizers(methods="lbfgs_fd", over=("difference=1,1e-8",), **settings)
+    coarse, fine = (line.split() for line in capsys.readouterr().out.splitlines() if "lbfgs_fd" in line)
+    assert (coarse[2], fine[2]) == ("difference=1", "difference=1e-08")
+    assert float(coarse[4]) < 0.5
+    assert float(fine[4]) == 1.0
+    with pytest.raises(SystemExit, match="over compares settings of one method, got methods ours,cobyqa"):
+        optimizers(methods="ours,cobyqa", over=("scale=1",), **settings)
+    with pytest.raises(SystemExit, match="over must be NAME=VALUE,VALUE with a name among difference, got scale=1"):
+        optimizers(methods="lbfgs_fd", over=("scale=1",), **settings)
+
+
+def test_rivals_have_their_settings_of_bbob(tmp_path):
+    optimizers(n=(2,), functions=(1,), instances=(11,), methods="lbfgs_fd", budget=10, out=tmp_path)
+    assert '["difference", 1e-08]' in (tmp_path / "parts.jsonl").read_text()
 
 
 def test_the_table_has_shares():
     jobs = {Job(2, f, 11, 0, "ours", 100): Reached((5,) * count, 1.0) for f, count in ((1, 51), (2, 0))}
     assert rows(jobs) == [[2, "ours: gaussian_process", 0.5, 0.5, 0.5, pytest.approx(1e3 * 2 / 205), 2]]
     assert "0.5 " in report(jobs)
+    assert profiles(jobs) == {2: {"ours: gaussian_process": ([2.5] * 51, 102)}}
     (short,) = rows({replace(job, budget=20): found for job, found in jobs.items()})
     assert short[2:5] == [0.5, None, None]  # these runs could not use 30 n evaluations
 

@@ -5,7 +5,8 @@ point whose value is within the precision of the minimum. The table has the shar
 100 n evaluations. Every method gets the same starts, the same box and the same size of the first step. A method that
 ends by itself starts again from a random point of the box.
 
-Instances 11 to 15 are for tuning, 1 to 5 for tables. `--over` compares settings of a method.
+Instances 11 to 15 are for tuning, 1 to 5 for tables. `--over` compares settings of a method; rivals have those of
+`experiments.methods.settings.rivals`.
 """
 
 import itertools

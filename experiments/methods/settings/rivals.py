@@ -144,6 +144,6 @@ TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
 
 # BBOB, instances 11 and 12, by the share of targets after 100 n evaluations:
 # optimizers --n 2 3 --methods lbfgs_fd --over difference=5e-9,1e-8,1e-6,1e-4,1e-3
-# The defaults are best of cma_es_bounded and cobyqa (--n 2 3 --over scale=0.1,0.25,0.5,1) and of py_bobyqa (--n 2 --over
-# scale=0.1,0.25,0.5,1 seek_global_minimum=True,False).
+# The defaults are best of cma_es_bounded and cobyqa (--n 2 3 --over scale=0.1,0.25,0.5,1) and of py_bobyqa (--n 2
+# --over scale=0.1,0.25,0.5,1 seek_global_minimum=True,False).
 ON_BBOB: Mapping[str, Mapping[str, Any]] = {"lbfgs_fd": {"difference": 1e-8}}

@@ -51,9 +51,6 @@ def around(
         """Put the values [fresh, *out] of the fresh elements into the batch, with their weight."""
         return change.new_zeros(B, *change.shape[1:]).index_add(0, part, B / fresh * change)
 
-    def predicted(z: Tensor) -> Tensor:
-        return control.predict(surrogate, z, aux)
-
     if not control.active:
         alone, constants = estimated(center[part], [one[part] for one in aux])
         return lambda x: spread(outer.value(alone(x[part]), constants, value))
@@ -61,6 +58,7 @@ def around(
         memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
     pathwise = len(sigma) > STEIN if memory.pathwise is None else memory.pathwise
     with torch.no_grad():
+        predicted = control.predictor(surrogate, aux)
         at_center = control.coefficient * predicted(center[:, None])[:, 0] if value == "center" else center[:, 0]
         scales = outer.scales(
             lambda: predicted((center[:, None] + sigma * u).to(center.dtype)), lambda losses: losses.mean(1)

@@ -65,7 +65,7 @@ class Control:
         predicted = None
         if self.memory.ready:
             with torch.no_grad():  # a module has parameters that require grad
-                predicted = self.predict(self.memory.surrogate, points, aux).double()
+                predicted = self.predictor(self.memory.surrogate, aux)(points).double()
             if predicted.shape != values.shape:
                 raise ValueError(
                     f"the surrogate of the memory must return [K, {_listed(outputs.shape[2:])}] like the black box, "
@@ -80,28 +80,32 @@ class Control:
             self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
         return predicted if self.active else None
 
-    def predict(self, surrogate: Any, z: Tensor, aux: Sequence[Tensor]) -> Tensor:
-        """Return h(g(z), r) [B, E, *out] for points z [B, E, n] and aux r [B, ...], differentiable in z.
+    def predictor(self, surrogate: Any, aux: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
+        """Return h(g(z), r) as a function of points z [B, E, n] with values [B, E, *out], differentiable in z.
 
         Args:
             surrogate: g, of the memory or a copy.
-            z: points [B, E, n].
             aux: r, [B, ...] each.
         """
-        B, E = z.shape[:2]
         head = self.outer.head
         space = getattr(surrogate, "space", None)
         if isinstance(head, SquaredError) and space is not None:
             head.check(space.shape, aux[0])
             known, outside = space.split(aux[0])
-            coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
-            losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]
-            return losses
-        outputs: Tensor = surrogate(z.flatten(0, 1))
-        if self.memory.scalar and outputs.shape[1:] == (1,):
-            outputs = outputs[:, 0]
-        outputs = outputs.unflatten(0, (B, E))
-        return outputs if head is None else apply_head(head, outputs, aux)
+
+        def predict(z: Tensor) -> Tensor:
+            B, E = z.shape[:2]
+            if isinstance(head, SquaredError) and space is not None:
+                coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
+                losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]
+                return losses
+            outputs: Tensor = surrogate(z.flatten(0, 1))
+            if self.memory.scalar and outputs.shape[1:] == (1,):
+                outputs = outputs[:, 0]
+            outputs = outputs.unflatten(0, (B, E))
+            return outputs if head is None else apply_head(head, outputs, aux)
+
+        return predict
 
 
 def _listed(shape: Sequence[int]) -> str:

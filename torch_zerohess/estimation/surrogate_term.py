@@ -17,7 +17,7 @@ import copy
 import functools
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -108,6 +108,11 @@ class SurrogateTerm:
     u: Tensor
     """[Q, n], see `nodes`."""
     pathwise: bool
+    _predicted: Callable[[Tensor], Tensor] = field(init=False)
+
+    def __post_init__(self) -> None:
+        # Before any transform of torch.func begins: what is computed inside of one cannot be used after it.
+        object.__setattr__(self, "_predicted", self.control.predictor(self.surrogate, self.aux))
 
     @classmethod
     def fixed(
@@ -157,7 +162,7 @@ class SurrogateTerm:
     def _each(self, x: Tensor) -> Tensor:
         """Return c h(g(x + sigma u), r) at every point, [B, Q, P]."""
         z = (x[:, None] + self.sigma * self.u).to(self.x.dtype)
-        values = self.control.coefficient * self.control.predict(self.surrogate, z, self.aux)
+        values = self.control.coefficient * self._predicted(z)
         return values.reshape(*values.shape[:2], -1).double()
 
     def _pairs(self, quantity: Quantity, v: Tensor | None) -> Tensor:
@@ -174,7 +179,7 @@ class SurrogateTerm:
         values, u = self._each(self.x.double()), self.u[:, None]
         if quantity == "value":
             return values
-        center = self.control.predict(self.surrogate, self.x[:, None], self.aux).double()
+        center = self._predicted(self.x[:, None]).double()
         change = (values - self.control.coefficient * center.reshape(len(values), 1, -1))[..., None]
         if quantity == "gradient":
             return change * u / self.sigma

@@ -31,6 +31,7 @@ from experiments.methods.settings import settings
 from experiments.problems.catalogue import FITTING, chosen, fitting
 from experiments.reports.medians import MEASURES, medians, objects
 from experiments.reports.progress import progress
+from experiments.reports.result_files import keep, may_keep
 from experiments.reports.results import METRICS, Run
 from experiments.reports.tables import Printer
 from experiments.runs.attempt import attempt
@@ -53,6 +54,8 @@ from experiments.studies.loss_sweeps import (
 WHERE = {"start": 1.0, "half way": 0.5, "near": 0.1}
 """Points of the line at which gradients are estimated."""
 LEVEL = 0.99
+_ERRORS = ["task", "loss", "where", "evaluations", "inside", "image", "truth: inside", "truth: image"]
+"""Headers: the loss inside of the black box, or after the image; then the errors of what both are compared with."""
 _SCRAMBLES = 4
 _Row = TypeVar("_Row")
 
@@ -119,6 +122,7 @@ def losses(
     limit: float = 60.0,
     seed: int = 0,
     out: Path = Path("results/losses"),
+    store: str | None = None,
 ) -> LossReport:
     """Measure a loss inside the black box against the same loss after an image-valued one.
 
@@ -130,12 +134,15 @@ def losses(
         samples: antithetic pairs of one estimate.
         truth: evaluations of a true gradient.
         sweep: evaluations of every position of a sweep.
-        evaluations: that a fit may use.
+        evaluations: that a fit may use; 0 leaves the fits out.
         limit: seconds that a fit may take.
         seed: of the perturbations.
         out: folder of parts.jsonl, which grows, and of losses.json, sweep.csv and sweep.png at the end.
+        store: name of the table of errors of gradients that is kept under experiments/results, for the documents.
     """
     torch.set_num_threads(1)
+    if store is not None:
+        may_keep(store)
     least = 4 * _SCRAMBLES
     if runs < 2 or min(samples, default=0) < 1 or min(truth, sweep) < least:
         raise SystemExit(
@@ -147,10 +154,12 @@ def losses(
     report = LossReport(
         list(_curves(kept, swept, sweep, seed)),
         list(_errors(kept, swept, samples, runs, truth, seed)),
-        list(_fits(kept, list(shown.values()), runs, evaluations, limit)),
+        list(_fits(kept, list(shown.values()), runs, evaluations, limit)) if evaluations else [],
     )
     _write(report, out)
     print(f"\nwritten to {out}")
+    if store is not None:
+        print(keep(_ERRORS, [_error_cells(a, b) for a, b in _pairs(report.errors)], store))
     return report
 
 
@@ -177,7 +186,7 @@ def _errors(
     """Yield the errors of the gradients, and print them."""
     printer = Printer(
         "\nrelative RMSE of the gradient of either objective, from the same evaluations",
-        ["task", "loss", "where", "evaluations", "inside", "image", "truth: inside", "image"],
+        _ERRORS,
         [6, 14, 8, 0, 7, 7, 0, 7],
     )
     given = {"samples": list(samples), "runs": runs, "truth": truth, "seed": seed}
@@ -187,8 +196,12 @@ def _errors(
             part, GradientError, partial(_gradient_errors, one, where, samples, runs=runs, truth=truth, seed=seed)
         )
         for a, b in _pairs(found):
-            printer([a.task, a.loss, a.where, a.evaluations, a.rmse, b.rmse, a.truth_error, b.truth_error])
+            printer(_error_cells(a, b))
         yield from found
+
+
+def _error_cells(a: GradientError, b: GradientError) -> list[object]:
+    return [a.task, a.loss, a.where, a.evaluations, a.rmse, b.rmse, a.truth_error, b.truth_error]
 
 
 def _fits(kept: KeptParts, shown: Sequence[Pictures], runs: int, evaluations: int, limit: float) -> Iterator[Fit]:

@@ -9,10 +9,12 @@ import pytest
 import torch
 
 import torch_zerohess as zh
+from experiments.ensembles import provenance
 from experiments.problems import catalogue
 from experiments.problems.soft_squares import box2
 from experiments.problems.task import Picture, Task, least_squares
 from experiments.problems.tasks.box2 import fitting
+from experiments.reports import result_files
 from experiments.runs.attempt import attempt
 from experiments.studies.loss_objectives import pictures_of
 from experiments.studies.losses import LossReport, losses
@@ -143,6 +145,17 @@ def test_a_second_call_measures_nothing_again(monkeypatch, measured) -> None:
     monkeypatch.setattr("experiments.studies.losses.attempt", fail)
     with pytest.raises(NotImplementedError):  # fits depend on the settings of their method
         losses(**SMALL, out=out)
+
+
+def test_errors_of_gradients_are_stored_without_fits(monkeypatch, measured, tmp_path) -> None:
+    first, out = measured
+    monkeypatch.setattr(result_files, "RESULTS", tmp_path)
+    monkeypatch.setattr(provenance, "code", lambda: {"commit": 40 * "0", "clean": True})
+    found = losses(**SMALL | {"evaluations": 0}, out=out, store="losses")
+    assert (found.errors, found.fits) == (first.errors, [])
+    table = result_files.read("losses")
+    assert len(table) == len(first.errors) // 2
+    assert table["image"].tolist() == pytest.approx([one.rmse for one in first.errors if one.form == "image"], rel=1e-5)
 
 
 def test_the_loss_of_a_mean_picture_is_at_most_the_mean_loss(report) -> None:

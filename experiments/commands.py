@@ -49,6 +49,11 @@ COMMANDS = {
         "experiments.studies.gradients:gradients", "derivatives by the renderer and by sampling", long=True
     ),
     "robustness": Command("experiments.studies.robustness:robustness", "other starts, samples and noise", long=True),
+    "least_squares": Command(
+        "experiments.studies.least_squares:least_squares",
+        "our search and others on the least-squares problems of More and Wild",
+        long=True,
+    ),
     "optimizers": Command(
         "experiments.studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True
     ),

@@ -11,28 +11,34 @@ from experiments.reports.error_curves import plain_ticks, styles
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 
+_SPAN = 300
+"""From the first to the last evaluation that is drawn, as a ratio."""
+Profile = tuple[Sequence[float], int]
+"""Evaluations, in some unit, after which pairs were reached, and the number of all pairs."""
 
-def draw(profiles: Mapping[int, Mapping[str, tuple[Sequence[float], int]]], most: float, path: Path) -> None:
-    """Draw a panel for each number of parameters n.
+
+def draw(profiles: Mapping[str, Mapping[str, Profile]], unit: str, most: float, path: Path) -> None:
+    """Draw a panel for each title.
 
     Args:
-        profiles: by n and method, evaluations over n at which pairs were reached, and the number of all pairs.
-        most: evaluations over n that a run could use.
+        profiles: by title and method.
+        unit: of the evaluations.
+        most: evaluations in this unit that a run could use.
         path: of the PNG file.
     """
     chosen = styles(name for methods in profiles.values() for name in methods)
     figure, axes = plt.subplots(
         1, len(profiles), figsize=(4 * len(profiles) + 2, 3.8), sharey=True, squeeze=False, layout="constrained"
     )
-    for axis, (n, methods) in zip(axes[0], profiles.items(), strict=True):
+    for axis, (title, methods) in zip(axes[0], profiles.items(), strict=True):
         for name, (reached, pairs) in methods.items():
             at = np.sort(np.asarray(reached, dtype=np.float64))
             share = np.arange(1, len(at) + 1) / pairs
             axis.step([*at, most], [*share, share[-1] if len(at) else 0.0], where="post", label=name, **chosen[name])
-        axis.set(xscale="log", xlim=(1 / n, most), ylim=(0, 1), xlabel="evaluations / n", title=f"n = {n}")
+        axis.set(xscale="log", xlim=(most / _SPAN, most), ylim=(0, 1), xlabel=f"evaluations / {unit}", title=title)
         plain_ticks(axis)
         axis.grid(alpha=0.3)
-    axes[0][0].set_ylabel("share of the targets reached")
+    axes[0][0].set_ylabel("share of the pairs reached")
     found = [axis.get_legend_handles_labels() for axis in axes[0]]
     legend = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}
     figure.legend(legend.values(), legend.keys(), loc="outside right upper", frameon=False)

@@ -124,7 +124,7 @@ def optimizers(
         (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, known[job.method], limit))
     print(report(done))
     path = out / "profiles.png"
-    data_profiles.draw(profiles(done), budget, path)
+    data_profiles.draw(profiles(done), "n", budget, path)
     print(path)
     if store is not None:
         print(keep(HEADERS, rows(done), store))
@@ -166,11 +166,11 @@ def reached(
 
     counted = replace(task, loss=loss)
     begun = time.process_time()
-    attempt(counted, method.name, run, lambda trial: _again(trial, method, settings), limit=limit)
+    attempt(counted, method.name, run, lambda trial: again(trial, method, settings), limit=limit)
     return Reached(tuple(hits), time.process_time() - begun)
 
 
-def _again(trial: Trial, method: Method, settings: Mapping[str, Any] | None) -> None:
+def again(trial: Trial, method: Method, settings: Mapping[str, Any] | None = None) -> None:
     """Start a method again where it ends by itself, from a random point of the box."""
     for start in starts(trial):
         trial.start = start
@@ -187,12 +187,12 @@ def rows(done: Mapping[Job, Reached]) -> list[list[object]]:
     return list(_rows(_groups(done)))
 
 
-def profiles(done: Mapping[Job, Reached]) -> dict[int, dict[str, tuple[list[float], int]]]:
-    """Return, by number of parameters n and method, evaluations over n of all pairs reached, and the count of pairs."""
-    found: dict[int, dict[str, tuple[list[float], int]]] = defaultdict(dict)
+def profiles(done: Mapping[Job, Reached]) -> dict[str, dict[str, data_profiles.Profile]]:
+    """Return, by "n = ..." and method, evaluations over n of all pairs reached, and the count of pairs."""
+    found: dict[str, dict[str, data_profiles.Profile]] = defaultdict(dict)
     for (n, name), group in _groups(done).items():
         counts = [count / n for _, one in group for count in one.evaluations]
-        found[n][name] = counts, len(group) * len(bbob.TARGETS)
+        found[f"n = {n}"][name] = counts, len(group) * len(bbob.TARGETS)
     return found
 
 

@@ -60,3 +60,8 @@ def test_as_few_points_are_chosen_as_explain_all_but_a_tenth_of_the_noise(noise,
         return float((2.0 - (between * torch.linalg.solve(own, between)).sum(0)).max())
 
     assert rest(chosen) <= left < rest(chosen[:-1])
+
+
+def test_at_most_512_points_are_chosen() -> None:
+    points = torch.randn(520, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert len(InducedProcess.condition(points, points, matern, 1e-6).points) == 512

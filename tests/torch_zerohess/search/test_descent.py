@@ -322,8 +322,9 @@ def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
         assert round(power) <= 7
 
 
-def test_after_ten_batches_without_a_finite_value_it_ends():
-    search, batches = Descent(zeros(2), sigma=1.0, seed=0), 0
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_after_ten_batches_without_a_finite_value_it_ends(noise):
+    search, batches = Descent(zeros(2), sigma=1.0, noise=noise, seed=0), 0
     search.tell(bowl(search.ask()))
     while not search.done and batches < 30:
         search.tell(torch.full((len(search.ask()),), math.nan))

@@ -1,6 +1,7 @@
 """Descent in a learned metric: narrow valleys, curved ones, plateaus, holes and rounds."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -134,3 +135,16 @@ def test_a_quadratic_is_fitted_to_at_most_300_evaluations(monkeypatch):
         for _ in range(3):
             search.tell(ellipsoid(10.0, n, 0)(search.ask(400)))
         assert counts[-1] == most
+
+
+@pytest.mark.parametrize(
+    ("ratio", "length", "factor"), [(0.75, 0.85, 2.0), (0.65, 0.85, 1.0), (0.75, 0.75, 1.0), (0.05, 0.85, 0.6)]
+)
+def test_sigma_grows_after_a_long_step_that_keeps_its_promise(ratio, length, factor):
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    for _ in range(3):
+        search.tell(search.ask() @ vector(1.0, 2.0))
+    known = replace(search._state.progress, length=length, refused=1)
+    after, nowhere = search._method._judged(known, ratio)
+    assert after.sigma / known.sigma == factor
+    assert nowhere is None

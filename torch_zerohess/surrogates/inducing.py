@@ -87,6 +87,5 @@ def _decomposed(points: Tensor, kernel: Kernel, left: float) -> tuple[Tensor, Te
         column = kernel((points - points[pivot]).norm(dim=1)) + CONSTANT - known[:, pivot] @ known
         rows[len(pivots)] = column / worst**0.5
         rest = (rest - rows[len(pivots)].square()).clamp_min(0.0)
-        rest[pivot] = 0.0
         pivots.append(pivot)
     return rows[: len(pivots)].mT.contiguous(), torch.tensor(pivots, dtype=torch.long, device=points.device)

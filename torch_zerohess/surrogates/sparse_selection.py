@@ -90,7 +90,7 @@ def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds
             if grids.joint:
                 counts[2 + which] += _histogram(grids.mean(squares), _LEAST_JOINT / K)
     own, joint = (_threshold(counts[k], counts[k + 1], rate) for k in (0, 2))
-    return Thresholds(own, joint)
+    return Thresholds(max(own, _LEAST_OWN / K), max(joint, _LEAST_JOINT / K))
 
 
 def spaced(energy: Tensor, count: int) -> list[int]:

@@ -43,6 +43,13 @@ def test_zero_gradient_stays():
     assert torch.equal(step.s, torch.zeros(3))
 
 
+def test_a_curvature_that_is_too_small_to_divide_by_leads_to_the_boundary():
+    gradient = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    step = steihaug(lambda v: 1e-320 * v, gradient, 2.0, iterations=5, tolerance=1e-6)
+    torch.testing.assert_close(step.s, -2.0 * gradient)
+    assert step.decrease == 2.0
+
+
 @pytest.mark.parametrize("condition", [1.0, 1e3, 1e6])
 def test_newton_cg_solves_a_quadratic_in_one_step(condition):
     scales = torch.tensor([1.0, condition**0.5, condition], dtype=torch.float64)

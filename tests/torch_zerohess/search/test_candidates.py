@@ -4,7 +4,7 @@ import pytest
 import torch
 from searches import waves
 
-from torch_zerohess.search.candidates import least_known, lowest
+from torch_zerohess.search.candidates import is_known, least_known, lowest
 from torch_zerohess.surrogates.gaussian_process import GaussianProcess
 from truths import vector
 
@@ -64,3 +64,10 @@ def test_the_least_known_point_is_far_from_those_that_are_known():
     uniform = LOWER + (UPPER - LOWER) * torch.rand(1000, 2, generator=generator, dtype=torch.float64)
     usual = torch.cdist(uniform, points).min(1).values
     assert min(apart) > float(usual.median())
+
+
+def test_a_point_is_known_within_a_ten_thousandth():
+    points = torch.stack([LOWER, vector(0.5, 0.3), UPPER])
+    process = GaussianProcess.fit(points, waves(points))
+    assert is_known(process, points[1] + vector(0.0, 0.9e-4))
+    assert not is_known(process, points[1] + vector(0.0, 1.1e-4))

@@ -169,14 +169,25 @@ def test_a_wall_of_values_that_are_not_finite(wrong, output):
     assert search.value < 3.0  # 18 at the start, 1 at best
 
 
-def test_a_refused_step_is_shortened():
-    search = Descent(zeros(1), sigma=1.0, seed=0)
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_a_refused_step_is_shortened(noise):
+    search = Descent(zeros(1), sigma=1.0, noise=noise, seed=0)
     search.tell((search.ask()[:, 0] - 5) ** 2)
     sigma, center = search.sigma, search.center
     search.ask()
     search.tell(vector(math.nan))
     assert search.sigma == 0.5 * sigma
     assert torch.equal(search.center, center)
+
+
+@pytest.mark.parametrize(("finite", "asked"), [(4, 2), (5, 1)])
+def test_a_model_takes_four_evaluations_besides_the_center(finite, asked):
+    """With fewer of seven, a pair of samples is asked for before the end of a step."""
+    search = Descent(zeros(6), sigma=1.0, noise=0.1, seed=0)
+    values = bowl(search.ask())
+    values[finite:] = math.nan
+    search.tell(values)
+    assert len(search.ask()) == asked
 
 
 def test_finite_only_at_the_start():
@@ -311,8 +322,9 @@ def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
         assert round(power) <= 7
 
 
-def test_after_ten_batches_without_a_finite_value_it_ends():
-    search, batches = Descent(zeros(2), sigma=1.0, seed=0), 0
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_after_ten_batches_without_a_finite_value_it_ends(noise):
+    search, batches = Descent(zeros(2), sigma=1.0, noise=noise, seed=0), 0
     search.tell(bowl(search.ask()))
     while not search.done and batches < 30:
         search.tell(torch.full((len(search.ask()),), math.nan))

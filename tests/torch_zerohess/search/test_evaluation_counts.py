@@ -57,6 +57,12 @@ def entropy(y):
     return (q * (q / p).log() + (1 - q) * ((1 - q) / (1 - p)).log()).mean()
 
 
+def rippled(z):
+    """A bowl with a ripple in every coordinate, without local minima."""
+    d = z - 0.3
+    return (0.5 * d.square() + 0.05 * (1 - torch.cos(8 * d))).sum(1)
+
+
 def ripples(z):
     """A paraboloid with a local minimum in every turn of a cosine."""
     d = z - vector(2.0, -1.5)
@@ -71,10 +77,12 @@ CASES = {
     "a bowl in 80 dimensions": Case(descent(zeros(80), sigma=1.0), bowl, 20.0, 2000, most=1000),
     "a curved valley": Case(descent(zeros(2) - 1.2, sigma=0.5), rosenbrock, 1e-4, 290),
     "a curved valley far up": Case(descent(zeros(2) - 1.2, sigma=0.5), lambda z: rosenbrock(z) + 1e4, 1e4 + 1e-3, 290),
+    "a rippled bowl": Case(descent(zeros(3) - 2, sigma=1.0), rippled, 1e-3, 120),
     "a plateau": Case(descent(vector(2.0, 1.0), sigma=1.0), plateau, -0.99, 600),
     # A descent with the output.
     "pictures": Case(descent(zeros(12) - 1, sigma=1.0, loss=misfit(pictures, zeros(12) + 0.3)), pictures, 1e-4, 165),
     "a bar, one parameter": Case(descent(vector(-1.0), sigma=1.0, loss=misfit(bar, vector(1.3))), bar, 1e-2, 110, 8),
+    "rays in 10 dimensions": Case(descent(zeros(10), sigma=1.0, loss=rays_loss(10)), rays, 1e-5, 165),
     # A process of the output.
     "rays": Case(process(zeros(2), sigma=1.0, bounds=(-3.0, 4.0), loss=rays_loss(2)), rays, 1e-5, 52),
     "a spiral": Case(

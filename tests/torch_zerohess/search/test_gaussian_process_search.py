@@ -76,6 +76,7 @@ def test_the_loss_need_not_be_quadratic(losses):
 
 
 def test_no_point_is_outside_of_the_box_and_none_comes_twice():
+    """The solution is a corner of the box, where steps have no length: sigma is a ten thousandth at least."""
     search = GaussianProcessSearch(
         vector(0.0, 0.9), sigma=5.0, bounds=(-1.0, 1.0), loss=misfit(waves, vector(1.0, 1.0)), seed=0
     )
@@ -85,6 +86,7 @@ def test_no_point_is_outside_of_the_box_and_none_comes_twice():
             break
         asked.append(search.ask())
         search.tell(waves(asked[-1]))
+        assert search.sigma >= 0.99e-4  # of the first one
     points = torch.cat(asked)
     assert float(points.abs().max()) <= 1.0
     distances = torch.cdist(points, points) + 10 * torch.eye(len(points), dtype=torch.float64)
@@ -240,3 +242,16 @@ def test_the_model_at_the_best_point_is_that_of_the_output_there():
     jacobian = torch.func.jacfwd(lambda x: waves(x[None])[0])(vector(1.0, 0.3))
     truth = 2 / 5 * jacobian.mT @ jacobian
     torch.testing.assert_close(model.full_hessian() / (0.5 * sigma) ** 2, truth, rtol=0.02, atol=0)
+
+
+def test_half_of_a_batch_is_around_the_end_of_the_step():
+    """With half of the distance of the nearest evaluation as their root mean square distance from it."""
+    search = GaussianProcessSearch(
+        vector(0.0, 0.9), sigma=1.0, bounds=(-30.0, 30.0), loss=misfit(waves, vector(1.0, 1.0)), seed=0
+    )
+    first = search.ask()
+    search.tell(waves(first))
+    points = search.ask(101)
+    nearest = float((first - points[0]).norm(dim=1).min())
+    spread = float((points[1:51] - points[0]).square().sum(1).mean().sqrt())
+    assert spread == pytest.approx(0.5 * nearest, rel=5 / math.sqrt(2 * 100))

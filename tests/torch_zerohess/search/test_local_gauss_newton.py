@@ -10,7 +10,9 @@ from searches import run
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
 from torch_zerohess.search.gauss_newton import LENGTHS
-from truths import normal
+from torch_zerohess.search.state import Evaluated
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+from truths import normal, vector
 
 SIDE = 12
 N = SIDE**2
@@ -58,6 +60,34 @@ def test_a_jacobian_that_predicts_well_is_trusted_in_long_steps_and_kept(f, radi
     assert lengths.tolist() == pytest.approx([radius * one for one in LENGTHS])
     search.tell(f(points))
     assert len(search.ask()) == asked
+
+
+@pytest.mark.parametrize(
+    ("samples", "gain", "after"),
+    [(32, 0.01, 64), (32, 0.05, 32), (64, 0.01, 64), (64, 0.05, 64), (64, 0.2, 32)],
+)
+def test_samples_are_doubled_after_a_small_gain_and_halved_after_a_large_one(samples, gain, after):
+    search = search_for(image, normal(N))
+    search.tell(image(search.ask()))
+    known = search._state.progress
+    told = Evaluated(known.center[None], vector((1 - gain) * known.best.loss), known.output[None], known.shape)
+    assert search._method.taken(replace(known, samples=samples), told).samples == after
+
+
+def test_steps_are_solved_where_sizes_of_texels_differ():
+    """The condition number of the Hessian is 100: along the gradient alone the loss would fall by a third."""
+    sizes = torch.linspace(1.0, 10.0, N).double().view(SIDE, SIDE)
+    truth = normal(N)
+    search = run(search_for(lambda x: sizes * image(x), truth), lambda x: sizes * image(x), 39)
+    assert search.value < 1e-3 * float((sizes * image(truth[None])).square().mean())
+
+
+def test_no_hessian_is_formed_for_more_than_a_thousand_parameters():
+    for n in (1000, 1001):
+        method = LocalGaussNewton(torch.zeros(n).double(), sigma=1.0, loss=square(0.0))._method
+        jacobian = SparseJacobian.empty(n, (2,), 1, torch.zeros(1))
+        known = replace(method.begun(), jacobian=jacobian, output=vector(1.0, 2.0), shape=torch.Size([2]))
+        assert (method.derivatives_at_center(known) is not None) == (n == 1000)
 
 
 @pytest.mark.parametrize(("explained", "agreed"), [(0.4, 0), (0.6, 1)])
@@ -178,6 +208,15 @@ def test_a_sparse_jacobian_is_chosen_by_evidence():
     again.load_state_dict(search.state_dict())
     assert again.engine == "local"
     assert torch.equal(again.ask(), search.ask())
+
+
+@pytest.mark.parametrize(("noise", "asked"), [(0.5, 6), (1.0, 32)])
+def test_where_the_first_samples_predict_less_than_half_the_rest_is_asked_for(noise, asked):
+    """Otherwise the next points are steps. A perfect fit would predict 1 / (1 + noise^2) of the change."""
+    search, generator = door(N, square(0.0)), torch.Generator().manual_seed(0)
+    points = search.ask()
+    search.tell(image(points) + noise * torch.randn(33, SIDE, SIDE, generator=generator, dtype=torch.float64))
+    assert len(search.ask()) == asked
 
 
 @pytest.mark.parametrize("n", [20, 100])

@@ -1,12 +1,14 @@
 """Descent in a learned metric: narrow valleys, curved ones, plateaus, holes and rounds."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from searches import plateau, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
+from torch_zerohess.search import metric_descent
 from truths import vector
 
 
@@ -121,3 +123,28 @@ def test_derivatives_do_not_come_from_evaluations_that_lie_too_close(seed):
     model, sigma = search.model_at_best()
     truth = torch.func.hessian(lambda z: f(z[None])[0])(search.x)
     assert float((model.full_hessian() / sigma**2 - truth).norm()) < 1e-2 * float(truth.norm())
+
+
+def test_a_quadratic_is_fitted_to_at_most_300_evaluations(monkeypatch):
+    """Otherwise to n more than it has coefficients, 84 for 11 parameters."""
+    counts, fitted = [], metric_descent.least_change
+    monkeypatch.setattr(metric_descent, "least_change", lambda u, *rest: counts.append(len(u)) or fitted(u, *rest))
+    for n, most in ((11, 89), (23, 300)):
+        search = Descent(zeros(n), sigma=1.0, seed=0)
+        counts.clear()
+        for _ in range(3):
+            search.tell(ellipsoid(10.0, n, 0)(search.ask(400)))
+        assert counts[-1] == most
+
+
+@pytest.mark.parametrize(
+    ("ratio", "length", "factor"), [(0.75, 0.85, 2.0), (0.65, 0.85, 1.0), (0.75, 0.75, 1.0), (0.05, 0.85, 0.6)]
+)
+def test_sigma_grows_after_a_long_step_that_keeps_its_promise(ratio, length, factor):
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    for _ in range(3):
+        search.tell(search.ask() @ vector(1.0, 2.0))
+    known = replace(search._state.progress, length=length, refused=1)
+    after, nowhere = search._method._judged(known, ratio)
+    assert after.sigma / known.sigma == factor
+    assert nowhere is None

@@ -1,5 +1,6 @@
 """The process of chosen points against the exact one."""
 
+import pytest
 import torch
 
 from torch_zerohess.surrogates.gaussian_process import GaussianProcess, gaussian, matern
@@ -44,3 +45,23 @@ def test_where_all_is_noise_no_point_is_chosen_and_the_mean_is_predicted() -> No
     torch.testing.assert_close(found(points[:3]), outputs.mean(0).expand(3, 3))
     spread = (outputs - outputs.mean(0)).square().mean() / 1e6  # variance of the process, a millionth of the noise
     torch.testing.assert_close(found.uncertainty(points[:3]), 2.0 * spread.expand(3), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(("noise", "left"), [(1.0, 0.1), (1e-2, 1e-3), (1e-6, 1e-7), (1e-8, 1e-7)])
+def test_as_few_points_are_chosen_as_explain_all_but_a_tenth_of_the_noise(noise, left) -> None:
+    """All but 1e-7 of the variance of the process at least. With one point fewer, more is left somewhere."""
+    points, outputs = data(300)
+    chosen = InducedProcess.condition(points, outputs, gaussian, noise).points
+    assert 1 < len(chosen) < 300
+
+    def rest(some):
+        """Variance of the process at all points, given some of them."""
+        between, own = (gaussian(torch.cdist(some, one)) + 1.0 for one in (points, some))
+        return float((2.0 - (between * torch.linalg.solve(own, between)).sum(0)).max())
+
+    assert rest(chosen) <= left < rest(chosen[:-1])
+
+
+def test_at_most_512_points_are_chosen() -> None:
+    points = torch.randn(520, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert len(InducedProcess.condition(points, points, matern, 1e-6).points) == 512

@@ -127,3 +127,22 @@ def test_a_third_derivative_in_noise_narrows_the_quadratic():
     """Of all 80 evaluations the error would be 6 standard errors."""
     scores, _ = scores_in_noise(0.3)
     assert float(scores.square().mean().sqrt()) < 3.0
+
+
+@pytest.mark.parametrize("times", [10.0, 40.0])
+def test_what_chance_leaves_of_a_quadratic_in_noise_is_no_contradiction(times):
+    """Eight values with 10 or 40 times the variance that noise has: the mean of 7 + 5 degrees of freedom is a.
+
+    Chance leaves up to a (1 + 2 (2/5)^1/2) of it. What is more does not average out over the eight.
+    """
+    z, noise = torch.arange(-3.5, 4.0, dtype=torch.float64), 1e-3
+    design = torch.stack([torch.ones_like(z), z, 0.5 * z.square()], 1)
+    solve = torch.linalg.inv(design.mT @ design)
+    left = z.pow(3) - design @ (solve @ (design.mT @ z.pow(3)))
+    left = left * (noise * math.sqrt(times * 5) / left.norm())
+    model, sigma, _ = quadratic_around(z[:1] * 0, z[:, None], design[:, 2] + left, noise)
+    mean = (7 + 5 * times) / 12 * noise**2
+    missed = 8 * max(times * noise**2 - mean * (1 + 2 * math.sqrt(2 / 5)), 0.0)
+    assert (missed > 0.0) == (times == 40.0)
+    truth = math.sqrt((mean + missed) * float(solve[2, 2]))
+    assert float(model.curvature_error) / sigma**2 == pytest.approx(truth, rel=1e-6)

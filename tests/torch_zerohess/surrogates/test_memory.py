@@ -151,3 +151,11 @@ def test_values_that_were_left_out_do_not_count() -> None:
     kept = torch.rand(1, 2000, generator=torch.Generator().manual_seed(1)) < 0.5
     memory.observe(torch.where(kept, truth, 0.0), truth, kept=kept)
     assert memory.coefficient == pytest.approx(1.0)
+
+
+def test_older_calls_count_less() -> None:
+    """The regression of 1, then of 1/4, with the weights 0.8 and 1."""
+    memory, truth = Memory(), normal(1, 2000)
+    memory.observe(truth, truth)
+    memory.observe(0.25 * truth, truth)
+    assert memory.coefficient == pytest.approx((0.8 * 1.0 + 0.25) / 1.8)

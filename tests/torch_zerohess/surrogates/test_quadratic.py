@@ -269,3 +269,11 @@ def test_second_derivatives_of_a_loss_are_those_of_torch_func(loss, count):
     assert value == pytest.approx(float(loss(output)))
     assert torch.allclose(slope, torch.func.grad(loss)(output).flatten())
     assert torch.allclose(products, directions.flatten(1) @ hessian)
+
+
+def test_a_second_derivative_that_is_a_multiple_of_the_identity_is_seen():
+    """Products then take no call of autograd. Its own rounding does not hide it."""
+    y = normal(torch.Generator().manual_seed(0), 60)
+    assert loss_curvature(lambda z: 3 * (z - 0.3).square().mean() / 7, y).second == pytest.approx(2 * 3 / 7 / 60)
+    bent = loss_curvature(lambda z: (z - 0.3).square().mean() + 1e-9 * z[0] ** 2, y)
+    assert not isinstance(bent.second, float)

@@ -267,7 +267,7 @@ def _speed_up(query: Query) -> tuple[str, pd.DataFrame, str]:
 def _origin(table: pd.DataFrame, note: str, whole: bool) -> str:
     """Return the line below a table; whole: with machine and command."""
     parts = [note] if note else []
-    if "runs" in table:
+    if {"runs", "first_run"} <= set(table):  # medians of runs; a study may have a column of this name, too
         counts = sorted({int(one) for one in table["runs"]})
         starts = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
         limit = _only(table, "limit")

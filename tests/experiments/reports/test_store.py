@@ -284,7 +284,7 @@ def test_the_table_of_speed_ups(folder):
 
 
 def test_studies_are_kept_as_they_are(results):
-    result_files.keep(["problem", "error", "repeats"], [["A", 0.123456, 2], ["B", 2000.0, 3]], "study")
+    result_files.keep(["problem", "error", "runs"], [["A", 0.123456, 2], ["B", 2000.0, 3]], "study")
     text = table_of("study", Query.of(["columns=problem,error", "problem=B"]))
     assert text.splitlines()[:3] == ["| problem | error |", "| --- | --- |", "| B | 2 000 |"]
     assert "Commit `012345678`" in text

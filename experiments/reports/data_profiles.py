@@ -1,4 +1,4 @@
-"""Data profiles: the share of (problem, target) pairs reached against evaluations (as in More and Wild 2009)."""
+"""Data profiles (More and Wild 2009): the share of problems solved, or of targets reached, against evaluations."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,14 +14,15 @@ from matplotlib import pyplot as plt
 _SPAN = 300
 """From the first to the last evaluation that is drawn, as a ratio."""
 Profile = tuple[Sequence[float], int]
-"""Evaluations, in some unit, after which pairs were reached, and the number of all pairs."""
+"""Evaluations, in some unit, after which problems were solved or targets reached, and the number of all."""
 
 
-def draw(profiles: Mapping[str, Mapping[str, Profile]], unit: str, most: float, path: Path) -> None:
+def draw(profiles: Mapping[str, Mapping[str, Profile]], of: str, unit: str, most: float, path: Path) -> None:
     """Draw a panel for each title.
 
     Args:
         profiles: by title and method.
+        of: what they are shares of.
         unit: of the evaluations.
         most: evaluations in this unit that a run could use.
         path: of the PNG file.
@@ -38,7 +39,7 @@ def draw(profiles: Mapping[str, Mapping[str, Profile]], unit: str, most: float, 
         axis.set(xscale="log", xlim=(most / _SPAN, most), ylim=(0, 1), xlabel=f"evaluations / {unit}", title=title)
         plain_ticks(axis)
         axis.grid(alpha=0.3)
-    axes[0][0].set_ylabel("share of the pairs reached")
+    axes[0][0].set_ylabel(f"share of {of}")
     found = [axis.get_legend_handles_labels() for axis in axes[0]]
     legend = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}
     figure.legend(legend.values(), legend.keys(), loc="outside right upper", frameon=False)

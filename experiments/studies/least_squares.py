@@ -2,21 +2,23 @@
 
 A method solves a problem to tau once a point has f <= f_L + tau (f(x0) - f_L), where f_L is the lowest value that any
 of the methods finds (More and Wild 2009). The table has the share of the 53 problems solved after 3, 10 and 100 (n + 1)
-evaluations. All methods have the same starts and no bounds. The first step is a tenth of the largest parameter, the
-default of DFO-LS and Py-BOBYQA. A method that ends by itself starts again from a random point.
+evaluations. All methods have the same starts and no bounds. The first step of the others is a tenth of the largest
+parameter, at least 0.1, the default of DFO-LS and Py-BOBYQA. A method that ends by itself starts again from a random
+point. No method is told of noise.
 
 Noise and oscillations are not in the values that are compared: what counts is where the points are.
+
+Tables have the start of the authors, run 0. `--over` compares settings of a method; use other runs for that.
 """
 
 import itertools
 import math
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -26,6 +28,7 @@ from experiments.methods import METHODS
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.ours import search
+from experiments.methods.settings.rivals import ON_MORE_WILD
 from experiments.problems import more_wild
 from experiments.problems.catalogue import chosen
 from experiments.problems.task import Task
@@ -34,11 +37,11 @@ from experiments.reports.progress import progress
 from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
-from experiments.studies.optimizers import again
+from experiments.studies.optimizers import again, row_name, with_choices
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search), uses="image")
 _SIGMA = 3.0
-"""First sigma of ours over the first step of the others; best of 1, 3 and 10 from random starts, which no table has."""
+"""First sigma of ours over the first step of the others; best of 1, 3 and 10 on run 1000."""
 RIVALS = ("dfo_ls", "cobyqa", "py_bobyqa", "bfgs_fd", "cma_es")
 BUDGETS = (3, 10, 100)
 """Evaluations over n + 1 after which the table counts."""
@@ -59,12 +62,18 @@ class Job:
     method: str
     budget: int
     """Evaluations over n + 1."""
+    run: int = 0
+    """Number of the start."""
+    settings: tuple[tuple[str, Any], ...] = ()
+    """Of the method, where they are not its defaults."""
 
 
 @dataclass(frozen=True)
 class Descent:
-    """Every evaluation with a lower value than all before, without noise, from the start on."""
+    """Every evaluation with a lower value than all before, without noise."""
 
+    first: float
+    """Value at the start of the task, which a method need not evaluate."""
     evaluations: Sequence[int]
     values: Sequence[float]
     seconds: float
@@ -84,6 +93,8 @@ def least_squares(
     problems: tuple[str, ...] = (),
     budget: int = BUDGETS[-1],
     limit: float = 600.0,
+    run: int = 0,
+    over: tuple[str, ...] = (),
     out: Path = Path("results/least_squares"),
     store: str | None = None,
 ) -> None:
@@ -96,11 +107,13 @@ def least_squares(
         problems: names, as watson_n6 or watson_n6_far; all 53 if not given.
         budget: evaluations over n + 1 that a run may use.
         limit: seconds that a run may take.
+        run: number of the start; 0 is the start of the authors, others are random.
+        over: settings of the one method in `methods` to compare, each with a row: `scale=0.3,1,3`.
         out: folder; runs that the same code has made there are not made again.
         store: name under which the table is kept for the documents, as experiments/results/NAME.csv.
     """
-    if budget < 1 or not limit > 0:
-        raise SystemExit(f"budget must be at least 1, limit positive, got {budget} and {limit:g}")
+    if budget < 1 or run < 0 or not limit > 0:
+        raise SystemExit(f"budget must be at least 1, run 0, limit positive, got {budget}, {run} and {limit:g}")
     if store is not None:
         may_keep(store)
     torch.set_num_threads(1)
@@ -114,93 +127,103 @@ def least_squares(
         if known[name].missing():
             raise SystemExit(f"{name} needs pip install {' '.join(known[name].missing())}")
     parts, done = KeptParts(out), dict[Job, Descent]()
-    each = itertools.product(kinds, names, wanted)
-    for kind, name, method in progress(list(each), "runs"):
-        problem, job = there[name], Job(name, kind, method, budget)
+    each = itertools.product(kinds, names, with_choices(wanted, over, ON_MORE_WILD))
+    for kind, name, (method, settings) in progress(list(each), "runs"):
+        problem, job = there[name], Job(name, kind, method, budget, run, tuple(settings.items()))
         task = more_wild.task(problem, budget * (problem.n + 1), kind)
         if known[method].unusable(task) is None:
-            make = partial(_run, task, known[method], limit)
+            make = partial(_run, job, task, known[method], limit)
             (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Descent, make)
+    if not done:
+        raise SystemExit(f"methods must have one that applies to {', '.join(kinds)}, got {', '.join(wanted)}")
     found = list(rows(done))
     print(table(HEADERS, found))
     path = out / "profiles.png"
-    data_profiles.draw(profiles(done), "(n + 1)", budget, path)
+    data_profiles.draw(profiles(done), "problems solved", "(n + 1)", budget, path)
     print(path)
     if store is not None:
         print(keep(HEADERS, found, store))
 
 
-def _run(task: Task, method: Method, limit: float) -> list[Descent]:
-    return [descent(task, method, limit)]
+def _run(job: Job, task: Task, method: Method, limit: float) -> list[Descent]:
+    return [descent(task, method, limit, job.run, dict(job.settings))]
 
 
-def descent(task: Task, method: Method, limit: float = 600.0) -> Descent:
-    """Run a method from the start of a task until its evaluations are used up."""
-    found: list[tuple[int, float]] = []
-    used = 0
-
-    def seen(points: Tensor) -> None:
-        nonlocal used
-        for point in points:
-            used += 1
-            value = task.truth.image_error(point)
-            if not found or value < found[-1][1]:
-                found.append((used, value))
+def descent(
+    task: Task, method: Method, limit: float = 600.0, run: int = 0, settings: Mapping[str, Any] | None = None
+) -> Descent:
+    """Run a method from a start of a task until its evaluations are used up. SystemExit if the method fails."""
+    seen: list[Tensor] = []
 
     def loss(x: Tensor) -> Tensor:
-        seen(x)
+        seen.extend(x)
         return task.loss(x)
 
     def image(x: Tensor) -> Tensor:
-        seen(x)
+        seen.extend(x)
         assert task.output is not None
         return task.output.image(x)
 
-    output = None if task.output is None else replace(task.output, image=image)
-    settings = {"sigma": _SIGMA * task.sigma} if method is OURS else None
-    counted, begun = replace(task, loss=loss, output=output), time.process_time()
-    attempt(counted, method.name, 0, lambda trial: again(trial, method, settings), limit=limit)
-    counts, values = zip(*found, strict=True) if found else ((), ())
-    return Descent(counts, values, time.process_time() - begun, used)
+    counted = replace(task, loss=loss, output=None if task.output is None else replace(task.output, image=image))
+    if method is OURS:
+        settings = {"sigma": _SIGMA * task.sigma, **(settings or {})}
+    outcome = attempt(counted, method.name, run, lambda trial: again(trial, method, settings), limit=limit)
+    if outcome.status == "failed":
+        raise SystemExit(f"{method.name} failed on {task.name}: {outcome.reason}\n{outcome.traceback}")
+    error, found = task.truth.image_error, list[tuple[int, float]]()
+    for count, point in enumerate(seen, 1):
+        value = error(point)
+        if not found or value < found[-1][1]:
+            found.append((count, value))
+    counts, values = zip(*found, strict=True)
+    return Descent(error(task.start(run)), counts, values, outcome.seconds, len(seen))
 
 
 def rows(done: Mapping[Job, Descent]) -> Iterator[list[object]]:
     """Yield a row per kind and method; None for more evaluations than the runs could use."""
-    known = {OURS.name: OURS, **METHODS}
-    for (kind, method), group in _solved(done).items():
+    known, most = {OURS.name: OURS, **METHODS}, min(job.budget for job in done)
+    for (kind, name), group in _grouped(done).items():
+        counts = _solved(group, _lowest(done))
         shares = [
-            sum(count <= budget for count in group[tau]) / len(group[tau]) if budget <= most else None
+            sum(count <= budget for count in counts[tau]) / len(group) if budget <= most else None
             for tau in TAUS
-            for budget, most in zip(BUDGETS, itertools.repeat(_budget(done)))
+            for budget in BUDGETS
         ]
-        runs = [one for job, one in done.items() if (job.kind, job.method) == (kind, method)]
-        milliseconds = 1e3 * sum(one.seconds for one in runs) / sum(one.used for one in runs)
-        yield [kind, method, known[method].uses if kind == "smooth" else "loss", *shares, milliseconds, len(runs)]
+        uses = known[group[0][0].method].uses if kind == "smooth" else "loss"
+        milliseconds = 1e3 * sum(one.seconds for _, one in group) / sum(one.used for _, one in group)
+        yield [kind, name, uses, *shares, milliseconds, len(group)]
 
 
 def profiles(done: Mapping[Job, Descent]) -> dict[str, dict[str, data_profiles.Profile]]:
     """Return, by kind with tau and by method, evaluations over n + 1 until problems are solved, and their number."""
     found: dict[str, dict[str, data_profiles.Profile]] = defaultdict(dict)
-    for (kind, method), group in _solved(done).items():
-        for tau, counts in group.items():
-            found[f"{kind}, tau = {tau:.0e}"][method] = [one for one in counts if math.isfinite(one)], len(counts)
+    for (kind, name), group in _grouped(done).items():
+        for tau, counts in _solved(group, _lowest(done)).items():
+            found[f"{kind}, tau = {tau:.0e}"][name] = [one for one in counts if math.isfinite(one)], len(counts)
     return found
 
 
-def _budget(done: Mapping[Job, Descent]) -> int:
-    return min(job.budget for job in done)
+def _grouped(done: Mapping[Job, Descent]) -> dict[tuple[str, str], list[tuple[Job, Descent]]]:
+    """Return the runs by kind and name of the row."""
+    groups: dict[tuple[str, str], list[tuple[Job, Descent]]] = defaultdict(list)
+    for job, one in done.items():
+        groups[job.kind, row_name(job.method, job.settings)].append((job, one))
+    return groups
 
 
-def _solved(done: Mapping[Job, Descent]) -> dict[tuple[str, str], dict[float, list[float]]]:
-    """Return, by kind and method, and then by tau, evaluations over n + 1 until each problem is solved."""
+def _lowest(done: Mapping[Job, Descent]) -> dict[tuple[str, str], float]:
+    """Return the lowest value of any method by kind and problem."""
     lowest: dict[tuple[str, str], float] = defaultdict(lambda: math.inf)
     for job, one in done.items():
-        lowest[job.kind, job.problem] = min(lowest[job.kind, job.problem], *one.values)
-    sizes = {one.name: one.n for one in more_wild.PROBLEMS}
-    found: dict[tuple[str, str], dict[float, list[float]]] = defaultdict(lambda: {tau: [] for tau in TAUS})
-    for job, one in done.items():
+        lowest[job.kind, job.problem] = min(lowest[job.kind, job.problem], one.first, *one.values)
+    return lowest
+
+
+def _solved(group: Sequence[tuple[Job, Descent]], lowest: Mapping[tuple[str, str], float]) -> dict[float, list[float]]:
+    """Return by tau the evaluations over n + 1 until each problem is solved."""
+    sizes, found = {one.name: one.n for one in more_wild.PROBLEMS}, {tau: list[float]() for tau in TAUS}
+    for job, one in group:
         low = lowest[job.kind, job.problem]
-        for tau in TAUS:
-            count = one.solved(low + tau * (one.values[0] - low))
-            found[job.kind, job.method][tau].append(count / (sizes[job.problem] + 1))
+        for tau, counts in found.items():
+            counts.append(one.solved(low + tau * (one.first - low)) / (sizes[job.problem] + 1))
     return found

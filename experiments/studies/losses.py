@@ -144,10 +144,10 @@ def losses(
     if store is not None:
         may_keep(store)
     least = 4 * _SCRAMBLES
-    if runs < 2 or min(samples, default=0) < 1 or min(truth, sweep) < least:
+    if runs < 2 or min(samples, default=0) < 1 or min(truth, sweep) < least or evaluations < 0:
         raise SystemExit(
-            f"runs must be at least 2, samples at least 1, truth and sweep at least {least}, "
-            f"got {runs}, {samples}, {truth} and {sweep}"
+            f"runs must be at least 2, samples at least 1, truth and sweep at least {least}, evaluations at least 0, "
+            f"got {runs}, {samples}, {truth}, {sweep} and {evaluations}"
         )
     shown = {name: pictures_of(fitting(name)) for name in chosen("tasks", tasks, list(FITTING))}
     swept, kept = [one for name, one in shown.items() if name in SOLUTIONS], KeptParts(out)

@@ -10,7 +10,6 @@ Instances 11 to 15 are for tuning, 1 to 5 for tables. `--over` compares settings
 """
 
 import itertools
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -114,7 +113,7 @@ def optimizers(
     for name in wanted:
         if known[name].missing():
             raise SystemExit(f"{name} needs pip install {' '.join(known[name].missing())}")
-    each = itertools.product(n, functions, instances, range(runs), _with_settings(wanted, over))
+    each = itertools.product(n, functions, instances, range(runs), with_choices(wanted, over, ON_BBOB))
     jobs = [
         Job(count, function, instance, run, name, budget, tuple(settings.items()))
         for count, function, instance, run, (name, settings) in each
@@ -124,19 +123,21 @@ def optimizers(
         (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, known[job.method], limit))
     print(report(done))
     path = out / "profiles.png"
-    data_profiles.draw(profiles(done), "n", budget, path)
+    data_profiles.draw(profiles(done), "targets reached", "n", budget, path)
     print(path)
     if store is not None:
         print(keep(HEADERS, rows(done), store))
 
 
-def _with_settings(names: Sequence[str], over: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
-    """Return methods with their settings on BBOB; a single method with all combinations of `over`, if there are any."""
+def with_choices(
+    names: Sequence[str], over: Sequence[str], chosen_settings: Mapping[str, Mapping[str, Any]]
+) -> list[tuple[str, dict[str, Any]]]:
+    """Return methods with their chosen settings; a single method with all combinations of `over`, if there are any."""
     if not over:
-        return [(name, dict(ON_BBOB.get(name, {}))) for name in names]
+        return [(name, dict(chosen_settings.get(name, {}))) for name in names]
     if len(names) != 1:
         raise SystemExit(f"over compares settings of one method, got methods {','.join(names)}")
-    choices = dict(choices_of(one, list(space(names[0], bbob.SIGMA))) for one in over)
+    choices = dict(choices_of(one, list(space(names[0], 1.0))) for one in over)
     return [(names[0], dict(zip(choices, one, strict=True))) for one in itertools.product(*choices.values())]
 
 
@@ -165,9 +166,10 @@ def reached(
         return values
 
     counted = replace(task, loss=loss)
-    begun = time.process_time()
-    attempt(counted, method.name, run, lambda trial: again(trial, method, settings), limit=limit)
-    return Reached(tuple(hits), time.process_time() - begun)
+    outcome = attempt(counted, method.name, run, lambda trial: again(trial, method, settings), limit=limit)
+    if outcome.status == "failed":
+        raise SystemExit(f"{method.name} failed on {task.name}: {outcome.reason}\n{outcome.traceback}")
+    return Reached(tuple(hits), outcome.seconds)
 
 
 def again(trial: Trial, method: Method, settings: Mapping[str, Any] | None = None) -> None:
@@ -207,7 +209,12 @@ def _named(job: Job) -> str:
     """Name of a row: the method with its settings; ours with the engine that it chooses."""
     if job.method == OURS.name:
         return f"{job.method}: {TrustRegion(torch.zeros(job.n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
-    return " ".join([job.method, *(f"{name}={value}" for name, value in job.settings)])
+    return row_name(job.method, job.settings)
+
+
+def row_name(method: str, settings: Sequence[tuple[str, Any]]) -> str:
+    """Name of a method in a table, with settings that are not its defaults."""
+    return " ".join([method, *(f"{name}={value}" for name, value in settings)])
 
 
 def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[object]]:

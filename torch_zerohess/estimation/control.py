@@ -93,16 +93,17 @@ class Control:
             head.check(space.shape, aux[0])
             known, outside = space.split(aux[0])
 
+            def squared(z: Tensor) -> Tensor:
+                coordinates: Tensor = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
+                return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
+
+            return squared
+
         def predict(z: Tensor) -> Tensor:
-            B, E = z.shape[:2]
-            if isinstance(head, SquaredError) and space is not None:
-                coordinates = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, (B, E))
-                losses: Tensor = (coordinates - known[:, None]).square().sum(2) + outside[:, None]
-                return losses
             outputs: Tensor = surrogate(z.flatten(0, 1))
             if self.memory.scalar and outputs.shape[1:] == (1,):
                 outputs = outputs[:, 0]
-            outputs = outputs.unflatten(0, (B, E))
+            outputs = outputs.unflatten(0, z.shape[:2])
             return outputs if head is None else apply_head(head, outputs, aux)
 
         return predict

@@ -32,7 +32,7 @@ class Part(NamedTuple):
 
     @classmethod
     def of(cls, one: Tensor) -> "Part":
-        """Return a tensor: a copy of its bytes, or a view of them if they are more than `PIPE`."""
+        """Return the part of a tensor, with a copy of its bytes, or with a view if they are more than `PIPE`."""
         one = one.detach().cpu().resolve_conj().resolve_neg().contiguous()
         if one.nbytes <= PIPE:
             return cls(str(one.dtype), tuple(one.shape), ctypes.string_at(one.data_ptr(), one.nbytes))

@@ -147,3 +147,5 @@ TUNED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
 # The defaults are best of cma_es_bounded and cobyqa (--n 2 3 --over scale=0.1,0.25,0.5,1) and of py_bobyqa (--n 2
 # --over scale=0.1,0.25,0.5,1 seek_global_minimum=True,False).
 ON_BBOB: Mapping[str, Mapping[str, Any]] = {"lbfgs_fd": {"difference": 1e-8}}
+# More and Wild, every third problem: best of 1e-3, 1e-5 and 1e-7. The other rivals have their defaults.
+ON_MORE_WILD: Mapping[str, Mapping[str, Any]] = {"bfgs_fd": {"difference": 1e-7}}

@@ -92,9 +92,11 @@ def test_tasks_without_a_picture_are_refused() -> None:
         losses(tasks=("box3",))
 
 
-@pytest.mark.parametrize("wrong", [{"runs": 1}, {"samples": ()}, {"truth": 2}, {"sweep": 0}])
+@pytest.mark.parametrize("wrong", [{"runs": 1}, {"samples": ()}, {"truth": 2}, {"sweep": 0}, {"evaluations": -1}])
 def test_wrong_arguments_of_the_command_are_named(wrong) -> None:
-    with pytest.raises(SystemExit, match="runs must be at least 2, samples at least 1, truth and sweep at least 16"):
+    with pytest.raises(
+        SystemExit, match="runs must be at least 2, samples at least 1, truth and sweep at least 16, evaluations"
+    ):
         losses(**wrong)
 
 

@@ -195,5 +195,5 @@ def test_constants_that_are_named_exist():
     named = set(re.findall(r"`(_?[A-Z][A-Z_]+)`", TEXTS["tests/README.md"].partition("The library:")[0]))
     sources = "\n".join(path.read_text() for path in (ROOT / "torch_zerohess").rglob("*.py"))
     assigned = {name for line in re.findall(r"^([A-Z_, ]+) = ", sources, re.MULTILINE) for name in line.split(", ")}
-    assert len(named) > 20
+    assert len(named) > 5
     assert named <= assigned

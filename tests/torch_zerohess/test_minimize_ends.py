@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -313,3 +314,12 @@ def test_fewer_evaluations_than_were_spent(resumed, tmp_path):
     said = "allows no more than the 12 so far" if resumed < 12 else "used up"
     assert f"max_evaluations ({resumed}) {said}" in fit.message
     assert fit.value <= first.value
+
+
+def test_verbose_says_something_once_per_second(monkeypatch, capsys):
+    """With a clock that goes on by a quarter of a second whenever it is read."""
+    clock = itertools.count(0.0, 0.25)
+    monkeypatch.setattr("torch_zerohess.minimization.running.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=20, verbose=True)
+    seconds, lines = next(clock), len(capsys.readouterr().err.splitlines())
+    assert 0 < lines <= seconds

@@ -8,6 +8,7 @@ from searches import TARGET, bowl, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.minimization.belief import believed
+from torch_zerohess.minimization.decision import decide
 from torch_zerohess.minimization.noise import differs, distinct, lowest_mean, reserved
 from truths import vector
 
@@ -334,3 +335,21 @@ def test_more_evaluations_go_to_points_that_may_be_best():
 def test_what_is_kept_for_the_end():
     assert (reserved(8), reserved(80), reserved(10_000)) == (4, 10, 48)
     assert torch.equal(distinct([TARGET, TARGET.clone(), -TARGET]), torch.stack([TARGET, -TARGET]))
+
+
+def test_two_points_with_low_values_may_be_best_besides_the_likely_ones():
+    """The values of a decision are 1 at the lowest point, 0 at the second lowest, -1 at the third and 2 elsewhere."""
+    points, losses = torch.arange(5.0).double()[:, None], vector(0.1, 0.2, 0.3, 0.4, 0.5)
+    truth = vector(1.0, 0.0, -1.0, 2.0, 2.0)
+    x, value, _ = decide(lambda z: truth[z[:, 0].long()], points, losses, [points[4]], 5, 12, 0.1)
+    assert (float(x), value) == (1.0, 0.0)
+
+
+def test_losses_may_be_ten_thousand_times_the_noise():
+    """A quadratic with values around 1e3 and noise of .1: coarser levels of noise would give an error of 2.6."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(40, 2, generator=generator, dtype=torch.float64)
+    losses = 1e3 * points.square().sum(1) + 0.1 * torch.randn(40, generator=generator, dtype=torch.float64)
+    x, value, error = believed(points, losses, zeros(2), torch.ones(2), 0.1)
+    assert error < 1.0
+    assert value == pytest.approx(1e3 * float(x.square().sum()), abs=3 * error)

@@ -7,6 +7,7 @@ import torch
 from searches import TARGET, bowl, plateau, rays, rays_loss, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
+from torch_zerohess.search import descent
 from truths import vector
 
 # Functions with known minima.
@@ -331,3 +332,15 @@ def test_after_ten_batches_without_a_finite_value_it_ends(noise):
         batches += 1
     assert batches == 10
     assert "10 batches in a row had values that are not finite" in search.message
+
+
+@pytest.mark.parametrize(("n", "follows"), [(1, False), (2, False), (3, True)])
+def test_an_output_is_followed_from_three_parameters_on(n, follows, monkeypatch):
+    """Of up to two parameters the quadratic is of the loss."""
+    fitted = []
+    for name in ("fit_values", "fit_outputs"):
+        fit = getattr(descent, name)
+        monkeypatch.setattr(descent, name, lambda *told, name=name, fit=fit: fitted.append(name) or fit(*told))
+    search = Descent(zeros(n), sigma=1.0, loss=torch.sum, seed=0)
+    search.tell(search.ask().square())
+    assert set(fitted) == {"fit_outputs" if follows else "fit_values"}

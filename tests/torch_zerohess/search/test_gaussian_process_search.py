@@ -1,12 +1,14 @@
 """Bayesian optimization of a composite function in a small box: where others get stuck, and in noise."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from searches import bar, bump, misfit, spiral, waves
 
 from torch_zerohess.optim import GaussianProcessSearch
+from torch_zerohess.search.state import Best, Evaluated
 from truths import normal, vector
 
 
@@ -255,3 +257,39 @@ def test_half_of_a_batch_is_around_the_end_of_the_step():
     nearest = float((first - points[0]).norm(dim=1).min())
     spread = float((points[1:51] - points[0]).square().sum(1).mean().sqrt())
     assert spread == pytest.approx(0.5 * nearest, rel=5 / math.sqrt(2 * 100))
+
+
+def test_eight_batches_are_kept():
+    """Of 20 points each, which are more than the 60 evaluations that are kept of single points."""
+    search = GaussianProcessSearch(vector(0.0, 0.0), sigma=1.0, bounds=(-5.0, 5.0), seed=0)
+    points = normal(200, 2, seed=1)
+    method, known = search._method, search._state.progress
+    for part in points.split(20):
+        losses = part.square().sum(1)
+        known = method.take(known, Evaluated(part, losses, None, extra=19))
+    assert len(known.pool) == 160
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0, 5.0, 20.0, 1e3])
+def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
+    """Wider by a power of 3/2 until n evaluations besides the center weigh .001, below ten times the first sigma."""
+    search = GaussianProcessSearch(vector(0.0, 0.0), sigma=1.0, bounds=(-1e4, 1e4), seed=0)
+    points = factor * vector(0.0, 0.0, 1.0, 0.0, 0.0, 1.0).view(3, 2)
+    method, known = search._method, search._state.progress
+    pool = known.pool.add(points, points.sum(1), None, points[0], 1.0)
+    best = Best(points[0], 0.0, 1.0)
+    found = method.model_at_best(replace(known, pool=pool, best=best))
+    reach = math.sqrt(2.0 * math.log(1e3))  # in sigma, where the weight is .001
+    powers = [1.5**k for k in range(6) if 1.5**k * reach > factor]
+    assert (found is None) == (not powers)
+    assert found is None or found[1] == pytest.approx(powers[0])
+
+
+@pytest.mark.parametrize(("distance", "stays"), [(0.04, True), (0.06, False)])
+def test_close_to_a_minimum_that_is_solved_the_step_is_to_the_minimum(distance, stays):
+    search = GaussianProcessSearch(vector(0.0, 0.0), sigma=1.0, bounds=(-5.0, 5.0), seed=0)
+    best, other = vector(0.0, 0.0), vector(distance, 0.0)
+    known = replace(search._state.progress, best=Best(best, 0.0, 1.0), solved=best)
+    x = search._method._lowest(known, lambda z: (z - other).square().sum(-1), torch.Generator().manual_seed(0))
+    assert torch.equal(x, best) == stays
+    assert stays or float((x - other).norm()) < 0.01

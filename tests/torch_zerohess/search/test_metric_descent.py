@@ -148,3 +148,21 @@ def test_sigma_grows_after_a_long_step_that_keeps_its_promise(ratio, length, fac
     after, nowhere = search._method._judged(known, ratio)
     assert after.sigma / known.sigma == factor
     assert nowhere is None
+
+
+@pytest.mark.parametrize(("n", "asked"), [(1, 1), (2, 1), (3, 3), (5, 5)])
+def test_from_three_parameters_on_there_are_two_points_along_every_axis(n, asked):
+    """Of up to two parameters a step is tried after the first point along every axis."""
+    search = Descent(zeros(n), sigma=1.0, seed=0)
+    search.tell(ellipsoid(2.0, n, 0)(search.ask()))
+    assert len(search.ask()) == asked
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_a_quadratic_is_known_sigma_falls_at_once(seed):
+    """A point that is as predicted confirms the minimum: 15 evaluations, and 43 or more if none counted as such."""
+    search = Descent(zeros(3), sigma=2.0, seed=seed, restarts=0)
+    run(search, ellipsoid(10.0, 3, 0), 1000)
+    assert search.done
+    assert search.evaluations <= 20
+    assert search.value < 1e-12

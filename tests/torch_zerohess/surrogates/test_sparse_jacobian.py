@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torch_zerohess.surrogates import sparse_selection
-from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
+from torch_zerohess.surrogates.sparse_fit import SparseSettings, _subset, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, largest, spaced, thresholds
 from truths import normal
@@ -229,3 +229,22 @@ def test_parts_are_spaced_by_their_energy():
     assert spaced(energy, 4) == [2, 3, 4]
     assert spaced(energy, 6) == list(range(6))
     assert spaced(torch.zeros(6), 3) == [0, 2, 4]
+
+
+def test_a_fit_takes_eight_samples():
+    with pytest.raises(ValueError, match="samples must be at least 8 to fit 2 parameters per output"):
+        check_samples(7, 2)
+    check_samples(8, 2)
+    with pytest.raises(ValueError, match="at least 12 "):
+        check_samples(11, 10)
+
+
+def test_held_out_elements_are_bands_of_four_rows():
+    """Of an image of 100 x 300 that changes in rows 10 to 19 and 60 to 69: 4 bands of 4 rows, all of which change."""
+    changes = torch.zeros(5, 100, 300, dtype=torch.float64)
+    changes[:, 10:20] = changes[:, 60:70] = normal(5, 10, 300)
+    part, grids = _subset(Grids((100, 300, 1)), changes.flatten(1))
+    rows = (part.view(-1, 300)[:, 0] // 300).tolist()
+    assert grids.pixels == (len(rows), 300, 1)
+    assert len(rows) == 16
+    assert all(sum(other in rows for other in range(one - 3, one + 4)) >= 4 for one in rows)

@@ -51,7 +51,7 @@ COMMANDS = {
     "robustness": Command("experiments.studies.robustness:robustness", "other starts, samples and noise", long=True),
     "least_squares": Command(
         "experiments.studies.least_squares:least_squares",
-        "our search and others on the least-squares problems of More and Wild",
+        "our search and others on least squares of More and Wild",
         long=True,
     ),
     "optimizers": Command(

@@ -270,16 +270,33 @@ def _origin(table: pd.DataFrame, note: str, whole: bool) -> str:
     if {"runs", "first_run"} <= set(table):  # medians of runs; a study may have a column of this name, too
         counts = sorted({int(one) for one in table["runs"]})
         starts = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        limit = _only(table, "limit")
-        end = f", {limit} s at most." if limit else "."
+        parts.append(f"{starts} starts, from number {_only(table, 'first_run')} on.")
+        parts += _limits(table)
         if "clock" in table:
-            end += (
-                f" Seconds are of the {'processor' if _only(table, 'clock') == 'processor' else 'clock on the wall'}."
-            )
-        parts.append(f"{starts} starts, from number {_only(table, 'first_run')} on{end}")
+            clock = "processor" if _only(table, "clock") == "processor" else "clock on the wall"
+            parts.append(f"Seconds are of the {clock}.")
     commits = ", ".join(f"`{one[:9]}`" for one in dict.fromkeys(table["commit"]))
     if not whole:
         return " ".join([*parts, f"Commit {commits}."])
     parts.append(f"Commit {commits}, {_only(table, 'date')}, {_only(table, 'machine')}.")
     parts += [f"`{one}`" for one in dict.fromkeys("; ".join(dict.fromkeys(table["command"])).split("; "))]
     return " ".join(parts)
+
+
+def _limits(table: pd.DataFrame) -> list[str]:
+    """Return sentences: what the runs of a table may use at most, and which of them the time ended."""
+    parts = []
+    if "evaluation_limit" in table and table["evaluation_limit"].notna().all():
+        tasks = {most: rows["task"].unique() for most, rows in table.groupby("evaluation_limit", sort=True)}
+        limits = [
+            number(int(most)) + (f" ({', '.join(t.upper() for t in tasks[most])})" if len(tasks) > 1 else "")
+            for most in tasks
+        ]
+        parts.append(f"A run has at most {' or '.join(limits)} evaluations.")
+    if not (limit := _only(table, "limit")):
+        return parts
+    if "ended_by_time" not in table:
+        return [*parts, f"A run has at most {limit} s."]
+    ended = table[table["ended_by_time"] > 0].drop_duplicates(["task", "method"]).to_dict("records")
+    runs = [f"{one['ended_by_time']:.0f} of `{one['method']}` on {one['task'].upper()}" for one in ended]
+    return [*parts, f"The limit of {limit} s ended {'these runs: ' + ', '.join(runs) if runs else 'no run'}."]

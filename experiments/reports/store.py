@@ -30,7 +30,8 @@ def store(
 ) -> None:
     """Write the medians of a folder of results, with their origin, to experiments/results/NAME.csv.
 
-    A fitting task has a row per method, error and level. A task that trains a network has a row per method. Refused if
+    A fitting task has a row per method, error and level. A task that trains a network has a row per method. Rows say
+    how many evaluations a run may use (`evaluation_limit`) and how many runs the limit of time ended. Refused if
     the runs are of several commits, of code with changes, of several machines, presets or limits, or not finished.
 
     Args:
@@ -158,4 +159,6 @@ def _about(task: str, method: str, runs: Sequence[Run]) -> dict[str, Any]:
         "title": known.title if known else "",
         "uses": known.uses if known else "",
         "first_run": min(run.outcome.run for run in runs),
+        "evaluation_limit": runs[0].outcome.settings.get("evaluations"),
+        "ended_by_time": sum(run.outcome.status == "time limit" for run in runs),
     }

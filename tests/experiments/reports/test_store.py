@@ -34,7 +34,7 @@ def results(tmp_path, monkeypatch):
     return tmp_path / "stored"
 
 
-def write(folder, task, method, run, errors, *, each, settings=None):
+def write(folder, task, method, run, errors, *, each, settings=None, status="stopped"):
     """A run with these image errors after `each` evaluations and half a second; parameter errors are their squares."""
     files = Files(folder / task / method, run)
     log = Log(files.log)
@@ -43,8 +43,8 @@ def write(folder, task, method, run, errors, *, each, settings=None):
     log.close()
     n = len(errors) - 1
     x = [] if task.startswith("cnn") else [1.0, 2.0]
-    write_outcome(Outcome(task, method, run, "stopped", "", 0.5 * n, 0.4 * n, n * each, n, x), files)
-    one = {"preset": "fast", "limit": 15.0, **(settings or {})}
+    one = {"preset": "fast", "limit": 15.0, "evaluations": 400, **(settings or {})}
+    write_outcome(Outcome(task, method, run, status, "", 0.5 * n, 0.4 * n, n * each, n, x, one), files)
     provenance.register(folder, {task: {method: one}})
 
 
@@ -236,7 +236,8 @@ def test_a_table_of_fits(folder):
     assert lines[0] == "| method | what it does | uses | BOWL, n = 2 |"
     cells = {line.split(" | ")[0].strip("| `"): line.split(" | ")[-1].strip(" |") for line in lines[2:4]}
     assert cells == {"fr22": "- (33 %)", "descent": "7.5, 1.25 s"}
-    for part in ("2 to 3 starts, from number 3 on, 15 s at most.", "Commit `012345678`", "`python -m experiments run"):
+    limits = "A run has at most 400 evaluations. The limit of 15 s ended no run."
+    for part in ("2 to 3 starts, from number 3 on. " + limits, "Commit `012345678`", "`python -m experiments run"):
         assert part in lines[-1]
     others = table_of("bowls", Query.of(["level=90", "metric=parameter", "show=evaluations", "methods=fr22"]))
     assert "| 30 (33 %) |" not in others  # one of three is fewer than half
@@ -249,6 +250,19 @@ def test_a_table_of_fits(folder):
     short = table_of("bowls", Query.of(["titles=hide", "origin=commit"])).splitlines()
     assert short[0] == "| method | uses | BOWL, n = 2 |"
     assert short[-1].endswith("Seconds are of the processor. Commit `012345678`.")
+
+
+def test_a_table_says_which_runs_the_time_ended(folder, results):
+    for run in (3, 4):
+        few = {"evaluations": 2000}
+        write(folder, "dish", "fr22", run, [100.0, 50.0], each=30, settings=few, status="time limit")
+    write(folder, "bowl", "fr22", 5, [100.0, 50.0], each=30, status="time limit")
+    store(folder, name="bowls")
+    ended = {(one["task"], one["method"]): one["ended_by_time"] for one in rows(results, "bowls")}
+    assert ended == {("bowl", "descent"): "0", ("bowl", "fr22"): "1", ("dish", "fr22"): "2"}
+    below = table_of("bowls", Query()).splitlines()[-1]
+    assert "A run has at most 400 (BOWL) or 2 000 (DISH) evaluations." in below
+    assert "The limit of 15 s ended these runs: 1 of `fr22` on BOWL, 2 of `fr22` on DISH." in below
 
 
 def test_means_of_ratios():

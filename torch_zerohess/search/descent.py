@@ -50,7 +50,8 @@ class LocalQuadratics(Method[DescentProgress]):
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
         self._n = n = settings.n
-        self._follows = settings.loss is not None and n > _FEW
+        self.follows = settings.loss is not None and n > _FEW
+        """Whether it models the output, not the loss."""
         self.capacity = settings.pool or _capacity(n, loss_alone=settings.loss is None)
 
     def first(self, generator: torch.Generator) -> tuple[DescentProgress, Tensor]:
@@ -75,7 +76,7 @@ class LocalQuadratics(Method[DescentProgress]):
         if known.refused >= _REFUSED:
             reason = f"{_REFUSED} batches in a row had values that are not finite"
             known = replace(known, refused=0)  # a later round may have started where nothing is finite
-            return self._arrived(known, reason, generator, last=known.rounds == 0)
+            return self.arrive(known, reason, generator, last=known.rounds == 0)
         loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
         if known.phase == "trial":
             known = self._judged(replace(known, iterations=known.iterations + 1), evaluated, loss)
@@ -85,7 +86,7 @@ class LocalQuadratics(Method[DescentProgress]):
             known = replace(known, value=loss if known.phase == "start" else known.value).trying()
         if known.sigma < self.settings.tolerance:
             reason = f"sigma fell below {self.settings.tolerance} of the first one"
-            known = self._arrived(known, reason, generator)
+            known = self.arrive(known, reason, generator)
         return self._planned(known) if known.phase == "trial" and not known.done else known
 
     def points(self, known: DescentProgress, generator: torch.Generator) -> Tensor:
@@ -153,11 +154,11 @@ class LocalQuadratics(Method[DescentProgress]):
         """Decide by the end of a step what to do next."""
         if loss == math.inf:
             return replace(known, sigma=_HALVING * known.sigma).sampling(2)
-        if evaluated.outputs is not None and self._follows:
+        if evaluated.outputs is not None and self.follows:
             return after_output(known, evaluated.points[0], loss, evaluated.outputs[0])
         return after_loss(known, evaluated.points[0], loss, self.settings.noise)
 
-    def _arrived(
+    def arrive(
         self, known: DescentProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> DescentProgress:
         """End, or start another round: at a random point and around the best one in turn."""
@@ -247,7 +248,7 @@ class LocalQuadratics(Method[DescentProgress]):
     def _fitted(self, known: DescentProgress, u: Tensor, near: Tensor, weights: Tensor) -> LocalModel:
         """Fit a model to the evaluations that are near, at u [P, n] with weights [P]."""
         outputs = known.pool.outputs
-        if self.settings.loss is None or outputs is None or not self._follows:
+        if self.settings.loss is None or outputs is None or not self.follows:
             return fit_values(u, known.pool.values[near], weights)
         return fit_outputs(u, outputs[near], weights, self.settings.loss, known.shape)
 

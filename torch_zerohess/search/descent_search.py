@@ -5,6 +5,7 @@ from typing import Any
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_descent import MOST, MetricQuadratics
+from torch_zerohess.search.output_descent import OutputDescent
 from torch_zerohess.search.protocol import AskTell
 
 
@@ -18,7 +19,8 @@ class Descent(AskTell[Any]):
       evaluations, and region and samples follow the metric of its Hessian: narrow valleys are as wide as long there.
     - With an output [K, *out] and a white-box `loss`, every evaluation is many equations: it follows the minimum of
       loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises for a
-      while.
+      while. Where a step was predicted well (up to 40 parameters, no noise), Gauss-Newton by interpolation goes on in a
+      trust region, until its steps fail.
     - On a plateau, in noise, and with the loss alone of more parameters the quadratic is one of the smoothed loss, and
       sigma grows on the plateau. New samples around x are asked for where the model has predicted badly.
 
@@ -30,7 +32,7 @@ class Descent(AskTell[Any]):
     times the evaluations that the quadratic of a loss is fitted to, and of an output max(60, 6 n).
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
-    order; evaluations are re-used as in derivative-free least squares (Cartis et al. 2019) and COBYQA.
+    order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation.
 
     Example:
         >>> import torch
@@ -46,7 +48,9 @@ class Descent(AskTell[Any]):
         return descent_method(settings)
 
 
-def descent_method(settings: Settings) -> LocalQuadratics | MetricQuadratics:
-    """Return quadratics in a learned metric for a loss alone, otherwise isotropic ones."""
-    alone = settings.loss is None and settings.noise == 0.0
-    return MetricQuadratics(settings) if alone and settings.n <= MOST else LocalQuadratics(settings)
+def descent_method(settings: Settings) -> LocalQuadratics | MetricQuadratics | OutputDescent:
+    """Return the method for an output, for a loss alone, or for a loss with noise or of many parameters."""
+    if settings.loss is not None:
+        return OutputDescent(settings)
+    alone = settings.noise == 0.0 and settings.n <= MOST
+    return MetricQuadratics(settings) if alone else LocalQuadratics(settings)

@@ -12,10 +12,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.descent import LocalQuadratics
-from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalProgress, LocalSettings
 from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
 from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
@@ -45,7 +44,7 @@ class EvidenceProgress(Progress):
     """[K]"""
     outputs: Tensor
     """[K, m]"""
-    descent: DescentProgress | None
+    descent: OutputDescentProgress | None
     local: LocalProgress | None = None
 
 
@@ -53,14 +52,14 @@ _SHARED = tuple(field.name for field in fields(Progress))
 
 
 class EvidenceMethod(Method[EvidenceProgress]):
-    """`LocalQuadratics` or `LocalMethod`, for outputs with a loss."""
+    """`OutputDescent` or `LocalMethod`, for outputs with a loss."""
 
     engine = "descent or local"
     progress = EvidenceProgress
 
     def __init__(self, settings: Settings, own: LocalSettings) -> None:
         super().__init__(settings)
-        self.descent, self.local = LocalQuadratics(settings), LocalMethod(settings, own)
+        self.descent, self.local = OutputDescent(settings), LocalMethod(settings, own)
 
     def first(self, generator: torch.Generator) -> tuple[EvidenceProgress, Tensor]:
         """Ask for the start and the first part of the samples."""

@@ -35,9 +35,9 @@ _FINEST = 1e-6
 """Sigma at which a round ends, over the tolerance of the search."""
 _FEW = 2
 """Parameters up to which a step is tried before there are two points along every axis."""
-_FAR, _RELATIVELY = 3.0, 2.0
+FAR, RELATIVELY = 3.0, 2.0
 """Evaluations farther than this, and than this times the distance of the n + 2 nearest ones, are left out."""
-_BAD, _GOOD, _LONG = 0.1, 0.7, 0.8
+BAD, _GOOD, _LONG = 0.1, 0.7, 0.8
 """Part of its promise that a refused step achieves; a good step, and its length in units of the region."""
 _GROWTH, _SHRINKING = 2.0, 0.6
 """Factors for sigma after a good long step and after a refused one."""
@@ -266,7 +266,7 @@ class MetricQuadratics(Method[MetricProgress]):
 
     def _judged(self, known: MetricProgress, ratio: float) -> tuple[MetricProgress, Tensor | None]:
         """Change sigma by the part of its promise that a step achieved; or return where the model knows least [n]."""
-        if ratio >= _BAD:
+        if ratio >= BAD:
             grows = ratio > _GOOD and known.length > _LONG
             return replace(known, refused=0, sigma=_GROWTH * known.sigma if grows else known.sigma), None
         known = replace(known, refused=known.refused + 1)
@@ -293,7 +293,7 @@ class MetricQuadratics(Method[MetricProgress]):
         u, n = known.scaled, self._n
         distance = u.norm(dim=1)
         order = distance.argsort()
-        far = max(_FAR, _RELATIVELY * float(distance[order[min(n + 1, len(order) - 1)]]))
+        far = max(FAR, RELATIVELY * float(distance[order[min(n + 1, len(order) - 1)]]))
         chosen = order[: self._fitted]
         enough = torch.arange(len(chosen), device=u.device) < 2 * n + 1
         chosen = chosen[(distance[chosen] <= far) | enough]

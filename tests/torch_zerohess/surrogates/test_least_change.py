@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from torch_zerohess.surrogates.least_change import least_change
+from torch_zerohess.surrogates.least_change import LeastNorm, least_change
+from truths import vector
 
 
 def quadratic(n, seed):
@@ -62,3 +63,33 @@ def test_near_points_count_more():
     u = torch.tensor([0.0, 0.1, -0.1, 0.2, -0.2, 3.0], dtype=torch.float64)[:, None]
     _, gradient, _ = least_change(u, u[:, 0] ** 3 / 27, torch.zeros(1, 1, dtype=torch.float64))
     assert abs(float(gradient)) < 0.01
+
+
+@pytest.mark.parametrize("P", [3, 5, 10, 14])
+def test_the_jacobian_against_a_direct_minimisation(P):
+    """Least |H|^2 / 2 + sum of squared misfits / (10^-3 |u|^6), over all slopes and Hessians of each output."""
+    n, m = 3, 2
+    u = 0.5 * points(P, n, 3)
+    changes = torch.stack([torch.sin(u @ torch.arange(1.0, 4.0).double()), u.square().sum(1) + u[:, 0]], 1)
+    pairs = [(i, j) for i in range(n) for j in range(i + 1)]
+    bends = [u[:, i] * u[:, j] * (0.5 if i == j else 0.5**0.5) for i, j in pairs]  # of norm one
+    weight = 1e-3**-0.5 / u.norm(dim=1, keepdim=True).pow(3)
+    design = torch.cat([u, torch.stack(bends, 1)], 1) * weight
+    penalty = torch.diag(torch.cat([torch.zeros(n), torch.full((len(bends),), 0.5**0.5)]).double())
+    padded = torch.cat([changes * weight, u.new_zeros(len(penalty), m)])
+    direct = torch.linalg.lstsq(torch.cat([design, penalty]), padded, driver="gelsd").solution
+    found = LeastNorm.through(u, changes)
+    torch.testing.assert_close(found.jacobian, direct[:n], rtol=1e-4, atol=1e-4)
+    slope = vector(2.0, -3.0)
+    hessian = u.new_zeros(n, n)
+    for (i, j), one in zip(pairs, direct[n:] @ slope, strict=True):
+        hessian[i, j] = hessian[j, i] = one * (1.0 if i == j else 0.5**0.5)
+    torch.testing.assert_close(found.hessian(slope), hessian, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("P", [1, 2])
+def test_few_points_tell_the_jacobian_along_them(P):
+    slopes = points(4, 2, 5)
+    u = torch.eye(4, dtype=torch.float64)[:P]
+    expected = torch.cat([slopes[:P], torch.zeros(4 - P, 2, dtype=torch.float64)])
+    torch.testing.assert_close(LeastNorm.through(u, u @ slopes).jacobian, expected, rtol=0, atol=1e-6)

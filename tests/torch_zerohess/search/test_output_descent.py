@@ -1,0 +1,145 @@
+"""Descent on an output: when Gauss-Newton takes over, what that gains, and when the descent follows again."""
+
+import pytest
+import torch
+from every_search import same, saved
+from searches import plateau, rays, rays_loss, run, zeros
+
+from torch_zerohess.optim import Descent
+from torch_zerohess.search import output_descent, output_gauss_newton
+from truths import vector
+
+
+def bent(x):
+    """Residuals [K, n + 2] whose sum of squares is 1 at its minimum 0, and curved there by the last residual."""
+    k = torch.arange(1, x.shape[1] + 1, dtype=x.dtype)
+    linear = (x + 0.3 * x.sum(1, keepdim=True)) / k
+    return torch.cat([linear, (x * k).sum(1, keepdim=True), 1 + 0.5 * x.square().sum(1, keepdim=True)], 1)
+
+
+def squares(y):
+    return y.square().sum()
+
+
+def evaluations(search, f, level, most=1000):
+    while search.value > level and not search.done and search.evaluations < most:
+        search.tell(f(search.ask()))
+    return search.evaluations if search.value <= level else most
+
+
+def smooth(search):
+    return search.state_dict()["progress"]["smooth"] is not None
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("n", "most"), [(4, 60), (8, 110)])
+def test_it_converges_fast_where_residuals_are_not_zero(n, most, seed, monkeypatch):
+    def search():
+        return Descent(torch.full((n,), 2.0, dtype=torch.float64), sigma=0.5, loss=squares, seed=seed, restarts=0)
+
+    assert evaluations(search(), bent, 1 + 1e-8) < most
+    monkeypatch.setattr(output_descent, "_PREDICTED", 0.0)
+    monkeypatch.setattr(output_descent, "MOST", 0)
+    assert evaluations(search(), bent, 1 + 1e-8) > 2 * most
+
+
+def test_a_step_that_was_predicted_is_the_evidence():
+    search, before = Descent(zeros(5), sigma=1.0, loss=rays_loss(5), seed=0, restarts=0), None
+    while not smooth(search):
+        before = search.value
+        search.tell(rays(search.ask()))
+    assert search.value < before
+    assert len(search.ask()) == 1
+    assert search.evaluations <= 20
+
+
+@pytest.mark.parametrize(("n", "noise"), [(3, 0.1), (41, 0.0)])
+def test_in_noise_and_in_many_dimensions_it_only_follows(n, noise):
+    search = Descent(zeros(n), sigma=1.0, loss=squares, noise=noise, seed=0, restarts=0)
+    for _ in range(20):
+        search.tell(search.ask() - 1.0)
+        assert search.done or not smooth(search)
+
+
+def test_where_the_output_has_steps_the_descent_follows_again():
+    """Outputs in steps of 1/2: their slope is told far from the minimum, and is zero or infinite nearby."""
+    search, seen = Descent(zeros(4), sigma=1.0, loss=squares, seed=1), []
+    while search.evaluations < 200:
+        points = search.ask()
+        search.tell(torch.round(2 * (points + 0.2 * points.sum(1, keepdim=True) - 7.1)) / 2)
+        seen.append(smooth(search))
+    assert True in seen
+    assert seen[seen.index(True) :].count(False) > 5
+    assert search.value < 0.5  # of 200
+
+
+def test_after_five_refused_steps_gauss_newton_has_failed(monkeypatch):
+    def count(patience=None):
+        if patience is not None:
+            monkeypatch.setattr(output_gauss_newton, "_PATIENCE", patience)
+        search = Descent(zeros(4), sigma=1.0, loss=squares, seed=1, restarts=0)
+        first = last = 0
+        while not (first and last) and search.evaluations < 400:
+            points = search.ask()
+            search.tell(torch.round(2 * (points + 0.2 * points.sum(1, keepdim=True) - 7.1)) / 2)
+            first = first or (smooth(search) and search.evaluations)
+            last = last or (first and not smooth(search) and search.evaluations)
+        return last - first
+
+    usual = count()
+    assert count(2) < usual < count(20)
+
+
+def test_on_a_plateau_it_never_begins():
+    search = Descent(vector(2.0, 1.0), sigma=1.5, loss=torch.sum, seed=0)
+    assert smooth(search)  # with two parameters it begins so
+    run(search, lambda z: torch.zeros(len(z), 1, dtype=torch.float64), 3)
+    assert not smooth(search)
+    run(search, lambda z: plateau(z)[:, None], 150)
+    assert search.value < -0.9
+
+
+def test_an_arrival_is_one_of_the_round():
+    search = Descent(torch.full((3,), 2.0).double(), sigma=0.5, loss=squares, seed=0, restarts=2)
+    run(search, bent, 2000)
+    assert search.done
+    assert search.solved
+    assert search.rounds == 3
+    assert search.value == pytest.approx(1.0, abs=1e-12)
+
+
+def test_it_goes_on_bit_by_bit_from_a_state_of_gauss_newton():
+    search, again = (Descent(zeros(5) - 1, sigma=0.5, loss=squares, seed=3) for _ in range(2))
+    while not smooth(search):
+        search.tell(bent(search.ask()))
+    for batch in (1, 1, 4, 1, 4, 1):
+        again.load_state_dict(saved(search.state_dict()))
+        assert torch.equal(search.ask(batch), again.ask(batch))
+        for one in (search, again):
+            one.tell(bent(one.ask(batch)))
+        assert same(search.state_dict(), again.state_dict())
+
+
+def test_its_model_at_the_best_point_is_that_of_the_output():
+    search = Descent(zeros(3) + 1, sigma=0.5, loss=squares, seed=0, restarts=0)
+    evaluations(search, bent, 1 + 1e-9)
+    assert smooth(search)
+    model, sigma = search.model_at_best()
+    jacobian = torch.func.jacrev(lambda x: bent(x[None])[0])(search.x)
+    width = sigma * float(search.unit[0])
+    curvature = 2 * width**2 * jacobian.mT @ jacobian
+    error = (model.full_hessian() - curvature).norm() / curvature.norm()
+    assert float(error) < 0.05
+
+
+def test_holes_do_not_shift_the_outputs():
+    """Values that are not finite are left out with their points."""
+
+    def holes(x):
+        return torch.where((x[:, :1] < 0.7) & (x[:, :1] > 0.4), torch.nan, bent(x))
+
+    start = torch.full((4,), 2.0, dtype=torch.float64)
+    search = Descent(start, sigma=0.5, loss=squares, seed=0, restarts=0)
+    assert evaluations(search, holes, 2.0) < 100
+    progress = search.state_dict()["progress"]["smooth"] or search.state_dict()["progress"]["descent"]["pool"]
+    torch.testing.assert_close(progress["outputs"], bent(progress["points"] * 0.5 + start * 0))

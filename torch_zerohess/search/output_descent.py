@@ -1,0 +1,129 @@
+"""Descent on an output: it follows the smoothed output, and goes on by Gauss-Newton where the output is smooth.
+
+Following (`LocalQuadratics`) passes plateaus and small minima, but converges slowly near a minimum whose residuals are
+not zero. Interpolation (`OutputGaussNewton`) converges fast on smooth functions and stops at every kink. The evidence
+is a step that lowers the loss and whose output was predicted well. Where Gauss-Newton fails, the descent follows again
+from the best point, with the sigma that it had.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.descent_progress import DescentProgress
+from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.metric_descent import MOST
+from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
+from torch_zerohess.search.state import Evaluated, Progress
+from torch_zerohess.surrogates.pool import Pool
+from torch_zerohess.surrogates.quadratic import LocalModel
+
+_PREDICTED = 0.25
+"""Misfit of a predicted output below which the output counts as smooth."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OutputDescentProgress(Progress):
+    """The descent that follows, and Gauss-Newton while it has taken over."""
+
+    descent: DescentProgress
+    smooth: OutputProgress | None = None
+
+
+_SHARED = tuple(field.name for field in fields(Progress))
+
+
+class OutputDescent(Method[OutputDescentProgress]):
+    """The method of `Descent` for an output under a loss. In noise, and above 40 parameters, it only follows.
+
+    With one or two parameters it begins with Gauss-Newton: a quadratic of the loss, by which the descent goes on
+    there, predicts no output.
+    """
+
+    engine = "descent"
+    progress = OutputDescentProgress
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        self._follow = LocalQuadratics(settings)
+        self._smooth = OutputGaussNewton(settings, self._follow.capacity)
+        self._may = settings.noise == 0.0 and settings.n <= MOST
+
+    def first(self, generator: torch.Generator) -> tuple[OutputDescentProgress, Tensor]:
+        descent, points = self._follow.first(generator)
+        known = _with(OutputDescentProgress(best=descent.best, center=descent.center, descent=descent), descent)
+        if not self._may or self._follow.follows:
+            return known, points
+        smooth, points = self._smooth.first(generator)
+        assert isinstance(smooth, OutputProgress)
+        return replace(known, smooth=smooth), points
+
+    def next(
+        self, known: OutputDescentProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[OutputDescentProgress, Tensor]:
+        if known.smooth is not None:
+            return self._went_on(known, *self._smooth.next(known.smooth, evaluated, generator), generator)
+        before = known.descent
+        descent = self._follow.take(before, evaluated, generator)
+        known = replace(known, descent=descent)
+        if self._is_smooth(before, descent, evaluated):
+            smooth = self._smooth.taking_over(descent, float((evaluated.points[0] - before.center).norm()))
+            return self._went_on(known, *self._smooth.plan(smooth, generator), generator)
+        return _with(known, descent), self._follow.points(descent, generator)
+
+    def more(self, known: OutputDescentProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        if known.smooth is not None:
+            return self._smooth.more(known.smooth, points, count, generator)
+        return self._follow.more(known.descent, points, count, generator)
+
+    def model_at_best(self, known: OutputDescentProgress) -> tuple[LocalModel, float] | None:
+        descent = known.descent if known.smooth is None else self._told(known.descent, known.smooth)
+        return self._follow.model_at_best(replace(descent, best=known.best))
+
+    def promise(self, known: OutputDescentProgress) -> float:
+        return super().promise(known) if known.smooth is None else self._smooth.promise(known.smooth)
+
+    def width(self, known: OutputDescentProgress) -> Tensor:
+        return super().width(known) if known.smooth is None else self._smooth.width(known.smooth)
+
+    def _is_smooth(self, before: DescentProgress, descent: DescentProgress, evaluated: Evaluated) -> bool:
+        """Whether the end of a step had the output that was predicted, and a lower loss."""
+        step = before.phase == "trial" and bool(evaluated.finite[0]) and descent.rounds == before.rounds
+        if not (step and self._may and self._follow.follows) or len(descent.pool) <= descent.n:
+            return False
+        assert before.model is not None
+        assert evaluated.outputs is not None
+        misfit = before.model.misfit(before.step, evaluated.outputs[0])
+        return misfit < _PREDICTED and float(evaluated.losses[0]) < before.value
+
+    def _went_on(
+        self, known: OutputDescentProgress, smooth: Progress, points: Tensor, generator: torch.Generator
+    ) -> tuple[OutputDescentProgress, Tensor]:
+        """Return the progress of Gauss-Newton and its points, or of the descent where Gauss-Newton is at its end."""
+        assert isinstance(smooth, OutputProgress)
+        rounds = {one: getattr(known, one) for one in ("rounds", "arrived", "agreed", "place")}
+        if not (smooth.done or smooth.failed):
+            return replace(_with(replace(known, smooth=smooth), smooth), **rounds), points
+        descent = self._told(known.descent, smooth)
+        if smooth.done:
+            descent = replace(descent, sigma=min(smooth.sigma, 0.5 * self.settings.tolerance))
+            descent = self._follow.arrive(descent, smooth.message, generator)
+        else:
+            descent = replace(descent, center=smooth.lowest.point, value=smooth.lowest.loss, faithful=False)
+            descent = descent.sampling(2)
+        return _with(replace(known, descent=descent, smooth=None), descent), self._follow.points(descent, generator)
+
+    def _told(self, descent: DescentProgress, smooth: OutputProgress) -> DescentProgress:
+        """Return the descent with the evaluations of Gauss-Newton."""
+        pool = Pool.empty(descent.n, smooth.points.device)
+        outputs = smooth.outputs if len(smooth.points) else None
+        pool = pool.add(smooth.points, smooth.values, outputs, smooth.lowest.point, 1.0)
+        shared = {one: getattr(smooth, one) for one in ("best", "lowest", "evaluations", "iterations", "shape")}
+        return replace(descent, pool=pool, **shared)
+
+
+def _with(known: OutputDescentProgress, inner: Progress) -> OutputDescentProgress:
+    """Copy the fields that every search has."""
+    return replace(known, **{name: getattr(inner, name) for name in _SHARED})

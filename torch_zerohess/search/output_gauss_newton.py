@@ -26,6 +26,8 @@ from torch_zerohess.surrogates.loss_curvature import loss_curvature
 
 _PATIENCE = 5
 """Refused steps in a row after which the method has failed."""
+_HOLES = 3
+"""Values in a row that are not finite, after which it has failed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,12 +53,14 @@ class OutputProgress(MetricProgress):
         outputs = self.outputs
         if new.outputs is not None and len(new):
             outputs = torch.cat([outputs, new.outputs])[-capacity:] if len(outputs) else new.outputs
+        lost = 0 if bool(evaluated.needed.finite.all()) else self.lost + 1
         return replace(
             known,
             outputs=outputs,
             shape=evaluated.shape,
             evaluations=self.evaluations + len(evaluated),
-            lost=0 if bool(evaluated.needed.finite.all()) else self.lost + 1,
+            lost=lost,
+            failed=lost >= _HOLES,
         )
 
 

@@ -33,7 +33,7 @@ def chebyquad(x):
     ids=["powell_singular", "chebyquad_6"],
 )
 def test_evaluations_to_a_hundred_thousandth(residuals, start, most, seed):
-    """Far below sigma the region is widened again: a faithful long step is followed by a longer one."""
+    """The first sigma is a tenth of the distance to the solution, or less: the region has to grow."""
     sigma = max(0.1 * float(start.abs().max()), 0.05)
     search = TrustRegion(start, sigma=sigma, loss=lambda y: y.square().sum(), seed=seed)
     first = float(residuals(start[None]).square().sum())

@@ -46,6 +46,11 @@ def test_a_step_that_lowers_the_loss_asks_for_no_samples(misfit, faithful, lengt
     assert now.sigma == pytest.approx(1.0 if faithful else narrowing, abs=1e-4)
 
 
+@pytest.mark.parametrize(("length", "before", "sigma"), [(0.91, 0.5, 0.75), (0.89, 0.5, 0.5), (0.91, 1.5, 1.6)])
+def test_a_long_step_of_a_faithful_model_widens_sigma(length, before, sigma):
+    assert after(step(length=length, sigma=before), misfit=0.24, loss=9.0).sigma == pytest.approx(sigma)
+
+
 @pytest.mark.parametrize(("misfit", "phase"), [(0.24, "sample"), (0.26, "trial")])
 def test_a_faithful_model_gets_samples_where_it_knows_nothing(misfit, phase):
     now = after(step(rank=N - 3), misfit=misfit, loss=9.0)

@@ -8,32 +8,15 @@ from typing import Any
 
 import pytest
 import torch
+from document_texts import ROOT, TEXTS, blocks, experiment_calls, prose
 
 from experiments.commands import COMMANDS, call
 from experiments.methods import METHODS
 from experiments.problems.catalogue import TASKS, chosen
-from experiments.reports.documents import DOCUMENTS, differences
+from experiments.reports.documents import differences
 
-ROOT = Path(__file__).parents[1]
-TEXTS = {name: (ROOT / name).read_text() for name in DOCUMENTS if (ROOT / name).exists()}
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-COMMAND = re.compile(r"^(?:\S*/)?python3? -m experiments (.*)$")
 SETUP = "python3 -m venv .venv && .venv/bin/pip install"
 FILE = re.compile(r"[\w./-]+\.(?:py|h|cpp|csv|png|webp|toml|md)(?!\w)")
-
-
-def blocks(text: str, language: str) -> list[str]:
-    return [content for kind, content in BLOCK.findall(text) if kind == language]
-
-
-def commands(text: str) -> list[str]:
-    """Command lines in blocks of shell, with lines that end in a backslash joined, cut at `&&`."""
-    lines = [line for block in blocks(text, "bash") for line in block.replace("\\\n", " ").splitlines()]
-    return [part.strip() for line in lines for part in line.split("&&") if part.strip()]
-
-
-def prose(text: str) -> str:
-    return BLOCK.sub("", text)
 
 
 def params(found: dict[str, list[str]]) -> list[Any]:
@@ -72,13 +55,13 @@ def searches(path: Path) -> list[str]:
     return [line.partition(";")[0] for line in re.findall(r"# (tune .*)", text)]
 
 
-CALLS = {name: [match[1] for line in commands(text) if (match := COMMAND.match(line))] for name, text in TEXTS.items()}
+CALLS = {name: experiment_calls(text) for name, text in TEXTS.items()}
 CALLS |= {one.name: searches(one) for one in sorted((ROOT / "experiments/methods/settings").glob("*.py"))}
 
 
 @pytest.mark.parametrize(("name", "line"), params(CALLS))
 def test_commands_can_be_called(name, line):
-    """They are parsed by the command's own parser, but not run."""
+    """They are parsed by the command's own parser; `test_documented_runs.py` runs them at a small size."""
     command, *arguments = shlex.split(line.partition("#")[0])
     assert command in COMMANDS
     function, given = COMMANDS[command].load(), {}

@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from experiments.ensembles.kept_parts import KeptParts
-from experiments.methods import METHODS
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.ours import search
@@ -34,15 +33,13 @@ from experiments.problems.catalogue import chosen
 from experiments.problems.task import Task
 from experiments.reports import data_profiles
 from experiments.reports.progress import progress
-from experiments.reports.result_files import keep, may_keep
-from experiments.reports.tables import table
-from experiments.runs.attempt import attempt
-from experiments.studies.optimizers import again, row_name, with_choices
+from experiments.reports.result_files import may_keep
+from experiments.studies.benchmark_suite import Settings, Suite, conclude, row_name, solve
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search), uses="image")
 _SIGMA = 3.0
 """First sigma of ours over the first step of the others; best of 1, 3 and 10 on run 1000."""
-RIVALS = ("dfo_ls", "cobyqa", "py_bobyqa", "bfgs_fd", "cma_es")
+SUITE = Suite(OURS, ("dfo_ls", "cobyqa", "py_bobyqa", "bfgs_fd", "cma_es"), ON_MORE_WILD)
 BUDGETS = (3, 10, 100)
 """Evaluations over n + 1 after which the table counts."""
 TAUS = (1e-3, 1e-5)
@@ -64,8 +61,7 @@ class Job:
     """Evaluations over n + 1."""
     run: int = 0
     """Number of the start."""
-    settings: tuple[tuple[str, Any], ...] = ()
-    """Of the method, where they are not its defaults."""
+    settings: Settings = ()
 
 
 @dataclass(frozen=True)
@@ -120,33 +116,32 @@ def least_squares(
     there = {one.name: one for one in more_wild.PROBLEMS}
     names = chosen("problems", problems or tuple(there), list(there))
     chosen("kinds", kinds, list(get_args(more_wild.Kind)))
-    known = {OURS.name: OURS, **METHODS}
-    all_methods = (OURS.name, *RIVALS)
-    wanted = all_methods if methods.strip() == "all" else chosen("methods", methods.split(","), list(known))
-    for name in wanted:
-        if known[name].missing():
-            raise SystemExit(f"{name} needs pip install {' '.join(known[name].missing())}")
+    wanted = SUITE.wanted(methods, over)
     parts, done = KeptParts(out), dict[Job, Descent]()
-    each = itertools.product(kinds, names, with_choices(wanted, over, ON_MORE_WILD))
-    for kind, name, (method, settings) in progress(list(each), "runs"):
-        problem, job = there[name], Job(name, kind, method, budget, run, tuple(settings.items()))
+    for kind, name, (method, settings) in progress(list(itertools.product(kinds, names, wanted)), "runs"):
+        problem, job = there[name], Job(name, kind, method, budget, run, settings)
         task = more_wild.task(problem, budget * (problem.n + 1), kind)
-        if known[method].unusable(task) is None:
-            make = partial(_run, job, task, known[method], limit)
+        if SUITE.method(method).unusable(task) is None:
+            make = partial(_run, job, task, limit)
             (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Descent, make)
     if not done:
-        raise SystemExit(f"methods must have one that applies to {', '.join(kinds)}, got {', '.join(wanted)}")
-    found = list(rows(done))
-    print(table(HEADERS, found))
-    path = out / "profiles.png"
-    data_profiles.draw(profiles(done), "problems solved", "(n + 1)", budget, path)
-    print(path)
-    if store is not None:
-        print(keep(HEADERS, found, store))
+        raise SystemExit(
+            f"methods must have one that applies to {', '.join(kinds)}, got {', '.join(name for name, _ in wanted)}"
+        )
+    conclude(
+        HEADERS,
+        list(rows(done)),
+        profiles(done),
+        reached="problems solved",
+        unit="(n + 1)",
+        budget=budget,
+        out=out,
+        store=store,
+    )
 
 
-def _run(job: Job, task: Task, method: Method, limit: float) -> list[Descent]:
-    return [descent(task, method, limit, job.run, dict(job.settings))]
+def _run(job: Job, task: Task, limit: float) -> list[Descent]:
+    return [descent(task, SUITE.method(job.method), limit, job.run, dict(job.settings))]
 
 
 def descent(
@@ -167,9 +162,7 @@ def descent(
     counted = replace(task, loss=loss, output=None if task.output is None else replace(task.output, image=image))
     if method is OURS:
         settings = {"sigma": _SIGMA * task.sigma, **(settings or {})}
-    outcome = attempt(counted, method.name, run, lambda trial: again(trial, method, settings), limit=limit)
-    if outcome.status == "failed":
-        raise SystemExit(f"{method.name} failed on {task.name}: {outcome.reason}\n{outcome.traceback}")
+    outcome = solve(counted, method, run, limit, settings)
     error, found = task.truth.image_error, list[tuple[int, float]]()
     for count, point in enumerate(seen, 1):
         value = error(point)
@@ -181,7 +174,7 @@ def descent(
 
 def rows(done: Mapping[Job, Descent]) -> Iterator[list[object]]:
     """Yield a row per kind and method; None for more evaluations than the runs could use."""
-    known, most = {OURS.name: OURS, **METHODS}, min(job.budget for job in done)
+    most = min(job.budget for job in done)
     for (kind, name), group in _grouped(done).items():
         counts = _solved(group, _lowest(done))
         shares = [
@@ -189,7 +182,7 @@ def rows(done: Mapping[Job, Descent]) -> Iterator[list[object]]:
             for tau in TAUS
             for budget in BUDGETS
         ]
-        uses = known[group[0][0].method].uses if kind == "smooth" else "loss"
+        uses = SUITE.method(group[0][0].method).uses if kind == "smooth" else "loss"
         milliseconds = 1e3 * sum(one.seconds for _, one in group) / sum(one.used for _, one in group)
         yield [kind, name, uses, *shares, milliseconds, len(group)]
 

@@ -21,27 +21,20 @@ import torch
 from torch import Tensor
 
 from experiments.ensembles.kept_parts import KeptParts
-from experiments.methods import METHODS
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.ours import search
-from experiments.methods.restarts import starts
-from experiments.methods.settings import space
 from experiments.methods.settings.rivals import ON_BBOB
 from experiments.problems import bbob
-from experiments.problems.catalogue import chosen
 from experiments.problems.task import Task
 from experiments.reports import data_profiles
 from experiments.reports.progress import progress
-from experiments.reports.result_files import keep, may_keep
-from experiments.reports.tables import table
-from experiments.runs.attempt import attempt
-from experiments.runs.trial import Trial
-from experiments.studies.tune import choices_of
+from experiments.reports.result_files import may_keep
+from experiments.studies.benchmark_suite import Settings, Suite, conclude, row_name, solve
 from torch_zerohess.optim import TrustRegion
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search, output=False))
-RIVALS = ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded")
+SUITE = Suite(OURS, ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded"), ON_BBOB)
 BUDGETS = (10, 30, 100)
 """Evaluations over n after which the table counts."""
 HEADERS = ("n", "method", *(f"{budget} n" for budget in BUDGETS), "ms per evaluation", "runs")
@@ -58,8 +51,7 @@ class Job:
     method: str
     budget: int
     """Evaluations over n."""
-    settings: tuple[tuple[str, Any], ...] = ()
-    """Of the method, where they are not its defaults."""
+    settings: Settings = ()
 
 
 @dataclass(frozen=True)
@@ -107,46 +99,34 @@ def optimizers(
     if store is not None:
         may_keep(store)
     torch.set_num_threads(1)
-    known = {OURS.name: OURS, **METHODS}
-    names = (OURS.name, *RIVALS)
-    wanted = names if methods.strip() == "all" else chosen("methods", methods.split(","), list(known))
-    for name in wanted:
-        if known[name].missing():
-            raise SystemExit(f"{name} needs pip install {' '.join(known[name].missing())}")
-    each = itertools.product(n, functions, instances, range(runs), with_choices(wanted, over, ON_BBOB))
+    wanted = SUITE.wanted(methods, over)
     jobs = [
-        Job(count, function, instance, run, name, budget, tuple(settings.items()))
-        for count, function, instance, run, (name, settings) in each
+        Job(count, function, instance, run, name, budget, settings)
+        for count, function, instance, run, (name, settings) in itertools.product(
+            n, functions, instances, range(runs), wanted
+        )
     ]
     parts, done = KeptParts(out), dict[Job, Reached]()
     for job in progress(jobs, "runs"):
-        (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, known[job.method], limit))
-    print(report(done))
-    path = out / "profiles.png"
-    data_profiles.draw(profiles(done), "targets reached", "n", budget, path)
-    print(path)
-    if store is not None:
-        print(keep(HEADERS, rows(done), store))
+        (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, limit))
+    conclude(
+        HEADERS,
+        rows(done),
+        profiles(done),
+        reached="targets reached",
+        unit="n",
+        budget=budget,
+        out=out,
+        store=store,
+    )
 
 
-def with_choices(
-    names: Sequence[str], over: Sequence[str], chosen_settings: Mapping[str, Mapping[str, Any]]
-) -> list[tuple[str, dict[str, Any]]]:
-    """Return methods with their chosen settings; a single method with all combinations of `over`, if there are any."""
-    if not over:
-        return [(name, dict(chosen_settings.get(name, {}))) for name in names]
-    if len(names) != 1:
-        raise SystemExit(f"over compares settings of one method, got methods {','.join(names)}")
-    choices = dict(choices_of(one, list(space(names[0], 1.0))) for one in over)
-    return [(names[0], dict(zip(choices, one, strict=True))) for one in itertools.product(*choices.values())]
-
-
-def _run(job: Job, method: Method, limit: float) -> list[Reached]:
+def _run(job: Job, limit: float) -> list[Reached]:
     try:
         task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
     except (ImportError, ValueError) as error:
         raise SystemExit(str(error)) from error
-    return [reached(task, method, job.run, limit, dict(job.settings))]
+    return [reached(task, SUITE.method(job.method), job.run, limit, dict(job.settings))]
 
 
 def reached(
@@ -165,23 +145,8 @@ def reached(
                 hits.append(count)
         return values
 
-    counted = replace(task, loss=loss)
-    outcome = attempt(counted, method.name, run, lambda trial: again(trial, method, settings), limit=limit)
-    if outcome.status == "failed":
-        raise SystemExit(f"{method.name} failed on {task.name}: {outcome.reason}\n{outcome.traceback}")
+    outcome = solve(replace(task, loss=loss), method, run, limit, settings)
     return Reached(tuple(hits), outcome.seconds)
-
-
-def again(trial: Trial, method: Method, settings: Mapping[str, Any] | None = None) -> None:
-    """Start a method again where it ends by itself, from a random point of the box."""
-    for start in starts(trial):
-        trial.start = start
-        method(trial, settings)
-
-
-def report(done: Mapping[Job, Reached]) -> str:
-    """Return the table of shares as text."""
-    return table(HEADERS, rows(done))
 
 
 def rows(done: Mapping[Job, Reached]) -> list[list[object]]:
@@ -210,11 +175,6 @@ def _named(job: Job) -> str:
     if job.method == OURS.name:
         return f"{job.method}: {TrustRegion(torch.zeros(job.n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
     return row_name(job.method, job.settings)
-
-
-def row_name(method: str, settings: Sequence[tuple[str, Any]]) -> str:
-    """Name of a method in a table, with settings that are not its defaults."""
-    return " ".join([method, *(f"{name}={value}" for name, value in settings)])
 
 
 def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[object]]:

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.metric_descent import MetricQuadratics
-from torch_zerohess.search.metric_progress import MetricProgress
+from torch_zerohess.search.metric_descent import MetricProgress, MetricQuadratics
 from torch_zerohess.search.process_method import APART, ROUND, ProcessMethod
 from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.state import Evaluated

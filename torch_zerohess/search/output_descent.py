@@ -57,7 +57,6 @@ class OutputDescent(Method[OutputDescentProgress]):
         if not self._may or self._follow.follows:
             return known, points
         smooth, points = self._smooth.first(generator)
-        assert isinstance(smooth, OutputProgress)
         return replace(known, smooth=smooth), points
 
     def next(
@@ -99,10 +98,9 @@ class OutputDescent(Method[OutputDescentProgress]):
         return misfit < _PREDICTED and float(evaluated.losses[0]) < before.value
 
     def _went_on(
-        self, known: OutputDescentProgress, smooth: Progress, points: Tensor, generator: torch.Generator
+        self, known: OutputDescentProgress, smooth: OutputProgress, points: Tensor, generator: torch.Generator
     ) -> tuple[OutputDescentProgress, Tensor]:
         """Return the progress of Gauss-Newton and its points, or of the descent where Gauss-Newton is at its end."""
-        assert isinstance(smooth, OutputProgress)
         rounds = {one: getattr(known, one) for one in ("rounds", "arrived", "agreed", "place")}
         if not (smooth.done or smooth.failed):
             return replace(_with(replace(known, smooth=smooth), smooth), **rounds), points

@@ -141,6 +141,17 @@ def from_afar():
     return Descent(torch.full((4,), 2.0, dtype=torch.float64), sigma=0.5, loss=squares, seed=0, restarts=0)
 
 
+def test_with_little_memory_every_output_stays_with_its_point():
+    """The best point stays, however old it is; four more points are the latest ones."""
+    search = Descent(zeros(2), sigma=1.0, loss=squares, seed=0, pool=5)
+    for _ in range(4):
+        search.tell(bent(search.ask(8) + 3.0))
+        known = search.state_dict()["progress"]["smooth"]
+        assert len(known["points"]) == 5
+        assert torch.equal(known["outputs"], bent(known["points"] + 3.0))
+        assert bool((known["points"] == known["lowest"]["point"]).all(1).any())
+
+
 def test_holes_do_not_shift_the_outputs():
     """Values that are not finite are left out with their points."""
     search, holes, met = from_afar(), bent_but_for(0.1, 0.3), 0

@@ -1,18 +1,19 @@
-"""The progress of a descent in a learned metric between two evaluations."""
+"""The progress of a search by quadratics in a trust region, between two evaluations."""
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.state import Best, Evaluated, Progress
+
+R = TypeVar("R", bound="RegionProgress")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MetricProgress(Progress):
+class RegionProgress(Progress):
     """A round: its evaluations, the last quadratic, and the region best + sigma B u, |u| <= 1."""
 
     points: Tensor
@@ -47,15 +48,13 @@ class MetricProgress(Progress):
     """Steps in a row whose end has exactly the value of the best point."""
     lost: int = 0
     """Batches in a row with values that were not finite at points that the search needed."""
-    wide: DescentProgress | None = None
-    """Isotropic descent on the smoothed loss, which takes over on a plateau."""
 
     @property
     def scaled(self) -> Tensor:
         """The evaluations as u [P, n]."""
         return torch.linalg.solve(self.root, (self.points - self.lowest.point).mT).mT / self.sigma
 
-    def remembered(self, evaluated: Evaluated, capacity: int) -> "MetricProgress":
+    def remembered(self: R, evaluated: Evaluated, capacity: int) -> R:
         """Add evaluations; a value that is not finite counts as the highest one of the round."""
         finite = evaluated.finite
         new = evaluated.those(finite)
@@ -68,13 +67,23 @@ class MetricProgress(Progress):
         if len(values) and len(new) < len(evaluated):
             holes = evaluated.points[~finite]
             points, values = torch.cat([points, holes]), torch.cat([values, values.max().expand(len(holes))])
+        which = latest(points, lowest.point, capacity)
         return replace(
             self,
             best=best,
             lowest=lowest,
             center=lowest.point,
-            points=points[-capacity:],
-            values=values[-capacity:],
+            points=points[which],
+            values=values[which],
             evaluations=self.evaluations + len(evaluated),
             lost=0 if bool(evaluated.needed.finite.all()) else self.lost + 1,
         )
+
+
+def latest(points: Tensor, keep: Tensor, capacity: int) -> Tensor:
+    """Return which points [P, n] are kept [capacity]: the latest ones, and the point `keep` [n] where it is older."""
+    which = torch.arange(max(len(points) - capacity, 0), len(points), device=points.device)
+    if len(which) < len(points):
+        same = (points == keep).all(1).nonzero()[-1:, 0]
+        which[: len(same)] = torch.minimum(which[: len(same)], same)
+    return which

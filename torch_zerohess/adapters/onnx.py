@@ -82,7 +82,9 @@ class OnnxFunction:
         self.n = sum(math.prod(shape) for shape in self.shapes.values())
         """Number of parameters."""
         self._batched = all(_free(self._inputs[name].shape[:1]) for name in (*self.parameters, *self.aux))
-        self._constants = {name: torch.as_tensor(one, device="cpu").to(self._type(name)) for name, one in fixed.items()}
+        self._constants = {
+            name: torch.as_tensor(one, device="cpu").to(self._type(name), copy=True) for name, one in fixed.items()
+        }
 
     def __repr__(self) -> str:
         parameters = ", ".join(f"{name} {list(shape)}" for name, shape in self.shapes.items())

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -97,12 +98,16 @@ class Program(Closing):
         if not callable(command):
             _found(command)
         self._server: Server | None = None
+        self._asked = threading.Lock()
 
     def __repr__(self) -> str:
         return f"Program({self.command!r}, server={self.server}, format={self.format!r})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_server": None}
+        return {name: one for name, one in vars(self).items() if name != "_asked"} | {"_server": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _asked=threading.Lock())
 
     def close(self) -> None:
         """End the server, if there is one."""
@@ -117,6 +122,8 @@ class Program(Closing):
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...]."""
         if callable(self.command):
+            if aux:
+                raise ValueError(f"aux must be empty for a command that is a function of x, got {len(aux)} tensors")
             found: dict[int, Tensor | None] = {}
             try:
                 for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
@@ -150,16 +157,17 @@ class Program(Closing):
 
     def _serve(self, request: bytes, points: int) -> Tensor:
         assert not callable(self.command)
-        if self._server is not None and not self._server.alive:
-            self.close()
-        if self._server is None:
-            self._server = Server(self._start(self.command))
-        try:
-            answer = self._server.ask(request, self.format == "npy", self._limit(points))
-            return self._values(answer, b"".join(self._server.errors))
-        except BaseException:  # also Ctrl-C: an answer may be on its way
-            self.close()
-            raise
+        with self._asked:
+            if self._server is not None and not self._server.alive:
+                self.close()
+            if self._server is None:
+                self._server = Server(self._start(self.command))
+            try:
+                answer = self._server.ask(request, self.format == "npy", self._limit(points))
+                return self._values(answer, b"".join(self._server.errors))
+            except BaseException:  # also Ctrl-C: an answer may be on its way
+                self.close()
+                raise
 
     def _limit(self, points: int) -> float | None:
         return None if self.timeout is None else self.timeout * max(1, points)

@@ -43,7 +43,8 @@ class BlackBox(nn.Module):
             registered. What is trained belongs behind a layer without a head.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
-            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept. Calls of several threads that share a
+            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless
+            value="smoothed". Calls of several threads that share a
             memory follow one another.
         smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
         vectorized: False if fn takes one point [n] at a time.
@@ -174,9 +175,11 @@ class BlackBox(nn.Module):
         """
         if self.memory is None:
             estimated, constants = self._estimated(center, aux, zero)
-            return lambda x: self.call.outer.value(estimated(x), constants, self.call.value)
-        self.control = Control.of(self.memory, self.call.outer, learning=self.training)
+            around = None if zero else estimated(center).detach()
+            return lambda x: self.call.outer.value(estimated(x), constants, self.call.value, around)
+        self.memory.check_parameters(center.shape[1])
         with transforms.outside(), transforms.random_numbers_allowed():
+            self.control = Control.of(self.memory, self.call.outer, learning=self.training)
             seed = self.smoothing.drawn_seed()
         try:
             return control_variate.around(
@@ -189,6 +192,7 @@ class BlackBox(nn.Module):
                 self.smoothing.order,
                 lambda part, its_aux: self._estimated(part, its_aux, zero),
                 value=self.call.value,
+                zero=zero,
             )
         finally:
             self.control = None

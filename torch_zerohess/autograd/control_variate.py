@@ -25,6 +25,7 @@ def around(
     estimated: Callable[[Tensor, list[Tensor]], tuple[Part, Tensor]],
     *,
     value: str,
+    zero: bool,
 ) -> Part:
     """Evaluate around a center [B, n] and return the estimate of the layer as a function of x [B, n].
 
@@ -39,6 +40,7 @@ def around(
         estimated: evaluates around a part of the batch, with its aux, and returns the estimate of the residual, and
             its constants, see `Outer.kept`.
         value: "center" or "smoothed", see `BlackBox`.
+        zero: promises that the function is called with the center alone.
     """
     B, memory, outer = len(center), control.memory, control.outer
     fresh = B if memory.fresh is None else min(memory.fresh, B)
@@ -53,8 +55,9 @@ def around(
 
     if not control.active:
         alone, constants = estimated(center[part], [one[part] for one in aux])
-        return lambda x: spread(outer.value(alone(x[part]), constants, value))
-    if memory.pathwise is None and not transforms.watched(center):
+        around = None if zero else alone(center[part]).detach()
+        return lambda x: spread(outer.value(alone(x.index_select(0, part)), constants, value, around))
+    if memory.pathwise is None and not (transforms.watched(center) or transforms.forward_mode_active()):
         memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
     pathwise = len(sigma) > STEIN if memory.pathwise is None else memory.pathwise
     with torch.no_grad():
@@ -69,15 +72,22 @@ def around(
     def values(z: Tensor) -> Tensor:
         return control.coefficient * outer.inner(predicted(z), scales)
 
-    def whole(x: Tensor) -> Tensor:
+    def expected(x: Tensor) -> tuple[Tensor, Tensor | None]:
+        """F at x, and what the new evaluations tell about its fresh elements."""
         term = smoothed(values, x, center, sigma, u, pathwise=pathwise)
-        new = None if rest is None else rest[0](x[part])
-        result = outer.corrected(term, None if new is None else spread(new), scales)
+        new = None if rest is None else rest[0](x.index_select(0, part))
+        return outer.corrected(term, None if new is None else spread(new), scales), new
+
+    fixed = None if zero or value == "smoothed" else expected(center)
+
+    def whole(x: Tensor) -> Tensor:
+        result, new = expected(x)
         if value == "smoothed":
             return result
+        around, new = (result, new) if fixed is None else fixed
         at = at_center
         if rest is not None and new is not None:
             at = at + spread(outer.value(new, rest[1], value).detach() - at[part])
-        return result - result.detach() + at.to(x.dtype)
+        return result - around.detach() + at.to(x.dtype)
 
     return whole

@@ -42,8 +42,8 @@ class Outer:
         """Return the constants float64 [B, constants] for values [B, 1, ...] at the center, or none [B, 0, ...]."""
         return values.new_empty(len(values), 0, dtype=torch.float64)
 
-    def value(self, Z: Tensor, constants: Tensor, value: str) -> Tensor:
-        """Return F from Z; with "center" its value is the one at the center."""
+    def value(self, Z: Tensor, constants: Tensor, value: str, around: Tensor | None = None) -> Tensor:
+        """Return F from Z; with "center" its value is the one at the center, where Z is `around` (Z itself if None)."""
         return Z
 
     def corrected(self, Z: Tensor, change: Tensor | None, scales: Tensor | None) -> Tensor:
@@ -79,9 +79,12 @@ class Entropy(Outer):
         assert scales is not None
         return torch.cat([scales, values.double().sum(1, keepdim=True)], 1)
 
-    def value(self, Z: Tensor, constants: Tensor, value: str) -> Tensor:
+    def value(self, Z: Tensor, constants: Tensor, value: str, around: Tensor | None = None) -> Tensor:
         result = self.corrected(Z, None, constants)
-        return result if value == "smoothed" else result - result.detach() + constants[:, 2].to(Z.dtype)
+        if value == "smoothed":
+            return result
+        at_center = result if around is None else self.corrected(around, None, constants)
+        return result - at_center.detach() + constants[:, 2].to(Z.dtype)
 
     def corrected(self, Z: Tensor, change: Tensor | None, scales: Tensor | None) -> Tensor:
         assert scales is not None

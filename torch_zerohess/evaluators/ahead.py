@@ -22,7 +22,7 @@ from torch import Tensor
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.factory import same
 from torch_zerohess.evaluators.finished import keep_finished
-from torch_zerohess.evaluators.inline import Closing, Evaluation
+from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
 from torch_zerohess.evaluators.transfer import Part
 from torch_zerohess.evaluators.values import checked_values
 
@@ -104,7 +104,7 @@ class Ahead(Closing, ABC):
         """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
         self._check_open()
         if len(points) == 0:
-            return checked_values(fn(points, *aux), points)
+            return checked_values(Inline()(fn, points.detach(), *aux), points)
         if threading.current_thread() is self._thread:
             raise RuntimeError(f"a callback of a future may submit to the {type(self).__name__}, but not wait for it")
         job = self._job(fn, points, aux)
@@ -133,7 +133,7 @@ class Ahead(Closing, ABC):
         """
         self._check_open()
         if len(points) == 0:
-            return Evaluation.of(lambda: checked_values(fn(points, *aux), points))
+            return Evaluation.of(lambda: checked_values(Inline()(fn, points.detach(), *aux), points))
         job = self._job(fn, points.clone(), [one.clone() for one in aux])  # the caller may write to them
         self._queue(job)
         return job.future

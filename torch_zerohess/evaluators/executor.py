@@ -13,7 +13,7 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
-from torch_zerohess.evaluators.inline import Closing, Evaluation
+from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
 from torch_zerohess.evaluators.values import checked_values
 
 _HELD = 4
@@ -64,7 +64,7 @@ class Executor(Closing):
         if self._closed:
             raise RuntimeError("the Executor is closed: make another one")
         if len(points) == 0:
-            return checked_values(fn(points, *aux), points)
+            return checked_values(Inline()(fn, points.detach(), *aux), points)
         batch, tasks = self._tasks(fn, points, aux)
         try:
             return _joined(batch, tasks).to(points.device)
@@ -80,7 +80,7 @@ class Executor(Closing):
         if self._closed:
             raise RuntimeError("the Executor is closed: make another one")
         if len(points) == 0:
-            return Evaluation.of(lambda: checked_values(fn(points, *aux), points))
+            return Evaluation.of(lambda: checked_values(Inline()(fn, points.detach(), *aux), points))
         batch, tasks = self._tasks(fn, points, aux)
         future, device = Evaluation(), points.device
         future.set_running_or_notify_cancel()  # what was given to the executor is its own

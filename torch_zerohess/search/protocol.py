@@ -69,7 +69,9 @@ class AskTell(ABC, Generic[P]):
         if not 0.0 < checked_number("tolerance", tolerance) < 1.0:
             raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
         pool = None if pool is None else checked_integer("pool", pool, 4)
-        seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_integer("seed", seed)
+        seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_integer("seed", seed, 0)
+        if seed >= 2**63:
+            raise ValueError(f"seed must be below 2**63, got {seed}")
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
         self._method = self._make(Settings(start, lower, upper, loss, restarts, tolerance, float(noise), pool))
@@ -233,17 +235,23 @@ class AskTell(ABC, Generic[P]):
             raise RuntimeError("ask for points before telling their values")
         if which is not None or self._early:
             early = joined(self._early, values, self.missing if which is None else which, len(points))
+            if 0 in early.keys() - self._early.keys():
+                self._check_start(self._evaluated(early[0][None], points[:1]))
             if not early.keys() >= set(range(len(points))):
                 self._out, self._early = points, early
                 return
             values = torch.stack([early[k] for k in range(len(points))])
         evaluated = self._evaluated(values, points)
-        if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
-            raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
+        self._check_start(evaluated)
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
         self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.losses
+
+    def _check_start(self, evaluated: Evaluated) -> None:
+        """Raise ValueError for a start without a finite value."""
+        if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
+            raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
 
     def losses(self, values: Any) -> Tensor:
         """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""
@@ -265,6 +273,8 @@ class AskTell(ABC, Generic[P]):
 
         ValueError if these do not go with it: another search, other parameters, another sigma or other bounds.
         """
+        if "unit" not in state:
+            raise ValueError(f"state must be a state_dict of a search, got keys {list(state)}")
         unit, device = state["unit"].to(self.unit), self.unit.device
         if len(unit) != self._method.settings.n:
             raise ValueError(f"state must be of a search with {len(self.unit)} parameters, got one with {len(unit)}")

@@ -27,7 +27,8 @@ class Space:
     @classmethod
     def checked(cls, x0: Tensor, sigma: float | Tensor | Sequence[float], bounds: Bounds | None) -> "Space":
         """Check what a caller gave. ValueError for a wrong shape or type, or a number out of range."""
-        return cls(x0.detach().clone(), _unit(sigma, x0), *_bounds(bounds, x0))
+        lower, upper = _bounds(bounds, x0)
+        return cls(x0.detach().clamp(lower, upper), _unit(sigma, x0), lower, upper)
 
     def coordinates(self, x: Tensor) -> Tensor:
         """Coordinates of parameters x, float64."""
@@ -90,14 +91,14 @@ def _bounds(bounds: Bounds | None, x0: Tensor) -> tuple[Tensor, Tensor]:
     if not bool((lower < upper).all()):
         k = int((~(lower < upper)).nonzero()[0])
         raise ValueError(f"bounds must have lower < upper, got {float(lower[k])} and {float(upper[k])} at index {k}")
-    start = x0.detach().double()
-    if not bool(((start >= lower) & (start <= upper)).all()):
-        k = int(((start < lower) | (start > upper)).nonzero()[0])
+    start, inner = x0.detach(), (lower.to(x0.dtype), upper.to(x0.dtype))
+    within = (start >= inner[0]) & (start <= inner[1])  # 0.3 is no number of float32, and may be start and bound
+    if not bool(within.all()):
+        k = int((~within).nonzero()[0])
         raise ValueError(
             f"x0 must be within the bounds, got {float(start[k])} at index {k}, outside of "
             f"[{float(lower[k])}, {float(upper[k])}]"
         )
-    inner = lower.to(x0.dtype), upper.to(x0.dtype)
     infinite = torch.full_like(inner[0], math.inf)
     return (
         torch.where(inner[0].double() < lower, inner[0].nextafter(infinite), inner[0]),

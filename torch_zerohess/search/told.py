@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.search.state import Evaluated
 
 
@@ -44,7 +45,7 @@ def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count
 
     Raises ValueError for a number that is not one of `count` points or is known, or for values of another shape.
     """
-    numbers = [int(one) for one in which]
+    numbers = [checked_integer("which", one) for one in which]
     for k, one in enumerate(numbers):
         if not 0 <= one < count or one in early or one in numbers[:k]:
             missing = [other for other in range(count) if other not in early]

@@ -69,7 +69,7 @@ class LeastNorm:
         factor = _factor(u, _CUBIC_OUTPUT)
         white = torch.linalg.solve_triangular(factor, u, upper=False)
         gram = white.mT @ white
-        gram.diagonal().add_(_FREE * float(gram.diagonal().mean()))
+        gram.diagonal().add_(_FREE * (float(gram.diagonal().mean()) or 1.0))
         weights = torch.linalg.solve_triangular(factor.mT, white, upper=True)
         return cls(u, changes, factor, torch.cholesky_solve(weights.mT @ changes, torch.linalg.cholesky(gram)))
 

@@ -41,6 +41,8 @@ class LowRank:
         span = flat[chosen.to(flat.device)] - mean
         values, vectors = torch.linalg.eigh((span @ span.mT).double())
         kept = values > max(_FLAT * float(values[-1]), math.ulp(0.0))
+        if not bool(kept.any()):  # all outputs are equal: any direction will do
+            return cls(mean, torch.full_like(mean, 1 / len(mean))[:, None], outputs.shape[1:])
         directions = (vectors[:, kept] / values[kept].sqrt()).to(flat.dtype)
         return cls(mean, span.mT @ directions / math.sqrt(flat.shape[1]), outputs.shape[1:])
 

@@ -97,6 +97,8 @@ class Memory:
         """Evaluations taken at the last fit."""
         self._rows = 0
         """How many of the evaluations that are kept the last fit knew: they come first."""
+        self._known = 0
+        """How many evaluations the last fit knew."""
         self._moments: list[list[float]] = []
         """Covariance of h(f) and h(g), and variance of h(g), over evaluations that g had not seen: of the values, then
         of what they add to first and second derivatives."""
@@ -121,6 +123,11 @@ class Memory:
     def scalar(self) -> bool:
         """Whether the black box returns one number per point, [K]. A surrogate may then return [K] or [K, 1]."""
         return bool(self._outputs) and self._outputs[0].dim() == 1
+
+    def check_parameters(self, n: int) -> None:
+        """Raise ValueError if the evaluations that are kept are of another number of parameters."""
+        if self._points and (kept := self._points[0].shape[1]) != n:
+            raise ValueError(f"x must have {kept} parameters like the evaluations in memory, got {n}")
 
     def add(self, points: Tensor, outputs: Tensor) -> None:
         """Keep outputs [K, *out] at points [K, n]; those that are not finite are left out.
@@ -154,7 +161,7 @@ class Memory:
         """
         if self._size < 2:
             raise ValueError(f"a surrogate is fitted to at least 2 evaluations, the memory has {self._size}: add some")
-        self._rows = self._size
+        self._rows = self._known = self._size
         self._fit_rows()
         self._fitted, self.pathwise = self.evaluations, None
 
@@ -236,21 +243,28 @@ class Memory:
             "evaluations": self.evaluations,
             "fitted": self._fitted,
             "rows": self._rows,
+            "known": self._known,
             "pathwise": self.pathwise,
             "moments": [list(one) for one in self._moments],
             "surrogate": model,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew."""
+        """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew.
+
+        It is fitted to all evaluations if the memory has dropped some that it knew.
+        """
         points, outputs = state["points"], state["outputs"]
         self._points, self._outputs = ([points], [outputs]) if len(points) else ([], [])
         self._size, self.evaluations = len(points), state["evaluations"]
         self._moments = [list(one) for one in state["moments"]]
+        self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
+        self._known = state["known"]
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
             self.surrogate.load_state_dict(state["surrogate"])
-        self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
-        if self._rows > 1:
+        elif self._rows < self._known:
+            self.fit()
+        elif self._rows > 1:
             self._fit_rows()
 
     def __getstate__(self) -> dict[str, Any]:

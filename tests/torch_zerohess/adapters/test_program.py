@@ -3,6 +3,7 @@
 import pickle
 import shutil
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 
 import torch_zerohess as zh
 from torch_zerohess.adapters.process import Program
+from torch_zerohess.evaluators import Executor
 from torch_zerohess.evaluators.finished import finished_values
 from truths import vector
 
@@ -33,6 +35,19 @@ def test_a_program_per_call():
     program = python(READ + "a = json.load(sys.stdin); " + ANSWER)
     assert torch.equal(program(Z), Z.sum(1))
     assert torch.equal(program(Z, torch.ones(2, 1)), Z.sum(1) + 1)
+
+
+def test_threads_take_turns_with_a_server(server):
+    points = torch.arange(40.0)[:, None].double()
+    with Executor(ThreadPoolExecutor(4)) as evaluator:
+        for _ in range(5):
+            assert torch.equal(evaluator(server, points), points[:, 0])
+
+
+def test_a_function_as_command_gets_no_further_inputs():
+    program = Program(lambda x: [sys.executable, "-c", "print(1.0)"], format=float)
+    with pytest.raises(ValueError, match="aux must be empty for a command that is a function of x, got 1 tensors"):
+        program(Z, torch.ones(2, 1))
 
 
 def test_a_server_answers_and_keeps_running(server):

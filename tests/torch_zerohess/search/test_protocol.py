@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from searches import TARGET, bowl, points_of, rays, rays_loss, rosenbrock, run, zeros
 
+import torch_zerohess as zh
 from torch_zerohess.optim import (
     Descent,
     GaussianProcessSearch,
@@ -391,3 +392,49 @@ def test_a_search_says_where_it_is() -> None:
         assert f"evaluations={search.evaluations}, value={search.value:.6g}, x=[" in repr(search)
     run(search, lambda z: (z**2).sum(1), 500)
     assert search.message in repr(search)
+
+
+def test_a_start_on_a_decimal_bound():
+    """0.3 as float32 is above 0.3."""
+    search = TrustRegion(torch.tensor([0.3, 0.1]), sigma=0.1, bounds=(0, 0.3), seed=0)
+    for _ in range(20):
+        points = search.ask()
+        assert bool((points.double() <= 0.3).all())
+        search.tell(points.square().sum(1))
+    with pytest.raises(ValueError, match="x0 must be within the bounds"):
+        TrustRegion(torch.tensor([0.30001]), sigma=0.1, bounds=(0, 0.3))
+
+
+def test_a_start_that_is_not_finite_can_be_told_again():
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    values = bowl(search.ask())
+    with pytest.raises(ValueError, match="the black box is not finite at the start"):
+        search.tell([math.nan], which=[0])
+    search.tell(values[:1], which=[0])
+    search.tell(values[1:])
+    assert search.evaluations == len(values)
+
+
+def test_wrong_states_seeds_and_numbers_are_named():
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    with pytest.raises(ValueError, match=r"state must be a state_dict of a search, got keys \[\]"):
+        search.load_state_dict({})
+    with pytest.raises(ValueError, match="seed must be below 2"):
+        Descent(zeros(2), sigma=1.0, seed=2**64)
+    search.ask()
+    with pytest.raises(TypeError, match=r"which must be an integer, got 0\.7"):
+        search.tell([1.0], which=[0.7])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_steps_below_the_rounding_of_float32(seed):
+    """The output is linear: the solution is found, and further steps round to it."""
+    target = torch.tensor([0.2, 0.7, 0.4])
+    found = zh.minimize(
+        *(lambda x: x, torch.zeros(3)),
+        sigma=0.3,
+        loss=lambda y: (y - target).square().mean(),
+        seed=seed,
+        max_evaluations=60,
+    )
+    assert found.value < 1e-12

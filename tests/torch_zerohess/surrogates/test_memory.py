@@ -105,6 +105,32 @@ def test_a_state_gives_the_same_predictions() -> None:
     assert (len(other), other.evaluations, other.coefficient) == (30, 30, memory.coefficient)
 
 
+def test_a_state_from_which_points_were_dropped_is_fitted_to_those_that_are_left() -> None:
+    torch.manual_seed(0)
+    memory, loaded = Memory(capacity=20), Memory(capacity=20)
+    first = torch.randn(60, 3)
+    memory.add(first[:24], first[:24].sum(1))
+    memory.fit()
+    memory.add(first[24:], first[24:].sum(1))
+    assert memory._rows < 20
+    loaded.load_state_dict(memory.state_dict())
+    z = torch.randn(50, 3)
+    torch.testing.assert_close(loaded.surrogate(z), z.sum(1), atol=0.05, rtol=0)
+
+
+def test_a_module_keeps_the_weights_of_its_state() -> None:
+    class Trained(torch.nn.Linear):
+        def fit(self, points: torch.Tensor, outputs: torch.Tensor) -> None:
+            torch.nn.init.zeros_(self.weight)
+
+    memory, loaded = (Memory(surrogate=Trained(2, 1)) for _ in range(2))
+    memory.add(torch.randn(8, 2), torch.randn(8, 1))
+    memory.fit()
+    torch.nn.init.ones_(memory.surrogate.weight)  # trained after the fit
+    loaded.load_state_dict(memory.state_dict())
+    assert torch.equal(loaded.surrogate.weight, torch.ones(1, 2))
+
+
 def test_a_module_without_fit_is_ready_and_never_fitted() -> None:
     module = nn.Linear(2, 1)
     memory, before = Memory(module), module.weight.clone()

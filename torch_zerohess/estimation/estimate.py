@@ -115,6 +115,7 @@ def estimate(
 
     alone = "one batch: no tolerance was given"
     if memory is not None:
+        memory.check_parameters(x.shape[-1])
         with memory.lock:
             control = Control.of(memory, call.outer, learning=True)
             if control.active:  # before this call's evaluations, which it must not know

@@ -14,6 +14,30 @@ def check_callable(**arguments: Any) -> None:
             raise TypeError(f"{name} must be callable, got {value!r}")
 
 
+def check_evaluator(value: Any) -> None:
+    """Raise TypeError for an evaluator that is neither None nor callable, or a class in place of an object."""
+    check_callable(evaluator=value)
+    if isinstance(value, type):
+        raise TypeError(f"evaluator must be an object, got the class {value.__name__}: write {value.__name__}(...)")
+
+
+def checked_seed(value: Any) -> int:
+    """Return a seed. TypeError if it is no integer, ValueError if it is below 0 or not below 2^63."""
+    seed = checked_integer("seed", value, 0)
+    if seed >= 2**63:
+        raise ValueError(f"seed must be below 2**63, got {seed}")
+    return seed
+
+
+def checked_timeout(value: Any) -> float | None:
+    """Return seconds, or None for no limit. TypeError if it is no number, ValueError if it is not positive."""
+    if value is None:
+        return None
+    if not checked_number("timeout", value) > 0:
+        raise ValueError(f"timeout must be seconds > 0 or None, got {value!r}")
+    return float(value)
+
+
 def checked_integer(name: str, value: Any, least: int | None = None) -> int:
     """Return an integer as one of Python. TypeError if it is none, ValueError if it is below `least`."""
     try:

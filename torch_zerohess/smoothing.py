@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import checked_integer, checked_seed
 from torch_zerohess.choice import chosen_baseline, chosen_sampler, chosen_signs, scrambles_of
 
 Proposal = Literal["aggregate", "gaussian", "optimal", "uniform", "fr22", "auto"]
@@ -74,14 +74,14 @@ class Smoothing:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
-        for name, least in (("samples", 1), ("order", 1), ("seed", 0), ("scrambles", 1)):
+        for name, least in (("samples", 1), ("order", 1), ("scrambles", 1)):
             number = getattr(self, name)
             if number is not None or name in ("samples", "order"):  # as integers of Python, for `state_dict`
                 object.__setattr__(self, name, checked_integer(name, number, least))
         if self.order > 2:
             raise ValueError(f"order must be 1 or 2, got {self.order}")
-        if self.seed is not None and self.seed >= 2**63:
-            raise ValueError(f"seed must be below 2**63, got {self.seed}")
+        if self.seed is not None:
+            object.__setattr__(self, "seed", checked_seed(self.seed))
         for name, value, allowed in (
             ("proposal", self.proposal, get_args(Proposal)),
             ("baseline", self.baseline, get_args(Baseline)),

@@ -8,6 +8,7 @@ import torch
 from searches import tilted, zeros
 
 import torch_zerohess as zh
+from torch_zerohess.evaluators import ProcessPool
 
 TWO_WAYS = (
     r"can be read in two ways, got .*: write \[\(-1, 1\), \(0, 9\)\] if each parameter has a pair, "
@@ -33,6 +34,8 @@ REFUSED = [
     ({"target": math.nan}, ValueError, "target must be a number, got nan"),
     ({"callback": 5}, TypeError, "callback must be callable, got 5"),
     ({"evaluator": 5}, TypeError, "evaluator must be callable, got 5"),
+    ({"evaluator": ProcessPool}, TypeError, "evaluator must be an object, got the class ProcessPool: write"),
+    ({"vectorized": "no"}, TypeError, "vectorized must be True or False, got 'no'"),
     ({"memory": {}}, TypeError, "memory must be a Memory, got dict"),
     ({"loss": "mse"}, TypeError, "loss must be callable, got 'mse'"),
     ({"fn": 3}, TypeError, "fn must be callable, got 3"),

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.adapters.server import Server, ended, late, shown
+from torch_zerohess.arguments import checked_timeout
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
@@ -86,11 +87,9 @@ class Program(Closing):
             raise ValueError(f"format must be 'json', 'npy' or a function of bytes, got {format!r}")
         if server and (callable(command) or callable(format)):
             raise ValueError("server=True needs a command that is a list, and format 'json' or 'npy'")
-        if timeout is not None and not timeout > 0:
-            raise ValueError(f"timeout must be seconds > 0 or None, got {timeout!r}")
         if on_failure not in ("raise", "nan"):
             raise ValueError(f"on_failure must be 'raise' or 'nan', got {on_failure!r}")
-        self.command, self.server, self.format, self.timeout = command, server, format, timeout
+        self.command, self.server, self.format, self.timeout = command, server, format, checked_timeout(timeout)
         self.on_failure, self._shape = on_failure, torch.Size()
         self.last_failure: str | None = None
         """Message of the last run that failed, with what it wrote to the standard error; in worker processes theirs."""

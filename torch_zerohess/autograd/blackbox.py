@@ -43,9 +43,8 @@ class BlackBox(nn.Module):
             registered. What is trained belongs behind a layer without a head.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
-            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless
-            value="smoothed". Calls of several threads that share a
-            memory follow one another.
+            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless value="smoothed". Calls of several
+            threads that share a memory follow one another.
         smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
@@ -155,6 +154,8 @@ class BlackBox(nn.Module):
             around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
         def frozen(z: Tensor) -> Tensor:
+            if z.shape != x.shape:
+                raise ValueError(f"x must have the shape {list(x.shape)} that was frozen, got {list(z.shape)}")
             result = around(z.reshape(-1, n))
             return result.reshape((*batch, *result.shape[1:]))
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_callable
+from torch_zerohess.arguments import check_evaluator
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.expansion import Expansion
@@ -53,7 +53,9 @@ class BlackBoxCall:
     def __post_init__(self) -> None:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
-        check_callable(evaluator=self.evaluator)
+        check_evaluator(self.evaluator)
+        if self.vectorized not in (True, False):
+            raise TypeError(f"vectorized must be True or False, got {self.vectorized!r}")
         if self.evaluator is None:
             object.__setattr__(self, "evaluator", Inline())
         checked_head(self.outer.head)

@@ -20,7 +20,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import checked_integer, checked_timeout
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.payload import dumped, loaded_error
@@ -92,13 +92,12 @@ class ProcessPool(Ahead):
         self.workers = cores() if workers is None else checked_integer("workers", workers, 1)
         retries = checked_integer("retries", retries, 0)
         recycle = None if recycle is None else checked_integer("recycle", recycle, 1)
-        if timeout is not None and not timeout > 0:
-            raise ValueError(f"timeout must be seconds > 0 or None, got {timeout!r}")
         if memory_limit is not None and not memory_limit > 0:
             raise ValueError(f"memory_limit must be bytes > 0 or None, got {memory_limit!r}")
         if memory_limit is not None and sys.platform != "linux":
             raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
-        self.timeout, self.retries, self.recycle, self.memory_limit = timeout, retries, recycle, memory_limit
+        self.timeout = checked_timeout(timeout)
+        self.retries, self.recycle, self.memory_limit = retries, recycle, memory_limit
         super().__init__()
         self._forget()
         _pools.add(self)

@@ -18,7 +18,7 @@ from typing import Any, Generic
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_callable, checked_integer, checked_number
+from torch_zerohess.arguments import check_callable, checked_integer, checked_number, checked_seed
 from torch_zerohess.estimation.inputs import short
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
@@ -69,9 +69,7 @@ class AskTell(ABC, Generic[P]):
         if not 0.0 < checked_number("tolerance", tolerance) < 1.0:
             raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
         pool = None if pool is None else checked_integer("pool", pool, 4)
-        seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_integer("seed", seed, 0)
-        if seed >= 2**63:
-            raise ValueError(f"seed must be below 2**63, got {seed}")
+        seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_seed(seed)
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
         self._method = self._make(Settings(start, lower, upper, loss, restarts, tolerance, float(noise), pool))
@@ -273,20 +271,12 @@ class AskTell(ABC, Generic[P]):
 
         ValueError if these do not go with it: another search, other parameters, another sigma or other bounds.
         """
-        if "unit" not in state:
+        if "search" not in state:
             raise ValueError(f"state must be a state_dict of a search, got keys {list(state)}")
-        unit, device = state["unit"].to(self.unit), self.unit.device
-        if len(unit) != self._method.settings.n:
-            raise ValueError(f"state must be of a search with {len(self.unit)} parameters, got one with {len(unit)}")
-        if not bool((unit == self.unit).all()):
-            raise ValueError(f"state must be of a search with sigma = {self.unit.tolist()}, got {unit.tolist()}")
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
-        for name, own in (("lower", self._space.lower), ("upper", self._space.upper)):
-            if not torch.equal(state[name].to(own), own):
-                raise ValueError(
-                    f"state must be of a search with {name} bounds {own.tolist()}, got {state[name].tolist()}"
-                )
+        self._space.check_state(state)
+        device = self.unit.device
         progress = restored(self._method.progress, state["progress"], device)
         early = {k: value.to(device) for k, value in state["early"].items()}
         out = None if state["out"] is None else state["out"].to(device)

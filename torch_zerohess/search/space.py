@@ -1,7 +1,7 @@
 """The parameters of a search: their bounds and type, and the units of sigma in which every search works."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,19 @@ class Space:
         """Check what a caller gave. ValueError for a wrong shape or type, or a number out of range."""
         lower, upper = _bounds(bounds, x0)
         return cls(x0.detach().clamp(lower, upper), _unit(sigma, x0), lower, upper)
+
+    def check_state(self, state: Mapping[str, Any]) -> None:
+        """Raise ValueError for the state of a search with other parameters, another sigma or other bounds."""
+        unit = state["unit"].to(self.unit)
+        if len(unit) != len(self.unit):
+            raise ValueError(f"state must be of a search with {len(self.unit)} parameters, got one with {len(unit)}")
+        if not bool((unit == self.unit).all()):
+            raise ValueError(f"state must be of a search with sigma = {self.unit.tolist()}, got {unit.tolist()}")
+        for name, own in (("lower", self.lower), ("upper", self.upper)):
+            if not torch.equal(state[name].to(own), own):
+                raise ValueError(
+                    f"state must be of a search with {name} bounds {own.tolist()}, got {state[name].tolist()}"
+                )
 
     def coordinates(self, x: Tensor) -> Tensor:
         """Coordinates of parameters x, float64."""

@@ -132,8 +132,11 @@ class Memory:
     def add(self, points: Tensor, outputs: Tensor) -> None:
         """Keep outputs [K, *out] at points [K, n]; those that are not finite are left out.
 
-        Raises ValueError if a shape differs from the shapes of earlier evaluations.
+        Raises ValueError if a shape differs from the shapes of earlier evaluations, TypeError for what is no tensor.
         """
+        for name, one in (("points", points), ("outputs", outputs)):
+            if not isinstance(one, Tensor):
+                raise TypeError(f"{name} must be a tensor, got {type(one).__name__}")
         if points.dim() != 2 or outputs.dim() < 1 or len(points) != len(outputs):
             raise ValueError(
                 f"points must be [K, n] and outputs [K, *out], got {list(points.shape)} and {list(outputs.shape)}"

@@ -50,6 +50,11 @@ def test_a_function_as_command_gets_no_further_inputs():
         program(Z, torch.ones(2, 1))
 
 
+def test_a_timeout_is_a_number():
+    with pytest.raises(TypeError, match="timeout must be a number, got '3'"):
+        python(ANSWER, timeout="3")
+
+
 def test_a_server_answers_and_keeps_running(server):
     for k in range(5):
         assert torch.equal(server(Z + k), (Z + k).sum(1))

@@ -268,6 +268,8 @@ def test_a_frozen_function_changes_with_its_argument(head: Any, memory: bool) ->
     for _ in range(3 if memory else 0):
         box((1 + 0.2 * torch.randn(8, 1)).requires_grad_())
     frozen, h = box.freeze(torch.ones(1)), 0.02
+    with pytest.raises(ValueError, match=r"x must have the shape \[1\] that was frozen, got \[2, 1\]"):
+        frozen(torch.ones(2, 1))
     assert float(frozen(torch.ones(1))) == pytest.approx(1.0, abs=1e-6)
     at = torch.tensor([1.03], requires_grad=True)
     (slope,) = torch.autograd.grad(frozen(at), at)

@@ -158,6 +158,11 @@ def test_wrong_settings_raise(options, error) -> None:
         Memory(**options)
 
 
+def test_lists_are_no_tensors() -> None:
+    with pytest.raises(TypeError, match="points must be a tensor, got list"):
+        Memory().add([[1.0, 2.0]], [1.0])  # type: ignore[arg-type]
+
+
 def test_a_fit_of_nothing_raises() -> None:
     with pytest.raises(ValueError, match="at least 2 evaluations, the memory has 0"):
         Memory().fit()

@@ -269,10 +269,10 @@ class AskTell(ABC, Generic[P]):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a `state_dict`; the settings and the loss stay those given here.
 
-        ValueError if these do not go with it: another search, other parameters, another sigma or other bounds.
+        ValueError for a state of another search, other parameters, sigma or bounds. KeyError if something is missing.
         """
-        if "search" not in state:
-            raise ValueError(f"state must be a state_dict of a search, got keys {list(state)}")
+        if missing := [name for name in self.state_dict() if name not in state]:
+            raise KeyError(f"state must be a state_dict of a search, this one lacks {', '.join(missing)}")
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         self._space.check_state(state)

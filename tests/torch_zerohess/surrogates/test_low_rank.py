@@ -48,7 +48,12 @@ def test_directions_in_rounding_are_left_out():
     outputs = (100 * normal(20, 2) @ normal(2, 40, seed=1)).float()
     space = LowRank.of(outputs, 20)
     assert space.basis.shape[1] == 2
-    assert LowRank.of(torch.ones(5, 3), 4).encode(torch.ones(2, 3)).shape == (2, 0)
+
+
+def test_equal_outputs_have_one_direction():
+    space = LowRank.of(torch.ones(5, 3), 4)
+    assert torch.equal(space.encode(torch.ones(2, 3)), torch.zeros(2, 1))
+    torch.testing.assert_close(space.basis.mT @ space.basis, torch.eye(1) / 3)
 
 
 def test_a_weak_direction_is_kept():

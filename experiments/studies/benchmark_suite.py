@@ -22,15 +22,24 @@ from experiments.studies.tune import choices_of
 
 Settings = tuple[tuple[str, Any], ...]
 """Settings of a method that are not its defaults."""
+Profiles = Mapping[str, Mapping[str, data_profiles.Profile]]
+"""Evaluations until targets were reached, and the number of all targets, by panel and by method."""
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Methods of a study: ours, the rivals that it compares by default, and their chosen settings."""
+    """Methods of a study, and how its table and picture are written."""
 
     ours: Method
     rivals: tuple[str, ...]
+    """Those that it compares by default."""
     settings: Mapping[str, Mapping[str, Any]]
+    """Chosen for methods whose defaults are not the best."""
+    headers: tuple[str, ...]
+    reached: str
+    """What is counted, as "problems solved"."""
+    unit: str
+    """Of the evaluations, as "n"."""
 
     def method(self, name: str) -> Method:
         """Return ours or any method of the harness."""
@@ -57,6 +66,25 @@ class Suite:
         combined = itertools.product(*choices.values())
         return [(names[0], tuple(zip(choices, values, strict=True))) for values in combined]
 
+    def conclude(
+        self, rows: Sequence[Sequence[object]], profiles: Profiles, budget: int, out: Path, store: str | None
+    ) -> None:
+        """Print the table, draw data profiles into OUT/profiles.png, and store the table if it has a name.
+
+        Args:
+            rows: of the table.
+            profiles: by panel and by method.
+            budget: evaluations over the unit that a run may use.
+            out: folder of the picture.
+            store: name of the stored table, None if it is not to be stored.
+        """
+        print(table(self.headers, rows))
+        path = out / "profiles.png"
+        data_profiles.draw(profiles, self.reached, self.unit, budget, path)
+        print(path)
+        if store is not None:
+            print(keep(self.headers, rows, store))
+
 
 def solve(task: Task, method: Method, run: int, limit: float, settings: Mapping[str, Any] | None = None) -> Outcome:
     """Run a method; where it ends by itself, again from a random point, until the task's evaluations are used.
@@ -78,34 +106,3 @@ def solve(task: Task, method: Method, run: int, limit: float, settings: Mapping[
 def row_name(method: str, settings: Settings) -> str:
     """Return the name of a method in a table, with settings that are not its defaults."""
     return " ".join([method, *(f"{name}={value}" for name, value in settings)])
-
-
-def conclude(
-    headers: Sequence[str],
-    rows: Sequence[Sequence[object]],
-    profiles: Mapping[str, Mapping[str, data_profiles.Profile]],
-    *,
-    reached: str,
-    unit: str,
-    budget: int,
-    out: Path,
-    store: str | None,
-) -> None:
-    """Print the table, draw data profiles into OUT/profiles.png, and store the table if it has a name.
-
-    Args:
-        headers: of the table.
-        rows: of the table.
-        profiles: by panel and by method.
-        reached: what is counted, as "problems solved".
-        unit: of the evaluations, as "n".
-        budget: evaluations over the unit that a run may use.
-        out: folder of the picture.
-        store: name of the stored table, None if it is not to be stored.
-    """
-    print(table(headers, rows))
-    path = out / "profiles.png"
-    data_profiles.draw(profiles, reached, unit, budget, path)
-    print(path)
-    if store is not None:
-        print(keep(headers, rows, store))

@@ -34,12 +34,12 @@ from experiments.problems.task import Task
 from experiments.reports import data_profiles
 from experiments.reports.progress import progress
 from experiments.reports.result_files import may_keep
-from experiments.studies.benchmark_suite import Settings, Suite, conclude, row_name, solve
+from experiments.studies.benchmark_suite import Settings, Suite, row_name, solve
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search), uses="image")
 _SIGMA = 3.0
 """First sigma of ours over the first step of the others; best of 1, 3 and 10 on run 1000."""
-SUITE = Suite(OURS, ("dfo_ls", "cobyqa", "py_bobyqa", "bfgs_fd", "cma_es"), ON_MORE_WILD)
+RIVALS = ("dfo_ls", "cobyqa", "py_bobyqa", "bfgs_fd", "cma_es")
 BUDGETS = (3, 10, 100)
 """Evaluations over n + 1 after which the table counts."""
 TAUS = (1e-3, 1e-5)
@@ -48,6 +48,7 @@ HEADERS = (
     *(f"{tau:.0e}: {budget} (n + 1)" for tau in TAUS for budget in BUDGETS),
     *("ms per evaluation", "problems"),
 )
+SUITE = Suite(OURS, RIVALS, ON_MORE_WILD, HEADERS, "problems solved", "(n + 1)")
 
 
 @dataclass(frozen=True)
@@ -128,16 +129,7 @@ def least_squares(
         raise SystemExit(
             f"methods must have one that applies to {', '.join(kinds)}, got {', '.join(name for name, _ in wanted)}"
         )
-    conclude(
-        HEADERS,
-        list(rows(done)),
-        profiles(done),
-        reached="problems solved",
-        unit="(n + 1)",
-        budget=budget,
-        out=out,
-        store=store,
-    )
+    SUITE.conclude(list(rows(done)), profiles(done), budget, out, store)
 
 
 def _run(job: Job, task: Task, limit: float) -> list[Descent]:

@@ -30,14 +30,15 @@ from experiments.problems.task import Task
 from experiments.reports import data_profiles
 from experiments.reports.progress import progress
 from experiments.reports.result_files import may_keep
-from experiments.studies.benchmark_suite import Settings, Suite, conclude, row_name, solve
+from experiments.studies.benchmark_suite import Settings, Suite, row_name, solve
 from torch_zerohess.optim import TrustRegion
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search, output=False))
-SUITE = Suite(OURS, ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded"), ON_BBOB)
+RIVALS = ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded")
 BUDGETS = (10, 30, 100)
 """Evaluations over n after which the table counts."""
 HEADERS = ("n", "method", *(f"{budget} n" for budget in BUDGETS), "ms per evaluation", "runs")
+SUITE = Suite(OURS, RIVALS, ON_BBOB, HEADERS, "targets reached", "n")
 
 
 @dataclass(frozen=True)
@@ -109,16 +110,7 @@ def optimizers(
     parts, done = KeptParts(out), dict[Job, Reached]()
     for job in progress(jobs, "runs"):
         (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, limit))
-    conclude(
-        HEADERS,
-        rows(done),
-        profiles(done),
-        reached="targets reached",
-        unit="n",
-        budget=budget,
-        out=out,
-        store=store,
-    )
+    SUITE.conclude(rows(done), profiles(done), budget, out, store)
 
 
 def _run(job: Job, limit: float) -> list[Reached]:

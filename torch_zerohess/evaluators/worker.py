@@ -68,30 +68,27 @@ def main(connection: "Connection[Any, Any]") -> None:
     torch.set_num_threads(1)
     messages = Messages(connection)
     fn: Any = None
-    with contextlib.suppress(OSError):  # the pool was closed meanwhile: there will be no message
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the pool was closed
         messages.send(READY)
-    while True:
-        try:
+        while True:
             kind, header, parts = messages.receive()
             if kind == ROOM:
                 _map(messages, header)
                 continue
-        except (EOFError, OSError):
-            return
-        values = None
-        torch.set_grad_enabled(kind == FUNCTION)  # it is made with gradients, and called without
-        try:
-            if kind == FUNCTION:
-                fn = None  # what it holds is given back before the next one is made
-                fn = pickle.loads(parts[0].data)
-                built(fn)
+            values = None
+            torch.set_grad_enabled(kind == FUNCTION)  # it is made with gradients, and called without
+            try:
+                if kind == FUNCTION:
+                    fn = None  # what it holds is given back before the next one is made
+                    fn = pickle.loads(parts[0].data)
+                    built(fn)
+                else:
+                    tensors = [one.tensor() for one in parts]
+                    values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+            except BaseException as error:  # SystemExit too: it is the black box's, not this process's
+                messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:
-                tensors = [one.tensor() for one in parts]
-                values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
-        except BaseException as error:  # SystemExit too: it is the black box's, not this process's
-            messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
-        else:
-            _answer(messages, values)
+                _answer(messages, values)
 
 
 def _answer(messages: Messages, values: Tensor | None) -> None:

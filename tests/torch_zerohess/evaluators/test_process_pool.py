@@ -406,3 +406,14 @@ def test_a_pool_is_closed_for_good_and_copied_by_its_settings():
     with pytest.raises(RuntimeError, match="the ProcessPool is closed"):
         pool(black_boxes.waves, points(1))
     pool.close()
+
+
+def test_a_pool_that_is_closed_while_a_worker_makes_its_black_box_prints_nothing(tmp_path, capfd):
+    pool = ProcessPool(1)
+    call = pool.submit(Factory(black_boxes.made_late, tmp_path / "begun"), points(1))
+    while not (tmp_path / "begun").exists():
+        time.sleep(0.01)
+    pool.close()
+    assert call.cancelled()
+    captured = capfd.readouterr()
+    assert captured.out + captured.err == ""

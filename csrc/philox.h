@@ -88,84 +88,130 @@ ZH_AVX2 static inline __m256d uniform_avx2(__m256i high, __m256i low) {
   return _mm256_add_pd(_mm256_sub_pd(from_one, _mm256_set1_pd(1.0)), _mm256_set1_pd(0x1p-53));
 }
 
-// Eight blocks at a time, each word in the lower half of a 64-bit lane; what the upper halves hold is not used.
+// Keys of all rounds, and the words of the counter that blocks have in common.
+struct RoundsAvx512 {
+  __m512i k0[10], k1[10], row_low, row_high, stream;
+};
+
+// 8 kSets blocks, each word in the lower half of a 64-bit lane; what the upper halves hold is not used. One set after
+// another would wait for its own products.
+template <int kSets, class Out>
+ZH_AVX512 static inline void blocks_avx512(const RoundsAvx512& with, uint64_t block, Out* out) {
+  const __m512i m0 = _mm512_set1_epi64(kMultiplier0), m1 = _mm512_set1_epi64(kMultiplier1);
+  const __m512i low = _mm512_set1_epi64(0xFFFFFFFF), counted = _mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0);
+  __m512i c0[kSets], c1[kSets], c2[kSets], c3[kSets];
+#pragma GCC unroll 2
+  for (int set = 0; set < kSets; ++set) {
+    c0[set] = _mm512_add_epi64(_mm512_set1_epi64(int64_t(block) + 8 * set), counted);
+    c1[set] = with.row_low;
+    c2[set] = with.row_high;
+    c3[set] = with.stream;
+  }
+#pragma GCC unroll 10
+  for (int round = 0; round < 10; ++round) {
+#pragma GCC unroll 2
+    for (int set = 0; set < kSets; ++set) {
+      const __m512i p0 = _mm512_mul_epu32(c0[set], m0), p1 = _mm512_mul_epu32(c2[set], m1);
+      c0[set] = _mm512_ternarylogic_epi64(_mm512_srli_epi64(p1, 32), c1[set], with.k0[round], 0x96);
+      c1[set] = p1;
+      c2[set] = _mm512_ternarylogic_epi64(_mm512_srli_epi64(p0, 32), c3[set], with.k1[round], 0x96);
+      c3[set] = p0;
+    }
+  }
+#pragma GCC unroll 2
+  for (int set = 0; set < kSets; ++set) {
+    Out* const to = out + 8 * kPerBlock<Out> * set;
+    if constexpr (sizeof(Out) == sizeof(double)) {
+      const __m512d even = uniform_avx512(c0[set], c1[set]), odd = uniform_avx512(c2[set], c3[set]);
+      _mm512_storeu_pd(to, _mm512_permutex2var_pd(even, _mm512_set_epi64(11, 3, 10, 2, 9, 1, 8, 0), odd));
+      _mm512_storeu_pd(to + 8, _mm512_permutex2var_pd(even, _mm512_set_epi64(15, 7, 14, 6, 13, 5, 12, 4), odd));
+    } else {
+      const __m512i first = _mm512_or_epi64(_mm512_and_epi64(c0[set], low), _mm512_slli_epi64(c1[set], 32));
+      const __m512i second = _mm512_or_epi64(_mm512_and_epi64(c2[set], low), _mm512_slli_epi64(c3[set], 32));
+      _mm512_storeu_si512(
+          to, _mm512_permutex2var_epi64(first, _mm512_set_epi64(11, 3, 10, 2, 9, 1, 8, 0), second));
+      _mm512_storeu_si512(
+          to + 16, _mm512_permutex2var_epi64(first, _mm512_set_epi64(15, 7, 14, 6, 13, 5, 12, 4), second));
+    }
+  }
+}
+
 template <class Out>
 ZH_AVX512 static inline void noise_avx512(const Counter& at, int64_t blocks, Out* out) {
-  const __m512i m0 = _mm512_set1_epi64(kMultiplier0), m1 = _mm512_set1_epi64(kMultiplier1);
-  const __m512i low = _mm512_set1_epi64(0xFFFFFFFF);
-  __m512i k0[10], k1[10];
+  RoundsAvx512 with;
   for (uint32_t round = 0; round < 10; ++round) {
-    k0[round] = _mm512_set1_epi64(uint32_t(at.seed) + round * kWeyl0);
-    k1[round] = _mm512_set1_epi64(uint32_t(at.seed >> 32) + round * kWeyl1);
+    with.k0[round] = _mm512_set1_epi64(uint32_t(at.seed) + round * kWeyl0);
+    with.k1[round] = _mm512_set1_epi64(uint32_t(at.seed >> 32) + round * kWeyl1);
   }
-  const __m512i row_low = _mm512_set1_epi64(uint32_t(at.row)), row_high = _mm512_set1_epi64(uint32_t(at.row >> 32));
+  with.row_low = _mm512_set1_epi64(uint32_t(at.row));
+  with.row_high = _mm512_set1_epi64(uint32_t(at.row >> 32));
+  with.stream = _mm512_set1_epi64(at.stream);
   int64_t i = 0;
-  for (; i + 8 <= blocks; i += 8) {
-    __m512i c0 = _mm512_add_epi64(_mm512_set1_epi64(at.block + i), _mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0));
-    __m512i c1 = row_low, c2 = row_high, c3 = _mm512_set1_epi64(at.stream);
-#pragma GCC unroll 10
-    for (int round = 0; round < 10; ++round) {
-      const __m512i p0 = _mm512_mul_epu32(c0, m0), p1 = _mm512_mul_epu32(c2, m1);
-      c0 = _mm512_ternarylogic_epi64(_mm512_srli_epi64(p1, 32), c1, k0[round], 0x96);
-      c1 = p1;
-      c2 = _mm512_ternarylogic_epi64(_mm512_srli_epi64(p0, 32), c3, k1[round], 0x96);
-      c3 = p0;
-    }
-    if constexpr (sizeof(Out) == sizeof(double)) {
-      const __m512d even = uniform_avx512(c0, c1), odd = uniform_avx512(c2, c3);
-      _mm512_storeu_pd(
-          out + 2 * i, _mm512_permutex2var_pd(even, _mm512_set_epi64(11, 3, 10, 2, 9, 1, 8, 0), odd));
-      _mm512_storeu_pd(
-          out + 2 * i + 8, _mm512_permutex2var_pd(even, _mm512_set_epi64(15, 7, 14, 6, 13, 5, 12, 4), odd));
-    } else {
-      const __m512i first = _mm512_or_epi64(_mm512_and_epi64(c0, low), _mm512_slli_epi64(c1, 32));
-      const __m512i second = _mm512_or_epi64(_mm512_and_epi64(c2, low), _mm512_slli_epi64(c3, 32));
-      _mm512_storeu_si512(
-          out + 4 * i, _mm512_permutex2var_epi64(first, _mm512_set_epi64(11, 3, 10, 2, 9, 1, 8, 0), second));
-      _mm512_storeu_si512(
-          out + 4 * i + 16, _mm512_permutex2var_epi64(first, _mm512_set_epi64(15, 7, 14, 6, 13, 5, 12, 4), second));
-    }
-  }
+  for (; i + 16 <= blocks; i += 16) blocks_avx512<2>(with, at.block + i, out + kPerBlock<Out> * i);
+  for (; i + 8 <= blocks; i += 8) blocks_avx512<1>(with, at.block + i, out + kPerBlock<Out> * i);
   noise_generic(Counter{at.seed, at.row, at.stream, at.block + uint32_t(i)}, blocks - i, out + kPerBlock<Out> * i);
 }
 
 // The same, four blocks at a time.
-template <class Out>
-ZH_AVX2 static inline void noise_avx2(const Counter& at, int64_t blocks, Out* out) {
+struct RoundsAvx2 {
+  __m256i k0[10], k1[10], row_low, row_high, stream;
+};
+
+template <int kSets, class Out>
+ZH_AVX2 static inline void blocks_avx2(const RoundsAvx2& with, uint64_t block, Out* out) {
   const __m256i m0 = _mm256_set1_epi64x(kMultiplier0), m1 = _mm256_set1_epi64x(kMultiplier1);
-  const __m256i low = _mm256_set1_epi64x(0xFFFFFFFF);
-  __m256i k0[10], k1[10];
-  for (uint32_t round = 0; round < 10; ++round) {
-    k0[round] = _mm256_set1_epi64x(uint32_t(at.seed) + round * kWeyl0);
-    k1[round] = _mm256_set1_epi64x(uint32_t(at.seed >> 32) + round * kWeyl1);
+  const __m256i low = _mm256_set1_epi64x(0xFFFFFFFF), counted = _mm256_set_epi64x(3, 2, 1, 0);
+  __m256i c0[kSets], c1[kSets], c2[kSets], c3[kSets];
+#pragma GCC unroll 2
+  for (int set = 0; set < kSets; ++set) {
+    c0[set] = _mm256_add_epi64(_mm256_set1_epi64x(int64_t(block) + 4 * set), counted);
+    c1[set] = with.row_low;
+    c2[set] = with.row_high;
+    c3[set] = with.stream;
   }
-  const __m256i row_low = _mm256_set1_epi64x(uint32_t(at.row)), row_high = _mm256_set1_epi64x(uint32_t(at.row >> 32));
-  int64_t i = 0;
-  for (; i + 4 <= blocks; i += 4) {
-    __m256i c0 = _mm256_add_epi64(_mm256_set1_epi64x(at.block + i), _mm256_set_epi64x(3, 2, 1, 0));
-    __m256i c1 = row_low, c2 = row_high, c3 = _mm256_set1_epi64x(at.stream);
 #pragma GCC unroll 10
-    for (int round = 0; round < 10; ++round) {
-      const __m256i p0 = _mm256_mul_epu32(c0, m0), p1 = _mm256_mul_epu32(c2, m1);
-      c0 = _mm256_xor_si256(_mm256_xor_si256(_mm256_srli_epi64(p1, 32), c1), k0[round]);
-      c1 = p1;
-      c2 = _mm256_xor_si256(_mm256_xor_si256(_mm256_srli_epi64(p0, 32), c3), k1[round]);
-      c3 = p0;
+  for (int round = 0; round < 10; ++round) {
+#pragma GCC unroll 2
+    for (int set = 0; set < kSets; ++set) {
+      const __m256i p0 = _mm256_mul_epu32(c0[set], m0), p1 = _mm256_mul_epu32(c2[set], m1);
+      c0[set] = _mm256_xor_si256(_mm256_xor_si256(_mm256_srli_epi64(p1, 32), c1[set]), with.k0[round]);
+      c1[set] = p1;
+      c2[set] = _mm256_xor_si256(_mm256_xor_si256(_mm256_srli_epi64(p0, 32), c3[set]), with.k1[round]);
+      c3[set] = p0;
     }
+  }
+#pragma GCC unroll 2
+  for (int set = 0; set < kSets; ++set) {
+    Out* const to = out + 4 * kPerBlock<Out> * set;
     if constexpr (sizeof(Out) == sizeof(double)) {
-      const __m256d even = uniform_avx2(c0, c1), odd = uniform_avx2(c2, c3);
+      const __m256d even = uniform_avx2(c0[set], c1[set]), odd = uniform_avx2(c2[set], c3[set]);
       const __m256d first = _mm256_unpacklo_pd(even, odd), second = _mm256_unpackhi_pd(even, odd);
-      _mm256_storeu_pd(out + 2 * i, _mm256_permute2f128_pd(first, second, 0x20));
-      _mm256_storeu_pd(out + 2 * i + 4, _mm256_permute2f128_pd(first, second, 0x31));
+      _mm256_storeu_pd(to, _mm256_permute2f128_pd(first, second, 0x20));
+      _mm256_storeu_pd(to + 4, _mm256_permute2f128_pd(first, second, 0x31));
     } else {
-      const __m256i even = _mm256_or_si256(_mm256_and_si256(c0, low), _mm256_slli_epi64(c1, 32));
-      const __m256i odd = _mm256_or_si256(_mm256_and_si256(c2, low), _mm256_slli_epi64(c3, 32));
+      const __m256i even = _mm256_or_si256(_mm256_and_si256(c0[set], low), _mm256_slli_epi64(c1[set], 32));
+      const __m256i odd = _mm256_or_si256(_mm256_and_si256(c2[set], low), _mm256_slli_epi64(c3[set], 32));
       const __m256i first = _mm256_unpacklo_epi64(even, odd), second = _mm256_unpackhi_epi64(even, odd);
-      __m256i* place = reinterpret_cast<__m256i*>(out + 4 * i);
+      __m256i* const place = reinterpret_cast<__m256i*>(to);
       _mm256_storeu_si256(place, _mm256_permute2x128_si256(first, second, 0x20));
       _mm256_storeu_si256(place + 1, _mm256_permute2x128_si256(first, second, 0x31));
     }
   }
+}
+
+template <class Out>
+ZH_AVX2 static inline void noise_avx2(const Counter& at, int64_t blocks, Out* out) {
+  RoundsAvx2 with;
+  for (uint32_t round = 0; round < 10; ++round) {
+    with.k0[round] = _mm256_set1_epi64x(uint32_t(at.seed) + round * kWeyl0);
+    with.k1[round] = _mm256_set1_epi64x(uint32_t(at.seed >> 32) + round * kWeyl1);
+  }
+  with.row_low = _mm256_set1_epi64x(uint32_t(at.row));
+  with.row_high = _mm256_set1_epi64x(uint32_t(at.row >> 32));
+  with.stream = _mm256_set1_epi64x(at.stream);
+  int64_t i = 0;
+  for (; i + 8 <= blocks; i += 8) blocks_avx2<2>(with, at.block + i, out + kPerBlock<Out> * i);
+  for (; i + 4 <= blocks; i += 4) blocks_avx2<1>(with, at.block + i, out + kPerBlock<Out> * i);
   noise_generic(Counter{at.seed, at.row, at.stream, at.block + uint32_t(i)}, blocks - i, out + kPerBlock<Out> * i);
 }
 ZH_END_IGNORE

@@ -6,7 +6,6 @@
 namespace zerohess {
 
 constexpr int kDegree = 7;
-constexpr int64_t kPart = 256;                // numbers searched for tails at a time
 constexpr uint32_t kTail = 1u << 15;          // of 2^32: words with less probability beyond them are in a tail
 constexpr float kBelowHalf = 0x1.fffffep+30f;  // 2^32 / 2 rounded down
 // By powers of t - 1.5 from the highest down, then by the last four bits of the exponent.
@@ -61,8 +60,7 @@ ZH_INLINE float float_from_bits(uint32_t bits) {
 ZH_INLINE uint32_t mirrored(uint32_t word) { return word ^ (0u - (word >> 31)); }
 
 // Quantile of p = (word + 1/2) / 2^32: (1/2 - p) times a ratio that is a polynomial in each octave 2^e t of p, 1 <= t < 2.
-ZH_INLINE float central_quantile(uint32_t word) {
-  const uint32_t beyond = mirrored(word);
+ZH_INLINE float central_quantile(uint32_t word, uint32_t beyond) {
   const float size = float(int32_t(beyond)) + 0.5f;
   const uint32_t bits = float_bits(size < kBelowHalf ? size : kBelowHalf), octave = bits >> 23 & 15;
   const float t = float_from_bits((bits & 0x007FFFFFu) | 0x3F800000u) - 1.5f;
@@ -72,22 +70,31 @@ ZH_INLINE float central_quantile(uint32_t word) {
   return float_from_bits(float_bits(u) ^ (~word & 0x80000000u));
 }
 
-ZH_INLINE void central_quantiles_generic(const uint32_t* words, int64_t count, float* out) {
-  for (int64_t i = 0; i < count; ++i) out[i] = central_quantile(words[i]);
+// Quantiles of words, wrong in the tails. Returns the least of `mirrored`, or `least`.
+ZH_INLINE uint32_t central_quantiles_generic(const uint32_t* words, int64_t count, float* out, uint32_t least) {
+  for (int64_t i = 0; i < count; ++i) {
+    const uint32_t beyond = mirrored(words[i]);
+    out[i] = central_quantile(words[i], beyond);
+    least = beyond < least ? beyond : least;
+  }
+  return least;
 }
 
 #if ZH_X86
 ZH_IGNORE_UNINITIALIZED
-ZH_AVX512 static inline void central_quantiles_avx512(const uint32_t* words, int64_t count, float* out) {
+ZH_AVX512 static inline uint32_t central_quantiles_avx512(
+    const uint32_t* words, int64_t count, float* out, uint32_t least) {
   __m512 table[kDegree + 1];
   for (int i = 0; i <= kDegree; ++i) table[i] = _mm512_load_ps(kRatio[i]);
   const __m512 half = _mm512_set1_ps(0.5f), most = _mm512_set1_ps(kBelowHalf), middle = _mm512_set1_ps(1.5f);
   const __m512i fraction = _mm512_set1_epi32(0x007FFFFF), one = _mm512_set1_epi32(0x3F800000);
   const __m512i inner = _mm512_set1_epi32(0x7FFFFFFF);
+  __m512i smallest = inner;
   int64_t i = 0;
   for (; i + 16 <= count; i += 16) {
     const __m512i word = _mm512_loadu_si512(words + i);
     const __m512i beyond = _mm512_xor_si512(word, _mm512_srai_epi32(word, 31));
+    smallest = _mm512_min_epu32(smallest, beyond);
     const __m512i bits = _mm512_castps_si512(_mm512_min_ps(_mm512_add_ps(_mm512_cvtepi32_ps(beyond), half), most));
     const __m512i octave = _mm512_srli_epi32(bits, 23);  // the permutation reads its last four bits
     const __m512i scaled = _mm512_ternarylogic_epi32(bits, fraction, one, 0xEA);  // (bits & fraction) | one
@@ -100,53 +107,54 @@ ZH_AVX512 static inline void central_quantiles_avx512(const uint32_t* words, int
     const __m512i u = _mm512_castps_si512(_mm512_mul_ps(q, ratio));
     _mm512_storeu_si512(out + i, _mm512_ternarylogic_epi32(u, word, inner, 0xE1));  // u ^ (~word & ~inner)
   }
-  central_quantiles_generic(words + i, count - i, out + i);
+  const uint32_t found = _mm512_reduce_min_epu32(smallest);
+  return central_quantiles_generic(words + i, count - i, out + i, found < least ? found : least);
 }
 
-ZH_AVX2 static inline __m256 coefficient_avx2(const float* row, __m256i octave, __m256 upper) {
-  return _mm256_blendv_ps(
-      _mm256_permutevar8x32_ps(_mm256_load_ps(row), octave), _mm256_permutevar8x32_ps(_mm256_load_ps(row + 8), octave),
-      upper);
-}
-
-ZH_AVX2 static inline void central_quantiles_avx2(const uint32_t* words, int64_t count, float* out) {
+ZH_AVX2 static inline uint32_t central_quantiles_avx2(
+    const uint32_t* words, int64_t count, float* out, uint32_t least) {
+  __m256 table[kDegree + 1];  // the octaves of 1/256 < p, for all but one number in 128
+  for (int i = 0; i <= kDegree; ++i) table[i] = _mm256_load_ps(kRatio[i] + 8);
   const __m256 half = _mm256_set1_ps(0.5f), most = _mm256_set1_ps(kBelowHalf), middle = _mm256_set1_ps(1.5f);
   const __m256i fraction = _mm256_set1_epi32(0x007FFFFF), one = _mm256_set1_epi32(0x3F800000);
   const __m256i inner = _mm256_set1_epi32(0x7FFFFFFF);
+  __m256i smallest = inner;
   int64_t i = 0;
   for (; i + 8 <= count; i += 8) {
     const __m256i word = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words + i));
     const __m256i beyond = _mm256_xor_si256(word, _mm256_srai_epi32(word, 31));
+    smallest = _mm256_min_epu32(smallest, beyond);
     const __m256i bits = _mm256_castps_si256(_mm256_min_ps(_mm256_add_ps(_mm256_cvtepi32_ps(beyond), half), most));
     const __m256i octave = _mm256_srli_epi32(bits, 23);
-    const __m256 upper = _mm256_castsi256_ps(_mm256_slli_epi32(bits, 5));  // bit 3 of the octave, as a sign
     const __m256 t =
         _mm256_sub_ps(_mm256_castsi256_ps(_mm256_or_si256(_mm256_and_si256(bits, fraction), one)), middle);
-    __m256 ratio = coefficient_avx2(kRatio[0], octave, upper);
+    __m256 ratio = _mm256_permutevar8x32_ps(table[0], octave);  // reads the last three bits of the octave
 #pragma GCC unroll 8
     for (int k = 1; k <= kDegree; ++k)
-      ratio = _mm256_add_ps(_mm256_mul_ps(ratio, t), coefficient_avx2(kRatio[k], octave, upper));
+      ratio = _mm256_add_ps(_mm256_mul_ps(ratio, t), _mm256_permutevar8x32_ps(table[k], octave));
     const __m256 q = _mm256_add_ps(_mm256_cvtepi32_ps(_mm256_xor_si256(beyond, inner)), half);
     const __m256 sign = _mm256_castsi256_ps(_mm256_andnot_si256(_mm256_or_si256(word, inner), _mm256_set1_epi32(-1)));
     _mm256_storeu_ps(out + i, _mm256_xor_ps(_mm256_mul_ps(q, ratio), sign));
+    int others = _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_slli_epi32(bits, 5))) ^ 0xFF;  // without bit 3
+    for (; others != 0; others &= others - 1) {
+      const int64_t k = i + __builtin_ctz(unsigned(others));
+      out[k] = central_quantile(words[k], mirrored(words[k]));
+    }
   }
-  central_quantiles_generic(words + i, count - i, out + i);
+  alignas(32) uint32_t found[8];
+  _mm256_store_si256(reinterpret_cast<__m256i*>(found), smallest);
+  for (const uint32_t one : found) least = one < least ? one : least;
+  return central_quantiles_generic(words + i, count - i, out + i, least);
 }
 ZH_END_IGNORE
 #endif
-ZH_DISPATCH(void, central_quantiles, (const uint32_t* words, int64_t count, float* out), (words, count, out))
-
-ZH_INLINE uint32_t least_generic(const uint32_t* words, int64_t count) {
-  uint32_t least = 0xFFFFFFFFu;
-  for (int64_t i = 0; i < count; ++i) least = mirrored(words[i]) < least ? mirrored(words[i]) : least;
-  return least;
-}
-ZH_VERSIONS(uint32_t, least, (const uint32_t* words, int64_t count), (words, count))
+ZH_DISPATCH(
+    uint32_t, central_quantiles, (const uint32_t* words, int64_t count, float* out, uint32_t least),
+    (words, count, out, least))
 
 // Quantiles of count words. A tail, one number in 65536, is computed in double precision and rounded.
 inline void normal_quantiles(const uint32_t* words, int64_t count, float* out) {
-  central_quantiles(words, count, out);
-  if (least(words, count) >= kTail) return;
+  if (central_quantiles(words, count, out, 0xFFFFFFFFu) >= kTail) return;
   for (int64_t i = 0; i < count; ++i)
     if (mirrored(words[i]) < kTail) out[i] = float(tail_quantile((double(words[i]) + 0.5) * 0x1p-32));
 }

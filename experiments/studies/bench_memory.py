@@ -14,7 +14,10 @@ import torch_zerohess as zh
 from experiments.problems import catalogue
 from experiments.studies.bench_ratios import Ratio, in_turn
 
-SIZES = (1, 5, 1024)
+SIZES = ((1, False), (5, False), (1024, False), (1024, True))
+"""Parameters, and whether each pixel depends on few of them."""
+_EACH = 4
+"""Parameters that a pixel depends on, where these are few."""
 _PIXELS = (3, 48, 64)
 _BATCH, _FRESH = 16, 2
 _GOAL = 5.0
@@ -30,12 +33,15 @@ def memory_ratios(evaluations: int, repeats: int) -> list[Ratio]:
     """
     mug = catalogue.fitting("mug")
     x = mug.start(0)[None]
-    return [row for n in SIZES for row in _rows(n, evaluations, repeats, lambda: mug.loss(x))]
+    return [row for n, local in SIZES for row in _rows(n, local, evaluations, repeats, lambda: mug.loss(x))]
 
 
-def _rows(n: int, evaluations: int, repeats: int, render: Callable[[], object]) -> list[Ratio]:
+def _rows(n: int, local: bool, evaluations: int, repeats: int, render: Callable[[], object]) -> list[Ratio]:
     generator = torch.Generator().manual_seed(0)
     slope = torch.randn(n, *_PIXELS, generator=generator) / n**0.5
+    if local:
+        chosen = torch.rand(n, *_PIXELS, generator=generator).topk(_EACH, 0).indices
+        slope = (n / _EACH) ** 0.5 * slope * torch.zeros_like(slope).scatter_(0, chosen, 1.0)
 
     def draw(z: Tensor) -> Tensor:
         return torch.tensordot(z.float(), slope, 1)
@@ -62,7 +68,8 @@ def _rows(n: int, evaluations: int, repeats: int, render: Callable[[], object]) 
     longer, shorter = in_turn(with_memory, without, repeats)
     one, _ = in_turn(render, without, repeats)
     added = max(longer - shorter, 1e-9)
+    name = f"memory of {evaluations}{', local' if local else ''}"
     return [
-        Ratio(f"memory of {evaluations}: a step against a render", n, _FRESH, added, one, _GOAL),
-        Ratio(f"memory of {evaluations}: a fit against as many renders", n, evaluations, fit, evaluations * one, _GOAL),
+        Ratio(f"{name}: a step against a render", n, _FRESH, added, one, _GOAL),
+        Ratio(f"{name}: a fit against as many renders", n, evaluations, fit, evaluations * one, _GOAL),
     ]

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
-from torch_zerohess.estimation.control import Control
+from torch_zerohess.estimation.control import Control, Prediction
 from torch_zerohess.estimation.surrogate_term import STEIN, nodes, prefers_pathwise, smoothed
 
 Part = Callable[[Tensor], Tensor]
@@ -47,7 +47,6 @@ def around(
     with transforms.outside(), transforms.random_numbers_allowed():
         generator = torch.Generator().manual_seed(seed)
         part = torch.randperm(B, generator=generator, device="cpu")[:fresh].sort().values.to(center.device)
-        u = nodes(seed, memory.draws, center.shape[1], B).to(center.device)
 
     def spread(change: Tensor) -> Tensor:
         """Put the values [fresh, *out] of the fresh elements into the batch, with their weight."""
@@ -57,20 +56,28 @@ def around(
         alone, constants = estimated(center[part], [one[part] for one in aux])
         around = None if zero else alone(center[part]).detach()
         return lambda x: spread(outer.value(alone(x.index_select(0, part)), constants, value, around))
-    if memory.pathwise is None and not (transforms.watched(center) or transforms.forward_mode_active()):
-        memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
-    pathwise = len(sigma) > STEIN if memory.pathwise is None else memory.pathwise
     with torch.no_grad():
-        predicted = control.predictor(surrogate, aux)
+        predicted = Prediction(control, surrogate, aux)
+    excess = predicted.excess(sigma) if outer.linear else None
+    if excess is None:
+        with transforms.outside(), transforms.random_numbers_allowed():
+            u = nodes(seed, memory.draws, center.shape[1], B).to(center.device)
+        if memory.pathwise is None and not (transforms.watched(center) or transforms.forward_mode_active()):
+            memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
+        pathwise = len(sigma) > STEIN if memory.pathwise is None else memory.pathwise
+    else:  # the mean over all points is known from the center
+        u, pathwise = sigma.new_zeros(1, len(sigma)), True
+    with torch.no_grad():
         at_center = control.coefficient * predicted(center[:, None])[:, 0] if value == "center" else center[:, 0]
         scales = outer.scales(
             lambda: predicted((center[:, None] + sigma * u).to(center.dtype)), lambda losses: losses.mean(1)
         )
-    whole_aux = aux if scales is None else [*aux, scales]
+    whole_aux = [*aux, *predicted.encoded, *([] if scales is None else [scales])]
     rest = estimated(center[part], [one[part] for one in whole_aux]) if fresh else None
 
     def values(z: Tensor) -> Tensor:
-        return control.coefficient * outer.inner(predicted(z), scales)
+        inner = outer.inner(predicted(z), scales)
+        return control.coefficient * (inner if excess is None else inner + excess)
 
     def expected(x: Tensor) -> tuple[Tensor, Tensor | None]:
         """F at x, and what the new evaluations tell about its fresh elements."""

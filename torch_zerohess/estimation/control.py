@@ -13,7 +13,10 @@ from torch import Tensor
 from torch_zerohess.estimation.head import apply_head
 from torch_zerohess.estimation.outer import Outer
 from torch_zerohess.heads import SquaredError
+from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.low_rank import LowRank
 from torch_zerohess.surrogates.memory import Memory
+from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,16 @@ class Control:
             raise ValueError("memory with fresh=0 has no surrogate yet: add evaluations and call memory.fit()")
         return cls(memory, outer, c > 0.0, c, learning)
 
-    def parted(self, aux: Sequence[Tensor]) -> tuple[Sequence[Tensor], Tensor | None]:
-        """Return the auxiliary inputs of the head, and the scales [B, 2] after them where the surrogate gave some."""
-        return (aux[:-1], aux[-1]) if self.active and not self.outer.linear else (aux, None)
+    def parted(self, aux: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor], Tensor | None]:
+        """Return the auxiliary inputs of the head, `Prediction.encoded` of them, and the scales [B, 2] if any.
+
+        While the surrogate is active, the others come after the inputs of the head.
+        """
+        if not self.active:
+            return aux, (), None
+        aux, scales = (aux, None) if self.outer.linear else (aux[:-1], aux[-1])
+        encoded = 2 if coordinates_of(self.memory.surrogate, self.outer) is not None else 0
+        return aux[: len(aux) - encoded], aux[len(aux) - encoded :], scales
 
     def explain(
         self,
@@ -49,6 +59,7 @@ class Control:
         points: Tensor,
         outputs: Tensor,
         aux: Sequence[Tensor],
+        encoded: Sequence[Tensor],
         added: Callable[[Tensor], list[Tensor]],
         kept: Tensor | None,
     ) -> Tensor | None:
@@ -59,13 +70,14 @@ class Control:
             points: [B, E, n].
             outputs: of the black box [B, E, *outputs].
             aux: of the head [B, ...].
+            encoded: of `Prediction` for these aux, if it is known.
             added: what values [B, E, *out] add to the derivatives of the estimate, by order.
             kept: which values were not left out [B, E]; all of them if None.
         """
         predicted = None
         if self.memory.ready:
             with torch.no_grad():  # a module has parameters that require grad
-                predicted = self.predictor(self.memory.surrogate, aux)(points).double()
+                predicted = Prediction(self, self.memory.surrogate, aux, encoded)(points).double()
             if predicted.shape != values.shape:
                 raise ValueError(
                     f"the surrogate of the memory must return [K, {_listed(outputs.shape[2:])}] like the black box, "
@@ -80,33 +92,53 @@ class Control:
             self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
         return predicted if self.active else None
 
-    def predictor(self, surrogate: Any, aux: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
-        """Return h(g(z), r) as a function of points z [B, E, n] with values [B, E, *out], differentiable in z.
 
-        Args:
-            surrogate: g, of the memory or a copy.
-            aux: r, [B, ...] each.
+class Prediction:
+    """h(g(z), r) as a function of points z [B, E, n] with values [B, E, *out], differentiable in z.
+
+    Args:
+        control: the head h.
+        surrogate: g, of the memory or a copy.
+        aux: r, [B, ...] each.
+        encoded: `encoded` of an earlier prediction with the same surrogate and aux; empty: to be computed.
+    """
+
+    def __init__(self, control: Control, surrogate: Any, aux: Sequence[Tensor], encoded: Sequence[Tensor] = ()) -> None:
+        self._surrogate, self._aux, self._head = surrogate, aux, control.outer.head
+        self._scalar = control.memory.scalar
+        self.encoded = list(encoded)
+        """Coordinates [B, r] of the references and the mean square [B] outside of them, where they have coordinates."""
+        space = coordinates_of(surrogate, control.outer)
+        if space is not None and not self.encoded:
+            SquaredError.check(space.shape, aux[0])
+            self.encoded = list(space.split(aux[0]))
+
+    def __call__(self, z: Tensor) -> Tensor:
+        if self.encoded:
+            known, outside = self.encoded
+            coordinates: Tensor = self._surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
+            return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
+        outputs: Tensor = self._surrogate(z.flatten(0, 1))
+        if self._scalar and outputs.shape[1:] == (1,):
+            outputs = outputs[:, 0]
+        outputs = outputs.unflatten(0, z.shape[:2])
+        return outputs if self._head is None else apply_head(self._head, outputs, self._aux)
+
+    def excess(self, sigma: Tensor) -> Tensor | None:
+        """Return E h(g(z + sigma u), r) - h(g(z), r) where it is the same for all z and r, else None.
+
+        It is for affine g and squared errors: the variance of an element of g(z + sigma u), as a mean over elements.
         """
-        head = self.outer.head
-        space = getattr(surrogate, "space", None)
-        if isinstance(head, SquaredError) and space is not None:
-            head.check(space.shape, aux[0])
-            known, outside = space.split(aux[0])
+        model = getattr(self._surrogate, "model", self._surrogate)
+        if not isinstance(self._head, SquaredError) or not isinstance(model, (LinearSurrogate, SparseSurrogate)):
+            return None
+        whole = model.variance(sigma)
+        return whole if self.encoded else whole / max(1, self._aux[0][0].numel())
 
-            def squared(z: Tensor) -> Tensor:
-                coordinates: Tensor = surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
-                return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
 
-            return squared
-
-        def predict(z: Tensor) -> Tensor:
-            outputs: Tensor = surrogate(z.flatten(0, 1))
-            if self.memory.scalar and outputs.shape[1:] == (1,):
-                outputs = outputs[:, 0]
-            outputs = outputs.unflatten(0, z.shape[:2])
-            return outputs if head is None else apply_head(head, outputs, aux)
-
-        return predict
+def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:
+    """Return the coordinates in which a surrogate tells squared errors, if it has any and the head is one."""
+    return getattr(surrogate, "space", None) if isinstance(outer.head, SquaredError) else None
 
 
 def _listed(shape: Sequence[int]) -> str:

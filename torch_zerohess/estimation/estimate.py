@@ -121,6 +121,7 @@ def estimate(
             if control.active:  # before this call's evaluations, which it must not know
                 sigma = smoothing.sigma_vector(n, flat.device)
                 term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, smoothing.drawn_seed(), smoothing.order)
+                aux_rows = [*aux_rows, *term.encoded]
             return made([draw(smoothing)], alone)
     if tolerance is None:
         return made([draw(smoothing)], alone)

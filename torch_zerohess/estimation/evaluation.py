@@ -218,7 +218,7 @@ def evaluate(
     # Where perturbations are too many to be kept, so are two copies of the points.
     redrawn = stein.u if isinstance(stein, LikelihoodRatio) and isinstance(stein.u, Redrawn) else None
     spare = redrawn is not None and control is None
-    references, scales = control.parted(aux) if control else (aux, None)
+    references, encoded, scales = control.parted(aux) if control else (aux, (), None)
     values, outputs = call.values(points, references, spare=spare)
     if spare and redrawn is not None and not math.isfinite(float(values.sum())):
         points = completed(redrawn.points(), x, with_center)  # as they were before fn
@@ -240,7 +240,7 @@ def evaluate(
         scales = outer.scales(lambda: values[:, :K].double(), mean)
     remaining = outer.inner(values, scales)
     if control is not None:
-        predicted = control.explain(values, points, outputs, references, added, counted)
+        predicted = control.explain(values, points, outputs, references, encoded, added, counted)
         if predicted is not None:
             remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
     baseline, coefficients = _coefficients(remaining.reshape(B, K + with_center, -1), share, smoothing, n)

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.control import Control
+from torch_zerohess.estimation.control import Control, Prediction
 from torch_zerohess.estimation.stein import Quantity
 
 _SOBOL = 64
@@ -108,11 +108,11 @@ class SurrogateTerm:
     u: Tensor
     """[Q, n], see `nodes`."""
     pathwise: bool
-    _predicted: Callable[[Tensor], Tensor] = field(init=False)
+    _predicted: Prediction = field(init=False)
 
     def __post_init__(self) -> None:
         # Before any transform of torch.func begins: what is computed inside of one cannot be used after it.
-        object.__setattr__(self, "_predicted", self.control.predictor(self.surrogate, self.aux))
+        object.__setattr__(self, "_predicted", Prediction(self.control, self.surrogate, self.aux))
 
     @classmethod
     def fixed(
@@ -125,6 +125,11 @@ class SurrogateTerm:
             memory.pathwise = prefers_pathwise(control, x, aux, sigma, u, order)
         copies = [one.clone() for one in aux]
         return cls(copy.deepcopy(memory.surrogate), control, x, copies, sigma, u, memory.pathwise)
+
+    @property
+    def encoded(self) -> list[Tensor]:
+        """What `Prediction` made of aux."""
+        return self._predicted.encoded
 
     def mean(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
         """Return a quantity; v is the direction [B, n] of the "hvp"."""

@@ -119,16 +119,19 @@ class Evaluated:
 
 
 def plain(value: Any) -> Any:
-    """Return a dataclass as a dictionary of tensors, numbers, strings, lists and such dictionaries."""
+    """Return a dataclass as a dictionary of tensors, numbers, strings, lists and such dictionaries.
+
+    Fields that are made of the others are left out.
+    """
     if dataclasses.is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value) if field.init}
     return [plain(one) for one in value] if isinstance(value, tuple) else value
 
 
 def restored(kind: type[T], data: dict[str, Any], device: torch.device) -> T:
     """Return the dataclass of which `plain` made `data`, with its tensors on the device."""
     hints = get_type_hints(kind)
-    names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    names = [field.name for field in dataclasses.fields(kind) if field.init]  # type: ignore[arg-type]
     return kind(**{name: _restored(hints[name], data[name], device) for name in names})
 
 

@@ -2,7 +2,7 @@
 
 Up to 32 parameters it is a Gaussian process or an affine map. For more parameters it is an affine map: of least norm,
 or with a sparse Jacobian where elements of the output depend on few parameters each. Outputs of many elements are
-represented by coordinates (`LowRank`).
+represented by coordinates (`LowRank`) unless the map is sparse.
 """
 
 import torch
@@ -22,8 +22,6 @@ _HELD_OUT = 5
 """One point in so many is held out to compare the two."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
-_SQUARE, _JACOBIAN = 4096, 1 << 27
-"""Parameters, and entries of a dense Jacobian, up to which a sparse map is represented by coordinates, too."""
 
 
 class AutomaticSurrogate:
@@ -47,8 +45,8 @@ class AutomaticSurrogate:
         points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
         if self._takes_sparse(points, outputs):
             return
-        self.space = LowRank.of(outputs, self._rank(points)) if outputs[0].numel() > _WIDE else None
-        known = outputs if self.space is None else self.space.encode(outputs)
+        space = LowRank.of(outputs, self._rank(points)) if outputs[0].numel() > _WIDE else None
+        known = outputs if space is None else space.encode(outputs)
         models = self._candidates(points)
         if len(models) > 1:
             index = torch.randperm(len(points), generator=torch.Generator().manual_seed(1), device="cpu")
@@ -61,12 +59,12 @@ class AutomaticSurrogate:
                 errors.append(float((model(points[held]) - known[held]).square().sum()))
             models = [models[errors.index(min(errors))]]
         models[0].fit(points, known)
-        self.model = models[0]
+        self.space, self.model = space, models[0]
 
     def _takes_sparse(self, points: Tensor, outputs: Tensor) -> bool:
         """Fit a sparse map, and take it if it predicts held-out outputs better than the map of least norm."""
-        (P, n), m = points.shape, outputs[0].numel()
-        if n <= _PROCESS or m <= _WIDE or P < FEWEST_SAMPLES:
+        P, n = points.shape
+        if n <= _PROCESS or outputs[0].numel() <= _WIDE or P < FEWEST_SAMPLES:
             return False
         sparse = SparseSurrogate(capacity=self.capacity)
         sparse.fit(points, outputs)
@@ -74,9 +72,6 @@ class AutomaticSurrogate:
         if sparse.jacobian.explained <= max(sparse.jacobian.explained_dense, 0.0):
             return False
         self.space, self.model = None, sparse
-        if n <= _SQUARE and m * n <= _JACOBIAN:
-            self.space, middle, slope = sparse.coordinates()
-            self.model = LinearSurrogate.of(middle, slope)
         return True
 
     def _rank(self, points: Tensor) -> int:

@@ -30,6 +30,7 @@ class LinearSurrogate:
         capacity = checked_integer("capacity", capacity, 2)
         self.capacity = capacity
         self._middle = self._mean = self._slope = torch.empty(0, device="cpu")
+        self._squares = torch.empty(0, device="cpu")  # of the slope, summed over the elements of the output [n]
         self._shape = torch.Size()
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
@@ -43,19 +44,16 @@ class LinearSurrogate:
             self._slope = _solve(z.mT @ z, z.mT @ y, _RIDGE)
         else:
             self._slope = z.mT @ _solve(z @ z.mT, y, _RIDGE)
-
-    @classmethod
-    def of(cls, middle: Tensor, slope: Tensor) -> "LinearSurrogate":
-        """Return the map z -> (z - middle) slope, of a point [n] and a matrix [n, m]."""
-        made = cls()
-        made._middle, made._slope, made._shape = middle.double(), slope.double(), slope.shape[1:]
-        made._mean = slope.new_zeros(slope.shape[1]).double()
-        return made
+        self._squares = self._slope.square().sum(1)
 
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         predicted = self._mean + (z.double() - self._middle) @ self._slope
         return predicted.reshape(len(z), *self._shape).to(z.dtype)
+
+    def variance(self, sigma: Tensor) -> Tensor:
+        """Return the variances of the elements of an output under N(z, sigma^2), summed, for sigma [n]."""
+        return self._squares @ sigma.to(self._squares).square()
 
 
 def _solve(square: Tensor, right: Tensor, ridge: float) -> Tensor:

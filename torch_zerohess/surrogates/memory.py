@@ -50,7 +50,8 @@ class Memory:
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
         draws: points per element at which the surrogate's term is evaluated. None: 4 for more than 32 parameters,
-            otherwise 1024 / B and at least 64.
+            otherwise 1024 / B and at least 64. An affine surrogate under `heads.SquaredError` needs none in a layer:
+            the expectation is known.
 
     Raises:
         TypeError, ValueError: an argument is not as described.

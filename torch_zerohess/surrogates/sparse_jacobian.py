@@ -1,10 +1,12 @@
 """The Jacobian of an output whose elements depend on few parameters each: `keep` entries per element."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from torch_zerohess.surrogates.sparse_product import SparseRows, product
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,15 @@ class SparseJacobian:
     """The same for the Jacobian of least norm, which has n entries per row, from the same samples."""
     evaluations: int = 0
     """Of the black box, for this Jacobian."""
+    _entries: tuple[SparseRows, SparseRows] = field(init=False, repr=False)
+    """The entries that are used, by rows and by columns."""
+
+    def __post_init__(self) -> None:
+        # Not when they are first needed: what is computed inside of a transform of torch.func cannot be used after it.
+        found = self.found
+        row, column, values = found.nonzero()[:, 0], self.index[found], self.values[found]
+        by_rows = SparseRows.of(row, column, values, len(found))
+        object.__setattr__(self, "_entries", (by_rows, SparseRows.of(column, row, values, self.n)))
 
     @classmethod
     def empty(cls, n: int, shape: Sequence[int], keep: int, like: Tensor) -> "SparseJacobian":
@@ -68,15 +79,20 @@ class SparseJacobian:
         return ~seen
 
     def matvec(self, v: Tensor) -> Tensor:
-        """Return J v [*out] for v [n], in the type of v."""
-        self._check("v", v, torch.Size([self.n]))
-        return (self.values.to(v) * v[self.index]).sum(1).view(self.shape)
+        """Return J v [*batch, *out] for v [*batch, n], in the type of v, with derivatives in v."""
+        batch, (rows, columns) = self._batch("v", v, torch.Size([self.n])), self._entries
+        return product(rows, columns, v.reshape(-1, self.n)).reshape(*batch, *self.shape)
 
     def rmatvec(self, w: Tensor) -> Tensor:
-        """Return J^T w [n] for w [*out], in the type of w."""
-        self._check("w", w, self.shape)
-        products = self.values.to(w) * w.reshape(-1, 1)
-        return w.new_zeros(self.n).index_add_(0, self.index.flatten(), products.flatten())
+        """Return J^T w [*batch, n] for w [*batch, *out], in the type of w, with derivatives in w."""
+        batch, (rows, columns) = self._batch("w", w, self.shape), self._entries
+        return product(columns, rows, w.reshape(-1, len(self.index))).reshape(*batch, self.n)
+
+    @property
+    def squared_lengths(self) -> Tensor:
+        """Squared lengths of the columns, [n]."""
+        columns = self._entries[1]
+        return columns._replace(values=columns.values.square()).times(self.values.new_ones(1, len(self.values)))[0]
 
     def dense(self) -> Tensor:
         """Return the Jacobian as a tensor [*out, n], m n numbers."""
@@ -90,6 +106,10 @@ class SparseJacobian:
             f"explained={self.explained:.3g}, untouched={left} of {self.n} parameters)"
         )
 
-    def _check(self, name: str, vector: Tensor, shape: torch.Size) -> None:
-        if vector.shape != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, got {list(vector.shape)}")
+    def _batch(self, name: str, vectors: Tensor, shape: torch.Size) -> torch.Size:
+        """Return the dimensions before `shape`, or raise ValueError if the others are not `shape`."""
+        first = len(vectors.shape) - len(shape)
+        if first < 0 or vectors.shape[first:] != shape:
+            wanted = ", ".join(map(str, ["*batch", *shape]))
+            raise ValueError(f"{name} must have shape [{wanted}], got {list(vectors.shape)}")
+        return vectors.shape[:first]

@@ -6,15 +6,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.low_rank import LowRank
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.surrogate import checked
-
-_BLOCK = 1 << 22
-"""Products of slopes and parameters held at a time."""
-_RIDGE = 1e-9
-"""Added to J^T J, in units of its mean diagonal: a parameter that nothing depends on leaves it singular."""
 
 
 class SparseSurrogate:
@@ -47,6 +41,7 @@ class SparseSurrogate:
         self.jacobian: SparseJacobian | None = None
         """Of the latest fit. `explained` is the share of the change of held-out outputs that it predicts."""
         self._middle = self._mean = torch.empty(0, device="cpu")
+        self._squares = torch.empty(0, device="cpu")  # squared lengths of the columns of the Jacobian [n]
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
@@ -57,35 +52,19 @@ class SparseSurrogate:
         keep = min(self.keep, n, P - 2)
         if P < FEWEST_SAMPLES:
             self.jacobian = SparseJacobian.empty(n, shape, 1, z)
-            return
-        settings = SparseSettings.checked(n, keep=keep, rate=self.rate, grid=self.grid)
-        self.jacobian = fit_sparse(z - self._middle, y - self._mean, shape, settings)
+        else:
+            settings = SparseSettings.checked(n, keep=keep, rate=self.rate, grid=self.grid)
+            self.jacobian = fit_sparse(z - self._middle, y - self._mean, shape, settings)
+        self._squares = self.jacobian.squared_lengths
 
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         jacobian = self._fitted()
-        change, size = z - self._middle.to(z), max(1, _BLOCK // max(1, len(z) * jacobian.index.shape[1]))
-        parts = [
-            (change[:, index] * values.to(z)).sum(2)
-            for index, values in zip(jacobian.index.split(size), jacobian.values.split(size), strict=True)
-        ]
-        return (self._mean.to(z) + torch.cat(parts, 1)).reshape(len(z), *jacobian.shape)
+        return self._mean.to(z).view(jacobian.shape) + jacobian.matvec(z - self._middle.to(z))
 
-    def coordinates(self) -> tuple[LowRank, Tensor, Tensor]:
-        """Return coordinates of outputs, a point [n], and the slope [n, n] of the map from its differences to them.
-
-        n numbers then stand for an output. With J^T J / m = L L^T, m elements of an output, the slope is L.
-        """
-        jacobian = self._fitted()
-        m, n = len(jacobian.index), jacobian.n
-        index, values = jacobian.index, jacobian.values.double()
-        pairs, products = index[:, :, None] * n + index[:, None], values[:, :, None] * values[:, None]
-        square = values.new_zeros(n * n).index_add_(0, pairs.flatten(), products.flatten()).view(n, n) / m
-        square.diagonal().add_(max(_RIDGE * float(square.diagonal().mean()), torch.finfo(torch.float64).tiny))
-        slope = torch.linalg.cholesky(square)
-        whole = jacobian.dense().view(m, n).double()
-        basis = (torch.linalg.solve_triangular(slope, whole.mT, upper=False).mT / m).float()
-        return LowRank(self._mean, basis, jacobian.shape), self._middle, slope
+    def variance(self, sigma: Tensor) -> Tensor:
+        """Return the variances of the elements of an output under N(z, sigma^2), summed, for sigma [n]."""
+        return self._squares.to(sigma) @ sigma.square()
 
     def _fitted(self) -> SparseJacobian:
         if self.jacobian is None:

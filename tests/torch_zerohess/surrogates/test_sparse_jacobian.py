@@ -44,11 +44,32 @@ def test_products_are_those_of_the_dense_matrix():
     torch.testing.assert_close(J.dense(), dense.view(2, 3, 7))
     torch.testing.assert_close(J.matvec(v).flatten(), dense @ v)
     torch.testing.assert_close(J.rmatvec(w), dense.mT @ w.flatten())
+    torch.testing.assert_close(J.squared_lengths, dense.square().sum(0))
     torch.testing.assert_close(J.untouched, (dense == 0).all(0))
-    with pytest.raises(ValueError, match=r"v must have shape \[7\], got \[6\]"):
+    many, images = normal(2, 5, 7, seed=3), normal(2, 5, 2, 3, seed=4)
+    torch.testing.assert_close(J.matvec(many).flatten(2), many @ dense.mT)
+    torch.testing.assert_close(J.rmatvec(images), images.flatten(2) @ dense)
+    with pytest.raises(ValueError, match=r"v must have shape \[\*batch, 7\], got \[6\]"):
         J.matvec(v[:6])
-    with pytest.raises(ValueError, match=r"w must have shape \[2, 3\], got \[6\]"):
+    with pytest.raises(ValueError, match=r"w must have shape \[\*batch, 2, 3\], got \[6\]"):
         J.rmatvec(w.flatten())
+
+
+def test_products_have_derivatives_of_every_order_in_every_mode():
+    J, dense = random_jacobian()
+    v, t = normal(5, 7, seed=1), normal(5, 7, seed=2)
+
+    def cubes(one, matvec=J.matvec, rmatvec=J.rmatvec):
+        return rmatvec(matvec(one) ** 3).sum()
+
+    def truth(one):
+        return cubes(one, lambda z: (z @ dense.mT).unflatten(-1, (2, 3)), lambda w: w.flatten(-2) @ dense)
+
+    torch.testing.assert_close(torch.func.hessian(cubes)(v), torch.func.hessian(truth)(v))
+    torch.testing.assert_close(torch.func.jacrev(torch.func.jacrev(cubes))(v), torch.func.hessian(truth)(v))
+    torch.testing.assert_close(torch.func.jvp(cubes, (v,), (t,))[1], torch.func.jvp(truth, (v,), (t,))[1])
+    torch.testing.assert_close(torch.func.vmap(torch.func.grad(cubes))(v), torch.func.vmap(torch.func.grad(truth))(v))
+    assert torch.autograd.gradgradcheck(cubes, v.requires_grad_())
 
 
 def test_the_largest_entries_of_rows():

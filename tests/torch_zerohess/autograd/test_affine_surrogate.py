@@ -1,0 +1,97 @@
+"""The term of an affine surrogate under a squared error is known: its value and derivatives have no noise."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_zerohess as zh
+from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
+from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
+
+n, B, SHAPE = 40, 3, (12, 10)
+SIGMA = torch.linspace(0.1, 0.5, n, dtype=torch.float64)
+
+
+def normal(*shape: int, seed: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def image(z: Tensor) -> Tensor:
+    """Each of 120 elements depends on two of 40 parameters: [K, 40] -> [K, 12, 10]."""
+    k = torch.arange(120)
+    return (2.0 * z[:, k % n] - z[:, (7 * k + 3) % n] + 0.01 * k).unflatten(1, SHAPE)
+
+
+SURROGATES = {
+    "linear": LinearSurrogate,
+    "low rank": lambda: LowRankSurrogate(LinearSurrogate(), rank=64),
+    "sparse": lambda: SparseSurrogate(keep=4),
+    "automatic": AutomaticSurrogate,
+}
+
+
+@pytest.fixture(params=SURROGATES)
+def layer(request):
+    memory = zh.Memory(SURROGATES[request.param](), fresh=0)
+    points = normal(200, n, seed=0)
+    memory.add(points, image(points))
+    memory.fit()
+    smoothing = zh.Smoothing(sigma=SIGMA.tolist(), samples=1)
+    return zh.BlackBox(image, smoothing, head=zh.heads.SquaredError(), memory=memory, value="smoothed")
+
+
+def truth(layer: zh.BlackBox, x: Tensor, references: Tensor) -> Tensor:
+    """E mean((g(x + sigma u) - r)^2) for affine g: the error at x, and the variance of an element of g."""
+    surrogate = layer.memory.surrogate
+    slope = torch.func.jacrev(lambda one: surrogate(one[None])[0])(x[0].detach())
+    return (surrogate(x) - references).square().mean((1, 2)) + (slope * SIGMA).square().sum(2).mean()
+
+
+def test_value_gradient_and_hessian_are_exact(layer):
+    x, references = normal(B, n, seed=1), normal(B, *SHAPE, seed=2)
+    torch.testing.assert_close(layer(x, references), truth(layer, x, references), rtol=1e-5, atol=0.0)
+    for of in (torch.func.grad, torch.func.hessian, lambda one: torch.func.jacrev(torch.func.jacrev(one))):
+        found = of(lambda z: layer(z, references).sum())(x)
+        torch.testing.assert_close(found, of(lambda z: truth(layer, z, references).sum())(x), rtol=1e-5, atol=1e-8)
+
+
+def test_two_calls_are_equal(layer):
+    x, references = normal(B, n, seed=1), normal(B, *SHAPE, seed=2)
+    assert torch.equal(layer(x, references), layer(x, references))
+
+
+def test_new_evaluations_correct_it():
+    """The black box is the map plus a constant that the surrogate does not know: the layer knows the sum."""
+    memory = zh.Memory(LinearSurrogate())
+    points = normal(200, n, seed=0)
+    memory.add(points, image(points))
+    memory.fit()
+    memory.observe(normal(2, 9, seed=3), normal(2, 9, seed=3))
+    assert memory.coefficient > 0.0
+    smoothing = zh.Smoothing(sigma=0.3, samples=2000, seed=0, proposal="gaussian")
+    layer = zh.BlackBox(
+        lambda z: image(z) + 1.0, smoothing, head=zh.heads.SquaredError(), memory=memory, value="smoothed"
+    ).eval()
+    x, references = normal(B, n, seed=1), normal(B, *SHAPE, seed=2)
+    expected = (image(x) + 1.0 - references).square().mean((1, 2)) + 5.0 * 0.3**2
+    torch.testing.assert_close(layer(x, references), expected, rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("head", [zh.heads.SquaredError(), zh.heads.LocalEntropy(zh.heads.SquaredError())])
+def test_references_are_split_once_per_call(head, monkeypatch):
+    memory = zh.Memory(LowRankSurrogate(LinearSurrogate(), rank=64), fresh=2)
+    points = normal(200, n, seed=0)
+    memory.add(points, image(points))
+    memory.fit()
+    memory.observe(normal(2, 9, seed=3), normal(2, 9, seed=3))
+    layer = zh.BlackBox(image, zh.Smoothing(sigma=0.3, samples=2, seed=0), head=head, memory=memory, value="smoothed")
+    calls, split = [], LowRank.split
+    monkeypatch.setattr(LowRank, "split", lambda space, outputs: calls.append(len(outputs)) or split(space, outputs))
+    x, references = normal(B, n, seed=1).requires_grad_(), normal(B, *SHAPE, seed=2)
+    torch.autograd.grad(layer(x, references).sum(), x)
+    assert calls == [B]
+    if head == zh.heads.SquaredError():
+        zh.estimate(image, x, layer.smoothing, references, head=head, memory=memory)
+        assert calls == [B, B]

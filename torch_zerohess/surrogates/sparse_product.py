@@ -1,0 +1,66 @@
+"""Products with a sparse matrix and its transpose, differentiable to every order."""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+
+class SparseRows(NamedTuple):
+    """The entries of a matrix, row after row."""
+
+    column: Tensor
+    """Of each entry, int64 [entries]."""
+    first: Tensor
+    """Where each row begins, int64 [rows]."""
+    values: Tensor
+    """[entries]"""
+
+    @classmethod
+    def of(cls, row: Tensor, column: Tensor, values: Tensor, rows: int) -> "SparseRows":
+        """Return entries in any order, in order."""
+        row, order = row.sort(stable=True)
+        counts = torch.bincount(row, minlength=rows)
+        return cls(column[order], counts.cumsum(0) - counts, values[order])
+
+    def times(self, vectors: Tensor) -> Tensor:
+        """Return the products [K, rows] with vectors [K, columns], without a graph."""
+        sums = nn.functional.embedding_bag(
+            self.column, vectors.mT.contiguous(), self.first, mode="sum", per_sample_weights=self.values.to(vectors)
+        )
+        return sums.mT
+
+
+def product(matrix: SparseRows, transposed: SparseRows, vectors: Tensor) -> Tensor:
+    """Return the products [K, rows] of a matrix, given with its transpose, and vectors [K, columns]."""
+    result: Tensor = _Product.apply(vectors, *matrix, *transposed)
+    return result
+
+
+class _Product(torch.autograd.Function):
+    """`apply(vectors, *matrix, *transposed)`: a linear map, whose derivatives are products with either matrix."""
+
+    @staticmethod
+    def forward(vectors: Tensor, *parts: Tensor) -> Tensor:
+        return SparseRows(*parts[:3]).times(vectors)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[1:])
+        ctx.save_for_forward(*inputs[1:])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+        parts = ctx.saved_tensors
+        return _Product.apply(gradient, *parts[3:], *parts[:3]), *(None for _ in parts)
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: Any) -> Tensor:
+        result: Tensor = _Product.apply(tangent, *ctx.saved_tensors)
+        return result
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], vectors: Tensor, *parts: Tensor) -> tuple[Tensor, int]:
+        """Fold the mapped dimension into K; matrices are not mapped over."""
+        vectors = vectors.movedim(in_dims[0], 0)
+        return _Product.apply(vectors.flatten(0, 1), *parts).unflatten(0, vectors.shape[:2]), 0

@@ -22,6 +22,9 @@ _HELD_OUT = 5
 """One point in so many is held out to compare the two."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
+_EXACT = 1e-6
+"""Share of the change of held-out outputs that a sparse map may leave, where the map of least norm leaves less: the
+sparse one takes far less time, and images have larger rounding."""
 
 
 class AutomaticSurrogate:
@@ -62,14 +65,15 @@ class AutomaticSurrogate:
         self.space, self.model = space, models[0]
 
     def _takes_sparse(self, points: Tensor, outputs: Tensor) -> bool:
-        """Fit a sparse map, and take it if it predicts held-out outputs better than the map of least norm."""
+        """Fit a sparse map, and take it if it predicts held-out outputs exactly, or better than least norm does."""
         P, n = points.shape
         if n <= _PROCESS or outputs[0].numel() <= _WIDE or P < FEWEST_SAMPLES:
             return False
         sparse = SparseSurrogate(capacity=self.capacity)
         sparse.fit(points, outputs)
         assert sparse.jacobian is not None
-        if sparse.jacobian.explained <= max(sparse.jacobian.explained_dense, 0.0):
+        explained, dense = sparse.jacobian.explained, sparse.jacobian.explained_dense
+        if explained <= min(max(dense, 0.0), 1.0 - _EXACT):
             return False
         self.space, self.model = None, sparse
         return True

@@ -70,6 +70,15 @@ def test_a_memory_takes_it_where_it_predicts_better():
     assert error(memory.surrogate) < 1e-3
 
 
+def test_an_exact_sparse_map_is_taken_where_points_determine_the_dense_one_too():
+    memory, z = zh.Memory(), normal(4 * n, n)
+    memory.add(z, image(z))
+    memory.fit()
+    model = memory.surrogate.model
+    assert isinstance(model, SparseSurrogate)
+    assert model.jacobian.explained < model.jacobian.explained_dense
+
+
 def test_a_dense_map_and_few_points_keep_the_map_of_least_norm():
     dense = normal(n, 120, seed=3) / n**0.5
     automatic, linear = AutomaticSurrogate(), LinearSurrogate()

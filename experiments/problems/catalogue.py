@@ -19,7 +19,7 @@ FITTING = {
     )
 }
 """Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
-RENDERED = {name: f"experiments.problems.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror")}
+RENDERED = {name: f"experiments.problems.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror", "poster")}
 """Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
 FITTING |= RENDERED
 RENDERED_NETWORKS = ("cnn", "cnn_wide", "cnn5", "cnn_texture")

@@ -50,7 +50,7 @@ def through_memory(
     target_radius: float = 0.5,
     fit_damping: float = 0.3,
     many_damping: float = 3e-4,
-    many_rate: tuple[float, float] = (6e-3, 3e-4),
+    many_rate: tuple[float, float] = (1e-2, 3e-4),
     temperature: float = 0.15,
 ) -> None:
     """Train until the evaluations are used.

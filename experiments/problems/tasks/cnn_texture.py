@@ -33,7 +33,8 @@ class Decoder(nn.Module):
     """Image [B, 3, h, w] to texture [B, 1024] in (0, 1): about 10 000 weights.
 
     Two convolutions, a linear map along each axis from pixels of the image to pixels of the texture, and two more
-    convolutions. The position of the label in the image is learned.
+    convolutions. The maps begin as a linear interpolation of the whole image. The position and the shape of the label
+    in the image are learned.
     """
 
     def __init__(self, film: int, channels: int = 8) -> None:
@@ -45,10 +46,22 @@ class Decoder(nn.Module):
         self.show = nn.Sequential(
             nn.ReLU(), nn.Conv2d(channels, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, 1, 3, padding=1)
         )
+        for one in (self.across, self.down):
+            nn.init.zeros_(one.bias)
+            with torch.no_grad():
+                one.weight.copy_(_interpolation(film, LABEL_SIDE))
 
     def forward(self, image: Tensor) -> Tensor:
         features = self.across(self.see(4.0 * image - 1.4))
         return torch.sigmoid(self.show(self.down(features.mT).mT).flatten(1))
+
+
+def _interpolation(fine: int, coarse: int) -> Tensor:
+    """Return the weights [coarse, fine] of means of `fine` pixels around the middles of `coarse` ones, in a triangle."""
+    ratio = fine / coarse
+    middle = ratio * (torch.arange(coarse) + 0.5) - 0.5
+    weights = (1.0 - (torch.arange(fine) - middle[:, None]).abs() / ratio).clamp_min(0.0)
+    return weights / weights.sum(1, keepdim=True)
 
 
 class Texture(NetworkTask):

@@ -109,3 +109,13 @@ def test_errors_are_of_the_held_out_images():
     assert BUMP.parameter_error(Constant()) == pytest.approx(float((13.0 - x).square().mean()))
     expected = float((BUMP.image(torch.full((1, 1), 13.0)) - images).square().mean())
     assert BUMP.image_error(Constant()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_decoder_begins_as_a_linear_interpolation_of_the_image() -> None:
+    decoder = catalogue.load("cnn_texture").encoder()
+    ramp = torch.linspace(-1.0, 1.0, 96)
+    for one in (decoder.across, decoder.down):
+        small = one(ramp)
+        torch.testing.assert_close(one(torch.ones(96)), torch.ones(32))
+        torch.testing.assert_close(small[1:-1].diff(), torch.full((29,), 3.0 * 2.0 / 95.0))
+        assert abs(float(small.mean())) < 1e-6

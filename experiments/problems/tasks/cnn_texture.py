@@ -57,7 +57,7 @@ class Decoder(nn.Module):
 
 
 def _interpolation(fine: int, coarse: int) -> Tensor:
-    """Return the weights [coarse, fine] of means of `fine` pixels around the middles of `coarse` ones, in a triangle."""
+    """Return the weights [coarse, fine] of triangular means around the middles of `coarse` pixels."""
     ratio = fine / coarse
     middle = ratio * (torch.arange(coarse) + 0.5) - 0.5
     weights = (1.0 - (torch.arange(fine) - middle[:, None]).abs() / ratio).clamp_min(0.0)

@@ -111,6 +111,7 @@ def test_errors_are_of_the_held_out_images():
     assert BUMP.image_error(Constant()) == pytest.approx(expected, rel=1e-5)
 
 
+@torch.no_grad()
 def test_the_decoder_begins_as_a_linear_interpolation_of_the_image() -> None:
     decoder = catalogue.load("cnn_texture").encoder()
     ramp = torch.linspace(-1.0, 1.0, 96)

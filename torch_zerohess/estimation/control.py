@@ -13,8 +13,9 @@ from torch import Tensor
 from torch_zerohess.estimation.head import apply_head
 from torch_zerohess.estimation.outer import Outer
 from torch_zerohess.heads import SquaredError
+from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
-from torch_zerohess.surrogates.low_rank import LowRank
+from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
 from torch_zerohess.surrogates.memory import Memory
 from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
 
@@ -129,8 +130,10 @@ class Prediction:
 
         It is for affine g and squared errors: the variance of an element of g(z + sigma u), as a mean over elements.
         """
-        model = getattr(self._surrogate, "model", self._surrogate)
-        if not isinstance(self._head, SquaredError) or not isinstance(model, (LinearSurrogate, SparseSurrogate)):
+        # Exact types: a subclass, or a surrogate of the caller's with a model in it, may be anything.
+        through = type(self._surrogate) in (AutomaticSurrogate, LowRankSurrogate)
+        model = self._surrogate.model if through else self._surrogate
+        if type(self._head) is not SquaredError or type(model) not in (LinearSurrogate, SparseSurrogate):
             return None
         whole = model.variance(sigma)
         return whole if self.encoded else whole / max(1, self._aux[0][0].numel())
@@ -138,7 +141,7 @@ class Prediction:
 
 def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:
     """Return the coordinates in which a surrogate tells squared errors, if it has any and the head is one."""
-    return getattr(surrogate, "space", None) if isinstance(outer.head, SquaredError) else None
+    return getattr(surrogate, "space", None) if type(outer.head) is SquaredError else None
 
 
 def _listed(shape: Sequence[int]) -> str:

@@ -95,3 +95,48 @@ def test_references_are_split_once_per_call(head, monkeypatch):
     if head == zh.heads.SquaredError():
         zh.estimate(image, x, layer.smoothing, references, head=head, memory=memory)
         assert calls == [B, B]
+
+
+class Weighted(zh.heads.SquaredError):
+    """A head of the caller's: three times the squared error."""
+
+    def __call__(self, outputs: Tensor, references: Tensor) -> Tensor:
+        return 3.0 * super().__call__(outputs, references)
+
+
+class Squares:
+    """A surrogate of the caller's that is not affine, though its model is."""
+
+    def __init__(self) -> None:
+        self.model = LinearSurrogate()
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        self.model.fit(points, outputs)
+
+    def __call__(self, z: Tensor) -> Tensor:
+        return self.model(z).square()
+
+
+def test_a_head_or_a_surrogate_of_the_callers_is_taken_as_it_is():
+    points, x, references = normal(200, n, seed=0), normal(B, n, seed=1), normal(B, *SHAPE, seed=2)
+
+    def layer(head, surrogate, draws=4000):
+        memory = zh.Memory(surrogate, fresh=0, draws=draws)
+        memory.add(points, image(points))
+        memory.fit()
+        smoothing = zh.Smoothing(sigma=SIGMA.tolist(), samples=1, seed=0)
+        return zh.BlackBox(image, smoothing, head=head, memory=memory, value="smoothed")
+
+    once = layer(zh.heads.SquaredError(), LowRankSurrogate(LinearSurrogate(), rank=64))(x, references)
+    three = layer(Weighted(), LowRankSurrogate(LinearSurrogate(), rank=64))(x, references)
+    torch.testing.assert_close(three, 3.0 * once, rtol=1e-2, atol=0.0)
+
+    model = LinearSurrogate()
+    model.fit(points, image(points))
+    slope = torch.func.jacrev(lambda one: model(one[None])[0])(x[0])
+    variance = (slope * SIGMA).square().sum(2)
+    mean = model(x).square() + variance  # of g^2, and the fourth moment of g
+    fourth = model(x) ** 4 + 6.0 * model(x).square() * variance + 3.0 * variance.square()
+    expected = (fourth - 2.0 * references * mean + references.square()).mean((1, 2))
+    found = layer(zh.heads.SquaredError(), Squares())(x, references)
+    torch.testing.assert_close(found, expected, rtol=2e-2, atol=0.0)

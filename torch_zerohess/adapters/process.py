@@ -1,6 +1,5 @@
 """An external program as a black box, over its standard input and output."""
 
-import contextlib
 import functools
 import io
 import json
@@ -115,8 +114,10 @@ class Program(Closing):
             self._server = None
 
     def __del__(self) -> None:
-        with contextlib.suppress(Exception):  # at the end of the interpreter
+        try:  # noqa: SIM105  # at the end of the interpreter contextlib may be gone
             self.close()
+        except Exception:
+            pass
 
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...]."""

@@ -82,8 +82,8 @@ def test_ratios_against_the_machine(costs) -> None:
         "gradient + HVP, drawn again",
         "noise, two threads against one",
         *(
-            f"memory of 30: a {what}"
-            for _ in range(3)
+            f"{memory}: a {what}"
+            for memory in (*3 * ("memory of 30",), "memory of 30, local")
             for what in ("step against a render", "fit against as many renders")
         ),
     ]

@@ -15,6 +15,7 @@ FITTING = {
     name: f"experiments.problems.tasks.{name}"
     for name in (
         *("quad", "box2", "box10", "texture", "brdf", "nonpsd", "throw", "caustic"),
+        *("discs", "hexagon"),
         *("meshfit", "meshfit_color", "suzanne", "banana"),
     )
 }

@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 import torch
-from skimage import data
+from skimage import data, draw
 
 import torch_zerohess as zh
 from experiments.problems import catalogue
@@ -13,10 +13,11 @@ from experiments.problems.task import Task
 from experiments.problems.tasks import brdf, nonpsd
 from experiments.studies.nonpsd import READINGS, nonpsd_error
 
-NAMES = ("quad", "box2", "box10", "texture", "brdf", "nonpsd")
+NAMES = ("quad", "box2", "box10", "texture", "brdf", "nonpsd", "discs", "hexagon")
 TASKS = {name: catalogue.load(name) for name in NAMES}
-IMAGES = ("box2", "box10", "texture", "brdf")
+IMAGES = ("box2", "box10", "texture", "brdf", "discs", "hexagon")
 TEXTURE = data.camera().reshape(32, 16, 32, 16).mean((1, 3)).ravel() / 255
+CORNERS = np.exp(2j * np.pi * (np.arange(6) + 0.3) / 6)  # of a regular hexagon
 SOLUTIONS = {
     "quad": [0.0, 0.0],
     "box2": [0.3, 0.3],
@@ -24,6 +25,11 @@ SOLUTIONS = {
     "texture": TEXTURE,
     "brdf": [0.6, 0.25, 0.15, 0.5, 0.5, 0.4, 0.7],
     "nonpsd": [0.0, 0.0],
+    "discs": [
+        *(0.22, 0.25, 0.12, 0.5, 0.2, 0.08, 0.78, 0.24, 0.14),
+        *(0.25, 0.72, 0.15, 0.55, 0.6, 0.1, 0.8, 0.75, 0.11),
+    ],
+    "hexagon": (0.55 + 0.5j + 0.32 * CORNERS).view(float),
 }
 STARTS = {
     "quad": ([800] * 2, [1000] * 2),
@@ -35,6 +41,8 @@ STARTS = {
     "texture": ([0] * 1024, [1] * 1024),
     "brdf": ([0] * 7, [0.5] * 6 + [0.3]),
     "nonpsd": ([-3] * 2, [3] * 2),
+    "discs": ([0.1, 0.1, 0.08] * 6, [0.9, 0.9, 0.14] * 6),
+    "hexagon": tuple((0.4 + 0.5j + 0.15 * CORNERS).view(float) + spread for spread in (-0.06, 0.06)),
 }
 
 
@@ -175,6 +183,38 @@ def test_squares_of_box10_are_interchangeable() -> None:
     merged = solution[[0, 0, 2, 3, 4]].flatten()
     assert task.truth.parameter_error(merged) == pytest.approx(2 * 0.29**2 / 10)
     assert task.truth.image_error(merged) > 0.01
+
+
+def test_discs_add_up_and_are_interchangeable() -> None:
+    task, solution = TASKS["discs"], np.array(SOLUTIONS["discs"]).reshape(6, 3)
+    pixel = (np.arange(64) + 0.5) / 64
+    for x in (solution, task.start(0).view(6, 3).numpy(), np.tile([0.4, 0.6, 0.2], (6, 1))):
+        inside = [(pixel[None] - px) ** 2 + (pixel[:, None] - py) ** 2 < r**2 for px, py, r in x]
+        image = task.output.image(vector(x.ravel())[None])[0]
+        torch.testing.assert_close(image, vector(0.5 * np.sum(inside, 0)))
+    others = vector(solution[[3, 1, 5, 0, 2, 4]].ravel())
+    assert task.truth.parameter_error(others) == 0.0
+    assert task.truth.image_error(others) == 0.0
+    moved = vector(np.where(np.arange(18) == 4, 0.3, others))  # y of the second disc, from 0.2
+    assert task.truth.parameter_error(moved) == pytest.approx(0.1**2 / 18)
+
+
+def test_hexagon_is_filled_and_its_corners_have_no_order() -> None:
+    task, solution = TASKS["hexagon"], vector(SOLUTIONS["hexagon"]).view(6, 2)
+    for x in (solution, task.start(0).view(6, 2)):
+        expected = draw.polygon2mask((64, 64), x.flip(1).numpy() * 64 - 0.5)  # row, column of pixel centres
+        image = task.output.image(x.flatten()[None])[0]
+        assert image.unique().tolist() == [0, 1]
+        assert float((image - vector(expected.astype(float))).abs().sum()) <= 2  # centres on an edge
+    for order in (solution.roll(2, 0), solution.flip(0).roll(1, 0)):
+        assert task.truth.parameter_error(order.flatten()) == pytest.approx(0.0, abs=1e-30)
+    assert task.truth.parameter_error(solution[[1, 0, 2, 3, 4, 5]].flatten()) > 1e-3  # crosses itself
+
+
+@pytest.mark.parametrize("name", ["discs", "hexagon"])
+def test_hard_shapes_are_constant_almost_everywhere(name) -> None:
+    x = starts(TASKS[name], 20)
+    assert torch.equal(TASKS[name].loss(x), TASKS[name].loss(x + 1e-9))
 
 
 def quadrature(task: Task, x: torch.Tensor, sigma: float, nodes: int = 60) -> float:

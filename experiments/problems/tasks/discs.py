@@ -1,0 +1,66 @@
+"""DISCS: six discs with hard edges must find their places and radii, from anywhere in the image.
+
+Parameters: x, y and radius of every disc, in units of the image side. Centres are between 0.1 and 0.9, radii between
+0.04 and 0.2. The brightness of discs that overlap adds up. Starts: centres uniform in the bounds, radii uniform in
+(0.08, 0.14). The image has 64x64 pixels without antialiasing, so that the loss, the mean squared difference of the
+images, is constant almost everywhere. The discs are interchangeable: the parameter error is the least over all
+assignments of discs to places. The loss has many local minima: two discs may share a place. Sigma: a seventh of the
+side.
+"""
+
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from experiments.problems import hard_shapes
+from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
+
+SOLUTION = (
+    *(0.22, 0.25, 0.12, 0.5, 0.2, 0.08, 0.78, 0.24, 0.14),
+    *(0.25, 0.72, 0.15, 0.55, 0.6, 0.1, 0.8, 0.75, 0.11),
+)
+"""x, y and radius of each disc."""
+BRIGHTNESS = 0.5
+"""Of a disc."""
+LOWER, UPPER = 6 * (0.1, 0.1, 0.04), 6 * (0.9, 0.9, 0.2)
+FIRST, LAST = 6 * (0.1, 0.1, 0.08), 6 * (0.9, 0.9, 0.14)
+"""Between these the starts are."""
+
+
+def task(preset: Preset = "fast") -> Task:
+    solution = _vector(SOLUTION)
+    places = solution.view(-1, 3)
+
+    def image(x: Tensor) -> Tensor:
+        return BRIGHTNESS * hard_shapes.discs(x.double())
+
+    reference = image(solution[None])[0]
+
+    def loss(x: Tensor) -> Tensor:
+        return (image(x) - reference).square().mean((1, 2))
+
+    def parameter_error(x: Tensor) -> float:
+        distance = (x.view(-1, 1, 3) - places).square().sum(2)
+        found, taken = linear_sum_assignment(distance.numpy())
+        return float(distance[torch.from_numpy(found), torch.from_numpy(taken)].sum()) / len(x)
+
+    return Task(
+        name="discs",
+        title="places and radii of six interchangeable discs with hard edges",
+        parameters="x, y, radius of six discs in units of the image side; centres 0.1 to 0.9, radii 0.04 to 0.2; "
+        "starts anywhere, radii U(0.08, 0.14)",
+        needs=f"one channel, {hard_shapes.SIDE}x{hard_shapes.SIDE} pixels; the source has no such task",
+        n=len(solution),
+        loss=loss,
+        start=uniform(_vector(FIRST), _vector(LAST)),
+        sigma=1 / 7,
+        bounds=(_vector(LOWER), _vector(UPPER)),
+        evaluations=20_000,
+        truth=Truth(lambda x: float(loss(x[None])[0]), parameter_error),
+        output=least_squares(image, lambda out: (out - reference).flatten()),
+        picture=Picture(lambda x: image(x[None])[0].clamp(max=1.0), lambda: reference),
+    )
+
+
+def _vector(numbers: tuple[float, ...]) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)

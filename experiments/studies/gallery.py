@@ -39,7 +39,8 @@ from experiments.runs.trial import LIMIT, Trial
 
 METHOD = "gaussian_process"
 OWN = {
-    **dict.fromkeys(("quad", "box10", "brdf", "texture"), "descent"),
+    **dict.fromkeys(("quad", "box10", "brdf", "discs", "hexagon"), "descent"),
+    **dict.fromkeys(("texture", "poster"), "local"),
     **dict.fromkeys(("meshfit", "meshfit_color", "suzanne", "banana"), "handles_newton"),
     "caustic": "block_gauss_newton",
 }

@@ -8,6 +8,8 @@ import small
 import torch
 from PIL import Image, ImageSequence
 
+from experiments.methods import METHODS
+from experiments.problems import catalogue
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.task import Task
 from experiments.problems.tasks import caustic, quad
@@ -25,7 +27,7 @@ from experiments.reports.animation import (
     together,
 )
 from experiments.runs.records import Outcome, Record
-from experiments.studies.gallery import gallery, trace
+from experiments.studies.gallery import METHOD, OWN, gallery, trace
 from truths import vector
 
 ENDED = Outcome("t", "m", 0, "stopped", "", 1.0, 1.0, 10, 0, [])
@@ -42,6 +44,11 @@ def made(points, evaluations=None, task=small.TASK):
 
 def pixel(image, x, y):
     return Image.Image.getpixel(image, (x, y))
+
+
+@pytest.mark.parametrize("name", catalogue.FITTING)
+def test_the_recommended_method_can_be_used(name):
+    assert METHODS[OWN.get(name, METHOD)].unusable(catalogue.fitting(name)) is None
 
 
 def test_a_trace_has_a_point_for_every_row():

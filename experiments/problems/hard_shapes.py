@@ -3,8 +3,13 @@
 Lengths are in units of the image side. Row is y, column is x, and a pixel is at its centre.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
+
+from experiments.problems.task import Picture, Task, Truth, least_squares
 
 SIDE = 64
 """Pixels along the image side."""
@@ -33,6 +38,27 @@ def polygon(points: Tensor) -> Tensor:
     crossing = x + (row - y) / height * (next_x - x)
     crossed = (spans & (column < crossing)).sum(1)  # [K, side, side]
     return (crossed % 2).to(points)
+
+
+def fitting(
+    image: Callable[[Tensor], Tensor], solution: Tensor, parameter_error: Callable[[Tensor], float], **given: Any
+) -> Task:
+    """Return the task of fitting the image of a solution [n], for DISCS and HEXAGON; given: the rest of the task."""
+    reference = image(solution[None])[0]
+
+    def loss(x: Tensor) -> Tensor:
+        return (image(x) - reference).square().mean((1, 2))
+
+    return Task(
+        needs=f"one channel, {SIDE}x{SIDE} pixels; the source has no such task",
+        n=len(solution),
+        loss=loss,
+        evaluations=20_000,
+        truth=Truth(lambda x: float(loss(x[None])[0]), parameter_error),
+        output=least_squares(image, lambda out: (out - reference).flatten()),
+        picture=Picture(lambda x: image(x[None])[0].clamp(max=1.0), lambda: reference),
+        **given,
+    )
 
 
 def _pixels(like: Tensor) -> Tensor:

@@ -12,8 +12,8 @@ import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from experiments.problems import hard_shapes
-from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
+from experiments.problems.hard_shapes import discs, fitting
+from experiments.problems.task import Preset, Task, uniform
 
 SOLUTION = (
     *(0.22, 0.25, 0.12, 0.5, 0.2, 0.08, 0.78, 0.24, 0.14),
@@ -32,33 +32,24 @@ def task(preset: Preset = "fast") -> Task:
     places = solution.view(-1, 3)
 
     def image(x: Tensor) -> Tensor:
-        return BRIGHTNESS * hard_shapes.discs(x.double())
-
-    reference = image(solution[None])[0]
-
-    def loss(x: Tensor) -> Tensor:
-        return (image(x) - reference).square().mean((1, 2))
+        return BRIGHTNESS * discs(x.double())
 
     def parameter_error(x: Tensor) -> float:
         distance = (x.view(-1, 1, 3) - places).square().sum(2)
         found, taken = linear_sum_assignment(distance.numpy())
         return float(distance[torch.from_numpy(found), torch.from_numpy(taken)].sum()) / len(x)
 
-    return Task(
+    return fitting(
+        image,
+        solution,
+        parameter_error,
         name="discs",
         title="places and radii of six interchangeable discs with hard edges",
         parameters="x, y, radius of six discs in units of the image side; centres 0.1 to 0.9, radii 0.04 to 0.2; "
         "starts anywhere, radii U(0.08, 0.14)",
-        needs=f"one channel, {hard_shapes.SIDE}x{hard_shapes.SIDE} pixels; the source has no such task",
-        n=len(solution),
-        loss=loss,
         start=uniform(_vector(FIRST), _vector(LAST)),
         sigma=1 / 7,
         bounds=(_vector(LOWER), _vector(UPPER)),
-        evaluations=20_000,
-        truth=Truth(lambda x: float(loss(x[None])[0]), parameter_error),
-        output=least_squares(image, lambda out: (out - reference).flatten()),
-        picture=Picture(lambda x: image(x[None])[0].clamp(max=1.0), lambda: reference),
     )
 
 

@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from experiments.problems import hard_shapes
-from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
+from experiments.problems.hard_shapes import fitting, polygon
+from experiments.problems.task import Preset, Task, uniform
 
 CORNERS = 6
 SPREAD = 0.06
@@ -25,28 +25,16 @@ def task(preset: Preset = "fast") -> Task:
     places = solution.view(CORNERS, 2)
     orders = torch.stack([one.roll(k, 0) for one in (places, places.flip(0)) for k in range(CORNERS)]).flatten(1)
 
-    def image(x: Tensor) -> Tensor:
-        return hard_shapes.polygon(x.double())
-
-    reference = image(solution[None])[0]
-
-    def loss(x: Tensor) -> Tensor:
-        return (image(x) - reference).square().mean((1, 2))
-
-    return Task(
+    return fitting(
+        lambda x: polygon(x.double()),
+        solution,
+        lambda x: float((orders - x).square().mean(1).min()),
         name="hexagon",
         title="the corners of a hexagon with hard edges",
         parameters="x, y of six corners in units of the image side, 0 to 1; starts: half as large, elsewhere, +- .06",
-        needs=f"one channel, {hard_shapes.SIDE}x{hard_shapes.SIDE} pixels; the source has no such task",
-        n=2 * CORNERS,
-        loss=loss,
         start=uniform(first - SPREAD, first + SPREAD),
         sigma=0.1,
         bounds=(torch.zeros_like(solution), torch.ones_like(solution)),
-        evaluations=20_000,
-        truth=Truth(lambda x: float(loss(x[None])[0]), lambda x: float((orders - x).square().mean(1).min())),
-        output=least_squares(image, lambda out: (out - reference).flatten()),
-        picture=Picture(lambda x: image(x[None])[0], lambda: reference),
     )
 
 

@@ -57,6 +57,7 @@ COMMANDS = {
     "optimizers": Command(
         "experiments.studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True
     ),
+    "batches": Command("experiments.studies.batches:batches", "several points at once, in worker processes", long=True),
     "recovery": Command("experiments.studies.recovery:recovery", "sparse Jacobians from few samples", long=True),
     "full_setting": Command(
         "experiments.studies.full_setting:full_setting", "time that tasks save over the source's setting", long=True

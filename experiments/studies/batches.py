@@ -1,0 +1,167 @@
+"""`python -m experiments batches`: what it saves to evaluate several points at once.
+
+`zh.minimize(engine="gaussian_process")` searches from the same starts with batches of several sizes, in this process
+and in worker processes, until the loss is reduced by 99 %. A round is one batch. The ratios are to batches of one point
+in this process: rounds tell what as many workers as points would gain, seconds what the workers of this machine gain.
+Runs of one start take turns, so that whatever else the machine does falls on all of them alike.
+"""
+
+import statistics
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import astuple, dataclass
+from typing import Annotated, Literal
+
+import torch
+import tyro
+from torch import Tensor
+
+import torch_zerohess as zh
+from experiments.methods import METHODS
+from experiments.methods.settings import settings
+from experiments.problems import catalogue
+from experiments.problems.task import Task
+from experiments.reports import result_files
+from experiments.reports.progress import progress
+from experiments.reports.tables import table
+from experiments.studies.workers import images_of
+from torch_zerohess.evaluators import Factory, Inline, ProcessPool
+from torch_zerohess.evaluators.inline import Evaluator
+
+METHOD: Literal["gaussian_process"] = "gaussian_process"
+TASKS = ("mug", "shad", "bunny", "mirror", "box2", "brdf")
+_WARM = 8
+"""Points of a call that gives each worker some."""
+REDUCED = 0.99
+"""Share of the first loss that is to be taken away."""
+HEADERS = [
+    *("task", "batch", "workers", "runs", "reached", "rounds", "evaluations", "seconds"),
+    *("rounds / one by one", "seconds / one by one"),
+]
+
+
+@dataclass(frozen=True)
+class Search:
+    """One search until the target."""
+
+    reached: bool
+    rounds: int
+    evaluations: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """Medians over starts; the ratios are medians of the ratios of single starts."""
+
+    task: str
+    batch: int
+    workers: int
+    """Processes that evaluate; 0: this process."""
+    runs: int
+    reached: float
+    """Share of the starts that get there."""
+    rounds: float
+    evaluations: float
+    seconds: float
+    rounds_ratio: float
+    seconds_ratio: float
+
+
+def batches(
+    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK...]")] = TASKS,
+    /,
+    sizes: tuple[int, ...] = (1, 4, 16),
+    workers: int = 2,
+    runs: int = 6,
+    seed: int = 0,
+    evaluations: int = 400,
+    store: str | None = None,
+) -> list[Row]:
+    """Measure rounds, evaluations and seconds of searches by the size of their batches.
+
+    Args:
+        tasks: fitting tasks.
+        sizes: of a batch, in points, 1 first.
+        workers: processes that evaluate batches of more than one point, besides this process; 0: none.
+        runs: starts.
+        seed: number of the first start.
+        evaluations: of a search, at most.
+        store: name under which the table is kept.
+    """
+    if not sizes or sizes[0] != 1 or min(sizes) < 1 or runs < 1 or workers < 0:
+        raise SystemExit(f"sizes must begin with 1, and runs be at least 1, got {sizes}, {runs} and {workers} workers")
+    names = catalogue.chosen("tasks", tasks, list(catalogue.FITTING))
+    for name in names:
+        if reason := METHODS[METHOD].unusable(catalogue.fitting(name)):
+            raise SystemExit(f"tasks must be such that {METHOD} searches them by their images, got {name}: {reason}")
+    if store:
+        result_files.may_keep(store)
+    torch.set_num_threads(1)
+    ways = [(size, count) for size in sizes for count in ((0,) if size == 1 or not workers else (0, workers))]
+    rows = []
+    with ExitStack() as stack:
+        pool = stack.enter_context(ProcessPool(workers)) if workers else None
+        for name in progress(names, "tasks"):
+            task, fn = catalogue.fitting(name), Factory(images_of, name)
+            starts = [task.start(run) for run in range(seed, seed + runs)]
+            found = [
+                [_search(task, fn, start, batch, pool if count else Inline(), evaluations) for batch, count in ways]
+                for start in starts
+            ]
+            rows += _rows(name, ways, found)
+    print(table(HEADERS, [list(astuple(row)) for row in rows]))
+    if store:
+        print(result_files.keep(HEADERS, [list(astuple(row)) for row in rows], store))
+    return rows
+
+
+def _search(
+    task: Task, fn: Factory, start: Tensor, batch: int, evaluator: Evaluator | None, evaluations: int
+) -> Search:
+    assert evaluator is not None
+    loss = task.output.loss if task.output else None
+    # Before the clock starts, every process has loaded its scene.
+    first = evaluator(fn, start.expand(_WARM, -1))[0]
+    rounds = 0
+
+    def count(_: zh.Iterate) -> None:
+        nonlocal rounds
+        rounds += 1
+
+    began = time.perf_counter()
+    found = zh.minimize(
+        fn,
+        start,
+        **{"sigma": task.sigma} | settings(METHOD, task.name),
+        loss=loss,
+        bounds=task.bounds,
+        engine=METHOD,
+        target=(1.0 - REDUCED) * float(loss(first) if loss else first),
+        max_evaluations=evaluations,
+        batch=batch,
+        evaluator=evaluator,
+        callback=count,
+        seed=0,
+    )
+    return Search(found.status == "target", rounds, found.evaluations, time.perf_counter() - began)
+
+
+def _rows(name: str, ways: Sequence[tuple[int, int]], found: Sequence[Sequence[Search]]) -> list[Row]:
+    """Return a row for each way, from the searches of each start."""
+    rows = []
+    for (batch, workers), searches in zip(ways, zip(*found, strict=True), strict=True):
+        alone = [of_start[0] for of_start in found]
+        rows.append(
+            Row(
+                *(name, batch, workers, len(searches)),
+                statistics.mean(one.reached for one in searches),
+                statistics.median(one.rounds for one in searches),
+                statistics.median(one.evaluations for one in searches),
+                statistics.median(one.seconds for one in searches),
+                statistics.median(one.rounds / first.rounds for one, first in zip(searches, alone, strict=True)),
+                statistics.median(one.seconds / first.seconds for one, first in zip(searches, alone, strict=True)),
+            )
+        )
+    return rows

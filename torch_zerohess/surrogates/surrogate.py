@@ -1,7 +1,10 @@
 """The interface of a surrogate: a model of a black box, fitted to evaluations, that torch can differentiate."""
 
+import contextlib
+from contextlib import AbstractContextManager
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 
@@ -27,3 +30,8 @@ def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
     if outputs.ndim < 1 or len(outputs) != len(points):
         raise ValueError(f"outputs must be [{len(points)}, *out], one per point, got {list(outputs.shape)}")
     return points.detach(), outputs.detach()
+
+
+def outside_inference() -> AbstractContextManager[None]:
+    """Make tensors that serve calls with a graph, too: autograd refuses those that are made in inference mode."""
+    return torch.inference_mode(False) if torch.is_inference_mode_enabled() else contextlib.nullcontext()

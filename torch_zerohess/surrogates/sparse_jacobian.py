@@ -68,6 +68,14 @@ class SparseJacobian:
             standard_error=self.standard_error.to(like),
         )
 
+    def times(self, factors: Tensor | float) -> "SparseJacobian":
+        """Return the Jacobian with its columns multiplied by factors [n], or by one factor."""
+        if isinstance(factors, Tensor):
+            factors = factors[self.index]
+        elif factors == 1.0:
+            return self
+        return replace(self, values=self.values * factors, standard_error=self.standard_error * factors)
+
     @property
     def found(self) -> Tensor:
         """Which entries are used, [m, keep]."""

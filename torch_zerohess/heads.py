@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
@@ -29,11 +30,16 @@ class SquaredError:
     def __call__(self, outputs: Tensor, references: Tensor) -> Tensor:
         """Return the mean squared differences [K]."""
         self.check(outputs.shape[1:], references)
-        return (outputs - references).flatten(1).square().mean(1)
+        squares = (outputs - references).square()
+        return squares.flatten(1).mean(1) if squares.dim() > 1 else squares
 
     @staticmethod
     def check(out: Sequence[int], references: Tensor) -> None:
-        """Raise ValueError for references that are not [K, *out]."""
+        """Raise TypeError for references that are no real numbers, ValueError if they are not [K, *out]."""
+        if references.dtype == torch.bool or references.is_complex():
+            raise TypeError(
+                f"references must be real numbers, got {references.dtype}: convert, e.g. references.float()"
+            )
         if references.shape[1:] != tuple(out):
             raise ValueError(
                 f"references must be [K, *out] with out = {list(out)}, the shape of one output, "

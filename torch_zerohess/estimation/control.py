@@ -19,6 +19,9 @@ from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
 from torch_zerohess.surrogates.memory import Memory
 from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
 
+_WITH_COORDINATES = (AutomaticSurrogate, LowRankSurrogate)
+"""Exact types: a subclass may predict anything, and a surrogate of the caller's may have a `space` of its own."""
+
 
 @dataclass(frozen=True)
 class Control:
@@ -107,6 +110,10 @@ class Prediction:
     def __init__(self, control: Control, surrogate: Any, aux: Sequence[Tensor], encoded: Sequence[Tensor] = ()) -> None:
         self._surrogate, self._aux, self._head = surrogate, aux, control.outer.head
         self._scalar = control.memory.scalar
+        if type(self._head) is SquaredError and len(aux) != 1:
+            raise TypeError(
+                f"aux must be the references alone, one tensor, for head SquaredError, got {len(aux)} tensors"
+            )
         self.encoded = list(encoded)
         """Coordinates [B, r] of the references and the mean square [B] outside of them, where they have coordinates."""
         space = coordinates_of(surrogate, control.outer)
@@ -130,9 +137,8 @@ class Prediction:
 
         It is for affine g and squared errors: the variance of an element of g(z + sigma u), as a mean over elements.
         """
-        # Exact types: a subclass, or a surrogate of the caller's with a model in it, may be anything.
-        through = type(self._surrogate) in (AutomaticSurrogate, LowRankSurrogate)
-        model = self._surrogate.model if through else self._surrogate
+        # A surrogate of the caller's with a model in it may be anything.
+        model = self._surrogate.model if type(self._surrogate) in _WITH_COORDINATES else self._surrogate
         if type(self._head) is not SquaredError or type(model) not in (LinearSurrogate, SparseSurrogate):
             return None
         whole = model.variance(sigma)
@@ -141,7 +147,9 @@ class Prediction:
 
 def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:
     """Return the coordinates in which a surrogate tells squared errors, if it has any and the head is one."""
-    return getattr(surrogate, "space", None) if type(outer.head) is SquaredError else None
+    known = type(surrogate) in _WITH_COORDINATES and type(outer.head) is SquaredError
+    space: LowRank | None = surrogate.space if known else None
+    return space
 
 
 def _listed(shape: Sequence[int]) -> str:

@@ -89,9 +89,9 @@ def sparse_jacobian(
     u, changes, weights, shape, evaluations = _sampled(call, work, smoothing)
     check_samples(len(u), keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)
-    earlier = None if previous is None else _scaled(_checked(previous, len(x), shape).to(work), sigma)
+    earlier = None if previous is None else _checked(previous, len(x), shape).to(work).times(sigma)
     found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
-    return replace(_scaled(found, 1.0 / sigma), evaluations=evaluations)
+    return replace(found.times(1.0 / sigma), evaluations=evaluations)
 
 
 def _sampled(call: BlackBoxCall, x: Tensor, smoothing: Smoothing) -> tuple[Tensor, Tensor, Tensor, torch.Size, int]:
@@ -129,9 +129,3 @@ def _checked(previous: SparseJacobian, n: int, shape: torch.Size) -> SparseJacob
             f"{list(previous.shape)} of {previous.n} parameters"
         )
     return previous
-
-
-def _scaled(jacobian: SparseJacobian, factors: Tensor) -> SparseJacobian:
-    """Multiply the columns by factors [n]."""
-    own = factors[jacobian.index]
-    return replace(jacobian, values=jacobian.values * own, standard_error=jacobian.standard_error * own)

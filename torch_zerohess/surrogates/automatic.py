@@ -59,7 +59,7 @@ class AutomaticSurrogate:
             errors = []
             for model in models:
                 model.fit(points[rest], known[rest])
-                errors.append(float((model(points[held]) - known[held]).square().sum()))
+                errors.append(float((model(points[held]) - known[held]).double().square().sum()))
             models = [models[errors.index(min(errors))]]
         models[0].fit(points, known)
         self.space, self.model = space, models[0]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.surrogate import Surrogate, checked
+from torch_zerohess.surrogates.surrogate import Surrogate, checked, scaled
 
 _FLAT = 1e-7
 """Variance along a direction, relative to the largest one, below which the direction is left out."""
@@ -38,7 +38,7 @@ class LowRank:
         flat = outputs.reshape(len(outputs), -1)
         mean = flat.mean(0)
         chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(0), device="cpu")[:rank]
-        span = flat[chosen.to(flat.device)] - mean
+        span = scaled(flat[chosen.to(flat.device)] - mean)[0]
         values, vectors = torch.linalg.eigh((span @ span.mT).double())
         kept = values > max(_FLAT * float(values[-1]), math.ulp(0.0))
         if not bool(kept.any()):  # all outputs are equal: any direction will do

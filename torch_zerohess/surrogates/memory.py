@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
-from torch_zerohess.surrogates.surrogate import Surrogate
+from torch_zerohess.surrogates.surrogate import Surrogate, outside_inference
 
 _GROWTH = 1.3
 """The surrogate is fitted again when there are this times as many evaluations as at the last fit."""
@@ -111,13 +111,13 @@ class Memory:
     @property
     def points(self) -> Tensor:
         """Points of the evaluations that are kept, [P, n]."""
-        self._points = [torch.cat(self._points)] if len(self._points) > 1 else self._points
+        self._points = _joined(self._points)
         return self._points[0] if self._points else torch.empty(0, 0, device="cpu")
 
     @property
     def outputs(self) -> Tensor:
         """Outputs there, [P, *out]."""
-        self._outputs = [torch.cat(self._outputs)] if len(self._outputs) > 1 else self._outputs
+        self._outputs = _joined(self._outputs)
         return self._outputs[0] if self._outputs else torch.empty(0, device="cpu")
 
     @property
@@ -152,8 +152,9 @@ class Memory:
         self.evaluations += len(points)
         if not bool(finite.any()):
             return
-        self._points.append(points.detach()[finite])
-        self._outputs.append(outputs.detach()[finite])
+        with outside_inference():
+            self._points.append(points.detach()[finite])
+            self._outputs.append(outputs.detach()[finite])
         self._size += len(self._points[-1])
         if self._size > _EXCESS * self.capacity:
             self._thin()
@@ -171,7 +172,8 @@ class Memory:
 
     def _fit_rows(self) -> None:
         if hasattr(self.surrogate, "fit"):
-            self.surrogate.fit(self.points[: self._rows], self.outputs[: self._rows])
+            with outside_inference():
+                self.surrogate.fit(self.points[: self._rows], self.outputs[: self._rows])
 
     def refresh(self) -> None:
         """Fit the surrogate if that is due: `evaluations` has grown by 30 % since the last fit."""
@@ -235,7 +237,8 @@ class Memory:
         scaled = points / points.std(0).clamp_min(torch.finfo(points.dtype).tiny)
         nearest = torch.cat([_to_later(scaled, row) for row in range(0, len(scaled), _BLOCK)])
         kept = first + nearest.argsort()[len(points) - self.capacity :].sort().values
-        self._points, self._outputs = [self.points[kept]], [self.outputs[kept]]
+        with outside_inference():
+            self._points, self._outputs = [self.points[kept]], [self.outputs[kept]]
         self._size, self._rows = len(kept), int((kept < self._rows).sum())
 
     def state_dict(self) -> dict[str, Any]:
@@ -290,6 +293,11 @@ def _shares(one: Tensor, other: Tensor) -> list[float]:
     product, square, first = (float(each.sum()) for each in (one * other, other.square(), one.square()))
     whole = first + square
     return [product / whole, square / whole] if whole > 0.0 else [0.0, 0.0]
+
+
+def _joined(parts: list[Tensor]) -> list[Tensor]:
+    with outside_inference():
+        return [torch.cat(parts)] if len(parts) > 1 else parts
 
 
 def _to_later(points: Tensor, first: int) -> Tensor:

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, spaced, thresholds
+from torch_zerohess.surrogates.surrogate import scaled
 
 FEWEST_SAMPLES = 8
 """That a fit needs."""
@@ -88,11 +89,12 @@ def fit_sparse(
     samples. The result has the type and device of u.
     """
     grids = Grids.of(shape, settings.grid)
-    before = SparseJacobian.empty(u.shape[1], shape, settings.keep, u) if previous is None else previous
+    changes, size = scaled(changes)
+    before = SparseJacobian.empty(u.shape[1], shape, settings.keep, u) if previous is None else previous.times(1 / size)
     ridges, explained, dense = _validated(u, changes, weights, grids, settings, before, previous is None)
     u, d = _centered(u, changes, weights)
     found = _fitted(u, d, grids, settings, before, ridges)
-    return replace(found, explained=explained, explained_dense=dense)
+    return replace(found, explained=explained, explained_dense=dense).times(size)
 
 
 def _validated(

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.surrogates.sparse_product import SparseRows, product
+from torch_zerohess.surrogates.surrogate import outside_inference
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +46,11 @@ class SparseJacobian:
 
     def __post_init__(self) -> None:
         # Not when they are first needed: what is computed inside of a transform of torch.func cannot be used after it.
-        found = self.found
-        row, column, values = found.nonzero()[:, 0], self.index[found], self.values[found]
-        by_rows = SparseRows.of(row, column, values, len(found))
-        object.__setattr__(self, "_entries", (by_rows, SparseRows.of(column, row, values, self.n)))
+        with outside_inference():
+            found = self.found
+            row, column, values = found.nonzero()[:, 0], self.index[found], self.values[found]
+            by_rows = SparseRows.of(row, column, values, len(found))
+            object.__setattr__(self, "_entries", (by_rows, SparseRows.of(column, row, values, self.n)))
 
     @classmethod
     def empty(cls, n: int, shape: Sequence[int], keep: int, like: Tensor) -> "SparseJacobian":
@@ -65,6 +67,14 @@ class SparseJacobian:
             values=self.values.to(like),
             standard_error=self.standard_error.to(like),
         )
+
+    def times(self, factors: Tensor | float) -> "SparseJacobian":
+        """Return the Jacobian with its columns multiplied by factors [n], or by one factor."""
+        if isinstance(factors, Tensor):
+            factors = factors[self.index]
+        elif factors == 1.0:
+            return self
+        return replace(self, values=self.values * factors, standard_error=self.standard_error * factors)
 
     @property
     def found(self) -> Tensor:

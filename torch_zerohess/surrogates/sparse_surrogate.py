@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.surrogate import checked
+from torch_zerohess.surrogates.surrogate import checked, scaled
 
 
 class SparseSurrogate:
@@ -47,14 +47,18 @@ class SparseSurrogate:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
         points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
         shape, (P, n) = outputs.shape[1:], points.shape
-        z, y = points.float(), outputs.reshape(len(outputs), -1).float()
+        # Differences to the means have the digits that float32 would round away where the means are large.
+        z, y = (one if one.dtype == torch.float64 else one.float() for one in (points, outputs.reshape(P, -1)))
         self._middle, self._mean = z.mean(0), y.mean(0)
+        z, y = z - self._middle, y - self._mean
+        (z, length), (y, size) = scaled(z), scaled(y)
+        z, y = z.float(), y.float()
         keep = min(self.keep, n, P - 2)
         if P < FEWEST_SAMPLES:
             self.jacobian = SparseJacobian.empty(n, shape, 1, z)
         else:
             settings = SparseSettings.checked(n, keep=keep, rate=self.rate, grid=self.grid)
-            self.jacobian = fit_sparse(z - self._middle, y - self._mean, shape, settings)
+            self.jacobian = fit_sparse(z, y, shape, settings).times(size / length)
         self._squares = self.jacobian.squared_lengths
 
     def __call__(self, z: Tensor) -> Tensor:

@@ -1,8 +1,15 @@
 """The interface of a surrogate: a model of a black box, fitted to evaluations, that torch can differentiate."""
 
+import contextlib
+import math
+from contextlib import AbstractContextManager
 from typing import Protocol
 
+import torch
 from torch import Tensor
+
+_MIDDLING = 2.0**30
+"""Numbers up to this, and down to its inverse, have squares that float32 can add up."""
 
 
 class Surrogate(Protocol):
@@ -27,3 +34,20 @@ def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
     if outputs.ndim < 1 or len(outputs) != len(points):
         raise ValueError(f"outputs must be [{len(points)}, *out], one per point, got {list(outputs.shape)}")
     return points.detach(), outputs.detach()
+
+
+def outside_inference() -> AbstractContextManager[None]:
+    """Make tensors that serve calls with a graph, too: autograd refuses those that are made in inference mode."""
+    return torch.inference_mode(False) if torch.is_inference_mode_enabled() else contextlib.nullcontext()
+
+
+def scaled(numbers: Tensor) -> tuple[Tensor, float]:
+    """Return numbers whose sums of squares neither vanish nor overflow, and the power of two that they were divided by.
+
+    The power is 1 where it can be. The digits stay the same.
+    """
+    largest = max(abs(float(one)) for one in numbers.aminmax()) if numbers.numel() else 0.0
+    if largest == 0.0 or not math.isfinite(largest) or 1.0 / _MIDDLING <= largest <= _MIDDLING:
+        return numbers, 1.0
+    size = 2.0 ** math.frexp(largest)[1]
+    return numbers.double().div_(size).to(numbers.dtype), size

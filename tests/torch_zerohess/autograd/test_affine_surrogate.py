@@ -140,3 +140,69 @@ def test_a_head_or_a_surrogate_of_the_callers_is_taken_as_it_is():
     expected = (fourth - 2.0 * references * mean + references.square()).mean((1, 2))
     found = layer(zh.heads.SquaredError(), Squares())(x, references)
     torch.testing.assert_close(found, expected, rtol=2e-2, atol=0.0)
+
+
+class Doubled(LowRankSurrogate):
+    """A subclass that does not predict what its coordinates say."""
+
+    def __call__(self, z: Tensor) -> Tensor:
+        return 2.0 * super().__call__(z)
+
+
+def test_coordinates_of_a_subclass_are_not_used():
+    points, x, references = normal(200, n, seed=0), normal(B, n, seed=1), normal(B, *SHAPE, seed=2)
+    memory = zh.Memory(Doubled(LinearSurrogate(), rank=64), fresh=0)
+    memory.add(points, image(points))
+    memory.fit()
+    layer = zh.BlackBox(image, zh.Smoothing(sigma=0.01, samples=1), head=zh.heads.SquaredError(), memory=memory)
+    expected = (2.0 * image(x) - references).square().mean((1, 2))
+    torch.testing.assert_close(layer(x.requires_grad_(), references), expected, rtol=1e-3, atol=0.0)
+
+
+class Module(torch.nn.Module):
+    """A surrogate of the caller's with an attribute of the same name as ours."""
+
+    space = "the unit box"
+
+    def forward(self, z: Tensor) -> Tensor:
+        return image(z)
+
+
+def test_a_module_may_have_a_space_of_its_own():
+    layer = zh.BlackBox(
+        image, zh.Smoothing(sigma=0.01, samples=1), head=zh.heads.SquaredError(), memory=zh.Memory(Module(), fresh=0)
+    )
+    x, references = normal(B, n, seed=1), normal(B, *SHAPE, seed=2)
+    expected = (image(x) - references).square().mean((1, 2))
+    torch.testing.assert_close(layer(x.requires_grad_(), references), expected, rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("model", [None, LinearSurrogate])
+def test_one_number_per_point_has_a_squared_error(model):
+    """E (a u + b)^2 of an affine function, with a memory and without one: its square and its variance."""
+    slope, points = normal(n, seed=4), normal(200, n, seed=0)
+    memory = None if model is None else zh.Memory(model(), fresh=0)
+    if memory is not None:
+        memory.add(points, points @ slope)
+        memory.fit()
+    smoothing = zh.Smoothing(sigma=0.3, samples=1 if memory else 4000, seed=0, proposal="gaussian")
+    head = zh.heads.SquaredError()
+    layer = zh.BlackBox(lambda z: z @ slope, smoothing, head=head, memory=memory, value="smoothed")
+    x, references = normal(B, n, seed=1), normal(B, seed=2)
+    expected = (x @ slope - references).square() + 0.09 * slope.square().sum()
+    torch.testing.assert_close(layer(x, references), expected, rtol=1e-6 if memory else 0.05, atol=0.0)
+
+
+@pytest.mark.parametrize("of", SURROGATES)
+def test_wrong_references_are_named(of):
+    memory, points = zh.Memory(SURROGATES[of](), fresh=0), normal(200, n, seed=0)
+    memory.add(points, image(points))
+    memory.fit()
+    layer = zh.BlackBox(image, zh.Smoothing(sigma=0.3, samples=1), head=zh.heads.SquaredError(), memory=memory)
+    x, references = normal(B, n, seed=1).requires_grad_(), normal(B, *SHAPE, seed=2)
+    for aux in ((), (references, references)):
+        with pytest.raises(TypeError, match=f"aux must be the references alone, one tensor, .* got {len(aux)} tensors"):
+            layer(x, *aux)
+    for wrong in (references > 0.0, references.to(torch.complex128)):
+        with pytest.raises(TypeError, match=f"references must be real numbers, got {wrong.dtype}"):
+            layer(x, wrong)

@@ -25,6 +25,13 @@ def test_outputs_in_the_span_are_their_coordinates():
     torch.testing.assert_close(found, expected)
 
 
+@pytest.mark.parametrize("size", [1e-30, 1e25])
+def test_outputs_of_any_size(size):
+    outputs, others = of_rank(5).float(), of_rank(5, 7, seed=1).float()
+    space = LowRank.of(outputs * size, 12)
+    torch.testing.assert_close(space.decode(space.encode(others * size)) / size, others, rtol=1e-3, atol=1e-3)
+
+
 def test_the_span_is_that_of_rank_outputs_and_the_projection_orthogonal():
     outputs = normal(30, 40)
     space = LowRank.of(outputs, 6)

@@ -163,6 +163,24 @@ def test_lists_are_no_tensors() -> None:
         Memory().add([[1.0, 2.0]], [1.0])  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("capacity", [20, 60])
+def test_what_is_kept_and_fitted_in_inference_mode_serves_calls_with_a_graph(capacity) -> None:
+    """A Jacobian of least squares is exact for an affine map; autograd refuses tensors made in inference mode."""
+    memory, slope = Memory(capacity=capacity), normal(3, 2, seed=2)
+    with torch.inference_mode():
+        for seed in range(2):
+            z = normal(15, 3, seed=seed)
+            memory.add(z, z @ slope)
+        memory.fit()
+        assert len(memory.points) == len(memory)
+    x = normal(4, 3, seed=3).requires_grad_()
+    (gradient,) = torch.autograd.grad(memory.surrogate(x).sum(), x)
+    torch.testing.assert_close(gradient, slope.sum(1).expand(4, 3), rtol=1e-3, atol=1e-3)
+    memory.fit()
+    assert not memory.points.is_inference()
+    assert not memory.outputs.is_inference()
+
+
 def test_a_fit_of_nothing_raises() -> None:
     with pytest.raises(ValueError, match="at least 2 evaluations, the memory has 0"):
         Memory().fit()

@@ -72,6 +72,14 @@ def test_products_have_derivatives_of_every_order_in_every_mode():
     assert torch.autograd.gradgradcheck(cubes, v.requires_grad_())
 
 
+def test_a_jacobian_made_in_inference_mode_has_products_with_a_graph():
+    with torch.inference_mode():
+        J, dense = random_jacobian()
+    v = normal(7, seed=1).requires_grad_()
+    (gradient,) = torch.autograd.grad(J.matvec(v).sum(), v)
+    torch.testing.assert_close(gradient, dense.clone().sum(0))
+
+
 def test_the_largest_entries_of_rows():
     row, column = torch.tensor([0, 0, 0, 2, 0]), torch.tensor([4, 1, 3, 2, 1])
     index, used = largest(row, column, torch.tensor([1.0, 0.6, 2.0, 5.0, 0.6]), 3, 2)

@@ -61,6 +61,28 @@ def test_its_derivative_is_the_map(fitted):
     assert float((jacobian.flatten(0, 1) - A).norm() / A.norm()) < 0.03
 
 
+@pytest.mark.parametrize(
+    ("middle", "length", "offset", "size", "dtype"),
+    [
+        (0.0, 1.0, 0.0, 1e-30, torch.float32),
+        (0.0, 1.0, 0.0, 1e25, torch.float32),
+        (0.0, 1e-25, 0.0, 1.0, torch.float32),
+        (0.0, 1e25, 0.0, 1e10, torch.float32),
+        (0.0, 1e-60, 0.0, 1e-50, torch.float64),
+        (1e6, 1e-3, 0.0, 1.0, torch.float64),
+        (0.0, 1.0, 1e8, 1.0, torch.float64),
+    ],
+)
+@pytest.mark.parametrize("kind", [SparseSurrogate, AutomaticSurrogate])
+def test_points_and_outputs_in_any_units(kind, middle, length, offset, size, dtype):
+    """The same map with other units and origins is known as well as `test_it_predicts_from_fewer_points` wants it."""
+    z, other = normal(P, n), normal(40, n, seed=5)
+    surrogate = kind()
+    surrogate.fit(z.to(dtype) * length + middle, image(z).to(dtype) * size + offset)
+    found = (surrogate(other.to(dtype) * length + middle) - offset) / size
+    assert float((found - image(other)).square().mean() / image(other).var()) < 1e-3
+
+
 def test_a_memory_takes_it_where_it_predicts_better():
     memory = zh.Memory()
     memory.add(normal(P, n), image(normal(P, n)))

@@ -42,6 +42,7 @@ OWN = {
     **dict.fromkeys(("quad", "box10", "brdf", "texture"), "descent"),
     **dict.fromkeys(("meshfit", "meshfit_color", "suzanne", "banana"), "handles_newton"),
     "caustic": "block_gauss_newton",
+    **dict.fromkeys(("texture100", "caustic64"), "local"),
 }
 """Tasks for which another method is recommended."""
 OTHER = "cma_es_bounded"

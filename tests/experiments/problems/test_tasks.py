@@ -13,15 +13,16 @@ from experiments.problems.task import Task
 from experiments.problems.tasks import brdf, nonpsd
 from experiments.studies.nonpsd import READINGS, nonpsd_error
 
-NAMES = ("quad", "box2", "box10", "texture", "brdf", "nonpsd")
+NAMES = ("quad", "box2", "box10", "texture", "texture100", "brdf", "nonpsd")
 TASKS = {name: catalogue.load(name) for name in NAMES}
-IMAGES = ("box2", "box10", "texture", "brdf")
+IMAGES = ("box2", "box10", "texture", "texture100", "brdf")
 TEXTURE = data.camera().reshape(32, 16, 32, 16).mean((1, 3)).ravel() / 255
 SOLUTIONS = {
     "quad": [0.0, 0.0],
     "box2": [0.3, 0.3],
     "box10": [0.21, 0.21, 0.5, 0.5, 0.79, 0.79, 0.21, 0.79, 0.79, 0.21],
     "texture": TEXTURE,
+    "texture100": data.camera()[6:506, 6:506].reshape(100, 5, 100, 5).mean((1, 3)).ravel() / 255,
     "brdf": [0.6, 0.25, 0.15, 0.5, 0.5, 0.4, 0.7],
     "nonpsd": [0.0, 0.0],
 }
@@ -33,6 +34,7 @@ STARTS = {
         [0.435, 0.435, 0.525, 0.525, 0.615, 0.615, 0.435, 0.615, 0.615, 0.435],
     ),
     "texture": ([0] * 1024, [1] * 1024),
+    "texture100": ([0] * 10_000, [1] * 10_000),
     "brdf": ([0] * 7, [0.5] * 6 + [0.3]),
     "nonpsd": ([-3] * 2, [3] * 2),
 }

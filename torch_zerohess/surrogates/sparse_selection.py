@@ -15,12 +15,17 @@ and over 3x3 parameters if these lie on a grid, is a second statistic, with a de
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 _BLOCK = 1 << 20
-"""Correlations held at a time."""
+"""Correlations of whole rows of the image held at a time, about."""
+_TILE, _SIDE, _ROWS = 1 << 18, 512, 8
+"""Correlations of a tile, about, which fit a cache; elements along it, about; rows of a grid along it, at least."""
+_FEWEST_ROWS = 4
+"""Of the image, from which the mean over neighbours is much like the mean inside of a large block."""
 _COUNTED = 1 << 20
 """Correlations from which thresholds are taken, at most about."""
 _LEAST_OWN, _LEAST_JOINT = 4.0, 1.25
@@ -53,9 +58,15 @@ class Grids:
         """Elements of a row of the image."""
         return self.pixels[1] * self.pixels[2]
 
+    @property
+    def beside(self) -> int:
+        """Parameters of a row of their grid."""
+        return 1 if self.parameters is None else self.parameters[1] * self.parameters[2]
+
     def mean(self, squares: Tensor) -> Tensor:
-        """Return the mean over neighbours of whole rows of the image, [b, n]."""
-        whole = squares.view(-1, *self.pixels[1:], *(self.parameters or (1, squares.shape[1], 1)))
+        """Return the mean over neighbours, for whole rows of the image and of the grid of parameters, [b, c]."""
+        grid = (1, squares.shape[1], 1) if self.parameters is None else (-1, *self.parameters[1:])
+        whole = squares.view(len(squares) // self.row, *self.pixels[1:], *grid)
         if self.pixels[1] > 1:
             whole = _of_three(_of_three(whole, 0), 1)
         if self.parameters is not None:
@@ -106,29 +117,36 @@ def spaced(energy: Tensor, count: int) -> list[int]:
 
 
 def candidates(u: Tensor, rest: Tensor, grids: Grids, least: Thresholds) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield element, parameter and size of the pairs that count, block by block in the order of the elements.
+    """Yield element, parameter and size of the pairs that count, tile by tile.
 
     The size is the slope that the correlation stands for, |sum u d| / sum u^2.
     """
-    n, row = u.shape[1], grids.row
+    n, row, beside = u.shape[1], grids.row, grids.beside
     directions, lengths = _normalized(u), u.norm(dim=0)
-    for first, last in _blocks(grids, n):
-        low = max(0, first - 1) if grids.joint else first
-        high = min(grids.pixels[0], last + 1) if grids.joint else last
-        part = rest[:, low * row : high * row]
-        squares = (_normalized(part).mT @ directions).square_()
-        inner = slice((first - low) * row, (last - low) * row)
-        counts = squares[inner] >= least.own
-        strength = squares[inner]
-        if grids.joint and least.joint <= 1.0:
-            mean = grids.mean(squares)[inner]
-            near = mean >= least.joint
-            strength = torch.where(counts, strength, torch.zeros_like(strength))
-            strength = torch.maximum(strength, torch.where(near, mean, torch.zeros_like(mean)))
-            counts = counts | near
-        element, parameter = counts.nonzero(as_tuple=True)
-        size = strength[element, parameter].sqrt() * part.norm(dim=0)[inner][element]
-        yield element + first * row, parameter, size / lengths[parameter].clamp_min(torch.finfo(u.dtype).tiny)
+    rows = max(_ROWS, _SIDE // row)
+    for pixels in _parts(grids.pixels[0], rows, int(grids.joint)):
+        part = rest[:, pixels.low * row : pixels.high * row]
+        changes, norms = _normalized(part).mT, part.norm(dim=0)
+        columns = max(_ROWS if grids.parameters else 1, _TILE // (min(rows, grids.pixels[0]) * row * beside))
+        for parameters in _parts(n // beside, columns, int(grids.parameters is not None)):
+            squares = (changes @ directions[:, parameters.low * beside : parameters.high * beside]).square_()
+            inner = pixels.inner(row), parameters.inner(beside)
+            strength = squares[inner]
+            counts = strength >= least.own
+            mean = None
+            if grids.joint and least.joint <= 1.0:
+                mean = grids.mean(squares)[inner]
+                counts |= mean >= least.joint
+            element, parameter = counts.nonzero(as_tuple=True)
+            found = strength[element, parameter]
+            if mean is not None:
+                near = mean[element, parameter]
+                found = torch.where(found >= least.own, found, 0.0)
+                found = torch.maximum(found, torch.where(near >= least.joint, near, 0.0))
+            element, parameter = element + inner[0].start, parameter + parameters.first * beside
+            size = found.sqrt() * norms[element]
+            size = size / lengths[parameter].clamp_min(torch.finfo(u.dtype).tiny)
+            yield element + pixels.low * row, parameter, size
 
 
 def largest(row: Tensor, column: Tensor, size: Tensor, m: int, keep: int) -> tuple[Tensor, Tensor]:
@@ -154,11 +172,30 @@ def largest(row: Tensor, column: Tensor, size: Tensor, m: int, keep: int) -> tup
 
 
 def _blocks(grids: Grids, n: int) -> Iterator[tuple[int, int]]:
-    """First and last row of the image, exclusive, of blocks that fit the memory."""
+    """First and last row of the image, exclusive, of blocks of whole rows."""
     rows = grids.pixels[0]
-    size = max(1, _BLOCK // (n * grids.row))
+    size = max(_FEWEST_ROWS if grids.pixels[1] > 1 else 1, _BLOCK // (n * grids.row))
     for first in range(0, rows, size):
         yield first, min(rows, first + size)
+
+
+class _Part(NamedTuple):
+    """Rows first <= r < last of a grid, and those from low to high with their neighbours."""
+
+    first: int
+    last: int
+    low: int
+    high: int
+
+    def inner(self, row: int) -> slice:
+        """The part without the neighbours, in rows of so many elements."""
+        return slice((self.first - self.low) * row, (self.last - self.low) * row)
+
+
+def _parts(rows: int, size: int, neighbours: int) -> Iterator[_Part]:
+    for first in range(0, rows, size):
+        last = min(rows, first + size)
+        yield _Part(first, last, max(0, first - neighbours), min(rows, last + neighbours))
 
 
 def _normalized(columns: Tensor) -> Tensor:

@@ -20,8 +20,9 @@ QUAD, BOX2, BOX10, BRDF, NONPSD and TEXTURE, on BRDF again after a look at the r
 LOCAL: dict[str, dict[str, Any]] = {
     # By hand on run 1000: 16 or 24 entries per pixel end higher; neighbours of the 32x32 coefficients share evidence.
     "caustic": {"local": {"grid": (32, 32), "keep": 40, "samples": 64}},
+    "caustic64": {"local": {"grid": (64, 64), "keep": 40, "samples": 64}},
 }
-"""Prior knowledge of CAUSTIC: that its coefficients lie on a grid."""
+"""Prior knowledge of CAUSTIC and CAUSTIC64: that their coefficients lie on a grid."""
 
 NETWORKS: dict[str, dict[str, Any]] = {
     # By hand on runs 100 to 102 with 1 000 simulations, beside the default radius.

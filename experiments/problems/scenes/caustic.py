@@ -1,9 +1,9 @@
 """A glass slab whose wavy side focuses light on a screen, and the picture it throws there: a photon splat.
 
 Lengths are in units of the side of the slab. Collimated light enters the flat side at a right angle, so that it is not
-bent there, crosses the glass and leaves through the surface z = h(x, y), 0 <= x, y <= 1, a uniform cubic B-spline with
-32x32 coefficients (29x29 patches). It is refracted exactly (Snell, as vectors) and lands on a screen as large as the
-slab, parallel to it at z = `distance`; what misses the screen is lost. Reflections are left out.
+bent there, crosses the glass and leaves through the surface z = h(x, y), 0 <= x, y <= 1, a uniform cubic B-spline. By
+default the spline has 32x32 coefficients (29x29 patches). Light is refracted exactly (Snell, as vectors) and lands on a
+screen as large as the slab, parallel to it at z = `distance`; what misses the screen is lost. Reflections are left out.
 
 Photons leave from the centres of a fixed grid of equal cells, one each: stratified, and the same for every slab. On the
 regular grid the spline is separable, so that heights and slopes of a slab are three small matrix products.
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 COEFFICIENTS = 32
-"""Of the spline, along each side."""
+"""Of the spline, along each side, if not told otherwise."""
 INDEX = 1.5
 """Refractive index of the glass, in air."""
 FAR = 1e6
@@ -36,17 +36,25 @@ class Caustic:
         photons: along the side of the slab; its square is their number.
         distance: of the screen from z = 0, in units of the side of the slab.
         unit: height of a coefficient of 1, in units of the side of the slab.
+        coefficients: of the spline, along each side.
 
     """
 
-    def __init__(self, side: int = 64, photons: int = 128, distance: float = 2.0, unit: float = 1.0) -> None:
+    def __init__(
+        self,
+        side: int = 64,
+        photons: int = 128,
+        distance: float = 2.0,
+        unit: float = 1.0,
+        coefficients: int = COEFFICIENTS,
+    ) -> None:
         for name, value in (("side", side), ("photons", photons), ("distance", distance), ("unit", unit)):
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
         self.side, self.photons, self.distance, self.unit = side, photons, distance, unit
         self._places = (torch.arange(photons, dtype=torch.float64) + 0.5) / photons
-        self._basis = basis(self._places).float()
-        self._slope = basis(self._places, derivative=1).float()
+        self._basis = basis(self._places, coefficients=coefficients).float()
+        self._slope = basis(self._places, 1, coefficients).float()
 
     @cached_property
     def _start(self) -> tuple[Tensor, Tensor]:
@@ -55,14 +63,14 @@ class Caustic:
         return places, places[:, None]
 
     def image(self, coefficients: Tensor) -> Tensor:
-        """Return the irradiance [K, side, side] (row is y), float64, of coefficients [K, 1024] (y major)."""
+        """Return the irradiance [K, side, side] (row is y), float64, of coefficients [K, n] (y major)."""
         return torch.stack([self._splat(*self.landing(one)) for one in coefficients])
 
     def landing(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Return x and y of all photons on the screen, each [photons, photons] float32, in pixels from the centre of
-        the first one; far beside it for a photon that is totally reflected. Coefficients are [1024].
+        the first one; far beside it for a photon that is totally reflected. Coefficients are [n].
         """
-        c = (self.unit * coefficients).float().view(COEFFICIENTS, COEFFICIENTS)
+        c = (self.unit * coefficients).float().view(self._basis.shape[1], -1)
         across = c @ self._basis.mT
         dx, dy = self._basis @ (c @ self._slope.mT), self._slope @ across
         scale = refraction(dx * dx + dy * dy).mul_(self.side * (self.distance - self._basis @ across))
@@ -106,10 +114,10 @@ def refraction(square: Tensor) -> Tensor:
     return torch.where(bent < 0, FAR, k / (INDEX - k))
 
 
-def basis(places: Tensor, derivative: int = 0) -> Tensor:
-    """Return the 32 B-splines, or their derivative by x, at places [m] between 0 and 1: [m, 32]."""
-    patches = COEFFICIENTS - 3
-    t = patches * places[:, None] - torch.arange(-1, COEFFICIENTS - 1, dtype=places.dtype)
+def basis(places: Tensor, derivative: int = 0, coefficients: int = COEFFICIENTS) -> Tensor:
+    """Return the B-splines, or their derivative by x, at places [m] between 0 and 1: [m, coefficients]."""
+    patches = coefficients - 3
+    t = patches * places[:, None] - torch.arange(-1, coefficients - 1, dtype=places.dtype)
     a = t.abs()
     if derivative == 0:
         return torch.where(a < 1, 2 / 3 - a**2 + a**3 / 2, (2 - a).clamp_min(0) ** 3 / 6)

@@ -41,8 +41,13 @@ SIZES = {"fast": (64, 128), "paper": (128, 512)}
 
 
 def task(preset: Preset = "fast") -> Task:
-    side, photons = SIZES[preset]
-    caustic, n = Caustic(side, photons, DISTANCE, UNIT), COEFFICIENTS**2
+    return slab("caustic", preset, COEFFICIENTS, SIZES, UNIT)
+
+
+def slab(name: str, preset: Preset, coefficients: int, sizes: dict[str, tuple[int, int]], unit: float) -> Task:
+    """Return the task of a slab with coefficients along each side, a coefficient of 1 being `unit` high."""
+    side, photons = sizes[preset]
+    caustic, n = Caustic(side, photons, DISTANCE, unit, coefficients), coefficients**2
     target = text(side)
     brightest = float(target.max())
 
@@ -56,9 +61,9 @@ def task(preset: Preset = "fast") -> Task:
         return (caustic.image(x) - target).square().mean((1, 2))
 
     return Task(
-        name="caustic",
+        name=name,
         title="the surface of a glass slab that focuses light into a text",
-        parameters="1024 B-spline coefficients in thousandths of the slab's side, -50 to 50; starts N(0, 0.3^2)",
+        parameters=f"{n} B-spline coefficients in units of {unit:g} sides of the slab, -50 to 50; starts N(0, 0.3^2)",
         needs=f"{side}x{side} pixels, {photons**2} photons, one colour, one refraction, no reflections",
         n=n,
         loss=loss,
@@ -69,7 +74,7 @@ def task(preset: Preset = "fast") -> Task:
         bounds=(torch.full((n,), -LARGEST).double(), torch.full((n,), LARGEST).double()),
         output=least_squares(caustic.image, residuals),
         picture=Picture(lambda x: (caustic.image(x[None])[0] / brightest).clamp(0, 1), lambda: target / brightest),
-        renderer=Renderer(full=lambda: task("paper")),
+        renderer=Renderer(full=lambda: slab(name, "paper", coefficients, sizes, unit)),
     )
 
 

@@ -16,12 +16,21 @@ from torch import Tensor
 from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
 
 SIDE = 32
+BLOCK = 16
+"""Pixels of the photograph along the side of a pixel of the texture."""
 
 
 def task(preset: Preset = "fast") -> Task:
+    return texture("texture", SIDE, BLOCK)
+
+
+def texture(name: str, side: int, block: int) -> Task:
+    """Return the task of finding the middle of the photograph, as side x side means over blocks."""
     photograph = torch.tensor(data.camera() / 255.0)
-    reference = photograph.unflatten(0, (SIDE, -1)).unflatten(2, (SIDE, -1)).mean((1, 3))
-    target, n = reference.flatten(), SIDE**2
+    margin = (len(photograph) - side * block) // 2
+    middle = photograph[margin:, margin:][: side * block, : side * block]
+    reference = middle.unflatten(0, (side, -1)).unflatten(2, (side, -1)).mean((1, 3))
+    target, n = reference.flatten(), side**2
 
     def residuals(image: Tensor) -> Tensor:
         return (image - reference).flatten()
@@ -33,9 +42,9 @@ def task(preset: Preset = "fast") -> Task:
         return float(loss(x[None])[0])
 
     return Task(
-        name="texture",
-        title="the pixels of a 32x32 texture",
-        parameters="1024 grey values, 0 to 1; starts U(0, 1)",
+        name=name,
+        title=f"the pixels of a {side}x{side} texture",
+        parameters=f"{n} grey values, 0 to 1; starts U(0, 1)",
         needs="the texture itself: no light, camera or film",
         n=n,
         loss=loss,
@@ -43,7 +52,7 @@ def task(preset: Preset = "fast") -> Task:
         sigma=0.3,
         evaluations=100_000,
         bounds=(torch.zeros(n).double(), torch.ones(n).double()),
-        output=least_squares(lambda x: x.view(-1, SIDE, SIDE), residuals),
+        output=least_squares(lambda x: x.view(-1, side, side), residuals),
         truth=Truth(error, error, analytic=lambda x, sigma: loss(x[None])[0] + sigma**2),
-        picture=Picture(lambda x: x.view(SIDE, SIDE).clamp(0, 1), lambda: reference),
+        picture=Picture(lambda x: x.view(side, side).clamp(0, 1), lambda: reference),
     )

@@ -39,9 +39,10 @@ def waves(size: float, seed: int = 0) -> torch.Tensor:
 
 def test_basis_is_that_of_scipy() -> None:
     places = torch.linspace(0, 1, 300, dtype=torch.float64)
-    spline = BSpline(KNOTS, np.eye(32), 3)
-    np.testing.assert_allclose(basis(places), spline(places.numpy()), atol=1e-13)
-    np.testing.assert_allclose(basis(places, 1), spline.derivative()(places.numpy()), atol=1e-10)
+    for count in (32, 64):
+        spline = BSpline(np.arange(-3, count + 1) / (count - 3), np.eye(count), 3)
+        np.testing.assert_allclose(basis(places, 0, count), spline(places.numpy()), atol=1e-13)
+        np.testing.assert_allclose(basis(places, 1, count), spline.derivative()(places.numpy()), atol=1e-10)
     with pytest.raises(ValueError, match="derivative must be 0 or 1, got 2"):
         basis(places, 2)
 
@@ -186,6 +187,19 @@ def test_smoothing_is_a_blur_of_a_pixel() -> None:
     optics = Caustic(64, 128, caustic.DISTANCE, caustic.UNIT)
     moved = [optics.landing(one)[0] - optics.landing(0 * one)[0] for one in (waves(1.0, seed) for seed in range(4))]
     assert 0.7 < float(torch.stack(moved).std()) < 1.4
+
+
+def test_more_coefficients_have_the_same_blur_in_smaller_pixels() -> None:
+    task = catalogue.load("caustic64")
+    x, target = torch.stack([task.start(0), 0 * task.start(0)]), caustic.text(128)
+    optics = Caustic(128, 256, caustic.DISTANCE, 0.25 * caustic.UNIT, 64)
+    torch.testing.assert_close(task.loss(x), (optics.image(x) - target).square().mean((1, 2)))
+    assert float(task.loss(x)[1]) == pytest.approx(float((1 - target).square().mean()), rel=1e-4)
+    generator = torch.Generator().manual_seed(0)
+    random = torch.randn(4, 4096, generator=generator, dtype=torch.float64)
+    moved = [optics.landing(one)[0] - optics.landing(0 * one)[0] for one in random]
+    assert 0.7 < float(torch.stack(moved).std()) < 1.4
+    assert task.renderer.full().name == "caustic64"
 
 
 def test_there_is_no_parameter_error(tmp_path) -> None:

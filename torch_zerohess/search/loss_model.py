@@ -46,6 +46,7 @@ class LossModel:
         self.slope = directions @ slope
         self.bend = directions @ bend.mT
         self.steepness = float(slope.square().sum()), bend @ slope, bend @ bend.mT
+        self.linear = expanded.second == 0.0
         size = float(directions.square().sum())
         self.trace = self.elements * max(float(self.bend.diagonal().sum()), 0.0) / size if size > 0.0 else 0.0
 
@@ -55,6 +56,8 @@ class LossModel:
         c = torch.cat([covariance.new_ones(len(x), 1), covariance[:, : self._known]], 1)
         variance = self.process.uncertainty(covariance)
         constant, linear, square = self.steepness
+        if self.linear:
+            return self._loss(c) - self.optimism * math.sqrt(constant * self.elements) * variance.sqrt()
         steepness = (constant + 2.0 * c @ linear + ((c @ square) * c).sum(1)).clamp_min(0.0).sqrt()
         # No prediction lies below the lowest value of the loss along the way: the parabola is cut at its vertex.
         reach = self.optimism * variance.sqrt() * math.sqrt(self.elements)
@@ -74,4 +77,5 @@ class LossModel:
         return abs(float(self._loss(c)[0]) - loss) <= _ERROR * abs(loss - self.value) + 1e-12 * abs(loss)
 
     def _loss(self, c: Tensor) -> Tensor:
-        return self.value + c @ self.slope + 0.5 * ((c @ self.bend) * c).sum(1)
+        loss = self.value + c @ self.slope
+        return loss if self.linear else loss + 0.5 * ((c @ self.bend) * c).sum(1)

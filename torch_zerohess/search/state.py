@@ -104,17 +104,18 @@ class Evaluated:
     @property
     def needed(self) -> "Evaluated":
         """The points that the method itself asked for."""
-        return self.those(torch.arange(len(self), device=self.points.device) < len(self) - self.extra)
+        return self.those(slice(len(self) - self.extra)) if self.extra else self
 
     @property
     def further(self) -> "Evaluated":
         """The points from `Method.more`."""
-        return self.those(torch.arange(len(self), device=self.points.device) >= len(self) - self.extra)
+        return self.those(slice(len(self) - self.extra, None))
 
     def those(self, which: Tensor | slice) -> "Evaluated":
         """The points that `which` selects: bools [K], indices, or a slice."""
         outputs = None if self.outputs is None else self.outputs[which]
-        extra = int((torch.arange(len(self), device=self.points.device)[which] >= len(self) - self.extra).sum())
+        numbers = torch.arange(len(self), device=self.points.device) if self.extra else None
+        extra = 0 if numbers is None else int((numbers[which] >= len(self) - self.extra).sum())
         return Evaluated(self.points[which], self.losses[which], outputs, self.shape, extra)
 
 

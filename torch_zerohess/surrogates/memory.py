@@ -20,7 +20,7 @@ _EXCESS = 1.05
 """Evaluations over the capacity at which they are thinned."""
 _BLOCK = 1024
 """Points whose distances to others are held at once."""
-_FORGET = 0.95
+_FORGET = 0.8
 """Weight of what the coefficient knows, at every new call."""
 
 
@@ -102,7 +102,7 @@ class Memory:
         """How many evaluations the last fit knew."""
         self._moments: list[list[float]] = []
         """Covariance of h(f) and h(g), and variance of h(g), over evaluations that g had not seen: of the values, then
-        of what they add to first and second derivatives. Each call counts alike, see `_shares`."""
+        of what they add to first and second derivatives."""
 
     def __len__(self) -> int:
         """Evaluations that are kept."""
@@ -191,7 +191,7 @@ class Memory:
 
         There is one regression for values and one for each order of derivatives, on the contributions of the
         evaluations. They differ: a surrogate may explain values and no curvature. c is the smallest coefficient, so
-        that no derivative becomes noisier. Each call counts alike, however large its values.
+        that no derivative becomes noisier.
         """
         if self.fresh == 0:
             return 1.0
@@ -219,7 +219,7 @@ class Memory:
         count = weight.sum(dim, keepdim=True).clamp_min(1.0)
         a, b = ((one - (weight * one).sum(dim, keepdim=True) / count) * weight for one in (a, b))
         pairs = [(a, b), *derivatives]
-        new = [_shares(one, other) for one, other in pairs]
+        new = [[float((one * other).sum()), float(other.square().sum())] for one, other in pairs]
         if not all(math.isfinite(one) for moments in new for one in moments):  # the surrogate predicts nonsense
             self._moments = []
             return
@@ -283,16 +283,6 @@ class Memory:
     def __repr__(self) -> str:
         kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"
         return f"Memory({type(self.surrogate).__name__}, {kept}, coefficient={self.coefficient:.2f})"
-
-
-def _shares(one: Tensor, other: Tensor) -> list[float]:
-    """Return the sums of one * other and of other^2, over the sum of the squares of both.
-
-    Calls with large values, such as at the edge of a plateau, would otherwise hide all others.
-    """
-    product, square, first = (float(each.sum()) for each in (one * other, other.square(), one.square()))
-    whole = first + square
-    return [product / whole, square / whole] if whole > 0.0 else [0.0, 0.0]
 
 
 def _joined(parts: list[Tensor]) -> list[Tensor]:

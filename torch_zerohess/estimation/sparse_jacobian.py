@@ -23,7 +23,7 @@ def sparse_jacobian(
     x: Tensor,
     smoothing: Smoothing,
     *,
-    keep: int = 16,
+    keep: int | None = None,
     rate: float = 0.1,
     grid: Sequence[int] | None = None,
     previous: SparseJacobian | None = None,
@@ -47,7 +47,7 @@ def sparse_jacobian(
         x: [n], float32 or float64.
         smoothing: how to sample; proposal "aggregate", "gaussian" or "uniform". An antithetic pair is one sample, of
             which even orders of fn are gone. The baseline is not used: a constant is part of the regression.
-        keep: parameters per output, at most.
+        keep: parameters per output, at most; 16 if None, or n if that is less.
         rate: of false discoveries among the pairs of output and parameter that are found in a round; there are three.
             A pair that is false gets a small slope.
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
@@ -83,11 +83,11 @@ def sparse_jacobian(
             f"corrects, got {smoothing.proposal!r}"
         )
     settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True)
-    check_samples(smoothing.samples, keep)
+    check_samples(smoothing.samples, settings.keep)
     call = BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite)
     work = x if x.dtype == torch.float64 else x.float()
     u, changes, weights, shape, evaluations = _sampled(call, work, smoothing)
-    check_samples(len(u), keep)
+    check_samples(len(u), settings.keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)
     earlier = None if previous is None else _checked(previous, len(x), shape).to(work).times(sigma)
     found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
@@ -123,6 +123,8 @@ def _sampled(call: BlackBoxCall, x: Tensor, smoothing: Smoothing) -> tuple[Tenso
 
 
 def _checked(previous: SparseJacobian, n: int, shape: torch.Size) -> SparseJacobian:
+    if not isinstance(previous, SparseJacobian):
+        raise TypeError(f"previous must be a SparseJacobian, got {type(previous).__name__}")
     if previous.n != n or previous.shape != shape:
         raise ValueError(
             f"previous must be a Jacobian of outputs {list(shape)} of {n} parameters, got one of outputs "

@@ -55,7 +55,13 @@ class LocalSettings:
 
     @classmethod
     def checked(
-        cls, settings: Settings, *, keep: int = 16, rate: float = 0.1, grid: tuple[int, ...] | None = None, **own: Any
+        cls,
+        settings: Settings,
+        *,
+        keep: int | None = None,
+        rate: float = 0.1,
+        grid: tuple[int, ...] | None = None,
+        **own: Any,
     ) -> "LocalSettings":
         """Check what a caller gave; ValueError for a setting out of range."""
         if not callable(settings.loss):
@@ -198,7 +204,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
             evidence, which helps where outputs depend on patches of parameters. None: they lie in no order.
-        keep: parameters per output, at most.
+        keep: parameters per output, at most; 16 if None, or all of them if they are fewer.
         samples: of an iteration at first, at least keep + 2. An iteration that hardly lowers the loss doubles
             them, once; a good one halves them again.
         rate: of false discoveries among the parameters that are found in a batch.
@@ -232,7 +238,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         loss: Callable[[Tensor], Tensor],
         bounds: Bounds | None = None,
         grid: tuple[int, ...] | None = None,
-        keep: int = 16,
+        keep: int | None = None,
         samples: int = 32,
         rate: float = 0.1,
         radius: float = 0.5,

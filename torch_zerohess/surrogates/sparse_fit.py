@@ -24,6 +24,8 @@ from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, spaced, thresholds
 from torch_zerohess.surrogates.surrogate import scaled
 
+_KEEP = 16
+"""Parameters that an output depends on at most, where a caller says nothing."""
 FEWEST_SAMPLES = 8
 """That a fit needs."""
 _FOLDS = 4
@@ -54,14 +56,20 @@ class SparseSettings:
     """Whether entries that are not significant beside the others of their row are left out in the end."""
 
     @classmethod
-    def checked(cls, n: int, *, keep: int, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
-        """Check what a caller gave for n parameters; ValueError for a setting out of range."""
+    def checked(cls, n: int, *, keep: int | None, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
+        """Check what a caller gave for n parameters; TypeError or ValueError for a setting that cannot be.
+
+        keep: 16 if None, or all parameters if they are fewer.
+        """
+        keep = min(_KEEP, n) if keep is None else keep
         if not 1 <= checked_integer("keep", keep) <= n:
             raise ValueError(f"keep must be between 1 and the number of parameters, {n}, got {keep}")
         if not 0.0 < rate < 1.0:
             raise ValueError(f"rate must be between 0 and 1, got {rate}")
         if grid is None:
             return cls(keep, rate)
+        if not isinstance(grid, Sequence) or not all(isinstance(one, int) for one in grid):
+            raise TypeError(f"grid must be rows and columns (and channels), two or three integers, got {grid!r}")
         if len(grid) not in (2, 3) or min(grid) < 1 or math.prod(grid) != n:
             raise ValueError(f"grid must be rows and columns (and channels) of {n} parameters, got {grid}")
         rows, columns, *channels = grid

@@ -118,6 +118,8 @@ class SparseJacobian:
 
     def _batch(self, name: str, vectors: Tensor, shape: torch.Size) -> torch.Size:
         """Return the dimensions before `shape`, or raise ValueError if the others are not `shape`."""
+        if not isinstance(vectors, Tensor) or not vectors.is_floating_point():
+            raise TypeError(f"{name} must be a real floating tensor, got {getattr(vectors, 'dtype', type(vectors))}")
         first = len(vectors.shape) - len(shape)
         if first < 0 or vectors.shape[first:] != shape:
             wanted = ", ".join(map(str, ["*batch", *shape]))

@@ -94,3 +94,26 @@ def test_errors_name_what_is_wrong(changes, message):
         zh.sparse_jacobian(given.pop("fn"), given.pop("x"), given.pop("smoothing"), **given)
     with pytest.raises(TypeError, match="smoothing must be a Smoothing, got float"):
         zh.sparse_jacobian(scaled, torch.zeros(N), 0.1)
+    with pytest.raises(TypeError, match="previous must be a SparseJacobian, got Tensor"):
+        zh.sparse_jacobian(scaled, torch.zeros(N), smoothing(), previous=torch.eye(N))
+    for grid in (100, (10.0, 10)):
+        with pytest.raises(TypeError, match=r"grid must be rows and columns .*, two or three integers, got"):
+            zh.sparse_jacobian(scaled, torch.zeros(N), smoothing(), grid=grid)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e25])
+def test_outputs_of_any_size(size):
+    """Squares of such numbers are 0 or infinite in float32; an earlier Jacobian of that size is of use."""
+    x = torch.zeros(N)
+    first = zh.sparse_jacobian(lambda z: size * scaled(z), x, smoothing(), keep=8)
+    second = zh.sparse_jacobian(lambda z: size * scaled(z), x, smoothing(seed=1), keep=8, previous=first)
+    for J in (first, second):
+        assert J.explained > 0.99
+        torch.testing.assert_close(J.dense().view(N, N) / size, torch.diag(SCALES).float(), atol=3e-3, rtol=0)
+
+
+def test_fewer_parameters_than_an_output_may_have():
+    """40 outputs of 5 parameters: unless `keep` is said, each may depend on all of them."""
+    A = normal(40, 5).sign() + normal(40, 5, seed=1) / 10
+    J = zh.sparse_jacobian(lambda z: z @ A.to(z).mT, torch.zeros(5).double(), smoothing(100))
+    torch.testing.assert_close(J.dense(), A, atol=3e-3, rtol=0)

@@ -247,3 +247,8 @@ def test_minimize_takes_it():
     assert fit.evaluations <= 45
     # The loss is mean((x - truth)^2): its Hessian is 2 / n on the diagonal.
     torch.testing.assert_close(fit.hessian, 2 / N * torch.eye(N).double(), atol=1e-3, rtol=0)
+
+
+def test_three_parameters_may_all_count_for_an_output():
+    search = zh.optim.LocalGaussNewton(torch.zeros(3), sigma=0.1, loss=lambda y: y.square().mean())
+    assert search.ask().shape == (33, 3)  # the start and its samples

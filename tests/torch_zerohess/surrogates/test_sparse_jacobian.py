@@ -53,6 +53,8 @@ def test_products_are_those_of_the_dense_matrix():
         J.matvec(v[:6])
     with pytest.raises(ValueError, match=r"w must have shape \[\*batch, 2, 3\], got \[6\]"):
         J.rmatvec(w.flatten())
+    with pytest.raises(TypeError, match=r"v must be a real floating tensor, got torch.int64"):
+        J.matvec(torch.ones(7, dtype=torch.int64))
 
 
 def test_products_have_derivatives_of_every_order_in_every_mode():

@@ -7,6 +7,7 @@ from experiments.methods import (
     gauss_newton,
     learned,
     memory_networks,
+    mesh_levels,
     meshes,
     mitsuba,
     ours,
@@ -20,7 +21,7 @@ METHODS: dict[str, Method] = {
     method.name: method
     for family in (
         *(paper, ours, memory_networks, gauss_newton, derivative_free, quasi_newton),
-        *(bayesian, turbo, learned, analytic, meshes, mitsuba),
+        *(bayesian, turbo, learned, analytic, meshes, mesh_levels, mitsuba),
     )
     for method in family.METHODS
 }

@@ -244,7 +244,8 @@ def _mesh(task: Task) -> FittedMesh:
     return task.mesh
 
 
-def _is_mesh(task: Task) -> str | None:
+def is_mesh(task: Task) -> str | None:
+    """Say why a task does not have the vertices of a mesh as its parameters."""
     if task.mesh is None:
         return "its parameters are not the vertices of a mesh that known cameras see"
     return None if task.output and task.output.residuals else "the black box returns no residuals"
@@ -252,7 +253,7 @@ def _is_mesh(task: Task) -> str | None:
 
 def _method(name: str, title: str, solve: Callable[..., None], **fixed: Any) -> Method:
     uses = "image, cameras, triangles" if fixed.get("credit") == "local" else "loss, triangles"
-    return Method(name, title, with_settings(solve, **fixed), _is_mesh, ("scipy",), uses=uses)
+    return Method(name, title, with_settings(solve, **fixed), is_mesh, ("scipy",), uses=uses)
 
 
 METHODS = (

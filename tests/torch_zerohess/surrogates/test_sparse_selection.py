@@ -32,7 +32,10 @@ def test_candidates_are_those_of_all_correlations(pixels, grid):
     """The image and the parameters are cut into tiles, whose edges are in the middle of them."""
     u = centered(normal(24, 900, seed=1))
     d = centered(u[:, torch.arange(m) % 900] + 2 * normal(24, m, seed=2))
-    least, grids = Thresholds(0.4, 0.12), Grids((*pixels, 1), None if grid is None else (*grid, 1))
+    least, grids = (
+        Thresholds(0.4, 0.12 if grid is None else 0.07),
+        Grids((*pixels, 1), None if grid is None else (*grid, 1)),
+    )
     parts = list(candidates(u, d, grids, least))
     element, parameter, size = (torch.cat([one[k] for one in parts]) for k in range(3))
     found = torch.zeros(m, 900).double().index_put_((element, parameter), size, accumulate=True)
@@ -53,6 +56,11 @@ def test_tiles_are_small_and_overlap_little(monkeypatch):
         assert max(sizes) <= 2 << 18
         assert sum(sizes) <= 1.4 * 2700 * 3600
         assert len(sizes) < 100
+    # Rows of this image are longer than the side of a tile: a tile has eight of them none the less.
+    sizes.clear()
+    wide = centered(normal(9, 24 * 600, seed=1).float())
+    list(candidates(u[:, :900], wide, Grids((24, 600, 1), (30, 30, 1)), Thresholds(0.99, 0.99)))
+    assert sum(sizes) <= 1.5 * 24 * 600 * 900
 
 
 def test_thresholds_of_large_images_are_those_of_all_pairs(monkeypatch):

@@ -1,0 +1,118 @@
+"""Gauss-Newton for the vertices of a mesh, from coarse to fine, by the public search for thousands of parameters.
+
+| method | perturbed | derivatives of | step |
+|---|---|---|---|
+| levels_local | handles | every pixel, found from samples | Gauss-Newton |
+
+*Handles* are the vertices of a coarser mesh, as in `experiments.methods.meshes`. Subdivision makes their displacements
+smooth, so that no other prior on the mesh is needed. Each stage is one `zh.optim.LocalGaussNewton` over the handles of
+a level. Samples tell which pixels a handle changes: no camera and no footprint is given.
+
+The output is the image after two white-box operations. A *tone curve* raises dark pixels: shading is a quarter at
+least where there is a mesh, and the background is 0. With the shading alone, a dark part that is missing is a small
+error. Then pixels are averaged over small blocks, so that fewer outputs have less noise of triangles' edges.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+import torch_zerohess as zh
+from experiments.methods.keywords import with_settings
+from experiments.methods.meshes import is_mesh
+from experiments.methods.method import Method
+from experiments.runs.trial import Trial
+
+DARKEST = 0.25
+"""Least brightness of a mesh, in front of a background of 0."""
+
+
+class Stage(NamedTuple):
+    """One search over the handles of a level."""
+
+    level: int
+    """Of the mesh whose vertices are the handles."""
+    evaluations: int
+    """After which no further batch is asked for."""
+    sigma: float
+    """In units of the mean distance of the handles at the start of the run."""
+    block: int
+    """Pixels along the side of the blocks that are averaged."""
+
+
+STAGES = (Stage(1, 200, 0.15, 2), Stage(2, 560, 0.2, 2), Stage(3, 1000, 0.25, 2), Stage(3, 500, 0.15, 1))
+"""Chosen by hand on run 1000, as the defaults of `levels_local`."""
+
+
+def levels_local(
+    trial: Trial,
+    *,
+    stages: tuple[Stage, ...] = STAGES,
+    silhouette: float = 0.5,
+    keep: int = 20,
+    samples: int = 48,
+    least_sigma: float = 0.3,
+    color: float = 0.5,
+) -> None:
+    """Search over the handles of one stage after the other, and end.
+
+    Args:
+        trial: the run.
+        stages: from coarse to fine.
+        silhouette: share of the tone curve in the output; the rest is the image itself.
+        keep: parameters per pixel, at most.
+        samples: of an iteration; see `zh.optim.LocalGaussNewton`.
+        least_sigma: share of the sigma of a stage below which no sample is drawn. Nearer samples move silhouettes by
+            less than a pixel, so most pixels there do not change at all.
+        color: change of a colour that counts as much as the distance of the handles.
+    """
+    task, mesh, x = trial.task, trial.task.mesh, trial.start
+    assert mesh is not None
+    assert task.output is not None
+    assert task.output.residuals is not None
+    black = torch.zeros_like(trial.image(x[None])[0])
+    target = -task.output.residuals(black).view_as(black)
+    for stage in stages:
+        control, start = mesh.control(stage.level), x
+        unit = torch.full((mesh.channels,), mesh.spacing(trial.start, stage.level), dtype=torch.float64)
+        unit[3:] = color
+        goal = toned(target[None], silhouette, stage.block)[0]
+        search = zh.optim.LocalGaussNewton(
+            torch.zeros(len(control) * mesh.channels, dtype=torch.float64),
+            sigma=stage.sigma * unit.repeat(len(control)),
+            loss=zh.losses.mse(goal),
+            keep=keep,
+            samples=samples,
+            least_sigma=least_sigma,
+            restarts=task.evaluations,
+            seed=trial.seed,
+        )
+        while search.evaluations < stage.evaluations and not search.done:
+            z = search.ask()
+            images = trial.image(control.displaced(start, mesh.rows(z)))
+            search.tell(toned(images, silhouette, stage.block))
+            x = control.displaced(start, mesh.rows(search.x)[None])[0]
+            trial.report(x, sigma=float(search.sigma * stage.sigma * unit[0]), loss=search.value)
+
+
+def toned(images: Tensor, silhouette: float, block: int) -> Tensor:
+    """Images [K, v, side, side, ...] as one sheet each, [K, v * rows, columns, channels], after curve and blocks."""
+    K, v, side = images.shape[:3]
+    images = images.double()
+    curve = (1.0 - silhouette) * images + silhouette * (images / DARKEST).clamp(max=1.0)
+    planes = curve.reshape(K * v, side, side, -1).movedim(3, 1)
+    blocks = torch.nn.functional.avg_pool2d(planes, block).movedim(1, 3)
+    return blocks.reshape(K, -1, *blocks.shape[2:])
+
+
+METHODS = (
+    Method(
+        "levels_local",
+        "ours for meshes: Gauss-Newton on a sparse Jacobian, handles of a mesh from coarse to fine",
+        with_settings(levels_local),
+        is_mesh,
+        ("scipy",),
+        uses="image, triangles",
+    ),
+)

@@ -9,7 +9,9 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <optional>
 #include <tuple>
+#include <vector>
 
 #include "reduce.h"
 
@@ -184,20 +186,25 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> sample(
   return {rows, points, u, weights};
 }
 
-// `rows_of(b)` gives the rows of U that belong to batch element b.
+// `rows_of(b)` gives the rows of U that belong to batch element b; a is [B, M, K].
 template <class RowsOf>
-Tensor accumulate_with(const RowsOf& rows_of, int64_t n, bool squares, const Tensor& a) {
-  const int64_t B = a.size(0), M = a.size(1), K = a.size(2), blocks = (n + kBlock - 1) / kBlock;
+Tensor accumulate_numbers(
+    const RowsOf& rows_of, int64_t B, int64_t M, int64_t K, int64_t n, bool squares, const double* a) {
+  const int64_t blocks = (n + kBlock - 1) / kBlock;
   Tensor result = torch::stable::empty({B, M, n}, ScalarType::Double);
-  const double* coefficients = a.const_data_ptr<double>();
   double* out = result.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, B * blocks, grain(M * K * std::min(n, kBlock)), [&](int64_t begin, int64_t end) {
     for (int64_t task = begin; task < end; ++task) {
       const int64_t b = task / blocks, first = task % blocks * kBlock;
-      accumulate_block(rows_of(b), first, K, n, M, squares, coefficients + b * M * K, out + b * M * n);
+      accumulate_block(rows_of(b), first, K, n, M, squares, a + b * M * K, out + b * M * n);
     }
   });
   return result;
+}
+
+template <class RowsOf>
+Tensor accumulate_with(const RowsOf& rows_of, int64_t n, bool squares, const Tensor& a) {
+  return accumulate_numbers(rows_of, a.size(0), a.size(1), a.size(2), n, squares, a.const_data_ptr<double>());
 }
 
 auto stored(const Tensor& u) {
@@ -240,6 +247,81 @@ Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
   check(a, "a", 3);
   STD_TORCH_CHECK(u.size(0) == a.size(0) && u.size(1) == a.size(2), "u and a do not fit");
   return accumulate_with(rows_of, u.size(2), squares, a);
+}
+
+template <class T>
+Tensor coefficients_of(const T* values, const double* share, int64_t B, int64_t E, int64_t P, int64_t K, bool center) {
+  Tensor result = torch::stable::empty({B, K, P}, ScalarType::Double);
+  double* out = result.mutable_data_ptr<double>();
+  torch::stable::parallel_for(0, B * K, grain(P), [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      const T* const f = values + (row / K * E + row % K) * P;
+      const T* const baseline = center ? values + (row / K * E + K) * P : nullptr;
+      center_row(f, baseline, share ? share[row] : 1.0 / double(K), P, out + row * P);
+    }
+  });
+  return result;
+}
+
+// (f - baseline) * share [B, K, P] for values [B, E, P] in single or double precision: the baseline is value K where
+// `center`, else zero; share is [B, K, 1], or 1 / K where it is absent.
+Tensor coefficients(const Tensor& values, const std::optional<Tensor>& share, int64_t K, bool center) {
+  const bool single = values.scalar_type() == ScalarType::Float;
+  check(values, "values", 3, single ? ScalarType::Float : ScalarType::Double);
+  const int64_t B = values.size(0), E = values.size(1), P = values.size(2);
+  STD_TORCH_CHECK(K > 0 && K + center <= E, "values do not have K rows, and one more for the center");
+  if (share) {
+    check(*share, "share", 3);
+    STD_TORCH_CHECK(share->size(0) == B && share->size(1) == K && share->size(2) == 1, "values and share do not fit");
+  }
+  const double* weights = share ? share->const_data_ptr<double>() : nullptr;
+  return single ? coefficients_of(values.const_data_ptr<float>(), weights, B, E, P, K, center)
+                : coefficients_of(values.const_data_ptr<double>(), weights, B, E, P, K, center);
+}
+
+// a[b, m, k] * weight[b, k], after a check of all that the sums of a likelihood ratio are made of.
+std::vector<double> weighted(const Tensor& u, const Tensor& weight, const Tensor& a) {
+  check(u, "u", 3);
+  check(weight, "weight", 2);
+  check(a, "a", 3);
+  const int64_t B = a.size(0), M = a.size(1), K = a.size(2);
+  STD_TORCH_CHECK(
+      u.size(0) == B && u.size(1) == K && weight.size(0) == B && weight.size(1) == K, "u, weight and a do not fit");
+  const double *weights = weight.const_data_ptr<double>(), *coefficients = a.const_data_ptr<double>();
+  std::vector<double> result(size_t(B * M * K));
+  for (int64_t row = 0; row < B * M; ++row)
+    for (int64_t k = 0; k < K; ++k)
+      result[size_t(row * K + k)] = coefficients[row * K + k] * weights[row / M * K + k];
+  return result;
+}
+
+Tensor weighted_gradient(const Tensor& u, const Tensor& weight, const Tensor& a) {
+  const std::vector<double> numbers = weighted(u, weight, a);
+  return accumulate_numbers(stored(u), a.size(0), a.size(1), a.size(2), u.size(2), false, numbers.data());
+}
+
+// sum_k a_k w_k ((u_k . v) u_k - v)
+Tensor weighted_hvp(const Tensor& u, const Tensor& weight, const Tensor& a, const Tensor& v) {
+  std::vector<double> numbers = weighted(u, weight, a);
+  check(v, "v", 3);
+  const int64_t B = a.size(0), M = a.size(1), K = a.size(2), n = u.size(2);
+  STD_TORCH_CHECK(v.size(0) == B && v.size(1) == M && v.size(2) == n, "u, a and v do not fit");
+  const auto rows_of = stored(u);
+  const double* vectors = v.const_data_ptr<double>();
+  std::vector<double> totals(size_t(B * M)), along(size_t(B * M * K));
+  for (int64_t row = 0; row < B * M; ++row) totals[size_t(row)] = total(numbers.data() + row * K, K);
+  torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      const int64_t b = row / K;
+      project_row(rows_of(b), row % K, K, n, M, vectors + b * M * n, along.data() + b * M * K);
+    }
+  });
+  for (size_t k = 0; k < numbers.size(); ++k) numbers[k] *= along[k];
+  Tensor result = accumulate_numbers(rows_of, B, M, K, n, false, numbers.data());
+  double* out = result.mutable_data_ptr<double>();
+  for (int64_t row = 0; row < B * M; ++row)
+    for (int64_t d = 0; d < n; ++d) out[row * n + d] -= totals[size_t(row)] * vectors[row * n + d];
+  return result;
 }
 
 Tensor project_drawn(
@@ -319,6 +401,9 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("project(Tensor u, Tensor t) -> Tensor");
   m.def("accumulate(Tensor u, Tensor a, bool squares) -> Tensor");
   m.def("hessian(Tensor u, Tensor a) -> Tensor");
+  m.def("coefficients(Tensor values, Tensor? share, int K, bool center) -> Tensor");
+  m.def("weighted_gradient(Tensor u, Tensor weight, Tensor a) -> Tensor");
+  m.def("weighted_hvp(Tensor u, Tensor weight, Tensor a, Tensor v) -> Tensor");
   m.def("mirror(Tensor(a!) matrices) -> ()");
   m.def(
       "project_drawn(Tensor rows, Tensor x, Tensor sigma, bool antithetic, bool single, Tensor t) "
@@ -342,6 +427,9 @@ STABLE_TORCH_LIBRARY_IMPL(torch_zerohess, CPU, m) {
   m.impl("project", TORCH_BOX(&project));
   m.impl("accumulate", TORCH_BOX(&accumulate));
   m.impl("hessian", TORCH_BOX(&hessian));
+  m.impl("coefficients", TORCH_BOX(&coefficients));
+  m.impl("weighted_gradient", TORCH_BOX(&weighted_gradient));
+  m.impl("weighted_hvp", TORCH_BOX(&weighted_hvp));
   m.impl("mirror", TORCH_BOX(&mirror));
   m.impl("project_drawn", TORCH_BOX(&project_drawn));
   m.impl("accumulate_drawn", TORCH_BOX(&accumulate_drawn));

@@ -128,6 +128,26 @@ inline void accumulate_block(const DrawnRows& rows, int64_t first, int64_t K, in
   for (int64_t m = 0; m < M; ++m) std::copy_n(sums.data() + m * count, count, out + m * n + first);
 }
 
+// out[p] = (f[p] - baseline[p]) * share in double precision; without a baseline f[p] * share.
+template <class T>
+inline void center_row(const T* f, const T* baseline, double share, int64_t P, double* out) {
+  if (baseline)
+    for (int64_t p = 0; p < P; ++p) out[p] = (double(f[p]) - double(baseline[p])) * share;
+  else
+    for (int64_t p = 0; p < P; ++p) out[p] = double(f[p]) * share;
+}
+
+// Sum of K numbers, block by block: an error of a few units in the last place of the sum of magnitudes.
+inline double total(const double* a, int64_t K) {
+  double whole = 0.0;
+  for (int64_t first = 0; first < K; first += kBlock) {
+    double part = 0.0;
+    for (int64_t k = first; k < std::min(K, first + kBlock); ++k) part += a[k];
+    whole += part;
+  }
+  return whole;
+}
+
 // out[i, j] = sum_k a[k] U[k, i] U[k, j] for one row i of the upper triangle; u is [K, n].
 inline void hessian_row(const double* u, int64_t i, int64_t K, int64_t n, const double* a, double* out) {
   std::fill_n(out + i * n + i, n - i, 0.0);

@@ -9,21 +9,22 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_evaluator
+from torch_zerohess.estimation.coefficients import baseline_of, coefficients_of, share_of
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
+from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
+from torch_zerohess.estimation.inputs import all_finite
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.outer import Outer, outer_of
 from torch_zerohess.estimation.perturbations import draws, perturb
-from torch_zerohess.estimation.stein import completed, total
 from torch_zerohess.evaluators.batch import loss_error
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.inline import Evaluator, Inline
 from torch_zerohess.evaluators.payload import RemoteTraceback
 from torch_zerohess.evaluators.values import checked_values
-from torch_zerohess.sampling.kernels import Redrawn
 from torch_zerohess.smoothing import Smoothing
 
 ValueMode = Literal["center", "smoothed"]
@@ -47,6 +48,8 @@ class BlackBoxCall:
     on_nonfinite: str | float = "raise"
     head: Head | None = None
     joint: bool = False
+    outer: Outer = field(init=False, repr=False, compare=False)
+    """The function outside of the expectation of the values."""
     answered: bool = field(default=False, init=False, repr=False, compare=False)
     """Whether a call has given values."""
 
@@ -58,6 +61,7 @@ class BlackBoxCall:
             raise TypeError(f"vectorized must be True or False, got {self.vectorized!r}")
         if self.evaluator is None:
             object.__setattr__(self, "evaluator", Inline())
+        object.__setattr__(self, "outer", outer_of(self.head))
         checked_head(self.outer.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
@@ -65,11 +69,6 @@ class BlackBoxCall:
         number = isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
         if not number and rule not in ("raise", "drop"):
             raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
-
-    @property
-    def outer(self) -> Outer:
-        """The function outside of the expectation of the values."""
-        return outer_of(self.head)
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
@@ -85,7 +84,8 @@ class BlackBoxCall:
             raise
         values = checked_values(result, points, self.vectorized)
         object.__setattr__(self, "answered", True)
-        return values.to(points.device, copy=True)  # the black box may go on writing to what it returned
+        # A copy: the black box may go on writing to what it returned.
+        return values.clone() if values.device == points.device else values.to(points.device)
 
     def values(self, points: Tensor, aux: Sequence[Tensor], *, spare: bool = False) -> tuple[Tensor, Tensor]:
         """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
@@ -99,7 +99,8 @@ class BlackBoxCall:
             return (self._jointly(points.transpose(0, 1).contiguous(), aux),) * 2
         flat = points.flatten(0, 1) if spare else points.flatten(0, 1).clone()
         if self.head is None:
-            values = self(flat, [one.repeat_interleave(E, 0) for one in aux]).unflatten(0, (B, E))
+            values = self(flat, [one.repeat_interleave(E, 0) for one in aux])
+            values = values.reshape(B, E, *values.shape[1:])
             self._lost(flat)
             return values, values
         outputs = self(flat, []).unflatten(0, (B, E))
@@ -129,68 +130,6 @@ class BlackBoxCall:
         return sorted(lost)
 
 
-@dataclass(frozen=True)
-class Evaluations:
-    """One call of the black box: its points and values, and the expansion made of them.
-
-    Shapes: B batch, K perturbations, n parameters.
-    """
-
-    all_points: Tensor | None
-    """Points [B, E, n], in the dtype of x, if they are kept: the K perturbed ones, and x where it was evaluated."""
-    all_values: Tensor
-    """Values there, [B, E, *out], as the black box returned them; zero where they were dropped."""
-    share: Tensor
-    """Weight of each row in a mean, [B, K, 1]: 1/K; where rows were dropped, zero for them and more for the others."""
-    remaining: Tensor
-    """What is smoothed, [B, E, *out]: the values, less what a control variate explains."""
-    baseline: Tensor
-    """What was subtracted from `rest`, its mean over the rows, [B, 1, P]."""
-    expansion: Expansion
-
-    @property
-    def values(self) -> Tensor:
-        """Values at the perturbed points, [B, K, *out]."""
-        return self.all_values[:, : self.share.shape[1]]
-
-    @property
-    def center(self) -> Tensor | None:
-        """f(x), [B, *out], where it was evaluated."""
-        K = self.share.shape[1]
-        return self.all_values[:, K] if self.all_values.shape[1] > K else None
-
-    @property
-    def rest(self) -> Tensor:
-        """The values at the perturbed points that are smoothed, [B, K, P]."""
-        B, K, _ = self.share.shape
-        return self.remaining[:, :K].reshape(B, K, -1)
-
-    @property
-    def points(self) -> Tensor:
-        """Perturbed points [B, K, n], in the dtype of x: made again where they are not kept."""
-        if self.all_points is not None:
-            return self.all_points[:, : self.share.shape[1]]
-        stein = self.expansion.stein
-        assert isinstance(stein, LikelihoodRatio)
-        assert isinstance(stein.u, Redrawn)
-        return stein.u.points()
-
-    @property
-    def smoothed(self) -> Tensor:
-        """The smoothed `rest` at x, float64 [B, *out], whether or not it is the base of the expansion.
-
-        Without a control variate this is the estimate of F(x).
-        """
-        expansion = self.expansion
-        a = expansion.coefficients.mT
-        return expansion.stein.smoothed(self.rest, self.baseline[:, 0], a).reshape(expansion.base.shape)
-
-    @property
-    def dropped(self) -> int:
-        """Evaluations left out because they, or the other one of their pair, were not finite."""
-        return int((self.share == 0).sum())
-
-
 def evaluate(
     call: BlackBoxCall,
     x: Tensor,
@@ -213,50 +152,53 @@ def evaluate(
     seed = smoothing.drawn_seed()
     with_center = call.value == "center" or smoothing.baseline == "center"
     perturbations = perturb(x, smoothing, seed, keep, with_center)
-    points, stein = perturbations.points, perturbations.stein
-    B, K, n = len(x), points.shape[1] - with_center, x.shape[1]
-    # Where perturbations are too many to be kept, so are two copies of the points.
-    redrawn = stein.u if isinstance(stein, LikelihoodRatio) and isinstance(stein.u, Redrawn) else None
-    spare = redrawn is not None and control is None
+    stein, sigma, outer = perturbations.stein, perturbations.sigma, call.outer
+    B, K, n = len(x), perturbations.points.shape[1] - with_center, x.shape[1]
+    # Points that can be made again are not copied for fn, which may write to them.
+    again = stein if isinstance(stein, LikelihoodRatio) and control is None else None
+
+    def points() -> Tensor:
+        return perturbations.points if again is None else again.points(x, sigma, with_center)
+
     references, encoded, scales = control.parted(aux) if control else (aux, (), None)
-    values, outputs = call.values(points, references, spare=spare)
-    if spare and redrawn is not None and not math.isfinite(float(values.sum())):
-        points = completed(redrawn.points(), x, with_center)  # as they were before fn
-    values, kept = finite_values(values, points, call.on_nonfinite, K, smoothing, stein)
-    share = torch.full((B, K, 1), 1.0 / K, dtype=torch.float64, device=x.device)
-    if kept is not None:
-        share = (kept / kept.sum(1, keepdim=True).double())[..., None]
+    values, outputs = call.values(perturbations.points, references, spare=again is not None)
+    remaining, kept, baseline, coefficients = values, None, None, None
+    if control is None and outer.linear and smoothing.baseline == "center":
+        _, coefficients = coefficients_of(values, None, K, smoothing, n)
+    if coefficients is None or not all_finite(coefficients):  # differences to f(x) are finite only if all values are
+        values, kept = finite_values(values, points, call.on_nonfinite, K, smoothing, stein)
+        share = share_of(kept, B, K, x.device)
 
-    def added(all_values: Tensor) -> list[Tensor]:
-        a = _coefficients(all_values.reshape(*all_values.shape[:2], -1), share, smoothing, n)[1]
-        return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
+        def added(all_values: Tensor) -> list[Tensor]:
+            a = coefficients_of(all_values, share, K, smoothing, n)[1]
+            return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
 
-    def mean(losses: Tensor) -> Tensor:
-        return (stein.value(losses[:, None] * share.mT) / stein.value(share.mT))[:, 0]
+        def mean(losses: Tensor) -> Tensor:
+            return (stein.value(losses[:, None] * share.mT) / stein.value(share.mT))[:, 0]
 
-    outer = call.outer
-    counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
-    if scales is None:
-        scales = outer.scales(lambda: values[:, :K].double(), mean)
-    remaining = outer.inner(values, scales)
-    if control is not None:
-        predicted = control.explain(values, points, outputs, references, encoded, added, counted)
-        if predicted is not None:
-            remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
-    baseline, coefficients = _coefficients(remaining.reshape(B, K + with_center, -1), share, smoothing, n)
-    # A sum is finite only if all terms are; a sum of finite terms may overflow.
-    if not math.isfinite(float(coefficients.sum())) and not bool(torch.isfinite(coefficients).all()):
-        raise ValueError(
-            f"fn returned values up to {float(values[:, :K].abs().max()):.3g}, whose differences are not finite in "
-            "float64: scale what fn returns"
-        )
+        counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
+        if scales is None:
+            scales = outer.scales(lambda: values[:, :K].double(), mean)
+        remaining = outer.inner(values, scales)
+        if control is not None:
+            predicted = control.explain(values, points(), outputs, references, encoded, added, counted)
+            if predicted is not None:
+                remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
+        baseline, coefficients = coefficients_of(remaining, share, K, smoothing, n)
+        if not all_finite(coefficients):
+            raise ValueError(
+                f"fn returned values up to {float(values[:, :K].abs().max()):.3g}, whose differences are not finite in "
+                "float64: scale what fn returns"
+            )
     if call.value == "center" and outer.linear:
-        base = values[:, K].double()
+        base = values.select(1, K).double()
     else:
         rest = remaining[:, :K]
-        base = stein.smoothed(rest.reshape(B, K, -1), baseline[:, 0], coefficients.mT).reshape((B, *rest.shape[2:]))
-    expansion = Expansion(base, coefficients, perturbations.sigma, outer.kept(scales, values[:, K:]), stein)
-    return Evaluations(None if spare else points, values, share, remaining, baseline, expansion)
+        subtracted = baseline_of(remaining, baseline, K, smoothing)[:, 0]
+        base = stein.smoothed(rest.reshape(B, K, -1), subtracted, coefficients.mT).reshape((B, *rest.shape[2:]))
+    expansion = Expansion(base, coefficients, sigma, outer.kept(scales, values, K), stein)
+    kept_points = None if again is not None else perturbations.points
+    return Evaluations(x, K, kept_points, values, kept, remaining, baseline, smoothing, expansion)
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -266,43 +208,3 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     if bool(bad.any()):
         values = replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
     return values
-
-
-def _coefficients(values: Tensor, share: Tensor, smoothing: Smoothing, n: int) -> tuple[Tensor, Tensor]:
-    """Return the mean baseline [B, 1, P] and (f - baseline) * share [B, K, P], for values [B, E, P], share [B, K, 1].
-
-    The value at the center is the last one, if there is one.
-    """
-    values, K = values.double(), share.shape[1]
-    f = values[:, :K]
-    if smoothing.baseline == "none":
-        return torch.zeros_like(f[:, :1]), f * share
-    if smoothing.baseline == "center":
-        center = values[:, K:]
-        return center, (f - center) * share
-    baseline = _mean_of_others(f, share, draws(smoothing, n))
-    return total(baseline * share), (f - baseline) * share
-
-
-def _mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
-    """Mean over the rows of all other independent draws: a baseline that no row's own value enters.
-
-    f: [B, K, P]; share: [B, K, 1], zero for dropped rows; draws: rows [D, r] of the draws, by size.
-    """
-    if sum(len(part) for part in draws) < 2:
-        raise ValueError(
-            "baseline 'mean' needs at least two independent draws to leave one out: use more samples (an even number "
-            "for sampler 'sobol'), or baseline 'center'"
-        )
-    # Differences to one of the values keep the precision of a small variation on a large offset.
-    origin = f[:, :1]
-    shifted = (f - origin) * share
-    whole, result = total(shifted), torch.empty_like(f)
-    for part in draws:
-        index = part.to(f.device)
-        own, own_share = shifted[:, index].sum(2), share[:, index].sum(2)
-        if bool((own_share > 1.0 - 1e-12).any()):
-            raise ValueError("on_nonfinite='drop' left one independent draw, baseline 'mean' needs two: use 'center'")
-        others = (whole - own) / (1.0 - own_share)
-        result[:, index] = others[:, :, None].expand(-1, -1, part.shape[1], -1)
-    return origin + result

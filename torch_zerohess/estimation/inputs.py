@@ -1,10 +1,12 @@
 """Checks of what the caller passes, the point x and auxiliary inputs of the black box; and tensors as short text."""
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
+_FEW = 64  # numbers up to which Python is faster than an operation of torch
 _SHOWN = 8  # numbers of a tensor that a text shows
 _HALF = (torch.float16, torch.bfloat16)
 
@@ -42,6 +44,22 @@ def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
                 f"aux[{number}] must have the batch dimensions {list(batch)} of x first, got {list(one.shape)}"
             )
     return [working(one.detach()).reshape(batch.numel(), *one.shape[len(batch) :]) for one in aux]
+
+
+def all_finite(tensor: Tensor) -> bool:
+    """Whether all numbers are finite: their sum is finite only then, and a sum of finite numbers may overflow."""
+    if tensor.dim() <= 1 and tensor.numel() <= _FEW:
+        whole = sum(tensor.tolist()) if tensor.dim() else tensor.item()
+    else:
+        whole = tensor.sum().item()
+    return math.isfinite(whole) or bool(torch.isfinite(tensor).all())
+
+
+def bound(x: Tensor) -> float:
+    """Return a number that is at least the largest magnitude in x [B, n], and not finite if one in x is not."""
+    if x.numel() <= _FEW:
+        return sum(sum(map(abs, row)) for row in x.tolist())
+    return float(x.abs().max())
 
 
 def short(tensor: Tensor) -> str:

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.standard_error import Divisible
-from torch_zerohess.estimation.stein import Layout, Projection, completed, total
-from torch_zerohess.sampling import kernels, proposals, samplers
+from torch_zerohess.estimation.stein import Layout, Projection, completed
+from torch_zerohess.sampling import kernels, proposals, samplers, stein_sums
 from torch_zerohess.sampling.kernels import Redrawn, Samples
+from torch_zerohess.sampling.stein_sums import total
 from torch_zerohess.smoothing import Smoothing
 
 
@@ -65,15 +66,20 @@ class LikelihoodRatio(Divisible):
         single = x.dtype == torch.float32
         return cls(Redrawn(first.flatten(0, 1), x.detach(), sigma, smoothing.paired, single), weight)
 
+    def points(self, x: Tensor, sigma: Tensor, center: bool) -> Tensor:
+        """Return the points around x [B, n] that `draw` returned, made again."""
+        if isinstance(self.u, Redrawn):
+            return completed(self.u.points(), x, center)
+        return completed((x[:, None] + sigma * self.u).to(x.dtype), x, center)
+
     def value(self, a: Tensor) -> Tensor:
         return total((a * self.weight[:, None]).mT)[:, 0]
 
     def gradient(self, a: Tensor) -> Tensor:
-        return kernels.accumulate(self.u, a * self.weight[:, None])
+        return stein_sums.gradient(self.u, self.weight, a)
 
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
-        a = a * self.weight[:, None]
-        return kernels.accumulate(self.u, a * kernels.project(self.u, v)).addcmul_(total(a.mT).mT, v, value=-1.0)
+        return stein_sums.hvp(self.u, self.weight, a, v)
 
     def hessian_diagonal(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]

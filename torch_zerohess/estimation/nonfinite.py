@@ -1,33 +1,32 @@
 """Values of a black box that are not finite: raise, drop the whole antithetic pair, or put a number in their place."""
 
-import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation.inputs import all_finite
 from torch_zerohess.estimation.stein import Stein
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.smoothing import Smoothing
 
 
 def finite_values(
-    values: Tensor, points: Tensor, on_nonfinite: str | float, K: int, smoothing: Smoothing, stein: Stein
+    values: Tensor, points: Callable[[], Tensor], on_nonfinite: str | float, K: int, smoothing: Smoothing, stein: Stein
 ) -> tuple[Tensor, Tensor | None]:
-    """Treat values [B, E, *out] that are not finite at points [B, E, n].
+    """Treat values [B, E, *out] that are not finite at points [B, E, n], which are asked for where an error names one.
 
     Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
     """
-    if math.isfinite(float(values.sum())):  # it is not, if one of them is not
+    if all_finite(values):
         return values, None
-    bad = ~torch.isfinite(values.reshape(*points.shape[:2], -1)).all(2)
-    if not bool(bad.any()):
-        return values, None
+    bad = ~torch.isfinite(values.reshape(*values.shape[:2], -1)).all(2)
     if on_nonfinite != "drop" or bool(bad[:, K:].any()):
         where = bad.nonzero()[0]
         if on_nonfinite == "drop":  # the center cannot be dropped
             where = torch.tensor([int(bad[:, K].nonzero()[0]), K], device="cpu")
         rule = "raise" if on_nonfinite == "drop" else on_nonfinite
-        return replaced(values, where, points, rule), None
+        return replaced(values, where, points(), rule), None
     kept = ~bad[:, :K]
     if smoothing.antithetic:
         pair = kept[:, : K // 2] & kept[:, K // 2 :]

@@ -38,8 +38,8 @@ class Outer:
         """Return the numbers whose expectation is Z."""
         return values
 
-    def kept(self, scales: Tensor | None, values: Tensor) -> Tensor:
-        """Return the constants float64 [B, constants] for values [B, 1, ...] at the center, or none [B, 0, ...]."""
+    def kept(self, scales: Tensor | None, values: Tensor, K: int) -> Tensor:
+        """Return the constants float64 [B, constants] for values [B, E, ...], of which those from K on are f(x)."""
         return values.new_empty(len(values), 0, dtype=torch.float64)
 
     def value(self, Z: Tensor, constants: Tensor, value: str, around: Tensor | None = None) -> Tensor:
@@ -75,9 +75,9 @@ class Entropy(Outer):
         T, m = scales[:, :1], scales[:, 1:]
         return ((m - values) / T).clamp(max=60.0).exp()
 
-    def kept(self, scales: Tensor | None, values: Tensor) -> Tensor:
+    def kept(self, scales: Tensor | None, values: Tensor, K: int) -> Tensor:
         assert scales is not None
-        return torch.cat([scales, values.double().sum(1, keepdim=True)], 1)
+        return torch.cat([scales, values[:, K:].double().sum(1, keepdim=True)], 1)
 
     def value(self, Z: Tensor, constants: Tensor, value: str, around: Tensor | None = None) -> Tensor:
         result = self.corrected(Z, None, constants)

@@ -1,11 +1,12 @@
 """From settings to the points where the black box is called, and the family of weights that goes with them."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.elementwise import Elementwise
+from torch_zerohess.estimation.inputs import bound
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.signed_lobes import SignedLobes
 from torch_zerohess.estimation.stein import Stein
@@ -31,8 +32,7 @@ def family(smoothing: Smoothing) -> type[Stein]:
     return FAMILIES["aggregate" if smoothing.proposal == "auto" else smoothing.proposal]
 
 
-@dataclass(frozen=True)
-class Perturbations:
+class Perturbations(NamedTuple):
     """Points z = x + sigma u, and how values at them become estimates."""
 
     points: Tensor
@@ -53,7 +53,7 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool
     """
     sigma = smoothing.sigma_vector(x.shape[1], x.device)
     scalar = smoothing.sigma if isinstance(smoothing.sigma, float) else None
-    largest, limits = float(x.abs().max()), torch.finfo(x.dtype)
+    largest, limits = bound(x), torch.finfo(x.dtype)
     least, most = (float(sigma.min()), float(sigma.max())) if scalar is None else (scalar, scalar)
     # No perturbation is longer than this: quantiles end at 10, and lengths of directions are sqrt(n) or little more.
     length = 10.0 + x.shape[1] ** 0.5

@@ -1,6 +1,5 @@
 """The result of an estimate: the value and derivatives, and the error of each."""
 
-import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple, get_args
@@ -8,8 +7,9 @@ from typing import NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluation import Evaluations, ValueMode
-from torch_zerohess.estimation.inputs import short
+from torch_zerohess.estimation.evaluation import ValueMode
+from torch_zerohess.estimation.evaluations import Evaluations
+from torch_zerohess.estimation.inputs import all_finite, short
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
@@ -154,7 +154,7 @@ class Estimate:
     def evaluations(self) -> int:
         """How often the black box was evaluated, f(x) included; a joint evaluation counts once."""
         found = [one.evaluations for one in self._batches]
-        each = sum(one.share.shape[1] + (one.center is not None) for one in found)
+        each = sum(one.K + (one.center is not None) for one in found)
         return each if self._joint else each * self._batch.numel()
 
     @cached_property
@@ -213,9 +213,9 @@ class Estimate:
 
     def _shaped(self, flat: Tensor, what: str) -> Tensor:
         """Return [B, P, ...] as [*batch, *out, ...] in the dtype of x; ValueError if it is not finite there."""
-        result = flat.reshape((*self._batch, *self._out, *flat.shape[2:])).to(self._x.dtype)
-        # A sum is finite only if all terms are; a sum of finite terms may overflow.
-        if not math.isfinite(float(result.sum())) and not bool(torch.isfinite(result).all()):
+        result = flat.reshape((*self._batch, *self._out, *flat.shape[2:]))
+        result = result if result.dtype == self._x.dtype else result.to(self._x.dtype)
+        if not all_finite(result):
             largest = max(float(one.evaluations.values.abs().max()) for one in self._batches)
             raise ValueError(
                 f"the {what} is not finite in {self._x.dtype}: sigma is {float(self._sigma.min()):g} at least and "

@@ -42,7 +42,6 @@ ORDER_ERRORS = {
     "use Smoothing(proposal='aggregate')",
 }
 """What to say of a derivative beyond the order that samples serve."""
-_BLOCK = 4096
 
 
 class Spread(NamedTuple):
@@ -166,12 +165,3 @@ class Stein(ABC):
 def completed(points: Tensor, x: Tensor, center: bool) -> Tensor:
     """Return points [B, K, n], with x [B, n] as the last one where `center`."""
     return torch.cat([points, x[:, None]], 1) if center else points
-
-
-def total(a: Tensor) -> Tensor:
-    """Sum [B, K, P] over K to [B, 1, P] in blocks of fixed size: the bits do not follow the number of threads."""
-    whole = a.shape[1] // _BLOCK * _BLOCK
-    if whole == 0:
-        return a.sum(1, keepdim=True)
-    blocks = a[:, :whole].unflatten(1, (-1, _BLOCK)).sum(2).sum(1, keepdim=True)
-    return blocks + a[:, whole:].sum(1, keepdim=True)

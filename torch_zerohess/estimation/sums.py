@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluation import Evaluations
+from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.perturbations import draws
 from torch_zerohess.estimation.stein import Quantity, Stein
 from torch_zerohess.smoothing import Smoothing
@@ -66,13 +66,13 @@ def combined(batches: Sequence[Sums], of: Callable[[Sums], Tensor]) -> Tensor:
     """Return the mean of a sum over independent batches, each weighted by its number of rows."""
     if len(batches) == 1:
         return of(batches[0])
-    rows = [one.evaluations.share.shape[1] for one in batches]
+    rows = [one.evaluations.K for one in batches]
     return torch.stack([of(one) * (count / sum(rows)) for one, count in zip(batches, rows, strict=True)]).sum(0)
 
 
 def combined_spread(batches: Sequence[Sums], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the standard error of the mean over independent batches, and its degrees of freedom (Satterthwaite)."""
-    rows = [one.evaluations.share.shape[1] for one in batches]
+    rows = [one.evaluations.K for one in batches]
     error, inverse = torch.zeros((), device="cpu"), torch.zeros((), device="cpu")
     for one, count in zip(batches, rows, strict=True):
         share = count / sum(rows)

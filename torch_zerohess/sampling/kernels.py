@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torch_zerohess.sampling import extension, philox, proposals
 
-_MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
+MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
 _WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
 _STRIP = 128  # rows of a wide Hessian that one matrix product gives
 _CHUNK = 1 << 22  # elements of drawn rows held at a time
@@ -154,7 +154,7 @@ def sample(
 def project(u: Samples, t: Tensor) -> Tensor:
     """Return sum_d u[b, k, d] t[b, m, d] as [B, M, K]: how far every sample lies along each vector."""
     if isinstance(u, Tensor):
-        if _compiled(u) and t.shape[1] <= _MANY_VECTORS:
+        if _compiled(u) and t.shape[1] <= MANY_VECTORS:
             return torch.ops.torch_zerohess.project(u.contiguous(), t.contiguous())
         return t @ u.mT
     if _compiled(u.x):
@@ -178,7 +178,7 @@ def accumulate_squares(u: Samples, a: Tensor) -> Tensor:
 def hessian(u: Samples, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] as [B, M, n, n]."""
     if isinstance(u, Tensor):
-        if _compiled(u) and a.shape[1] <= _MANY_VECTORS and u.shape[2] <= _WIDE:
+        if _compiled(u) and a.shape[1] <= MANY_VECTORS and u.shape[2] <= _WIDE:
             return torch.ops.torch_zerohess.hessian(u.contiguous(), a.contiguous())
         if a.shape[1] > u.shape[2]:  # many vectors, few parameters: outer products of the samples, in pieces
             rows = max(1, _CHUNK // u.shape[2] ** 2)
@@ -212,7 +212,7 @@ def _symmetric(upper: Tensor) -> Tensor:
 
 def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:
     if isinstance(u, Tensor):
-        if _compiled(u) and a.shape[1] <= _MANY_VECTORS:
+        if _compiled(u) and a.shape[1] <= MANY_VECTORS:
             return torch.ops.torch_zerohess.accumulate(u.contiguous(), a.contiguous(), squares)
         return a @ (u * u if squares else u)
     if _compiled(u.x):

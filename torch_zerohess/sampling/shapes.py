@@ -68,6 +68,18 @@ def accumulate_drawn(
     return a.new_empty(a.shape[0], a.shape[1], x.shape[1])
 
 
+def coefficients(values: Tensor, share: Tensor | None, K: int, center: bool) -> Tensor:
+    return values.new_empty(values.shape[0], K, values.shape[2], dtype=torch.float64)
+
+
+def weighted_gradient(u: Tensor, weight: Tensor, a: Tensor) -> Tensor:
+    return a.new_empty(a.shape[0], a.shape[1], u.shape[2])
+
+
+def weighted_hvp(u: Tensor, weight: Tensor, a: Tensor, v: Tensor) -> Tensor:
+    return torch.empty_like(v)
+
+
 def mirror(matrices: Tensor) -> None:
     return None
 
@@ -75,6 +87,7 @@ def mirror(matrices: Tensor) -> None:
 OPERATORS = (
     *(pick_rows, draw, uniforms, shape, with_lobes, sample, place),
     *(project, accumulate, hessian, mirror, project_drawn, accumulate_drawn),
+    *(coefficients, weighted_gradient, weighted_hvp),
 )
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate
-from torch_zerohess.estimation.evaluation import _mean_of_others
+from torch_zerohess.estimation.coefficients import mean_of_others
 from truths import spread, vector
 
 S = Smoothing(sigma=0.5, samples=8, proposal="gaussian", seed=1)
@@ -99,7 +99,7 @@ def test_the_baseline_is_the_mean_of_the_other_draws() -> None:
     values, draws = spread(6, -1.0, 3.0).view(1, 6, 1), [[[0]], [[1, 2]], [[3, 4, 5]]]
     kept = torch.tensor([1.0, 1.0, 1.0, 1.0, 0.0, 1.0], dtype=torch.float64)
     share = (kept / kept.sum()).view(1, 6, 1)
-    got = _mean_of_others(values, share, [torch.tensor(one) for one in draws])[0, :, 0]
+    got = mean_of_others(values, share, [torch.tensor(one) for one in draws])[0, :, 0]
     f = values[0, :, 0]
     first, second, third = f[0], f[1:3].sum(), f[3] + f[5]
     expected = [(second + third) / 4, *[(first + third) / 3] * 2, *[(first + second) / 3] * 3]
@@ -111,7 +111,7 @@ def test_the_baseline_of_a_constant_is_the_constant_to_the_bit() -> None:
     for K in (3, 7, 11, 13):
         values = torch.full((1, K, 1), 1e12 / 3, dtype=torch.float64)
         share = torch.full((1, K, 1), 1 / K, dtype=torch.float64)
-        assert torch.equal(_mean_of_others(values, share, [torch.arange(K)[:, None]]), values)
+        assert torch.equal(mean_of_others(values, share, [torch.arange(K)[:, None]]), values)
 
 
 OFFSET = {

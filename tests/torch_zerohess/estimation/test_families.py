@@ -23,9 +23,9 @@ from torch_zerohess.estimation.stein import (
     Spread,
     Stein,
     completed,
-    total,
 )
 from torch_zerohess.sampling import kernels, proposals
+from torch_zerohess.sampling.stein_sums import total
 from truths import Exponential, deviation, spread, vector
 
 N, B, P = 3, 2, 2

@@ -213,13 +213,13 @@ def test_sums_within_the_bound(n: int, M: int) -> None:
 
 @pytest.mark.parametrize(("n", "M"), [(3, 2), (3, 9), (64, 8), (65, 9)])
 def test_extension_and_matrix_product_agree_within_the_bound(n: int, M: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`_MANY_VECTORS`, `_WIDE` and `_CHUNK` choose the faster of two ways: no result changes beyond rounding."""
+    """`MANY_VECTORS`, `_WIDE` and `_CHUNK` choose the faster of two ways: no result changes beyond rounding."""
     K = 11
     u, t, a = samples(n, K, M)
     size, squares, weighted = u.abs(), u * u, u.mT[:, None] * a[:, :, None]
     for threshold in (0, 10**9):
         for chunk in (1, 1 << 22):
-            monkeypatch.setattr(kernels, "_MANY_VECTORS", threshold)
+            monkeypatch.setattr(kernels, "MANY_VECTORS", threshold)
             monkeypatch.setattr(kernels, "_WIDE", threshold)
             monkeypatch.setattr(kernels, "_CHUNK", chunk)
             monkeypatch.setattr(kernels, "_STRIP", 7)

@@ -162,7 +162,10 @@ def evaluate(
 
     references, encoded, scales = control.parted(aux) if control else (aux, (), None)
     values, outputs = call.values(perturbations.points, references, spare=again is not None)
-    remaining, kept, baseline, coefficients = values, None, None, None
+    remaining = values
+    kept: Tensor | None = None
+    baseline: Tensor | None = None
+    coefficients: Tensor | None = None
     if control is None and outer.linear and smoothing.baseline == "center":
         _, coefficients = coefficients_of(values, None, K, smoothing, n)
     if coefficients is None or not all_finite(coefficients):  # differences to f(x) are finite only if all values are

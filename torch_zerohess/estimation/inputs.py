@@ -58,7 +58,7 @@ def all_finite(tensor: Tensor) -> bool:
 def bound(x: Tensor) -> float:
     """Return a number that is at least the largest magnitude in x [B, n], and not finite if one in x is not."""
     if x.numel() <= _FEW:
-        return sum(sum(map(abs, row)) for row in x.tolist())
+        return float(sum(sum(map(abs, row)) for row in x.tolist()))
     return float(x.abs().max())
 
 

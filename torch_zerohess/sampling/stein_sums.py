@@ -29,7 +29,7 @@ def coefficients(values: Tensor, share: Tensor | None, K: int, center: bool) -> 
     """
     if extension.available and values.is_cpu:
         values = values if values.dtype == torch.float32 else values.double()
-        return torch.ops.torch_zerohess.coefficients.default(values.contiguous(), share, K, center)
+        return torch.ops.torch_zerohess.coefficients(values.contiguous(), share, K, center)
     values = values.double()
     f = values[:, :K] - values[:, K : K + 1] if center else values[:, :K]
     return f * (1.0 / K if share is None else share)
@@ -42,14 +42,14 @@ def _compiled(u: Samples, a: Tensor) -> bool:
 def gradient(u: Samples, weight: Tensor, a: Tensor) -> Tensor:
     """Return sum_k a_k w_k u_k, [B, M, n], for u [B, K, n] or its recipe, weight w [B, K] and a [B, M, K]."""
     if _compiled(u, a):
-        return torch.ops.torch_zerohess.weighted_gradient.default(u.contiguous(), weight.contiguous(), a.contiguous())
+        return torch.ops.torch_zerohess.weighted_gradient(u.contiguous(), weight.contiguous(), a.contiguous())
     return kernels.accumulate(u, a * weight[:, None])
 
 
 def hvp(u: Samples, weight: Tensor, a: Tensor, v: Tensor) -> Tensor:
     """Return sum_k a_k w_k ((u_k . v) u_k - v), [B, M, n], for v [B, M, n]; the others as in `gradient`."""
     if _compiled(u, a):
-        return torch.ops.torch_zerohess.weighted_hvp.default(
+        return torch.ops.torch_zerohess.weighted_hvp(
             u.contiguous(), weight.contiguous(), a.contiguous(), v.contiguous()
         )
     a = a * weight[:, None]

@@ -35,20 +35,20 @@ def coefficients(values: Tensor, share: Tensor | None, K: int, center: bool) -> 
     return f * (1.0 / K if share is None else share)
 
 
-def _compiled(u: Samples, a: Tensor) -> bool:
-    return extension.available and isinstance(u, Tensor) and u.is_cpu and a.shape[1] <= kernels.MANY_VECTORS
+def _compiled(u: Tensor, a: Tensor) -> bool:
+    return extension.available and u.is_cpu and a.shape[1] <= kernels.MANY_VECTORS
 
 
 def gradient(u: Samples, weight: Tensor, a: Tensor) -> Tensor:
     """Return sum_k a_k w_k u_k, [B, M, n], for u [B, K, n] or its recipe, weight w [B, K] and a [B, M, K]."""
-    if _compiled(u, a):
+    if isinstance(u, Tensor) and _compiled(u, a):
         return torch.ops.torch_zerohess.weighted_gradient(u.contiguous(), weight.contiguous(), a.contiguous())
     return kernels.accumulate(u, a * weight[:, None])
 
 
 def hvp(u: Samples, weight: Tensor, a: Tensor, v: Tensor) -> Tensor:
     """Return sum_k a_k w_k ((u_k . v) u_k - v), [B, M, n], for v [B, M, n]; the others as in `gradient`."""
-    if _compiled(u, a):
+    if isinstance(u, Tensor) and _compiled(u, a):
         return torch.ops.torch_zerohess.weighted_hvp(
             u.contiguous(), weight.contiguous(), a.contiguous(), v.contiguous()
         )

@@ -94,7 +94,8 @@ def batches(
         raise SystemExit(f"sizes must begin with 1, and runs be at least 1, got {sizes}, {runs} and {workers} workers")
     names = catalogue.chosen("tasks", tasks, list(catalogue.FITTING))
     for name in names:
-        if reason := METHODS[METHOD].unusable(catalogue.fitting(name)):
+        task = catalogue.fitting(name)
+        if reason := METHODS[METHOD].unusable(task) or (None if task.output else "its black box returns the loss only"):
             raise SystemExit(f"tasks must be such that {METHOD} searches them by their images, got {name}: {reason}")
     if store:
         result_files.may_keep(store)
@@ -120,8 +121,8 @@ def batches(
 def _search(
     task: Task, fn: Factory, start: Tensor, batch: int, evaluator: Evaluator | None, evaluations: int
 ) -> Search:
+    assert task.output is not None
     assert evaluator is not None
-    loss = task.output.loss if task.output else None
     # Before the clock starts, every process has loaded its scene.
     first = evaluator(fn, start.expand(_WARM, -1))[0]
     rounds = 0
@@ -135,10 +136,10 @@ def _search(
         fn,
         start,
         **{"sigma": task.sigma} | settings(METHOD, task.name),
-        loss=loss,
+        loss=task.output.loss,
         bounds=task.bounds,
         engine=METHOD,
-        target=(1.0 - REDUCED) * float(loss(first) if loss else first),
+        target=(1.0 - REDUCED) * float(task.output.loss(first)),
         max_evaluations=evaluations,
         batch=batch,
         evaluator=evaluator,

@@ -27,12 +27,6 @@ def test_larger_batches_take_fewer_rounds_and_workers_change_nothing(capsys):
     assert capsys.readouterr().out.splitlines()[0].split() == table(HEADERS, []).splitlines()[0].split()
 
 
-def test_a_loss_alone_is_searched_too():
-    alone, four = batches(("nonpsd",), sizes=(1, 4), workers=0, runs=1, seed=1000)
-    assert alone.reached == four.reached == 1.0
-    assert four.rounds < alone.rounds
-
-
 def test_a_row_has_medians_over_starts():
     found = [
         [Search(True, 10, 12, 1.0), Search(True, 4, 16, 0.5)],
@@ -53,6 +47,7 @@ def test_a_row_has_medians_over_starts():
     [
         ({"sizes": (4, 1)}, "sizes must begin with 1"),
         ({"runs": 0}, "got .* 0 and"),
+        ({"tasks": ("nonpsd",)}, "got nonpsd: its black box returns the loss only"),
         ({"tasks": ("meshfit",)}, "got meshfit: searches within finite bounds"),
         ({"tasks": ("texture",)}, "got texture: a Gaussian process for up to 10 parameters"),
         ({"tasks": (TASK.name,)}, "tasks must be some of"),

@@ -15,7 +15,6 @@ from typing import Annotated, Literal
 
 import torch
 import tyro
-from torch import Tensor
 
 import torch_zerohess as zh
 from experiments.methods import METHODS
@@ -27,7 +26,6 @@ from experiments.reports.progress import progress
 from experiments.reports.tables import table
 from experiments.studies.workers import images_of
 from torch_zerohess.evaluators import Factory, Inline, ProcessPool
-from torch_zerohess.evaluators.inline import Evaluator
 
 METHOD: Literal["gaussian_process"] = "gaussian_process"
 TASKS = ("mug", "shad", "bunny", "mirror", "box2", "brdf")
@@ -105,26 +103,26 @@ def batches(
     with ExitStack() as stack:
         pool = stack.enter_context(ProcessPool(workers)) if workers else None
         for name in progress(names, "tasks"):
-            task, fn = catalogue.fitting(name), Factory(images_of, name)
-            starts = [task.start(run) for run in range(seed, seed + runs)]
+            task, spread = catalogue.fitting(name), Factory(images_of, name)
             found = [
-                [_search(task, fn, start, batch, pool if count else Inline(), evaluations) for batch, count in ways]
-                for start in starts
+                [_search(task, spread, run, batch, pool if count else None, evaluations) for batch, count in ways]
+                for run in range(seed, seed + runs)
             ]
             rows += _rows(name, ways, found)
+            if task.renderer is not None:  # two loaded scenes slow each other down
+                task.renderer.release()
     print(table(HEADERS, [list(astuple(row)) for row in rows]))
     if store:
         print(result_files.keep(HEADERS, [list(astuple(row)) for row in rows], store))
     return rows
 
 
-def _search(
-    task: Task, fn: Factory, start: Tensor, batch: int, evaluator: Evaluator | None, evaluations: int
-) -> Search:
+def _search(task: Task, spread: Factory, run: int, batch: int, pool: ProcessPool | None, evaluations: int) -> Search:
+    """Search from one start, in this process without a pool."""
     assert task.output is not None
-    assert evaluator is not None
-    # Before the clock starts, every process has loaded its scene.
-    first = evaluator(fn, start.expand(_WARM, -1))[0]
+    start, evaluator = task.start(run), pool or Inline()
+    fn = task.output.image if pool is None else spread
+    first = evaluator(fn, start.expand(_WARM, -1))[0]  # before the clock starts, every process has loaded its scene
     rounds = 0
 
     def count(_: zh.Iterate) -> None:

@@ -213,11 +213,18 @@ def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, tim
                 different += int((values != (part**3).sin().sum(1)).sum())
                 lost += len(pool.lost)
                 while len(killed) < due[0]:  # as many as are due, then go on
+                    if not _workers():  # all were killed after the call: there is nobody to kill before the next one
+                        different += int((pool(fn, part[:count]) != (part[:count] ** 3).sin().sum(1)).sum())
                     time.sleep(0.01)
                 done += len(values)
-    left = [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
+    left = _workers()
     files = len(_open_files() - before)
     return Faults(done, len(killed), hangs, different, lost, len(left), files, time.monotonic() - start)
+
+
+def _workers() -> list[multiprocessing.process.BaseProcess]:
+    """Return the worker processes that are alive."""
+    return [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
 
 
 @contextmanager
@@ -233,7 +240,7 @@ def _killer(kills: int, chance: random.Random, due: list[int]) -> Iterator[list[
         while len(killed) < kills and not over.wait(chance.expovariate(1.0)):
             if len(killed) >= due[0] + _EARLY:
                 continue
-            running = [one for one in multiprocessing.active_children() if one.name == "torch_zerohess worker"]
+            running = _workers()
             if running and (pid := chance.choice(running).pid) is not None and pid not in killed:
                 os.kill(pid, signal.SIGKILL)
                 killed.append(pid)

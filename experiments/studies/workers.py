@@ -42,6 +42,8 @@ _CALL = 200
 """Points of a call that is disturbed."""
 _EARLY = 5
 """Kills before they are due."""
+_IN_A_ROW = 4
+"""Kills between two calls that end. A pool gives up a black box whose workers die more often without a value."""
 
 
 @dataclass(frozen=True)
@@ -203,18 +205,20 @@ def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, tim
     different = lost = done = 0
     with tempfile.TemporaryDirectory() as folder, ProcessPool(count, timeout=timeout, retries=20) as pool:
         fn = Hanging(folder)
-        due = [0]
-        with _killer(kills, chance, due) as killed:
+        due, killed_before = [0], [0]
+        with _killer(kills, chance, due, killed_before) as killed:
             for k, part in enumerate(progress(calls, "disturbed calls")):
                 for number in range(hanging.count(k)):
                     (Path(folder) / str(number)).touch()
                 due[0] = kills * (k + 1) // len(calls)
                 values = pool(fn, part)
+                killed_before[0] = len(killed)
                 different += int((values != (part**3).sin().sum(1)).sum())
                 lost += len(pool.lost)
                 while len(killed) < due[0]:  # as many as are due, then go on
-                    if not _workers():  # all were killed after the call: there is nobody to kill before the next one
+                    if not _workers() or len(killed) >= killed_before[0] + _IN_A_ROW:  # until workers are made again
                         different += int((pool(fn, part[:count]) != (part[:count] ** 3).sin().sum(1)).sum())
+                        killed_before[0] = len(killed)
                     time.sleep(0.01)
                 done += len(values)
     left = _workers()
@@ -228,7 +232,7 @@ def _workers() -> list[multiprocessing.process.BaseProcess]:
 
 
 @contextmanager
-def _killer(kills: int, chance: random.Random, due: list[int]) -> Iterator[list[int]]:
+def _killer(kills: int, chance: random.Random, due: list[int], killed_before: list[int]) -> Iterator[list[int]]:
     """Kill workers at random times, a few more than are due at most, and append the number of each.
 
     Where workers start slowly, they would all die before they begin, if kills did not keep step with calls.
@@ -238,7 +242,7 @@ def _killer(kills: int, chance: random.Random, due: list[int]) -> Iterator[list[
 
     def kill() -> None:
         while len(killed) < kills and not over.wait(chance.expovariate(1.0)):
-            if len(killed) >= due[0] + _EARLY:
+            if len(killed) >= min(due[0] + _EARLY, killed_before[0] + _IN_A_ROW):
                 continue
             running = _workers()
             if running and (pid := chance.choice(running).pid) is not None and pid not in killed:

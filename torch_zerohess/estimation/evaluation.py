@@ -108,7 +108,20 @@ class BlackBoxCall:
         if lost:  # a head may make a number of NaN
             values = values.clone()
             values[[k // E for k in lost], [k % E for k in lost]] = torch.nan
+        if self.on_nonfinite == "raise" and not all_finite(values):
+            self._check_head(values, outputs)
         return values, outputs
+
+    def _check_head(self, values: Tensor, outputs: Tensor) -> None:
+        """Raise ValueError if all losses of an element are not finite, and outputs are: its aux or the head is wrong."""
+        sound = torch.isfinite(outputs.reshape(*outputs.shape[:2], -1)).all(2)
+        wrong = (sound & ~torch.isfinite(values)).all(1)
+        if bool(wrong.any()):
+            b = int(wrong.nonzero()[0])
+            raise ValueError(
+                f"head returned {float(values[b, 0])} for every output of batch element {b}, and all these outputs are "
+                f"finite: look for values in aux[{b}] that are not finite"
+            )
 
     def _jointly(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [B, E, *out] of points [E, B, n], of which each row is one evaluation."""

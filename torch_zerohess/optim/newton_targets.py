@@ -62,7 +62,7 @@ class NewtonTargets:
     def __call__(self, losses: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
         """Return the targets [B, n], without a graph.
 
-        Raises ValueError for y that is not [B, n], for losses that are not [B], and for a gradient or curvature that is
+        Raises ValueError for y that is not [B, n], for losses that are not [B] or without a graph, and for a gradient or curvature that is
         not finite.
 
         Args:
@@ -76,6 +76,8 @@ class NewtonTargets:
             values = losses(at)
             if values.shape != at.shape[:1]:
                 raise ValueError(f"losses(y) must be [{len(at)}], one for each element, got {list(values.shape)}")
+            if not values.requires_grad:
+                raise ValueError("losses(y) has no graph back to y: compute it from y by torch, without no_grad or detach")
             (g,) = torch.autograd.grad(values.sum(), at, create_graph=True)
         self.losses = values.detach()
         gradient = g.detach()

@@ -30,9 +30,18 @@ class SparseRows(NamedTuple):
         )
         return sums.mT
 
+    def times_in_graph(self, vectors: Tensor) -> Tensor:
+        """Return the same by operations that torch differentiates."""
+        entry = torch.arange(len(self.column), device=self.column.device)
+        row = torch.searchsorted(self.first, entry, right=True) - 1
+        terms = vectors[:, self.column] * self.values.to(vectors)
+        return vectors.new_zeros(len(vectors), len(self.first)).index_add(1, row, terms)
+
 
 def product(matrix: SparseRows, transposed: SparseRows, vectors: Tensor) -> Tensor:
     """Return the products [K, rows] of a matrix, given with its transpose, and vectors [K, columns]."""
+    if torch.compiler.is_compiling():
+        return matrix.times_in_graph(vectors)  # Dynamo traces no function with a custom jvp
     result: Tensor = _Product.apply(vectors, *matrix, *transposed)
     return result
 

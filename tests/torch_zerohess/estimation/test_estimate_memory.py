@@ -199,6 +199,13 @@ def test_a_head_gets_aux_by_views() -> None:
     torch.testing.assert_close(got.value, same.value)
 
 
+def test_a_reference_that_is_not_finite_is_named() -> None:
+    """The black box is not to blame: its outputs are finite."""
+    references = torch.tensor([[1.0], [torch.nan]])
+    with pytest.raises(ValueError, match=r"head returned nan for every output of batch element 1.*aux\[1\]"):
+        estimate(torch.sin, torch.zeros(2, 1), Smoothing(sigma=0.1), references, head=SquaredError())
+
+
 def test_without_a_head_outputs_keep_their_shape() -> None:
     got = estimate(image, X, SMOOTHING.replace(samples=256), memory=Whole(Model(lambda z: image(z) + z), draws=256))
     assert got.gradient.shape == (2, 2)

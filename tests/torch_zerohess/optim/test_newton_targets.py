@@ -105,5 +105,7 @@ def test_losses_and_outputs_are_checked():
         targets(lambda y: y, torch.zeros(3))
     with pytest.raises(ValueError, match=r"losses\(y\) must be \[2\], one for each element, got \[\]"):
         targets(lambda y: y.square().mean(), torch.zeros(2, 3))
+    with pytest.raises(ValueError, match=r"losses\(y\) has no graph back to y"):
+        targets(lambda y: y.detach().square().sum(1), torch.ones(2, 3))
     with pytest.raises(ValueError, match="is not finite"):
         targets(lambda y: (y * torch.inf).square().sum(1), torch.ones(2, 3))

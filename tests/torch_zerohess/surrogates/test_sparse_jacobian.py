@@ -74,6 +74,17 @@ def test_products_have_derivatives_of_every_order_in_every_mode():
     assert torch.autograd.gradgradcheck(cubes, v.requires_grad_())
 
 
+def test_compiled_products_and_their_gradients_are_those_of_the_dense_matrix():
+    """Row 3 is empty, and so are the last ones."""
+    index = torch.tensor([[0, 3], [2, 0], [6, 1], [0, 0], [5, 2], [0, 0]])
+    values = torch.tensor([[1.0, 2.0], [5.0, 0.0], [3.0, -1.0], [0.0, 0.0], [4.0, 1.0], [0.0, 0.0]]).double()
+    J = SparseJacobian(index, values, values.abs(), 7, torch.Size([6]))
+    v, w = normal(2, 7), normal(2, 6)
+    for method, at in ((J.matvec, v), (J.rmatvec, w)):
+        compiled = torch.compile(torch.func.grad(lambda z, m=method: m(z).sin().sum()), fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(at), torch.func.grad(lambda z, m=method: m(z).sin().sum())(at))
+
+
 def test_a_jacobian_made_in_inference_mode_has_products_with_a_graph():
     with torch.inference_mode():
         J, dense = random_jacobian()

@@ -20,7 +20,7 @@ _EXCESS = 1.05
 """Evaluations over the capacity at which they are thinned."""
 _BLOCK = 1024
 """Points whose distances to others are held at once."""
-_FORGET = 0.8
+_FORGET = 0.9
 """Weight of what the coefficient knows, at every new call."""
 
 
@@ -101,8 +101,8 @@ class Memory:
         self._known = 0
         """How many evaluations the last fit knew."""
         self._moments: list[list[float]] = []
-        """Covariance of h(f) and h(g), and variance of h(g), over evaluations that g had not seen: of the values, then
-        of what they add to first and second derivatives."""
+        """Covariance of h(f) and h(g), and variance of h(g), over the sum of both variances in a call, averaged over
+        calls that g had not seen: of the values, then of what they add to first and second derivatives."""
 
     def __len__(self) -> int:
         """Evaluations that are kept."""
@@ -192,6 +192,9 @@ class Memory:
         There is one regression for values and one for each order of derivatives, on the contributions of the
         evaluations. They differ: a surrogate may explain values and no curvature. c is the smallest coefficient, so
         that no derivative becomes noisier.
+
+        Calls are weighted by the inverse of their sum of squares, var h(f) + var h(g). Losses at the edge of a plateau
+        are a thousand times as large as elsewhere: without the weights one call there would decide alone.
         """
         if self.fresh == 0:
             return 1.0
@@ -219,7 +222,7 @@ class Memory:
         count = weight.sum(dim, keepdim=True).clamp_min(1.0)
         a, b = ((one - (weight * one).sum(dim, keepdim=True) / count) * weight for one in (a, b))
         pairs = [(a, b), *derivatives]
-        new = [[float((one * other).sum()), float(other.square().sum())] for one, other in pairs]
+        new = [_moments_of(one, other) for one, other in pairs]
         if not all(math.isfinite(one) for moments in new for one in moments):  # the surrogate predicts nonsense
             self._moments = []
             return
@@ -283,6 +286,12 @@ class Memory:
     def __repr__(self) -> str:
         kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"
         return f"Memory({type(self.surrogate).__name__}, {kept}, coefficient={self.coefficient:.2f})"
+
+
+def _moments_of(a: Tensor, b: Tensor) -> list[float]:
+    """Return the covariance of two samples without a mean and the variance of b, over the sum of both variances."""
+    size = float(a.square().sum() + b.square().sum())
+    return [float((a * b).sum()) / size, float(b.square().sum()) / size] if size != 0.0 else [0.0, 0.0]
 
 
 def _joined(parts: list[Tensor]) -> list[Tensor]:

@@ -166,6 +166,9 @@ for dtype in (torch.float32, torch.float64):
         made += ops.sample(2**40 + 1, 6, x, sigma, True, proposal, True, True)
 u = ops.draw(every, n)[None]
 made += [ops.project(u, t), ops.accumulate(u, half, False), ops.hessian(u, half)]
+weight = a[:, 0, :120].exp().contiguous()
+made += [ops.coefficients(u[..., :5].contiguous(), None, 119, True), ops.weighted_gradient(u, weight, half)]
+made += [ops.weighted_hvp(u, weight, half, t)]
 for single in (True, False):
     recipe = (every, x, sigma, True, single)
     made += [ops.project_drawn(*recipe, t), ops.accumulate_drawn(*recipe, a, False)]

@@ -203,8 +203,17 @@ def test_values_that_were_left_out_do_not_count() -> None:
 
 
 def test_older_calls_count_less() -> None:
-    """The regression of 1, then of 1/4, with the weights 0.8 and 1."""
+    """The regression of 1, then of 1/4, with the weights 0.9 and 1, over the sums of squares 2 and 17/16."""
     memory, truth = Memory(), normal(1, 2000)
     memory.observe(truth, truth)
     memory.observe(0.25 * truth, truth)
-    assert memory.coefficient == pytest.approx((0.8 * 1.0 + 0.25) / 1.8)
+    assert memory.coefficient == pytest.approx((0.9 / 2 + 0.25 * 16 / 17) / (0.9 / 2 + 16 / 17))
+
+
+def test_one_call_with_large_values_does_not_decide() -> None:
+    """The surrogate is right in twenty calls and opposite in one, whose values are a thousand times as large."""
+    memory, truth = Memory(), normal(1, 2000)
+    for _ in range(20):
+        memory.observe(truth, truth, [(truth, truth)])
+    memory.observe(1000.0 * truth, -1000.0 * truth, [(1e6 * truth, -1e6 * truth)])
+    assert memory.coefficient > 0.7

@@ -113,7 +113,7 @@ class BlackBoxCall:
         return values, outputs
 
     def _check_head(self, values: Tensor, outputs: Tensor) -> None:
-        """Raise ValueError if all losses of an element are not finite, and outputs are: its aux or the head is wrong."""
+        """Raise ValueError if no loss of an element is finite and its outputs are: its aux or the head is wrong."""
         sound = torch.isfinite(outputs.reshape(*outputs.shape[:2], -1)).all(2)
         wrong = (sound & ~torch.isfinite(values)).all(1)
         if bool(wrong.any()):

@@ -62,8 +62,8 @@ class NewtonTargets:
     def __call__(self, losses: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
         """Return the targets [B, n], without a graph.
 
-        Raises ValueError for y that is not [B, n], for losses that are not [B] or without a graph, and for a gradient or curvature that is
-        not finite.
+        Raises ValueError for y that is not [B, n], for losses that are not [B] or have no graph, and for a gradient or
+        curvature that is not finite.
 
         Args:
             losses: outputs [B, n] -> losses [B], twice differentiable, each of its own element.
@@ -77,7 +77,9 @@ class NewtonTargets:
             if values.shape != at.shape[:1]:
                 raise ValueError(f"losses(y) must be [{len(at)}], one for each element, got {list(values.shape)}")
             if not values.requires_grad:
-                raise ValueError("losses(y) has no graph back to y: compute it from y by torch, without no_grad or detach")
+                raise ValueError(
+                    "losses(y) has no graph back to y: compute it from y by torch, without no_grad or detach"
+                )
             (g,) = torch.autograd.grad(values.sum(), at, create_graph=True)
         self.losses = values.detach()
         gradient = g.detach()

@@ -6,7 +6,7 @@ more, no few draws hit a valley, and the loss is the mean. This is what a user w
 public names of the library. All tasks have the same settings, the defaults below, but for the radius of
 `memory_newton` on CNN-THROW. They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
 runs 100 to 107 of CNN-THROW, which no table reports. The weights in the coefficient of `zh.Memory` were chosen on runs
-14, 16 and 17 of CNN with 1 200 renders; the tables of CNN with up to 1 200 renders report runs 20 to 39.
+14, 16 and 17 of CNN with 1 200 renders; the tables of CNN with 400 and 1 200 renders report runs 20 to 39.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the

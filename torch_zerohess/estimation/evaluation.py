@@ -120,7 +120,7 @@ class BlackBoxCall:
             b = int(wrong.nonzero()[0])
             raise ValueError(
                 f"head returned {float(values[b, 0])} for every output of batch element {b}, and all these outputs are "
-                f"finite: look for values in aux[{b}] that are not finite"
+                f"finite: look at element {b} of aux for values that are not finite, or at the head"
             )
 
     def _jointly(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:

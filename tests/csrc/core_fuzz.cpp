@@ -166,6 +166,13 @@ Numbers test_sums(Bytes in) {
       check_sum(sums[size_t(i)], K, in.wild,
                 [&](int64_t k) { return A(i, k) * U(k, i % n) * (squares ? U(k, i % n) : 1.0L); });
   }
+  for (int64_t m = 0; m < M; ++m)
+    check_sum(total(a.data() + m * K, K), K, in.wild, [&](int64_t k) { return (long double)(a[size_t(m * K + k)]); });
+  const std::vector<T> f(a.begin(), a.begin() + K), base(p.begin(), p.begin() + K);
+  Numbers centered(f.size()), alone(f.size());
+  center_row(f.data(), base.data(), t[0], K, centered.data()), center_row<T>(f.data(), nullptr, t[0], K, alone.data());
+  for (size_t k = 0; k < f.size(); ++k)
+    EXPECT(same(centered[k], (double(f[k]) - double(base[k])) * t[0]) && same(alone[k], double(f[k]) * t[0]));
   if (n > 64) return sums;
   for (int64_t i = 0; i < n; ++i) hessian_row(u.data(), i, K, n, a.data(), H.data());
   H_parts = H;

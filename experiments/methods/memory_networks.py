@@ -46,6 +46,7 @@ def through_memory(
     steps: Literal["newton", "targets", "adam"],
     batch: int = 16,
     radius: tuple[float, float] = (0.07, 0.003),
+    output_radius: float = 0.7,
     damping: float = 3e-4,
     rate: tuple[float, float] = (3e-3, 3e-4),
     target_damping: float = 1e-2,
@@ -66,6 +67,7 @@ def through_memory(
         steps: "newton" on the weights, "targets" on the outputs, to whose ends the network is fitted, or "adam".
         batch: images of a step.
         radius: first and last trust radius of "newton", in the weights.
+        output_radius: longest move of the outputs in a step of "newton", over sigma.
         damping: of "newton".
         rate: first and last learning rate of "adam".
         target_damping: of the Newton steps on up to 10 outputs.
@@ -95,7 +97,7 @@ def through_memory(
     if not total:  # everything is known that may be known
         memory.fresh, total = 0, _STEPS_ALONE
     update = {
-        "newton": partial(_newton, network, layer, radius, damping),
+        "newton": partial(_newton, network, layer, radius, output_radius, damping),
         "targets": partial(_targets, network, layer, target_damping, target_radius, fit_damping)
         if task.n <= MOST
         else partial(_many_targets, network, layer, many_damping, many_rate),
@@ -111,7 +113,9 @@ def through_memory(
             trial.report(sigma=sigma, loss=loss, measured=last or step % (10 * every) == 0)
 
 
-def _newton(network: nn.Module, layer: zh.BlackBox, radius: tuple[float, float], damping: float) -> Update:
+def _newton(
+    network: nn.Module, layer: zh.BlackBox, radius: tuple[float, float], output_radius: float, damping: float
+) -> Update:
     optimizer = zh.optim.NewtonCG(
         network.parameters(),
         radius=radius[0],
@@ -127,7 +131,8 @@ def _newton(network: nn.Module, layer: zh.BlackBox, radius: tuple[float, float],
             y = network(images)
             return layer(y, images).mean(), y, zh.optim.SampleJacobian(network, images)
 
-        optimizer.param_groups[0]["radius"] = _annealed(radius, share)
+        group = optimizer.param_groups[0]
+        group["radius"], group["output_radius"] = _annealed(radius, share), output_radius * sigma
         return optimizer.step(closure)
 
     return update

@@ -34,9 +34,12 @@ def dual_step(J: Tensor, A: Tensor, g: Tensor, radius: float, damping: float) ->
     return Step(-scale * (J.mT @ w.to(J)), decrease, "boundary" if scale < 1.0 else "converged")
 
 
-def clipped(step: Step, gradient: Tensor, radius: float) -> Step:
-    """Return a step of a quadratic model with this gradient [N], shortened to the radius."""
-    length = float(step.s.norm())
+def clipped(step: Step, gradient: Tensor, radius: float, length: float | None = None) -> Step:
+    """Return a step of a quadratic model with this gradient [N], shortened to the radius.
+
+    length: of the step, in the units of the radius; its Euclidean norm if None.
+    """
+    length = float(step.s.norm()) if length is None else length
     if length <= radius:
         return step
     slope, scale = float(gradient.dot(step.s)), radius / length

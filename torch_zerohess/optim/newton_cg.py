@@ -57,6 +57,9 @@ class NewtonCG(NewtonStep):
         max_radius: the radius never grows beyond it.
         noise: number of standard errors by which residual and curvature must differ from zero, if there are several
             losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact.
+        output_radius: longest move of the input y [n] of a black box, for every element of the batch, in units of y;
+            None: any. Sampled derivatives describe a black box within about sigma of y. Steps of the weights that are
+            short can still move y far beyond it. Needs curvature "gauss_newton".
         lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change. With `adapt`
             the radius does not grow while it is below 1.
 
@@ -87,6 +90,7 @@ class NewtonCG(NewtonStep):
         adapt: bool = True,
         max_radius: float = math.inf,
         noise: float = 2.0,
+        output_radius: float | None = None,
         lr: float = 1.0,
     ) -> None:
         check_radius(radius)
@@ -96,8 +100,10 @@ class NewtonCG(NewtonStep):
             raise ValueError(f"solver must be one of {', '.join(map(repr, SOLVERS))}, got {solver!r}")
         if modification not in (None, "abs"):
             raise ValueError(f"modification must be None or 'abs', got {modification!r}")
-        if (modification or solver == "dual") and curvature != "gauss_newton":
-            what = "modification 'abs'" if modification else "solver 'dual'"
+        if output_radius is not None:
+            check_positive(output_radius=output_radius)
+        if (modification or solver == "dual" or output_radius) and curvature != "gauss_newton":
+            what = "modification 'abs'" if modification else "solver 'dual'" if solver == "dual" else "output_radius"
             raise ValueError(f"{what} needs curvature 'gauss_newton', got {curvature!r}")
         if solver == "dual" and not damping > 0.0:
             raise ValueError(f"solver 'dual' needs a positive damping, got {damping}")
@@ -113,6 +119,7 @@ class NewtonCG(NewtonStep):
             "adapt": adapt,
             "max_radius": max_radius,
             "noise": noise,
+            "output_radius": output_radius,
         }
         super().__init__(params, defaults)
 
@@ -122,6 +129,12 @@ class NewtonCG(NewtonStep):
         return modification
 
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
+        step = self._solved(model, radius, group)
+        most = group.get("output_radius")  # absent from the states of older versions
+        return step if most is None else clipped(step, model.gradient, most, model.longest_move(step.s))
+
+    @staticmethod
+    def _solved(model: Model, radius: float, group: dict[str, Any]) -> Step:
         solver, damping = group["solver"], group["damping"]
         if solver == "dual" and (exact := model.dual_step(radius, damping)) is not None:
             return exact

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -89,11 +90,7 @@ class Model:
         A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
         slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
         g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
-        J = (
-            white_box_jacobian(self._operators[0])
-            if self._jacobian is None
-            else self._jacobian(self._operators[0].inputs)
-        )
+        J = self._white_box
         if float((self.gradient - (J.mT @ g.to(J)).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
             raise ValueError(
                 "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone: "
@@ -104,6 +101,23 @@ class Model:
             if float(values[0]) < -_INDEFINITE * torch.finfo(self.loss.dtype).eps * float(values.abs().max()):
                 return None
         return dual_step(J, A, g, radius, damping)
+
+    @cached_property
+    def _white_box(self) -> Tensor:
+        """J [M, N] of all outputs of the white box."""
+        operator = self._operators[0]
+        return white_box_jacobian(operator) if self._jacobian is None else self._jacobian(operator.inputs)
+
+    def longest_move(self, s: Tensor) -> float:
+        """Return how far a step s [N] moves the input [n] of a black box, for the element that moves farthest."""
+        operator = self._operators[0]
+        if self._jacobian is None:
+            moved = operator.output_step(s)
+        else:
+            sizes = [one.numel() for one in operator.through]
+            flat = (self._white_box @ s.to(self._white_box)).split(sizes)
+            moved = [one.view_as(y) for one, y in zip(flat, operator.through, strict=True)]
+        return max(float(one.norm(dim=-1).max()) for one in moved)
 
     def _dense(self, index: int) -> list[Tensor]:
         """Blocks [n, n] of one operator, modified if they are to be."""

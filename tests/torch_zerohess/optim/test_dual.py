@@ -42,24 +42,17 @@ def flat(net: nn.Module) -> Tensor:
     return torch.cat([one.detach().flatten() for one in net.parameters()])
 
 
-@pytest.mark.parametrize("solver", ["dual", "clip", "dual with a Jacobian"])
-@pytest.mark.parametrize("radius", [1e6, 0.05])
-def test_steps_equal_the_dense_solution(solver: str, radius: float) -> None:
-    net, damping = network(), 1e-2
-    J, A, g, _ = dense(net)
-    H = J.mT @ A @ J + damping * torch.eye(J.shape[1], dtype=torch.float64)
-    expected = -torch.linalg.solve(H, J.mT @ g)
-    expected = expected * min(1.0, radius / float(expected.norm()))
+def stepped(net: nn.Module, solver: str, **settings: float | None) -> Tensor:
+    """The step [N] of NewtonCG on the losses of the images, with magnitudes of eigenvalues."""
     optimizer = zh.optim.NewtonCG(
         net.parameters(),
-        radius=radius,
         curvature="gauss_newton",
         solver=solver.split()[0],
         modification="abs",
         iterations=500,
         tolerance=1e-13,
-        damping=damping,
         adapt=False,
+        **settings,  # type: ignore[arg-type]
     )
     before = flat(net)
 
@@ -69,7 +62,29 @@ def test_steps_equal_the_dense_solution(solver: str, radius: float) -> None:
         return (loss, y, SampleJacobian(net, IMAGES)) if "Jacobian" in solver else (loss, y)
 
     optimizer.step(closure)  # type: ignore[arg-type]
-    torch.testing.assert_close(flat(net) - before, expected, rtol=1e-5, atol=1e-8)
+    return flat(net) - before
+
+
+@pytest.mark.parametrize("solver", ["dual", "clip", "dual with a Jacobian"])
+@pytest.mark.parametrize("radius", [1e6, 0.05])
+def test_steps_equal_the_dense_solution(solver: str, radius: float) -> None:
+    net, damping = network(), 1e-2
+    J, A, g, _ = dense(net)
+    H = J.mT @ A @ J + damping * torch.eye(J.shape[1], dtype=torch.float64)
+    expected = -torch.linalg.solve(H, J.mT @ g)
+    expected = expected * min(1.0, radius / float(expected.norm()))
+    torch.testing.assert_close(stepped(net, solver, radius=radius, damping=damping), expected, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", ["dual", "dual with a Jacobian", "clip", "steihaug"])
+def test_no_element_of_the_outputs_moves_beyond_the_output_radius(solver: str) -> None:
+    free = stepped(network(), solver, radius=1e6, damping=1e-2)
+    J, *_ = dense(network())
+    farthest = float((J @ free).view(5, 2).norm(dim=1).max())
+    for output_radius in (0.5 * farthest, 2.0 * farthest, None):
+        step = stepped(network(), solver, radius=1e6, damping=1e-2, output_radius=output_radius)
+        factor = 0.5 if output_radius == 0.5 * farthest else 1.0
+        torch.testing.assert_close(step, factor * free, rtol=1e-6, atol=1e-9)
 
 
 def test_jacobians_agree() -> None:
@@ -150,6 +165,8 @@ def test_wrong_settings_say_so() -> None:
         ("needs curvature 'gauss_newton'", {"solver": "dual", "damping": 1.0}),
         ("needs curvature 'gauss_newton'", {"modification": "abs"}),
         ("needs a positive damping", {"solver": "dual", "curvature": "gauss_newton"}),
+        ("output_radius needs curvature 'gauss_newton'", {"output_radius": 1.0}),
+        ("output_radius must be positive, got 0", {"output_radius": 0.0, "curvature": "gauss_newton"}),
     ):
         with pytest.raises(ValueError, match=message):
             zh.optim.NewtonCG(net.parameters(), **settings)  # type: ignore[arg-type]

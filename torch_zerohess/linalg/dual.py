@@ -42,6 +42,6 @@ def clipped(step: Step, gradient: Tensor, radius: float, length: float | None = 
     length = float(step.s.norm()) if length is None else length
     if length <= radius:
         return step
-    slope, scale = float(gradient.dot(step.s)), radius / length
+    slope, scale = float(gradient.dot(step.s.to(gradient))), radius / length
     bend = -2.0 * (step.decrease + slope)  # s.Hs
     return Step(scale * step.s, -scale * (slope + 0.5 * scale * bend), "boundary")

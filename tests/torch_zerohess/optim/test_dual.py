@@ -87,6 +87,14 @@ def test_no_element_of_the_outputs_moves_beyond_the_output_radius(solver: str) -
         torch.testing.assert_close(step, factor * free, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("solver", ["dual", "dual with a Jacobian", "clip", "steihaug"])
+def test_weights_of_single_precision_have_an_output_radius(solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {"radius": 1.0, "damping": 1e-2, "output_radius": 0.01}
+    expected = stepped(network(), solver, **settings)
+    monkeypatch.setitem(globals(), "IMAGES", IMAGES.float())
+    torch.testing.assert_close(stepped(network().float(), solver, **settings), expected.float(), rtol=1e-3, atol=1e-6)
+
+
 def test_jacobians_agree() -> None:
     net = network()
     y = net(IMAGES)

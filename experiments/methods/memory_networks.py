@@ -7,7 +7,7 @@ public names of the library. All tasks have the same settings, the defaults belo
 `memory_newton` on CNN-THROW. They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
 runs 100 to 107 of CNN-THROW, which no table reports. The weights in the coefficient of `zh.Memory` were chosen on runs
 14, 16 and 17 of CNN with 1 200 renders, and `output_radius` on runs 17, 33 and 36. The table of 400 renders reports
-runs 20 to 39, the table of 1 200 renders runs 40 to 59.
+runs 20 to 39, the table of 1 200 renders runs 40 to 49.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the

@@ -55,11 +55,12 @@ def stepped(net: nn.Module, solver: str, **settings: float | None) -> Tensor:
         **settings,  # type: ignore[arg-type]
     )
     before = flat(net)
+    images = IMAGES.to(before.dtype)
 
     def closure() -> object:
-        y = net(IMAGES)
+        y = net(images)
         loss = losses(y).mean()
-        return (loss, y, SampleJacobian(net, IMAGES)) if "Jacobian" in solver else (loss, y)
+        return (loss, y, SampleJacobian(net, images)) if "Jacobian" in solver else (loss, y)
 
     optimizer.step(closure)  # type: ignore[arg-type]
     return flat(net) - before
@@ -88,10 +89,9 @@ def test_no_element_of_the_outputs_moves_beyond_the_output_radius(solver: str) -
 
 
 @pytest.mark.parametrize("solver", ["dual", "dual with a Jacobian", "clip", "steihaug"])
-def test_weights_of_single_precision_have_an_output_radius(solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_of_single_precision_have_an_output_radius(solver: str) -> None:
     settings = {"radius": 1.0, "damping": 1e-2, "output_radius": 0.01}
     expected = stepped(network(), solver, **settings)
-    monkeypatch.setitem(globals(), "IMAGES", IMAGES.float())
     torch.testing.assert_close(stepped(network().float(), solver, **settings), expected.float(), rtol=1e-3, atol=1e-6)
 
 

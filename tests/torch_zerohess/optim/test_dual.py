@@ -90,9 +90,11 @@ def test_no_element_of_the_outputs_moves_beyond_the_output_radius(solver: str) -
 
 @pytest.mark.parametrize("solver", ["dual", "dual with a Jacobian", "clip", "steihaug"])
 def test_weights_of_single_precision_have_an_output_radius(solver: str) -> None:
-    settings = {"radius": 1.0, "damping": 1e-2, "output_radius": 0.01}
-    expected = stepped(network(), solver, **settings)
-    torch.testing.assert_close(stepped(network().float(), solver, **settings), expected.float(), rtol=1e-3, atol=1e-6)
+    settings = {"radius": 1e6, "damping": 1e-2, "output_radius": 0.01}
+    step = stepped(network().float(), solver, **settings)
+    torch.testing.assert_close(step, stepped(network(), solver, **settings).float(), rtol=1e-3, atol=1e-6)
+    J, *_ = dense(network())
+    assert float((J @ step.double()).view(5, 2).norm(dim=1).max()) == pytest.approx(0.01, rel=1e-3)
 
 
 def test_jacobians_agree() -> None:

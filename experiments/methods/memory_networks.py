@@ -6,8 +6,8 @@ more, no few draws hit a valley, and the loss is the mean. This is what a user w
 public names of the library. All tasks have the same settings, the defaults below, but for the radius of
 `memory_newton` on CNN-THROW. They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
 runs 100 to 107 of CNN-THROW, which no table reports. The weights in the coefficient of `zh.Memory` were chosen on runs
-14, 16 and 17 of CNN with 1 200 renders, and `output_radius` on runs 17, 33 and 36. The table of 400 renders reports
-runs 20 to 39, the table of 1 200 renders runs 40 to 49.
+14, 16 and 17 of CNN with 1 200 renders, `output_radius` on runs 17, 33 and 36, and `warm_up` on run 8 of CNN-TEXTURE.
+The tables report runs from 60 on of CNN, and from 10 on of CNN-TEXTURE.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the
@@ -55,6 +55,7 @@ def through_memory(
     fit_damping: float = 0.3,
     many_damping: float = 3e-4,
     many_rate: tuple[float, float] = (1e-2, 3e-4),
+    warm_up: float = 0.05,
     temperature: float = 0.15,
 ) -> None:
     """Train until the evaluations are used.
@@ -76,6 +77,8 @@ def through_memory(
         fit_damping: of the steps on the weights that follow them.
         many_damping: of the Newton steps on more outputs.
         many_rate: first and last learning rate of Adam, which follows them.
+        warm_up: share of the training in which the learning rate grows to its first value. Without it, some networks
+            do not train.
         temperature: of the local entropy over the mean loss, with up to 10 parameters.
     """
     task, network = trial.task, trial.encoder
@@ -101,7 +104,7 @@ def through_memory(
         "newton": partial(_newton, network, layer, radius, output_radius, damping),
         "targets": partial(_targets, network, layer, target_damping, target_radius, fit_damping)
         if task.n <= MOST
-        else partial(_many_targets, network, layer, many_damping, many_rate),
+        else partial(_many_targets, network, layer, many_damping, many_rate, warm_up),
         "adam": partial(_adam, network, layer, rate),
     }[steps]()
     for step in range(total):
@@ -152,13 +155,15 @@ def _targets(network: nn.Module, layer: zh.BlackBox, damping: float, radius: flo
     return update
 
 
-def _many_targets(network: nn.Module, layer: zh.BlackBox, damping: float, rate: tuple[float, float]) -> Update:
+def _many_targets(
+    network: nn.Module, layer: zh.BlackBox, damping: float, rate: tuple[float, float], warm_up: float
+) -> Update:
     optimizer, newton = torch.optim.Adam(network.parameters()), zh.optim.NewtonTargets(damping=damping)
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         y = network(images)
         ends = newton(lambda at: layer(at, images), y)
-        _step(optimizer, _annealed(rate, share), (y - ends).square().mean())
+        _step(optimizer, _annealed(rate, share) * min(share / warm_up, 1.0), (y - ends).square().mean())
         assert newton.losses is not None
         return newton.losses.mean()
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Literal
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.estimation.sums import Sums
@@ -70,8 +70,8 @@ def draw_until(
 
 def check_limits(tolerance: float | None, of: Derivative, max_evaluations: int | None) -> None:
     """Raise ValueError or TypeError for limits out of their ranges, or for another argument without a tolerance."""
-    if of not in get_args(Derivative):
-        raise ValueError(f"tolerance_of must be one of {', '.join(map(repr, get_args(Derivative)))}, got {of!r}")
+    if of not in _NAMES:
+        raise ValueError(f"tolerance_of must be one of {', '.join(map(repr, _NAMES))}, got {of!r}")
     if tolerance is None:
         if of != "gradient":
             raise ValueError(f"tolerance_of says whose error a tolerance is: give tolerance too, got {of!r} alone")

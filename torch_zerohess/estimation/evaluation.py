@@ -166,7 +166,7 @@ def evaluate(
     with_center = call.value == "center" or smoothing.baseline == "center"
     perturbations = perturb(x, smoothing, seed, keep, with_center)
     stein, sigma, outer = perturbations.stein, perturbations.sigma, call.outer
-    B, K, n = len(x), perturbations.points.shape[1] - with_center, x.shape[1]
+    (B, n), K = x.shape, perturbations.points.shape[1] - with_center
     # Points that can be made again are not copied for fn, which may write to them.
     again = stein if isinstance(stein, LikelihoodRatio) and control is None else None
 

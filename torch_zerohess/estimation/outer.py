@@ -40,7 +40,7 @@ class Outer:
 
     def kept(self, scales: Tensor | None, values: Tensor, K: int) -> Tensor:
         """Return the constants float64 [B, constants] for values [B, E, ...], of which those from K on are f(x)."""
-        return values.new_empty(len(values), 0, dtype=torch.float64)
+        return values.new_empty(values.shape[0], 0, dtype=torch.float64)
 
     def value(self, Z: Tensor, constants: Tensor, value: str, around: Tensor | None = None) -> Tensor:
         """Return F from Z; with "center" its value is the one at the center, where Z is `around` (Z itself if None)."""

@@ -233,7 +233,7 @@ class Estimate:
         return None if v is None else self._vector(v)
 
     def _vector(self, v: Tensor) -> Tensor:
-        n = len(self._sigma)
+        (n,) = self._sigma.shape
         if not isinstance(v, Tensor) or v.shape not in ((n,), (*self._batch, n)):
             given = list(v.shape) if isinstance(v, Tensor) else type(v).__name__
             raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")

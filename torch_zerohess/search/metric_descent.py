@@ -38,6 +38,8 @@ _RATE, _FIRST_RATE = 0.3, 0.7
 """Rate at which the metric is learned from a full quadratic, and from the first one."""
 _CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
+_ROUNDED = 1e15
+"""A Hessian of values that were larger than those of now by this factor is made of their roundings."""
 _AWAY = 2.0
 """Standard deviation of a further start from the first one, where there is no box to draw it from."""
 
@@ -155,8 +157,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         chosen = self._nearest(known, 2 * n + 1)
         values = known.values[chosen] - known.lowest.loss
         size = float(values.abs().max()) or 1.0
-        axes = known.sigma * known.root
-        before = axes.mT @ (known.size / size * known.hessian) @ axes
+        axes, ratio = known.sigma * known.root, known.size / size
+        before = axes.mT @ (ratio * known.hessian) @ axes if ratio < _ROUNDED else torch.zeros_like(known.hessian)
         if len(known.values) <= 2 * n:
             before = fit_values(u[chosen], values / size, torch.ones_like(values)).full_hessian()
         _, gradient, hessian = least_change(u[chosen], values / size, before)

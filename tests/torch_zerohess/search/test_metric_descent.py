@@ -168,7 +168,7 @@ def test_where_a_quadratic_is_known_sigma_falls_at_once(seed):
     assert search.value < 1e-12
 
 
-@pytest.mark.parametrize("seed", (4, 12, 28, 51))
+@pytest.mark.parametrize("seed", [4, 12, 28, 51])
 def test_a_wall_near_the_largest_number_is_forgotten(seed):
     """A curvature of 1e240 in units of the values that remain is not squared: it would be infinite."""
     search = Descent(vector(2.0, 0.0, 0.0), sigma=0.5, seed=seed)

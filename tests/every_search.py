@@ -1,6 +1,7 @@
 """Every search with a black box that keeps it busy, and when two states are the same."""
 
 import io
+from functools import partial
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from torch_zerohess.optim import (
 # Every search with and without a loss; restarts keep it busy.
 SEARCHES = {
     "descent of the loss": (Descent, 3, False),
+    "descent in noise": (partial(Descent, noise=0.05, pool=80), 3, False),
     "descent of the output": (Descent, 5, True),
     "process of the loss": (GaussianProcessSearch, 2, False),
     "process of the output": (GaussianProcessSearch, 2, True),

@@ -31,6 +31,8 @@ def decide(
     before: int,
     most: int,
     noise: float,
+    *,
+    trusted: bool,
 ) -> tuple[Tensor, float, float] | None:
     """Evaluate the best points again; return the point with the lowest mean, the mean, and its standard error.
 
@@ -43,6 +45,7 @@ def decide(
             used again if they are of the same points.
         most: evaluations that the decision gets.
         noise: standard deviation of a loss.
+        trusted: whether a model of many evaluations has chosen the first of the likely points, see `lowest_mean`.
     """
     lowest = torch.where(torch.isfinite(losses), losses, torch.inf)[:before].argsort()[:_OTHERS]
     candidates = distinct([*likely, *points[lowest]])
@@ -61,5 +64,5 @@ def decide(
             told[missing] = evaluate(asked[missing])
         return told
 
-    found = lowest_mean(again, candidates, most, noise)
+    found = lowest_mean(again, candidates, most, noise, trusted=trusted)
     return None if found is None else (candidates[found[0]], *found[1:])

@@ -13,6 +13,9 @@ _ROUNDING = 1e-6
 _SHARE, _MOST, _LEAST = 8, 48, 4
 """The part of all evaluations that the decision at the end gets: one in so many, at most and at least so many."""
 
+_SIGNIFICANT = 2.0
+"""Standard errors by which a mean must be lower than the mean of a point that is trusted."""
+
 
 def differs(one: Tensor, other: Tensor) -> bool:
     """Whether two values [*out] of one point differ by more than rounding."""
@@ -39,7 +42,7 @@ def distinct(points: Sequence[Tensor]) -> Tensor:
 
 
 def lowest_mean(
-    evaluate: Callable[[Tensor], Tensor], points: Tensor, evaluations: int, noise: float
+    evaluate: Callable[[Tensor], Tensor], points: Tensor, evaluations: int, noise: float, *, trusted: bool = False
 ) -> tuple[int, float, float] | None:
     """Evaluate points [C, n] again; return which has the lowest mean, and its mean and standard error.
 
@@ -53,6 +56,8 @@ def lowest_mean(
         points: to choose from.
         evaluations: how many may be made.
         noise: standard deviation of a loss; a larger measured deviation takes its place.
+        trusted: whether a model of many evaluations has chosen the first point. Another point then takes its place only
+            if the mean is lower by two standard errors of the difference.
     """
     left, choosing = torch.arange(len(points), device="cpu"), evaluations // 2
     losses = torch.zeros(len(points), 0, dtype=torch.float64, device="cpu")  # of those that are left
@@ -63,7 +68,10 @@ def lowest_mean(
             told = evaluate(points[left].repeat(each, 1)).reshape(each, -1).mT.cpu()
             choosing, evaluations = choosing - told.numel(), evaluations - told.numel()
             losses = torch.cat([losses, torch.where(torch.isfinite(told), told, torch.inf)], 1)
-            better = losses.mean(1).argsort()[: math.ceil(len(left) / 2)]
+            means = losses.mean(1)
+            if trusted:
+                means[left == 0] -= _SIGNIFICANT * noise * math.sqrt(2.0 / losses.shape[1])
+            better = means.argsort()[: math.ceil(len(left) / 2)]
             left, losses = left[better], losses[better]
     told = evaluate(points[left[:1]].repeat(evaluations, 1))
     told = told[torch.isfinite(told)]

@@ -169,8 +169,9 @@ class Running:
             return
         self._deciding = before, allowed
         points, losses = self._record.told
-        likely = [self._believed(before).x, self.search.center]
-        found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise)
+        search, believed = self.search, self._believed(before).x
+        likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
+        found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise, trusted=search.averages)
         if found is not None:
             self._decided = Decision(*found, self.evaluations)
         self._deciding = None

@@ -5,6 +5,7 @@ from typing import Any
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_descent import MOST, MetricQuadratics
+from torch_zerohess.search.noisy_descent import NoisyQuadratics
 from torch_zerohess.search.output_descent import OutputDescent
 from torch_zerohess.search.protocol import AskTell
 
@@ -17,19 +18,24 @@ class Descent(AskTell[Any]):
 
     - With the loss alone (up to 40 parameters, no noise), the quadratic is the one of least change through the nearest
       evaluations, and region and samples follow the metric of its Hessian: narrow valleys are as wide as long there.
+    - With the loss alone and `noise` (up to 40 parameters), the quadratic is a regression through all evaluations near
+      by, with standard errors. No single value decides: x is the center of the region, and the value what the quadratic
+      says there.
     - With an output [K, *out] and a white-box `loss`, every evaluation is many equations: it follows the minimum of
       loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises for a
       while. Where a step was predicted well (up to 40 parameters, no noise), Gauss-Newton by interpolation goes on in a
       trust region, until its steps fail.
-    - On a plateau, in noise, and with the loss alone of more parameters the quadratic is one of the smoothed loss, and
-      sigma grows on the plateau. New samples around x are asked for where the model has predicted badly.
+    - On a plateau, with the loss alone of more parameters, and with an output in noise the quadratic is one of the
+      smoothed loss, and sigma grows on the plateau. New samples around x are asked for where the model has predicted
+      badly.
 
     Where sigma is below `tolerance` (with the loss alone a millionth of it) the search has arrived at a minimum,
     possibly a local one. It then starts again, up to `restarts` times: from a random point, or in turn from a random
     point and around the best one with more samples per iteration.
 
-    It has the settings of `AskTell`. Decreases below twice the `noise` do not count. By default the pool keeps three
-    times the evaluations that the quadratic of a loss is fitted to, and of an output max(60, 6 n).
+    It has the settings of `AskTell`. With an output and with more than 40 parameters, decreases below twice the `noise`
+    do not count. By default the pool keeps three times the evaluations that the quadratic of a loss is fitted to, in
+    noise twice, and of an output max(60, 6 n).
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
     order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation.
@@ -48,9 +54,10 @@ class Descent(AskTell[Any]):
         return descent_method(settings)
 
 
-def descent_method(settings: Settings) -> LocalQuadratics | MetricQuadratics | OutputDescent:
+def descent_method(settings: Settings) -> LocalQuadratics | MetricQuadratics | NoisyQuadratics | OutputDescent:
     """Return the method for an output, for a loss alone, or for a loss with noise or of many parameters."""
     if settings.loss is not None:
         return OutputDescent(settings)
-    alone = settings.noise == 0.0 and settings.n <= MOST
-    return MetricQuadratics(settings) if alone else LocalQuadratics(settings)
+    if settings.n > MOST:
+        return LocalQuadratics(settings)
+    return NoisyQuadratics(settings) if settings.noise else MetricQuadratics(settings)

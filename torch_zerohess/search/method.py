@@ -52,6 +52,8 @@ class Method(ABC, Generic[P]):
 
     engine: ClassVar[str]
     """Name for a reader."""
+    averages: ClassVar[bool] = False
+    """Whether the best point is the minimum of a model that averages noise, and not an evaluation."""
     progress: type[P]
     """Class of what it knows."""
 

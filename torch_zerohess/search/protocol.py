@@ -110,6 +110,11 @@ class AskTell(ABC, Generic[P]):
         return self._space.parameters(self._state.progress.center)
 
     @property
+    def averages(self) -> bool:
+        """Whether `x` is the minimum of a model that averages noise, and not an evaluation."""
+        return self._method.averages
+
+    @property
     def sigma(self) -> float:
         """Current smoothing, in units of the first one."""
         return self._state.progress.sigma

@@ -301,7 +301,7 @@ def test_a_target_that_the_mean_refutes_does_not_end_the_search(target, status):
 
 def test_a_time_limit_holds_in_noise():
     fit = zh.minimize(noisy(0), zeros(2), sigma=2.0, seed=0, max_evaluations=60, time_limit=0.0, noise=0.3)
-    assert (fit.status, fit.evaluations) == ("time", 3)
+    assert (fit.status, fit.evaluations) == ("time", 5)
     assert 0.1 < fit.value_error < 0.4
 
 
@@ -310,12 +310,12 @@ def test_the_decision_keeps_the_batch(batch):
     f = Counted(noisy(0))
     fit = zh.minimize(f, zeros(1), sigma=2.0, seed=0, max_evaluations=60, batch=batch, noise=0.3)
     assert fit.evaluations == 60
-    assert max(map(len, f.points)) == max(batch, 2)  # the start and a sample
+    assert max(map(len, f.points)) == max(batch, 3)  # the start and two samples
 
 
-@pytest.mark.parametrize("settings", [{"xtol": 0.5}, {"restarts": 0, "tolerance": 0.5}, {"xtol": 9.0, "ftol": 9.0}])
+@pytest.mark.parametrize("settings", [{"xtol": 0.5}, {"restarts": 0}, {"xtol": 9.0, "ftol": 9.0}])
 def test_a_small_region_is_no_minimum_in_noise(settings):
-    fit = zh.minimize(noisy(0), zeros(2), sigma=2.0, seed=0, max_evaluations=300, noise=0.3, **settings)
+    fit = zh.minimize(noisy(0), zeros(2), sigma=2.0, seed=0, max_evaluations=2000, noise=0.3, **settings)
     assert (fit.status, fit.success) == ("stalled", False)
     assert fit.value_error > 0
 
@@ -341,7 +341,7 @@ def test_two_points_with_low_values_may_be_best_besides_the_likely_ones():
     """The values of a decision are 1 at the lowest point, 0 at the second lowest, -1 at the third and 2 elsewhere."""
     points, losses = torch.arange(5.0).double()[:, None], vector(0.1, 0.2, 0.3, 0.4, 0.5)
     truth = vector(1.0, 0.0, -1.0, 2.0, 2.0)
-    x, value, _ = decide(lambda z: truth[z[:, 0].long()], points, losses, [points[4]], 5, 12, 0.1)
+    x, value, _ = decide(lambda z: truth[z[:, 0].long()], points, losses, [points[4]], 5, 12, 0.1, trusted=False)
     assert (float(x), value) == (1.0, 0.0)
 
 

@@ -144,7 +144,7 @@ def test_types(name, dtype):
     loss = loss_of(name)
     search = kind(zeros(n, dtype), sigma=1.0, bounds=(-3.0, 4.0), loss=loss, restarts=1000, seed=0)
     start = black_box(name)(zeros(n)[None])[0]
-    run(search, lambda z: black_box(name)(z).to(dtype), 60)
+    run(search, lambda z: black_box(name)(z).to(dtype), 200 if name == "descent in noise" else 60)
     for z in (search.x, search.center, search.ask()):
         assert z.dtype == dtype
         assert not z.requires_grad

@@ -106,7 +106,7 @@ def test_the_settings_stay_those_of_the_search_that_loads():
     copy = Descent(zeros(2), sigma=1.0, noise=1e-3, pool=5, seed=0)
     copy.load_state_dict(search.state_dict())
     copy.tell(bowl(copy.ask()))
-    assert len(copy.state_dict()["progress"]["pool"]["values"]) == 5
+    assert len(copy.state_dict()["progress"]["values"]) == 5
 
 
 def test_rounds_agree_that_arrive_at_one_point_which_is_the_best_one():

@@ -1,0 +1,95 @@
+"""Descent in noise: valleys, what the best point is, values that are not finite, and the end."""
+
+import math
+import statistics
+
+import pytest
+import torch
+from searches import run, zeros
+
+from torch_zerohess.optim import Descent
+from torch_zerohess.search import noisy_descent
+
+
+def valley(n, condition):
+    """A quadratic of a condition number with its minimum 0 at ones, its axes turned at random."""
+    axes, _ = torch.linalg.qr(torch.randn(n, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    sizes = condition ** torch.linspace(0, 1, n, dtype=torch.float64)
+    return lambda z: (((z - 1.0) @ axes).square() * sizes).sum(1)
+
+
+def noisy(f, seed, spread=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    return lambda z: f(z) + spread * torch.randn(len(z), generator=generator, dtype=torch.float64)
+
+
+def ends(f, n, evaluations, spread=1.0, seeds=5):
+    """Losses without noise where searches are after so many evaluations."""
+    found = []
+    for seed in range(seeds):
+        search = Descent(zeros(n), sigma=2.0, noise=spread, seed=seed, restarts=0)
+        found.append(float(f(run(search, noisy(f, seed, spread), evaluations).x[None])[0]))
+    return found
+
+
+@pytest.mark.parametrize(("condition", "most"), [(1.0, 0.02), (1e4, 0.05), (1e6, 0.05)])
+def test_a_valley_in_noise(condition, most):
+    """Losses up to 1e6, noise of 1, five parameters, 1 000 evaluations: the best of them is lower by luck alone."""
+    assert statistics.median(ends(valley(5, condition), 5, 1000)) < most
+
+
+def test_more_evaluations_are_averaged():
+    """Four times the evaluations at least halve the loss, which is a quarter if errors fall as one over the root."""
+    f = valley(3, 10.0)
+    few, many = (statistics.mean(ends(f, 3, count, seeds=12)) for count in (100, 400))
+    assert many < 0.5 * few
+
+
+def test_the_best_point_is_what_the_quadratic_says_and_not_the_luckiest():
+    f = valley(2, 10.0)
+    search = Descent(zeros(2), sigma=2.0, noise=1.0, seed=0, restarts=0)
+    g, lowest = noisy(f, 0), math.inf
+    while search.evaluations < 300:
+        values = g(search.ask())
+        lowest = min(lowest, float(values.min()))
+        search.tell(values)
+    assert lowest < -0.7
+    assert search.value == pytest.approx(float(f(search.x[None])[0]), abs=0.3)
+
+
+def test_a_region_without_variation_grows():
+    """Around the minimum of a bowl that is a tenth of the noise over the first region."""
+    search = Descent(torch.ones(3, dtype=torch.float64), sigma=0.3, noise=1.0, seed=0, restarts=0)
+    run(search, noisy(valley(3, 1.0), 0), 100)
+    assert search.sigma > 1.5
+
+
+def test_half_of_the_box_has_no_value():
+    f = valley(3, 10.0)
+
+    def g(z):
+        return torch.where(z[:, 0] > 1.5, math.nan, f(z))
+
+    search = Descent(zeros(3), sigma=2.0, bounds=(-4.0, 4.0), noise=0.1, seed=0, restarts=0)
+    run(search, noisy(g, 0, 0.1), 300)
+    assert float(f(search.x[None])[0]) < 0.1
+
+
+def test_it_arrives_when_a_fit_has_all_the_evaluations_it_takes(monkeypatch):
+    monkeypatch.setattr(noisy_descent, "_MORE", 5)
+    search = Descent(zeros(2), sigma=2.0, noise=1.0, seed=0, restarts=1)
+    run(search, noisy(valley(2, 1.0), 0), 2000)
+    assert (search.done, search.rounds) == (True, 2)
+    assert "within noise" in search.message
+    assert search.evaluations < 300
+
+
+def test_a_further_round_keeps_the_best_end():
+    """The second round begins far away, where the loss is a thousand."""
+    f = valley(2, 100.0)
+    search = Descent(zeros(2), sigma=2.0, bounds=(-5.0, 5.0), noise=1.0, seed=0)
+    while search.rounds == 0:
+        search.tell(noisy(f, search.evaluations)(search.ask()))
+    end = search.x
+    search.tell(noisy(f, 1)(search.ask()))
+    assert torch.equal(search.x, end)

@@ -1,0 +1,286 @@
+"""Descent on quadratics where the loss is noisy: regression in a learned metric, and no single value decides.
+
+An iteration evaluates a few random points of the region center + sigma B u, |u| <= 1, and fits a quadratic to all
+evaluations near by (`fit_noisy`). The center moves to the minimum of the quadratic within the region. The metric B
+moves towards |H|^(-1/2), as far as the curvature is known (`learned`).
+
+Two regimes set sigma. Where the decrease that a step promises is well above its standard error, the next quadratic
+tells what the step has achieved, and sigma follows as in any trust region. Where it is not, noise dominates: sigma
+grows, so that the loss varies by more than the noise, unless the residuals say that no quadratic fits. Evaluations in
+the region are kept, so the standard error of the center falls with their number.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.metric import learned, region_step
+from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.random_points import normal, reflect, uniform
+from torch_zerohess.search.region_progress import latest
+from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
+from torch_zerohess.surrogates.quadratic import LocalModel
+
+_FITTED, _MORE, _ENOUGH = 3, 60, 3000
+"""Evaluations that a quadratic is fitted to, over its coefficients: at least; if they are in the region up to so many;
+and the number of evaluations beyond which there are no more than at least."""
+_REGION = 2.0
+"""Distance up to which evaluations are in the region."""
+_SIGNIFICANT = 2.0
+"""Standard errors from which a promised decrease is above the noise."""
+_KEPT, _BROKEN, _LONG = 0.3, 0.1, 0.8
+"""Part of its promise that a good step achieves, and a bad one; length of a step that ends at the edge."""
+_GROWTH, _SHRINKING, _WIDEST = 1.5, 0.7, 2.0
+"""Factors for sigma, and its largest value."""
+_SHORT = 0.5
+"""Length of a significant step after which sigma shrinks."""
+_VARIATION = 3.0
+"""Variation of the quadratic over the region, over the noise, from which sigma does not grow."""
+_RATE = 0.3
+"""Rate at which the metric is learned from a full quadratic."""
+_SLOPE = 1e-3
+"""Curvature over the region, relative to the slope, below which it says nothing about the metric."""
+_STILL = 3
+"""Iterations in a row, in noise and with as many evaluations in the region as a fit takes, that are an arrival."""
+_FINEST = 1e-3
+"""Sigma at which a round ends, over the tolerance of the search."""
+_LOST, _HALVING = 10, 0.5
+"""Batches in a row without a finite value that end a round, and the factor for sigma after each of them."""
+_AWAY = 2.0
+"""Standard deviation of a further start from the first one, where there is no box to draw it from."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NoisyProgress(Progress):
+    """A round: its evaluations, the metric, and the last step."""
+
+    points: Tensor
+    """[P, n]"""
+    values: Tensor
+    """[P]"""
+    root: Tensor
+    """B [n, n], symmetric, positive, of determinant 1."""
+    hessian: Tensor
+    """Of the last quadratic [n, n]."""
+    settled: Best
+    """The best end of the rounds before."""
+    first: Tensor
+    """Where the search began [n]."""
+    before: Tensor
+    """Center before the last step [n]."""
+    promised: float = 0.0
+    """Decrease that the last step promised; 0 if there was none."""
+    length: float = 1.0
+    """Of the last step, in units of the region."""
+    still: int = 0
+    """Iterations in a row that told nothing new."""
+    lost: int = 0
+    """Batches in a row without a finite value."""
+
+
+class NoisyQuadratics(Method[NoisyProgress]):
+    """The method of `Descent` for a loss alone with noise, of up to 40 parameters.
+
+    The best point is the center of the last region, its loss what the quadratic says there.
+    """
+
+    engine = "descent"
+    averages = True
+    progress = NoisyProgress
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        n = settings.n
+        self._coefficients = (n + 1) * (n + 2) // 2
+        self._least = _FITTED * self._coefficients
+        most = max(self._least, min(_MORE * self._coefficients, _ENOUGH))
+        self._most = min(most, max(settings.pool // 2, 1)) if settings.pool else most
+        self._capacity = settings.pool or 2 * most
+
+    def first(self, generator: torch.Generator) -> tuple[NoisyProgress, Tensor]:
+        start = self.settings.start
+        return self._started(self._begun(start, Best(start)), generator)
+
+    def next(
+        self, known: NoisyProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[NoisyProgress, Tensor]:
+        known = self._remembered(known, evaluated)
+        if known.lost >= _LOST:
+            reason = f"{_LOST} batches in a row had values that are not finite"
+            return self._arrived(known, reason, generator, last=known.rounds == 0)
+        if known.lost or not len(known.values):
+            known = replace(known, sigma=_HALVING * known.sigma if known.lost else known.sigma)
+            return known, self._drawn(known, self.settings.n + 1, generator)
+        known = self._stepped(known)
+        if known.still >= _STILL:
+            reason = f"{_STILL} steps in a row were within noise"
+            return self._arrived(known, reason, generator)
+        if known.sigma < _FINEST * self.settings.tolerance:
+            reason = f"sigma fell below {_FINEST * self.settings.tolerance:g} of the first one"
+            return self._arrived(known, reason, generator)
+        return known, self._drawn(known, self.settings.n + 1, generator)
+
+    def more(self, known: NoisyProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Return further points of the region."""
+        return self._drawn(known, count, generator)
+
+    def model_at_best(self, known: NoisyProgress) -> tuple[LocalModel, float] | None:
+        u = (known.points - known.best.point) / known.sigma
+        near = u.norm(dim=1).argsort()[: self._most]
+        if len(near) < self._coefficients:
+            return None
+        n, before = self.settings.n, known.sigma**2 * known.hessian
+        fit = fit_noisy(u[near], known.values[near], _weights(u[near], self._least), self.settings.noise, before)
+        i, j = torch.triu_indices(n, n, device=u.device)
+        curvature = fit.errors[1 + n :][i == j]
+        return LocalModel(fit.value, fit.gradient, fit.hessian, None, fit.errors[1 : 1 + n], curvature), known.sigma
+
+    def width(self, known: NoisyProgress) -> Tensor:
+        """Return the length of the last step along every parameter, at most: evaluations may be farther away."""
+        return min(known.length, 1.0) * known.sigma * known.root.norm(dim=0)
+
+    # Rounds.
+
+    def _begun(self, center: Tensor, settled: Best) -> NoisyProgress:
+        n = self.settings.n
+        nothing = center.new_zeros(n, n)
+        return NoisyProgress(
+            best=settled,
+            center=center,
+            settled=settled,
+            points=nothing[:0],
+            values=nothing[:0, 0],
+            root=torch.eye(n, dtype=center.dtype, device=center.device),
+            hessian=nothing,
+            first=self.settings.start,
+            before=center,
+        )
+
+    def _started(self, known: NoisyProgress, generator: torch.Generator) -> tuple[NoisyProgress, Tensor]:
+        return known, torch.cat([known.center[None], self._drawn(known, 2 * self.settings.n, generator)])
+
+    def _arrived(
+        self, known: NoisyProgress, reason: str, generator: torch.Generator, *, last: bool = False
+    ) -> tuple[NoisyProgress, Tensor]:
+        """End, or start another round at a random point."""
+        settings, rounds = self.settings, known.rounds + 1
+        known = replace(known, arrived=min(known.arrived, known.best.loss), rounds=rounds)
+        if last or rounds > settings.restarts:
+            return replace(known, done=True, message=f"{reason}, in round {rounds}"), known.points[:0]
+        if settings.bounded:
+            center = uniform(generator, settings.lower, settings.upper, 1)[0]
+        else:
+            center = known.first + _AWAY * normal(generator, known.center, settings.n)
+            center = center.clamp(settings.lower, settings.upper)
+        names = ("first", "evaluations", "iterations", "rounds", "arrived")
+        fresh = replace(self._begun(center, known.best), **{name: getattr(known, name) for name in names})
+        return self._started(fresh, generator)
+
+    # An iteration.
+
+    def _remembered(self, known: NoisyProgress, evaluated: Evaluated) -> NoisyProgress:
+        """Add the evaluations with finite values."""
+        new = evaluated.those(evaluated.finite)
+        points, values = torch.cat([known.points, new.points]), torch.cat([known.values, new.losses])
+        which = latest(points, known.center, self._capacity)
+        return replace(
+            known,
+            points=points[which],
+            values=values[which],
+            evaluations=known.evaluations + len(evaluated),
+            lost=0 if len(new) else known.lost + 1,
+        )
+
+    def _stepped(self, known: NoisyProgress) -> NoisyProgress:
+        """Fit a quadratic, judge the last step, learn the metric, and move the center."""
+        settings, x = self.settings, known.center
+        axes = known.sigma * known.root
+        back = torch.linalg.inv(axes)
+        fit, full = self._fitted(known, axes, back)
+        gradient, hessian = back.mT @ fit.gradient, back.mT @ fit.hessian @ back
+        step = region_step(gradient, hessian, axes, settings.lower - x, settings.upper - x)
+        u = back @ step
+        change, error = fit.change(u)
+        length, significant = float(u.norm()), -change > _SIGNIFICANT * error
+        sigma = self._judged(known, fit, back)
+        known = replace(
+            known,
+            iterations=known.iterations + 1,
+            still=0 if significant or not full else known.still + 1,
+            hessian=hessian,
+        )
+        if len(known.values) >= self._coefficients:
+            highest = fit.value + _SIGNIFICANT * float(fit.errors[0])
+            lower = highest < known.settled.loss
+            known = replace(
+                known,
+                best=Best(x, fit.value, known.sigma) if lower else known.settled,
+                sigma=min(sigma * self._factor(fit, length, significant), _WIDEST),
+                root=self._learned(known, fit, back),
+            )
+        else:
+            known = replace(known, sigma=min(sigma, _WIDEST))
+        if change >= 0.0:
+            return replace(known, promised=0.0)
+        end = (x + step).clamp(settings.lower, settings.upper)
+        return replace(known, center=end, before=x, promised=-change, length=length)
+
+    def _factor(self, fit: NoisyQuadratic, length: float, significant: bool) -> float:
+        """Return the factor for sigma before a step of a length in the region."""
+        if significant:
+            return _SHRINKING if length < _SHORT else 1.0
+        if fit.misfit:
+            return _SHRINKING
+        return _GROWTH if _variation(fit) < _VARIATION * self.settings.noise else 1.0
+
+    def _fitted(self, known: NoisyProgress, axes: Tensor, back: Tensor) -> tuple[NoisyQuadratic, bool]:
+        """Fit to the nearest evaluations; return whether as many as a fit takes are in the region."""
+        u = (known.points - known.center) @ back.mT
+        distance = u.norm(dim=1)
+        near = int((distance <= _REGION).sum())
+        chosen = distance.argsort()[: min(max(self._least, near), self._most)]
+        before = axes.mT @ known.hessian @ axes
+        weights = _weights(u[chosen], self._coefficients + self.settings.n)
+        fit = fit_noisy(u[chosen], known.values[chosen], weights, self.settings.noise, before)
+        return fit, near >= self._most
+
+    def _judged(self, known: NoisyProgress, fit: NoisyQuadratic, back: Tensor) -> float:
+        """Return sigma after what the last step has achieved, according to the new quadratic."""
+        if known.promised <= 0.0:
+            return known.sigma
+        achieved, error = fit.change(back @ (known.before - known.center))
+        if achieved > _KEPT * known.promised and known.length > _LONG:
+            return _GROWTH * known.sigma
+        broken = achieved < _BROKEN * known.promised and known.promised > error
+        return _SHRINKING * known.sigma if broken else known.sigma
+
+    def _learned(self, known: NoisyProgress, fit: NoisyQuadratic, back: Tensor) -> Tensor:
+        """Return the metric after a quadratic; curvatures within their standard errors are taken as equal."""
+        rate = _RATE * min(1.0, len(known.values) / self._least)
+        error = float(fit.errors[1 + self.settings.n :].mean())
+        known_from = max(error, _SLOPE * float(fit.gradient.norm()))
+        own = learned(torch.eye(len(back), dtype=back.dtype, device=back.device), fit.hessian, rate, known_from)
+        axes, sizes, _ = torch.linalg.svd(known.root @ own)
+        logs = sizes.log()
+        return (axes * (logs - logs.mean()).exp()) @ axes.mT
+
+    def _drawn(self, known: NoisyProgress, count: int, generator: torch.Generator) -> Tensor:
+        """Draw points of the region [count, n]."""
+        n = self.settings.n
+        u = normal(generator, known.center, count, n) / n**0.25
+        points = known.center + known.sigma * u @ known.root.mT
+        return reflect(points, self.settings.lower, self.settings.upper)
+
+
+def _variation(fit: NoisyQuadratic) -> float:
+    """Return by how much the quadratic varies over the region, at most."""
+    return float(fit.gradient.norm() + 0.5 * torch.linalg.eigvalsh(fit.hessian).abs().sum())
+
+
+def _weights(u: Tensor, count: int) -> Tensor:
+    """Return normal weights [P] of points [P, n], nearest first, as wide as the `count` nearest ones."""
+    distance = u.norm(dim=1)
+    width = max(float(distance[min(count, len(u)) - 1]), 1.0)
+    return torch.exp(-0.5 * (distance / width).square())

@@ -1,0 +1,110 @@
+"""A quadratic through noisy values, and how certain each of its predictions is: Bayesian linear regression."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_FREE = 1e-8
+"""Prior precision of the constant and of the slopes, relative to the precision of curvatures."""
+_CURVED = 2.0
+"""Prior standard deviation of a change of curvature, over the variation of the values."""
+_LOOKS = 3
+"""Times that the variance of the values and the coefficients are estimated from each other."""
+_PARAMETERS = 0.7
+"""Values that a quadratic through too few of them explains by itself, as a share of them."""
+_UNLIKELY, _UNSURE = 2.0, 2.0
+"""Residuals are more than noise from so many standard deviations of their variance on, if the variance of the noise may
+be larger than given by the second factor: a deviation that was measured with eight values is that uncertain."""
+
+
+@dataclass(frozen=True)
+class NoisyQuadratic:
+    """c + g.u + u.H u/2 for u [n], as coefficients (c, g, upper triangle of H) with their covariance."""
+
+    size: float
+    """Unit of the coefficients: the squares of the largest values do not exist."""
+    coefficients: Tensor
+    """[q] with q = (n + 1)(n + 2)/2."""
+    covariance: Tensor
+    """[q, q]"""
+    misfit: bool
+    """Whether residuals are larger than the noise."""
+    n: int
+
+    @property
+    def value(self) -> float:
+        """At u = 0."""
+        return self.size * float(self.coefficients[0])
+
+    @property
+    def gradient(self) -> Tensor:
+        """At u = 0, [n]."""
+        return self.size * self.coefficients[1 : 1 + self.n]
+
+    @property
+    def hessian(self) -> Tensor:
+        """[n, n]"""
+        i, j = torch.triu_indices(self.n, self.n, device=self.coefficients.device)
+        hessian = self.coefficients.new_zeros(self.n, self.n)
+        hessian[i, j] = hessian[j, i] = self.size * self.coefficients[1 + self.n :]
+        return hessian
+
+    @property
+    def errors(self) -> Tensor:
+        """Standard errors of c, g and the upper triangle of H, [q]."""
+        return self.size * self.covariance.diagonal().clamp_min(0.0).sqrt()
+
+    def change(self, u: Tensor) -> tuple[float, float]:
+        """Return the value at u [n] less the value at 0, and its standard error."""
+        terms = _terms(u[None])[0]
+        terms[0] = 0.0
+        error = math.sqrt(max(float(terms @ self.covariance @ terms), 0.0))
+        return self.size * float(terms @ self.coefficients), self.size * error
+
+
+def fit_noisy(u: Tensor, values: Tensor, weights: Tensor, noise: float, before: Tensor) -> NoisyQuadratic:
+    """Fit a quadratic to values [P] at u [P, n], for any P >= 1.
+
+    The prior of the Hessian is normal around `before`, and nearly flat in the constant and the slopes. The variance of
+    a value is the square of the noise, or the mean squared residual if that is larger. A residual beyond the noise is
+    what no quadratic explains.
+
+    Args:
+        u: points.
+        values: at the points.
+        weights: of the values, [P], at most 1.
+        noise: standard deviation of a value.
+        before: Hessian that is expected [n, n].
+    """
+    n, size = u.shape[1], float(values.abs().max()) or 1.0
+    values, noise, before = values / size, noise / size, before / size  # their squares neither overflow nor vanish
+    terms = _terms(u)
+    middle = values.median()
+    spread = float((values - middle).abs().median()) + noise + math.ulp(1.0)
+    i, j = torch.triu_indices(n, n, device=u.device)
+    expected = torch.cat([values.new_zeros(1 + n), before[i, j]])
+    expected[0] = middle
+    precision = torch.ones_like(expected)
+    precision[: 1 + n] = _FREE
+    precision = (precision / (_CURVED * spread) ** 2).diag()
+    count = float(weights.sum())
+    degrees = max(count - min(len(expected), _PARAMETERS * count), 1.0)
+    weighted, rest = terms.mT * weights, values - terms @ expected
+    least = max(noise, math.ulp(1.0)) ** 2
+    variance = least
+    for _ in range(_LOOKS):
+        inverse = precision + weighted @ terms / variance
+        coefficients = expected + torch.linalg.solve(inverse, weighted @ rest / variance)
+        residual = float(weights @ (values - terms @ coefficients).square()) / degrees
+        variance = max(least, residual)
+    misfit = residual > _UNSURE * least * (1.0 + _UNLIKELY * math.sqrt(2.0 / degrees))
+    return NoisyQuadratic(size, coefficients, torch.linalg.inv(inverse), misfit, n)
+
+
+def _terms(u: Tensor) -> Tensor:
+    """Return 1, u_i and the products of the Hessian's upper triangle at u [P, n], [P, q]."""
+    i, j = torch.triu_indices(u.shape[1], u.shape[1], device=u.device)
+    products = u[:, i] * u[:, j]
+    return torch.cat([torch.ones_like(u[:, :1]), u, torch.where(i == j, 0.5 * products, products)], 1)

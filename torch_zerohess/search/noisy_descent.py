@@ -4,10 +4,9 @@ An iteration evaluates a few random points of the region center + sigma B u, |u|
 evaluations near by (`fit_noisy`). The center moves to the minimum of the quadratic within the region. The metric B
 moves towards |H|^(-1/2), as far as the curvature is known (`learned`).
 
-Two regimes set sigma. Where the decrease that a step promises is well above its standard error, the next quadratic
-tells what the step has achieved, and sigma follows as in any trust region. Where it is not, noise dominates: sigma
-grows, so that the loss varies by more than the noise, unless the residuals say that no quadratic fits. Evaluations in
-the region are kept, so the standard error of the center falls with their number.
+The next quadratic tells what a step has achieved, and sigma follows as in any trust region. In a region where noise
+hides the slope, sigma shrinks only if the residuals say that no quadratic fits. Evaluations in the region are kept, so
+the standard error of the center falls with their number.
 """
 
 from dataclasses import dataclass, replace
@@ -34,14 +33,8 @@ _KEPT, _BROKEN, _LONG = 0.3, 0.1, 0.8
 """Part of its promise that a good step achieves, and a bad one; length of a step that ends at the edge."""
 _GROWTH, _SHRINKING, _WIDEST = 1.5, 0.7, 2.0
 """Factors for sigma, and its largest value."""
-_SHORT = 0.5
-"""Length of a significant step after which sigma shrinks."""
-_VARIATION = 3.0
-"""Variation of the quadratic over the region, over the noise, from which sigma does not grow."""
 _RATE = 0.3
 """Rate at which the metric is learned from a full quadratic."""
-_SLOPE = 1e-3
-"""Curvature over the region, relative to the slope, below which it says nothing about the metric."""
 _STILL = 3
 """Iterations in a row, in noise and with as many evaluations in the region as a fit takes, that are an arrival."""
 _FINEST = 1e-3
@@ -203,7 +196,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         step = region_step(gradient, hessian, axes, settings.lower - x, settings.upper - x)
         u = back @ step
         change, error = fit.change(u)
-        length, significant = float(u.norm()), -change > _SIGNIFICANT * error
+        significant = -change > _SIGNIFICANT * error
         sigma = self._judged(known, fit, back)
         known = replace(
             known,
@@ -213,27 +206,18 @@ class NoisyQuadratics(Method[NoisyProgress]):
         )
         if len(known.values) >= self._coefficients:
             highest = fit.value + _SIGNIFICANT * float(fit.errors[0])
-            lower = highest < known.settled.loss
             known = replace(
                 known,
-                best=Best(x, fit.value, known.sigma) if lower else known.settled,
-                sigma=min(sigma * self._factor(fit, length, significant), _WIDEST),
-                root=self._learned(known, fit, back),
+                best=Best(x, fit.value, known.sigma) if highest < known.settled.loss else known.settled,
+                root=self._learned(known, fit),
             )
-        else:
-            known = replace(known, sigma=min(sigma, _WIDEST))
+            if fit.misfit and not significant:
+                sigma *= _SHRINKING
+        known = replace(known, sigma=min(sigma, _WIDEST))
         if change >= 0.0:
             return replace(known, promised=0.0)
         end = (x + step).clamp(settings.lower, settings.upper)
-        return replace(known, center=end, before=x, promised=-change, length=length)
-
-    def _factor(self, fit: NoisyQuadratic, length: float, significant: bool) -> float:
-        """Return the factor for sigma before a step of a length in the region."""
-        if significant:
-            return _SHRINKING if length < _SHORT else 1.0
-        if fit.misfit:
-            return _SHRINKING
-        return _GROWTH if _variation(fit) < _VARIATION * self.settings.noise else 1.0
+        return replace(known, center=end, before=x, promised=-change, length=float(u.norm()))
 
     def _fitted(self, known: NoisyProgress, axes: Tensor, back: Tensor) -> tuple[NoisyQuadratic, bool]:
         """Fit to the nearest evaluations; return whether as many as a fit takes are in the region."""
@@ -256,12 +240,13 @@ class NoisyQuadratics(Method[NoisyProgress]):
         broken = achieved < _BROKEN * known.promised and known.promised > error
         return _SHRINKING * known.sigma if broken else known.sigma
 
-    def _learned(self, known: NoisyProgress, fit: NoisyQuadratic, back: Tensor) -> Tensor:
+    def _learned(self, known: NoisyProgress, fit: NoisyQuadratic) -> Tensor:
         """Return the metric after a quadratic; curvatures within their standard errors are taken as equal."""
         rate = _RATE * min(1.0, len(known.values) / self._least)
         error = float(fit.errors[1 + self.settings.n :].mean())
-        known_from = max(error, _SLOPE * float(fit.gradient.norm()))
-        own = learned(torch.eye(len(back), dtype=back.dtype, device=back.device), fit.hessian, rate, known_from)
+        own = learned(
+            torch.eye(self.settings.n, dtype=known.root.dtype, device=known.root.device), fit.hessian, rate, error
+        )
         axes, sizes, _ = torch.linalg.svd(known.root @ own)
         logs = sizes.log()
         return (axes * (logs - logs.mean()).exp()) @ axes.mT
@@ -272,11 +257,6 @@ class NoisyQuadratics(Method[NoisyProgress]):
         u = normal(generator, known.center, count, n) / n**0.25
         points = known.center + known.sigma * u @ known.root.mT
         return reflect(points, self.settings.lower, self.settings.upper)
-
-
-def _variation(fit: NoisyQuadratic) -> float:
-    """Return by how much the quadratic varies over the region, at most."""
-    return float(fit.gradient.norm() + 0.5 * torch.linalg.eigvalsh(fit.hessian).abs().sum())
 
 
 def _weights(u: Tensor, count: int) -> Tensor:

@@ -89,6 +89,19 @@ def test_sigma_follows_what_a_step_has_achieved(achieved, error, length, factor)
     assert search._method._judged(known, Fit(), torch.eye(2, dtype=torch.float64)) == factor
 
 
+@pytest.mark.parametrize(("region", "least", "most"), [(0.0, 18, 18), (noisy_descent._REGION, 80, 101)])
+def test_a_quadratic_is_fitted_to_three_values_for_each_coefficient_or_to_all_in_the_region(
+    monkeypatch, region, least, most
+):
+    """Six coefficients. Near the minimum of a bowl nearly all evaluations are in the region."""
+    counts, fit = [], noisy_descent.fit_noisy
+    monkeypatch.setattr(noisy_descent, "fit_noisy", lambda u, *rest: counts.append(len(u)) or fit(u, *rest))
+    monkeypatch.setattr(noisy_descent, "_REGION", region)
+    search = Descent(zeros(2), sigma=1.0, noise=1.0, seed=0, restarts=0)
+    run(search, noisy(valley(2, 1.0), 0), 101)
+    assert least <= counts[-1] <= most
+
+
 def test_half_of_the_box_has_no_value():
     f = valley(3, 10.0)
 

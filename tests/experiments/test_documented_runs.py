@@ -30,10 +30,6 @@ def tiny_networks(monkeypatch):
 def small(line):
     """Return the command of a line and its arguments, of which later ones win, without storing a table."""
     command, *arguments = shlex.split(line.partition("#")[0])
-    if command == "least_squares":
-        place = arguments.index("--store")
-        del arguments[place : place + 2]
-        return command, [*arguments, "--problems", "linear_full_rank_n9", "--budget", "3"]
     evaluations = AFFINE + 24 if "cnn_texture" in arguments else 24
     return command, [*arguments, "--runs", "1", "--evaluations", str(evaluations), "--jobs", "1"]
 
@@ -50,4 +46,4 @@ def test_it_ends_with_a_table(line, tmp_path, capsys, one_process, tiny_networks
 
 
 def test_the_documents_have_commands():
-    assert len(LINES) >= 6
+    assert len(LINES) >= 5

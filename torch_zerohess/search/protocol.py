@@ -9,7 +9,6 @@ To add a search: a subclass of `Progress` with its fields, a subclass of `Method
 """
 
 import math
-import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -23,8 +22,8 @@ from torch_zerohess.estimation.inputs import short
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
+from torch_zerohess.search.told import converted, joined
 from torch_zerohess.search.told import evaluated as told
-from torch_zerohess.search.told import joined
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 
@@ -230,7 +229,7 @@ class AskTell(ABC, Generic[P]):
         no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
         raises. The search is then as before, and the same values can be told again.
         """
-        values, points = self._converted(values), self._given
+        values, points = converted(values, self.unit.device), self._given
         if self._out is None and which is None and not self._early:
             count = len(values) if values.ndim else 1
             points = self._points(count)[:count]
@@ -258,7 +257,7 @@ class AskTell(ABC, Generic[P]):
 
     def losses(self, values: Any) -> Tensor:
         """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""
-        values = self._converted(values)
+        values = converted(values, self.unit.device)
         return self._evaluated(values, self.unit.expand(len(values) if values.ndim else 0, -1)).losses
 
     def state_dict(self) -> dict[str, Any]:
@@ -295,7 +294,8 @@ class AskTell(ABC, Generic[P]):
 
     @property
     def _kind(self) -> str:
-        return f"{self._method.engine} of {'the loss' if self._method.settings.loss is None else 'the output'}"
+        of = "the loss" if self._method.settings.loss is None else "the output"
+        return f"{self._method.engine} of {of}{' in noise' if self._method.averages else ''}"
 
     def _after(self, progress: P, asked: Tensor, generator: torch.Generator) -> State[P]:
         return State(progress, self._space.rounded(asked), generator.get_state())
@@ -311,13 +311,6 @@ class AskTell(ABC, Generic[P]):
         generator.manual_seed(own)
         further = self._method.more(self._state.progress, points, batch - len(points), generator)
         return torch.cat([points, self._space.rounded(further)])
-
-    def _converted(self, values: Any) -> Tensor:
-        try:
-            values = torch.as_tensor(values, dtype=torch.float64, device=self.unit.device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}") from error
-        return values.detach()
 
     def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:
         """Return what was told about points [K, n], of which those beyond the search's own are from `Method.more`."""

@@ -1,12 +1,24 @@
 """The values that a caller tells about the points of a search: checked, and kept until all of them are known."""
 
+import reprlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.search.state import Evaluated
+
+
+def converted(values: Any, device: torch.device) -> Tensor:
+    """Return what a caller told as float64, detached; TypeError if it is no tensor, array or list of numbers."""
+    try:
+        values = torch.as_tensor(values, dtype=torch.float64, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}") from error
+    found: Tensor = values.detach()
+    return found
 
 
 def evaluated(values: Tensor, points: Tensor, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size) -> Evaluated:

@@ -109,6 +109,14 @@ def test_the_settings_stay_those_of_the_search_that_loads():
     assert len(copy.state_dict()["progress"]["values"]) == 5
 
 
+def test_a_state_in_noise_is_of_another_search():
+    state = Descent(zeros(2), sigma=1.0, noise=0.1, seed=0).state_dict()
+    with pytest.raises(
+        ValueError, match="must be of a search by descent of the loss, got one by descent of the loss in"
+    ):
+        Descent(zeros(2), sigma=1.0, seed=0).load_state_dict(state)
+
+
 def test_rounds_agree_that_arrive_at_one_point_which_is_the_best_one():
     """Within 0.05 of each parameter, root mean square."""
     first = agreeing(Progress(best=Best(vector(1.0, 0.0)), center=zeros(2)), vector(1.0, 0.0), 0.05)

@@ -1,13 +1,13 @@
 """`python -m experiments noise`: our search and others on functions of BBOB with noise.
 
-Every value has normal noise of a fixed size, far below the first values and far above the last ones. What counts is the
-loss without noise at the point that a method returns: `Minimum.x` of ours, the mean of the distribution of CMA-ES
-(`xfavorite`), the solution of Py-BOBYQA, which is told that values are noisy. All methods have the same starts, box,
-size of the first step and evaluations. A method that ends by itself does not start again.
+Every value has normal noise of a fixed size. What counts is the loss without noise at the point that a method returns:
+`Minimum.x` of ours, the mean of the distribution of CMA-ES (`xfavorite`), and the solution of Py-BOBYQA, which is told
+that values are noisy. All methods have the same starts, box, size of the first step and evaluations. Ours and Py-BOBYQA
+start again by themselves. CMA-ES does not, and none of them is started again from outside.
 
-The functions are smooth, of one valley each: a sphere, a cone that is a hundred times as steep on one side (attractive
-sector), Rosenbrock's curved valley, an ellipsoid whose axes differ by a thousand, and different powers. Instances 11 to
-15 are for tuning, 1 to 5 for tables.
+Each function has one valley: a sphere; one that is a hundred times as steep on one side as on the other (attractive
+sector); Rosenbrock's curved valley; an ellipsoid whose axes differ by a factor of a thousand; and different powers of
+the parameters. Instances 11 to 15 are for tuning, 1 to 5 for tables.
 """
 
 import itertools
@@ -40,6 +40,7 @@ FUNCTIONS: Mapping[int, str] = {
 HEADERS = ("function", "n", "noise", "method", "evaluations", "loss", "largest", "runs")
 
 Noisy = Callable[[Tensor], Tensor]
+"""Points [K, n] to values with noise [K]."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Method(ABC, Generic[P]):
     engine: ClassVar[str]
     """Name for a reader."""
     averages: ClassVar[bool] = False
-    """Whether the best point is the minimum of a model that averages noise, and not an evaluation."""
+    """Whether a model of many evaluations has chosen the best point, and not a single value."""
     progress: type[P]
     """Class of what it knows."""
 

@@ -6,9 +6,11 @@ moves towards |H|^(-1/2), as far as the curvature is known (`learned`).
 
 The next quadratic tells what a step has achieved, and sigma follows as in any trust region. In a region where noise
 hides the slope, sigma shrinks only if the residuals say that no quadratic fits. Evaluations in the region are kept, so
-the standard error of the center falls with their number.
+the standard error of the center falls with their number. A batch that is higher than the lowest one throughout, or has
+no value, sends the center back to where the lowest one was.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,15 +24,22 @@ from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.quadratic import LocalModel
 
-_FITTED, _MORE, _ENOUGH = 3, 60, 3000
-"""Evaluations that a quadratic is fitted to, over its coefficients: at least; if they are in the region up to so many;
-and the number of evaluations beyond which there are no more than at least."""
+_FITTED = 3
+"""Evaluations per coefficient that a quadratic is fitted to, at least."""
+_MORE, _ENOUGH = 60, 3000
+"""Evaluations in the region that it is fitted to, at most: per coefficient, and in all."""
+_LARGEST = 1e100
+"""Magnitude at which values and the noise are cut: squares of larger numbers would be infinite."""
+_PROPORTION = 1e3
+"""Deviations from the median, in medians of them, above which a value counts as high and no more, as a penalty is."""
 _REGION = 2.0
 """Distance up to which evaluations are in the region."""
 _SIGNIFICANT = 2.0
 """Standard errors from which a promised decrease is above the noise."""
 _KEPT, _BROKEN, _LONG = 0.3, 0.1, 0.8
 """Part of its promise that a good step achieves, and a bad one; length of a step that ends at the edge."""
+_LOW = 4.0
+"""Deviations of the noise. If all values of a batch are higher than the lowest batch by more, the center returns."""
 _GROWTH, _SHRINKING, _WIDEST = 1.5, 0.7, 2.0
 """Factors for sigma, and its largest value."""
 _RATE = 0.3
@@ -63,6 +72,12 @@ class NoisyProgress(Progress):
     """Where the search began [n]."""
     before: Tensor
     """Center before the last step [n]."""
+    home: Tensor
+    """Center of the lowest batch [n]."""
+    middle: float = math.inf
+    """Median of the lowest batch."""
+    highest: float = math.inf
+    """Highest value of the lowest batch."""
     promised: float = 0.0
     """Decrease that the last step promised; 0 if there was none."""
     length: float = 1.0
@@ -91,6 +106,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         most = max(self._least, min(_MORE * self._coefficients, _ENOUGH))
         self._most = min(most, max(settings.pool // 2, 1)) if settings.pool else most
         self._capacity = settings.pool or 2 * most
+        self._noise = min(settings.noise, _LARGEST)
 
     def first(self, generator: torch.Generator) -> tuple[NoisyProgress, Tensor]:
         start = self.settings.start
@@ -103,9 +119,14 @@ class NoisyQuadratics(Method[NoisyProgress]):
         if known.lost >= _LOST:
             reason = f"{_LOST} batches in a row had values that are not finite"
             return self._arrived(known, reason, generator, last=known.rounds == 0)
-        if known.lost or not len(known.values):
-            known = replace(known, sigma=_HALVING * known.sigma if known.lost else known.sigma)
+        values = evaluated.losses[evaluated.finite]
+        if known.lost or float(values.min()) > known.highest + _LOW * self._noise:
+            factor = _HALVING if known.lost else _SHRINKING
+            known = replace(known, center=known.home, sigma=factor * known.sigma, promised=0.0)
             return known, self._drawn(known, self.settings.n + 1, generator)
+        middle = float(values.median())
+        if middle < known.middle:
+            known = replace(known, home=known.center, middle=middle, highest=float(values.max()))
         known = self._stepped(known)
         if known.still >= _STILL:
             reason = f"{_STILL} steps in a row were within noise"
@@ -125,7 +146,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         if len(near) < self._coefficients:
             return None
         n, before = self.settings.n, known.sigma**2 * known.hessian
-        fit = fit_noisy(u[near], known.values[near], _weights(u[near], self._least), self.settings.noise, before)
+        fit = self._fit(known, u, near, self._least, before)
         i, j = torch.triu_indices(n, n, device=u.device)
         curvature = fit.errors[1 + n :][i == j]
         return LocalModel(fit.value, fit.gradient, fit.hessian, None, fit.errors[1 : 1 + n], curvature), known.sigma
@@ -149,6 +170,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
             hessian=nothing,
             first=self.settings.start,
             before=center,
+            home=center,
         )
 
     def _started(self, known: NoisyProgress, generator: torch.Generator) -> tuple[NoisyProgress, Tensor]:
@@ -176,7 +198,8 @@ class NoisyQuadratics(Method[NoisyProgress]):
     def _remembered(self, known: NoisyProgress, evaluated: Evaluated) -> NoisyProgress:
         """Add the evaluations with finite values."""
         new = evaluated.those(evaluated.finite)
-        points, values = torch.cat([known.points, new.points]), torch.cat([known.values, new.losses])
+        points = torch.cat([known.points, new.points])
+        values = torch.cat([known.values, new.losses.clamp(-_LARGEST, _LARGEST)])
         which = latest(points, known.center, self._capacity)
         return replace(
             known,
@@ -204,15 +227,13 @@ class NoisyQuadratics(Method[NoisyProgress]):
             still=0 if significant or not full else known.still + 1,
             hessian=hessian,
         )
-        if len(known.values) >= self._coefficients:
-            highest = fit.value + _SIGNIFICANT * float(fit.errors[0])
-            known = replace(
-                known,
-                best=Best(x, fit.value, known.sigma) if highest < known.settled.loss else known.settled,
-                root=self._learned(known, fit),
-            )
-            if fit.misfit and not significant:
-                sigma *= _SHRINKING
+        determined = len(known.values) >= self._coefficients
+        if determined or known.rounds == 0:
+            lower = fit.value + _SIGNIFICANT * float(fit.errors[0]) < known.settled.loss
+            known = replace(known, best=Best(x, fit.value, known.sigma) if lower else known.settled)
+        if determined:
+            known = replace(known, root=self._learned(known, fit))
+            sigma *= _SHRINKING if fit.misfit and not significant else 1.0
         known = replace(known, sigma=min(sigma, _WIDEST))
         if change >= 0.0:
             return replace(known, promised=0.0)
@@ -226,9 +247,14 @@ class NoisyQuadratics(Method[NoisyProgress]):
         near = int((distance <= _REGION).sum())
         chosen = distance.argsort()[: min(max(self._least, near), self._most)]
         before = axes.mT @ known.hessian @ axes
-        weights = _weights(u[chosen], self._coefficients + self.settings.n)
-        fit = fit_noisy(u[chosen], known.values[chosen], weights, self.settings.noise, before)
-        return fit, near >= self._most
+        return self._fit(known, u, chosen, self._coefficients + self.settings.n, before), near >= self._most
+
+    def _fit(self, known: NoisyProgress, u: Tensor, chosen: Tensor, close: int, before: Tensor) -> NoisyQuadratic:
+        """Fit to chosen evaluations at u [P, n], nearest first, with weights as wide as the `close` nearest ones."""
+        values = known.values[chosen]
+        middle = values.median()
+        high = float(middle) + _PROPORTION * max(float((values - middle).abs().median()), self._noise)
+        return fit_noisy(u[chosen], values.clamp(max=high), _weights(u[chosen], close), self._noise, before)
 
     def _judged(self, known: NoisyProgress, fit: NoisyQuadratic, back: Tensor) -> float:
         """Return sigma after what the last step has achieved, according to the new quadratic."""

@@ -110,7 +110,7 @@ class AskTell(ABC, Generic[P]):
 
     @property
     def averages(self) -> bool:
-        """Whether `x` is the minimum of a model that averages noise, and not an evaluation."""
+        """Whether a model of many evaluations has chosen `x`, and not a single value."""
         return self._method.averages
 
     @property

@@ -6,17 +6,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_FREE = 1e-8
-"""Prior precision of the constant and of the slopes, relative to the precision of curvatures."""
 _CURVED = 2.0
 """Prior standard deviation of a change of curvature, over the variation of the values."""
+_FLAT = 10.0
+"""Prior standard deviation of the constant and of a slope, over that of a curvature."""
 _LOOKS = 3
 """Times that the variance of the values and the coefficients are estimated from each other."""
 _PARAMETERS = 0.7
-"""Values that a quadratic through too few of them explains by itself, as a share of them."""
-_UNLIKELY, _UNSURE = 2.0, 2.0
-"""Residuals are more than noise from so many standard deviations of their variance on, if the variance of the noise may
-be larger than given by the second factor: a deviation that was measured with eight values is that uncertain."""
+"""Share of the values that a quadratic fits by itself, where there are fewer values than coefficients."""
+_UNLIKELY = 2.0
+"""Standard deviations of the mean squared residual by which it is larger than the noise in a misfit."""
+_UNSURE = 2.0
+"""Factor by which the variance of the noise may be larger than given: eight values measure it no better."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class NoisyQuadratic:
     """c + g.u + u.H u/2 for u [n], as coefficients (c, g, upper triangle of H) with their covariance."""
 
     size: float
-    """Unit of the coefficients: the squares of the largest values do not exist."""
+    """Unit of the coefficients and of their standard errors: squares of large values would be infinite."""
     coefficients: Tensor
     """[q] with q = (n + 1)(n + 2)/2."""
     covariance: Tensor
@@ -68,8 +69,8 @@ def fit_noisy(u: Tensor, values: Tensor, weights: Tensor, noise: float, before: 
     """Fit a quadratic to values [P] at u [P, n], for any P >= 1.
 
     The prior of the Hessian is normal around `before`, and nearly flat in the constant and the slopes. The variance of
-    a value is the square of the noise, or the mean squared residual if that is larger. A residual beyond the noise is
-    what no quadratic explains.
+    a value is the square of the noise, or the mean squared residual if the residual is larger. The fit has a misfit if
+    the mean squared residual is significantly larger than the noise.
 
     Args:
         u: points.
@@ -86,21 +87,24 @@ def fit_noisy(u: Tensor, values: Tensor, weights: Tensor, noise: float, before: 
     i, j = torch.triu_indices(n, n, device=u.device)
     expected = torch.cat([values.new_zeros(1 + n), before[i, j]])
     expected[0] = middle
-    precision = torch.ones_like(expected)
-    precision[: 1 + n] = _FREE
-    precision = (precision / (_CURVED * spread) ** 2).diag()
+    prior = torch.full_like(expected, _CURVED * spread)
+    prior[: 1 + n] *= _FLAT
     count = float(weights.sum())
     degrees = max(count - min(len(expected), _PARAMETERS * count), 1.0)
-    weighted, rest = terms.mT * weights, values - terms @ expected
-    least = max(noise, math.ulp(1.0)) ** 2
-    variance = least
+    scaled, rest = terms * prior, values - terms @ expected
+    told, axes = torch.linalg.eigh((scaled.mT * weights) @ scaled)  # what the values tell of combinations
+    told = told.clamp_min(0.0)
+    rounding = torch.finfo(told.dtype).eps * len(told) * float(told[-1])  # of the smallest ones
+    least = max(noise**2, rounding)
+    variance, pulled = least, axes.mT @ (scaled.mT @ (weights * rest))
     for _ in range(_LOOKS):
-        inverse = precision + weighted @ terms / variance
-        coefficients = expected + torch.linalg.solve(inverse, weighted @ rest / variance)
+        coefficients = expected + prior * (axes @ (pulled / (variance + told)))
         residual = float(weights @ (values - terms @ coefficients).square()) / degrees
         variance = max(least, residual)
+    axes = prior[:, None] * axes
+    covariance = (axes * (variance / (variance + told))) @ axes.mT
     misfit = residual > _UNSURE * least * (1.0 + _UNLIKELY * math.sqrt(2.0 / degrees))
-    return NoisyQuadratic(size, coefficients, torch.linalg.inv(inverse), misfit, n)
+    return NoisyQuadratic(size, coefficients, covariance, misfit, n)
 
 
 def _terms(u: Tensor) -> Tensor:

@@ -175,10 +175,10 @@ def test_a_wall_of_values_that_are_not_finite(wrong, output):
 def test_a_refused_step_is_shortened(noise):
     search = Descent(zeros(1), sigma=1.0, noise=noise, seed=0)
     search.tell((search.ask()[:, 0] - 5) ** 2)
-    sigma, center = search.sigma, search.center
+    sigma, x = search.sigma, search.x
     search.tell(torch.full((len(search.ask()),), math.nan))
     assert search.sigma == 0.5 * sigma
-    assert torch.equal(search.center, center)
+    assert torch.equal(search.center, x)
 
 
 @pytest.mark.parametrize(("finite", "asked"), [(4, 2), (5, 1)])

@@ -10,6 +10,7 @@ from searches import run, zeros
 
 from torch_zerohess.optim import Descent
 from torch_zerohess.search import noisy_descent
+from truths import vector
 
 
 def valley(n, condition, waves=0.0):
@@ -105,6 +106,43 @@ def test_a_quadratic_is_fitted_to_three_values_for_each_coefficient_or_to_all_in
     search = Descent(zeros(2), sigma=1.0, noise=1.0, seed=0, restarts=0)
     run(search, noisy(valley(2, 1.0), 0), 101)
     assert least <= counts[-1] <= most
+
+
+def test_a_batch_without_values_leads_back_to_where_there_were_some():
+    search = Descent(zeros(2), sigma=1.0, noise=0.1, seed=0)
+    search.tell(noisy(valley(2, 1.0), 0, 0.1)(search.ask()))
+    assert not torch.equal(search.center, zeros(2))
+    search.tell(torch.full((len(search.ask()),), math.nan))
+    assert torch.equal(search.center, zeros(2))
+    assert search.sigma == 0.5
+
+
+def test_before_a_quadratic_is_determined_the_value_is_what_is_known_of_the_start():
+    """The first batch has 11 values for 21 coefficients."""
+    search = Descent(zeros(5), sigma=0.5, noise=0.1, seed=0)
+    search.tell(noisy(valley(5, 1.0), 0, 0.1)(search.ask()))
+    assert search.value == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize("spread", [1e-14, 1e-3, 0.1])
+def test_a_wall_near_the_largest_number(spread):
+    """A step into the wall leads back, and the wall does not hide the bowl beside it."""
+    f = valley(3, 10.0)
+    for seed in range(4):
+        search = Descent(zeros(3), sigma=2.0, noise=spread, seed=seed, restarts=0)
+        run(search, lambda z: f(z) + (800 * (z[:, 1] - 1.2)).clamp(max=709).exp(), 300)
+        assert float(f(search.x[None])[0]) < 1e-3
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("spread", [1e-3, 1e305])
+def test_values_and_noise_near_the_largest_number(spread, sign):
+    """The search begins inside of a wall, or above a pit without a floor: no number becomes infinite."""
+    for seed in range(3):
+        search = Descent(vector(0.0, 3.0, 0.0), sigma=0.7, noise=spread, seed=seed, restarts=2)
+        run(search, lambda z: valley(3, 10.0)(z) + sign * (80 * (z[:, 1] - 1.2)).clamp(max=709).exp(), 120)
+        assert bool(torch.isfinite(search.x).all())
+        assert bool(torch.isfinite(search.ask()).all())
 
 
 def test_half_of_the_box_has_no_value():

@@ -11,7 +11,7 @@ from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.random_points import normal, reflect, uniform
+from torch_zerohess.search.random_points import further_start, normal, reflect
 from torch_zerohess.search.state import Best, Evaluated, agreeing
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -32,8 +32,6 @@ _HALVING = 0.5
 """Factor for sigma after a step to a point whose value is not finite."""
 _RESTART = 1.5
 """First sigma of a further round."""
-_AWAY = 2.0
-"""Standard deviation of its start from the first one, where there is no box to draw it from."""
 _WIDENINGS, _WIDENING = 8, 1.5
 """How often, and by which factor, sigma is widened to find evaluations around the best point."""
 
@@ -168,11 +166,8 @@ class LocalQuadratics(Method[DescentProgress]):
         if last or rounds > settings.restarts:
             return replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
         center = known.best.point
-        if rounds % 2 and settings.bounded:
-            center = uniform(generator, settings.lower, settings.upper, 1)[0]
-        elif rounds % 2:
-            center = known.first + _AWAY * normal(generator, center, self._n)
-            center = center.clamp(settings.lower, settings.upper)
+        if rounds % 2:
+            center = further_start(generator, known.first, settings.lower, settings.upper)
         return replace(
             known,
             phase="start",

@@ -18,7 +18,7 @@ from torch_zerohess.linalg.metric import learned
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.random_points import normal, uniform
+from torch_zerohess.search.random_points import further_start, normal, uniform
 from torch_zerohess.search.region_descent import LOST, RegionDescent, coefficients
 from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import Best, Evaluated, agreeing
@@ -40,8 +40,6 @@ _CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
 _ROUNDED = 1e15
 """A Hessian of values that were larger than those of now by this factor is made of their roundings."""
-_AWAY = 2.0
-"""Standard deviation of a further start from the first one, where there is no box to draw it from."""
 
 _SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place")
 """What further rounds, and isotropic quadratics on a plateau, go on with."""
@@ -125,11 +123,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         if last or rounds > settings.restarts:
             known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
             return known, known.points[:0]
-        if settings.bounded:
-            center = uniform(generator, settings.lower, settings.upper, 1)[0]
-        else:
-            center = known.first + _AWAY * normal(generator, known.center, self._n)
-            center = center.clamp(settings.lower, settings.upper)
+        center = further_start(generator, known.first, settings.lower, settings.upper)
         fresh = replace(
             self._begun(Best(center)),
             **{name: getattr(known, name) for name in ("iterations", *_SHARED)} | {"rounds": rounds},

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.random_points import normal, reflect, uniform
+from torch_zerohess.search.random_points import further_start, normal, reflect
 from torch_zerohess.search.region_progress import latest
 from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
@@ -50,8 +50,6 @@ _FINEST = 1e-3
 """Sigma at which a round ends, over the tolerance of the search."""
 _LOST, _HALVING = 10, 0.5
 """Batches in a row without a finite value that end a round, and the factor for sigma after each of them."""
-_AWAY = 2.0
-"""Standard deviation of a further start from the first one, where there is no box to draw it from."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -184,11 +182,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         known = replace(known, arrived=min(known.arrived, known.best.loss), rounds=rounds)
         if last or rounds > settings.restarts:
             return replace(known, done=True, message=f"{reason}, in round {rounds}"), known.points[:0]
-        if settings.bounded:
-            center = uniform(generator, settings.lower, settings.upper, 1)[0]
-        else:
-            center = known.first + _AWAY * normal(generator, known.center, settings.n)
-            center = center.clamp(settings.lower, settings.upper)
+        center = further_start(generator, known.first, settings.lower, settings.upper)
         names = ("first", "evaluations", "iterations", "rounds", "arrived")
         fresh = replace(self._begun(center, known.best), **{name: getattr(known, name) for name in names})
         return self._started(fresh, generator)

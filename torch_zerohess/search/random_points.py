@@ -3,6 +3,9 @@
 import torch
 from torch import Tensor
 
+_AWAY = 2.0
+"""Standard deviation of a further start from the first one, where there is no box to draw it from."""
+
 
 def normal(generator: torch.Generator, like: Tensor, *shape: int) -> Tensor:
     """Standard normal numbers on the device of `like`."""
@@ -13,6 +16,13 @@ def uniform(generator: torch.Generator, lower: Tensor, upper: Tensor, count: int
     """Points [count, n] all over the box."""
     unit = torch.rand(count, len(lower), generator=generator, dtype=torch.float64, device="cpu").to(lower.device)
     return lower + (upper - lower) * unit
+
+
+def further_start(generator: torch.Generator, first: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Point [n] where another round begins: anywhere in a finite box, otherwise around the first start."""
+    if bool(torch.isfinite(torch.cat([lower, upper])).all()):
+        return uniform(generator, lower, upper, 1)[0]
+    return (first + _AWAY * normal(generator, first, len(first))).clamp(lower, upper)
 
 
 def reflect(z: Tensor, lower: Tensor, upper: Tensor) -> Tensor:

@@ -21,6 +21,8 @@ LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
 _REFUSED = 0.4
 """Factor of the radius where no step lowers the loss."""
+_AROUND = 2.0
+"""Distance from the center, over sigma sqrt(n), up to which the model at the center is one of the best point."""
 _ENDLESS = 10
 """Batches in a row with values that are not finite, after which the search ends."""
 
@@ -37,6 +39,8 @@ class JacobianProgress(Progress):
     """Root mean square over the parameters."""
     output: Tensor
     """At the center [m], float64; empty before the first values."""
+    loss: float = math.inf
+    """At the center. The best point may be a sample with a lower loss."""
     refused: int = 0
     """Batches in a row without a finite value."""
 
@@ -47,6 +51,14 @@ class JacobianProgress(Progress):
         if refused < _ENDLESS:
             return known
         return replace(known, done=True, message=f"{_ENDLESS} batches in a row had no finite value")
+
+    def recorded(self: Q, evaluated: Evaluated) -> Q:
+        """Return the progress whose best point is that of the lowest loss, of samples and steps alike."""
+        finite = evaluated.those(evaluated.finite)
+        k = int(finite.losses.argmin()) if len(finite) else -1
+        if k < 0 or float(finite.losses[k]) >= self.best.loss:
+            return self
+        return replace(self, best=Best(finite.points[k].clone(), float(finite.losses[k]), self.sigma))
 
 
 class GaussNewton(Method[Q]):
@@ -90,7 +102,7 @@ class GaussNewton(Method[Q]):
 
     def next(self, known: Q, evaluated: Evaluated, generator: torch.Generator) -> tuple[Q, Tensor]:
         """Renew the Jacobian by samples, or take the best step; then ask for what follows."""
-        known = known.counted(evaluated)
+        known = known.counted(evaluated).recorded(evaluated)
         if not known.done and known.phase == "sample":
             known = self.sampled(known, evaluated)
         elif not known.done:
@@ -103,8 +115,7 @@ class GaussNewton(Method[Q]):
         """Renew the Jacobian by samples, the first of which is the start at the beginning."""
         assert evaluated.outputs is not None
         if not len(known.output):
-            best = replace(known.best, loss=float(evaluated.losses[0]))
-            known = replace(known, output=evaluated.outputs[0].clone(), best=best)
+            known = replace(known, output=evaluated.outputs[0].clone(), loss=float(evaluated.losses[0]))
             evaluated = evaluated.those(slice(1, None))
         return self.renewed(known, evaluated)
 
@@ -118,13 +129,12 @@ class GaussNewton(Method[Q]):
         """Go to the best of the steps with finite values if it lowers the loss."""
         known = replace(known, iterations=known.iterations + 1, phase="sample")
         k = int(evaluated.losses.argmin()) if len(evaluated) else -1
-        if k >= 0 and float(evaluated.losses[k]) < known.best.loss:
+        if k >= 0 and float(evaluated.losses[k]) < known.loss:
             assert evaluated.outputs is not None
             point, output = evaluated.points[k].clone(), evaluated.outputs[k].clone()
             step, change = point - known.center, output - known.output
-            best = Best(point, float(evaluated.losses[k]), known.sigma)
-            radius = float(step.norm()) / math.sqrt(self.settings.n)
-            known = self.moved(replace(known, best=best, center=point, radius=radius, output=output), step, change)
+            loss, radius = float(evaluated.losses[k]), float(step.norm()) / math.sqrt(self.settings.n)
+            known = self.moved(replace(known, center=point, loss=loss, radius=radius, output=output), step, change)
         else:
             known = replace(known, radius=_REFUSED * known.radius)
         if known.radius < self.settings.tolerance:
@@ -140,16 +150,19 @@ class GaussNewton(Method[Q]):
         return replace(known, rounds=rounds, radius=self.radius, phase="sample")
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
-        """The model of the latest Jacobian, which is one at the center, without standard errors.
+        """The model of the latest Jacobian, moved from the center to the best point, without standard errors.
 
-        None around another point, and where the derivatives are not known there.
+        None farther from the center than samples are, and where the derivatives are not known.
         """
-        derivatives = self.derivatives_at_center(known) if torch.equal(known.best.point, known.center) else None
+        away, sigma = known.best.point - known.center, known.sigma
+        near = float(away.norm()) <= _AROUND * sigma * math.sqrt(self.settings.n)
+        derivatives = self.derivatives_at_center(known) if near else None
         if derivatives is None:
             return None
         gradient, hessian = derivatives
-        sigma, unknown = known.sigma, torch.full_like(known.center, math.inf)
-        model = LocalModel(known.best.loss, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
+        value = known.loss + float(away @ gradient) + 0.5 * float(away @ hessian @ away)
+        gradient, unknown = gradient + hessian @ away, torch.full_like(known.center, math.inf)
+        model = LocalModel(value, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
         return model, sigma
 
 

@@ -110,7 +110,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         """Return the progress after the start and samples around it at sigma; None if they give no Jacobian."""
         if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
             return None
-        known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated))
+        known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated)).recorded(evaluated)
         known = self.sampled(known, evaluated)
         return known if known.phase == "trial" else None
 
@@ -148,7 +148,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
     def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Take the best step; double the samples after a small gain, and halve them after a large one."""
         after = super().taken(known, evaluated)
-        before, gain = known.best.loss, known.best.loss - after.best.loss
+        before, gain = known.loss, known.loss - after.loss
         count = known.samples * (2 if gain < _SLOW * abs(before) else 1) // (2 if gain > _FAST * abs(before) else 1)
         return replace(after, samples=min(max(count, self.own.samples), _MOST * self.own.samples))
 

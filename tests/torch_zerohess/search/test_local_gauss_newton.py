@@ -56,10 +56,22 @@ def test_a_jacobian_that_predicts_well_is_trusted_in_long_steps_and_kept(f, radi
     search = search_for(f, 3 * normal(N))
     search.tell(f(search.ask()))
     points = search.ask()
-    lengths = (points - search.x).norm(dim=1) / math.sqrt(N)
+    lengths = (points - search.center).norm(dim=1) / math.sqrt(N)
     assert lengths.tolist() == pytest.approx([radius * one for one in LENGTHS])
     search.tell(f(points))
     assert len(search.ask()) == asked
+
+
+def test_the_model_is_one_at_the_best_sample():
+    truth = normal(N)
+    search = search_for(image, truth, sigma=0.1)
+    search.tell(image(search.ask()))
+    assert not torch.equal(search.x, search.center)
+    found = search.model_at_best()
+    assert found is not None
+    model, sigma = found
+    assert model.value == pytest.approx(search.value, rel=1e-4)
+    torch.testing.assert_close(model.gradient / (0.1 * sigma), 2.0 * (search.x - truth) / N, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +82,7 @@ def test_samples_are_doubled_after_a_small_gain_and_halved_after_a_large_one(sam
     search = search_for(image, normal(N))
     search.tell(image(search.ask()))
     known = search._state.progress
-    told = Evaluated(known.center[None], vector((1 - gain) * known.best.loss), known.output[None], known.shape)
+    told = Evaluated(known.center[None], vector((1 - gain) * known.loss), known.output[None], known.shape)
     assert search._method.taken(replace(known, samples=samples), told).samples == after
 
 

@@ -58,10 +58,23 @@ def test_a_model_is_one_around_the_point_that_is_given(name):
     assert value > search.value
     assert search.model_at_best() is not None
     found = search.model_at_best(x)
-    if "Gauss-Newton" in name or name == "by evidence":  # they know the Jacobian at the center alone
-        assert found is None
-    elif found is not None:
+    if found is not None:
         assert abs(found[0].value - value) < abs(found[0].value - search.value)
+
+
+@every_search
+def test_the_best_point_is_the_lowest_of_samples_and_steps(name):
+    """In noise it is the point where the search believes the loss is lowest."""
+    search, f, loss = make(name), black_box(name), loss_of(name)
+    points, values = [], []
+    for _ in range(12):
+        points.append(search.ask())
+        told = f(points[-1])
+        search.tell(told)
+        values += [float(one if loss is None else loss(one)) for one in told]
+        if "noise" not in name:
+            assert search.value == pytest.approx(min(values), rel=1e-6)
+            assert torch.equal(search.x, torch.cat(points)[values.index(min(values))])
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

@@ -225,11 +225,22 @@ def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: 
     """Whether pathwise derivatives of the surrogate at x [B, n] vary less than Stein's sums.
 
     Both are computed for a few elements of the batch, and the variances of the derivative of this order compared. The
-    answer depends on the surrogate and not on evaluations of the present call.
+    answer depends on the surrogate and not on evaluations of the present call. A table, a tree or a model outside of
+    autograd has no derivative of use: its pathwise derivatives are 0, without variance.
     """
+    surrogate = control.memory.surrogate
+    if _jumps(surrogate, (x[0] + sigma * u).to(x.dtype)):
+        return False
     if len(sigma) > STEIN:
         return True
-    surrogate = control.memory.surrogate
     few = SurrogateTerm(surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
     quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
     return float(few.variance(quantity).sum()) < float(replace(few, pathwise=False).variance(quantity).sum())
+
+
+def _jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool:
+    """Whether outputs at points z [Q, n] differ where their derivative says that they are constant."""
+    with torch.no_grad():
+        outputs = surrogate(z)
+    constant = bool((outputs == outputs[:1]).all())
+    return not constant and not bool(_derivative(surrogate, z, torch.ones_like(z)).any())

@@ -108,6 +108,25 @@ def test_unbiased_for_every_surrogate(name: str, pathwise: bool) -> None:
         assert float(z.abs().max()) < 5, "of 20 numbers; false alarms: 1 in 10 000"
 
 
+@pytest.mark.parametrize("function", [lambda z: render(z.detach()), lambda z: render((20.0 * z).round() / 20.0)])
+def test_a_surrogate_without_derivatives_is_smoothed_by_stein(function: Callable[[Tensor], Tensor]) -> None:
+    """A model outside of autograd, or a table: its pathwise derivatives are 0, without variance."""
+    torch.manual_seed(6)
+    x, r = point()
+    memory = remembering(Fixed(function), draws=1024)
+    box = layer(memory, samples=16).eval()
+    exact = x.clone().requires_grad_()
+    (g,) = torch.autograd.grad(truth(exact, r).sum(), exact)
+    gradients = []
+    for _ in range(32):
+        y = x.clone().requires_grad_()
+        gradients.append(torch.autograd.grad(box(y, r).sum(), y)[0])
+    assert memory.pathwise is False
+    each = torch.stack(gradients)
+    z = (each.mean(0) - g) / (each.std(0) / math.sqrt(len(each)))
+    assert float(z.abs().max()) < 5, "of 8 numbers; false alarms: 1 in 5 000"
+
+
 def test_an_exact_surrogate_leaves_no_noise_of_new_samples() -> None:
     torch.manual_seed(4)
     x, r = point()

@@ -1,6 +1,6 @@
 """Value, gradient, Hessian and Hessian-vector products of a smoothed function from one batch of evaluations."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -84,7 +84,7 @@ def estimate(
         raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
     call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head, joint)
     check_limits(tolerance, tolerance_of, max_evaluations)
-    _check_memory(call, memory, tolerance)
+    _check_memory(call, aux, memory, tolerance)
     x = checked_input(x).detach().clone()
     if joint and (x.ndim != 2 or head is not None or memory is not None):
         raise ValueError(
@@ -139,10 +139,15 @@ def estimate(
     return made(batches, reason)
 
 
-def _check_memory(call: BlackBoxCall, memory: Memory | None, tolerance: float | None) -> None:
+def _check_memory(call: BlackBoxCall, aux: Sequence[Tensor], memory: Memory | None, tolerance: float | None) -> None:
     if not call.outer.linear:
         raise ValueError("head LocalEntropy is no mean over samples, which an estimate is: use BlackBox with this head")
     check_memory(memory)
+    if memory is not None and aux and call.head is None:
+        raise ValueError(
+            f"aux must be empty with a memory and no head, got {len(aux)} tensors: fn gets points alone, and what "
+            "depends on aux belongs into head"
+        )
     if memory is not None and tolerance is not None:
         raise ValueError(
             f"a memory serves one batch, a tolerance asks for several: give one of the two, got tolerance {tolerance}"

@@ -52,7 +52,7 @@ class LinearSigma:
     def sigma(self) -> float:
         """The current sigma."""
         share = min(max(self.count - self.hold, 0) / self.steps, 1.0)
-        return self.start + share * (self.end - self.start)
+        return (1.0 - share) * self.start + share * self.end  # without rounding at both ends
 
     def step(self) -> None:
         """Go on by one step; beyond the last, sigma stays at its end."""

@@ -15,6 +15,7 @@ def test_linear_sigma():
         schedule.step()
         seen.append(layer.smoothing.sigma)
     assert seen == pytest.approx([1.0, 1.0, 0.8, 0.6, 0.4, 0.2, 0.2, 0.2])
+    assert (seen[0], seen[-1]) == (1.0, 0.2)
     other = zh.LinearSigma(layer, 5.0, 4.0, steps=1)
     schedule.count = 2
     other.load_state_dict(schedule.state_dict())

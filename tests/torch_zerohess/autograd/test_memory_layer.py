@@ -108,9 +108,16 @@ def test_unbiased_for_every_surrogate(name: str, pathwise: bool) -> None:
         assert float(z.abs().max()) < 5, "of 20 numbers; false alarms: 1 in 10 000"
 
 
-@pytest.mark.parametrize("function", [lambda z: render(z.detach()), lambda z: render((20.0 * z).round() / 20.0)])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda z: render(z.detach()),
+        lambda z: render((20.0 * z).round() / 20.0),
+        lambda z: torch.from_numpy(render(z.detach()).numpy()),
+    ],
+)
 def test_a_surrogate_without_derivatives_is_smoothed_by_stein(function: Callable[[Tensor], Tensor]) -> None:
-    """A model outside of autograd, or a table: its pathwise derivatives are 0, without variance."""
+    """A model outside of autograd, a table, NumPy: pathwise derivatives are 0, without variance, or there are none."""
     torch.manual_seed(6)
     x, r = point()
     memory = remembering(Fixed(function), draws=1024)

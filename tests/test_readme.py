@@ -41,7 +41,8 @@ def test_code_runs(name, tmp_path, monkeypatch):
     if name == "torch_zerohess/README.md":
         assert names["search"].value < 0.05
         assert names["found"].value <= 1e-6
-        assert names["found"].evaluations <= 60  # 9 to 24 of 12 seeds; threads of the renderer round differently
+        # 60 seeds take 9 to 36. This one takes 40 or 41: threads of the renderer round differently from call to call.
+        assert names["found"].evaluations <= 60
         assert names["state"]["progress"]["evaluations"] == names["search"].evaluations >= 20
         assert names["calibrated"].value < 0.5 * names["missed"]([0.3, 0.8])
         assert names["wrong"] < 0.5  # a guess has log 2

@@ -19,7 +19,7 @@ from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head
-from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
+from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing
@@ -112,7 +112,7 @@ class BlackBox(nn.Module):
 
             return eager(self, x, *aux)
         dtype, x = checked_input(x, empty=True).dtype, working(x)
-        self._check_aux(aux)
+        check_aux(aux, self.memory, self.call.head)
         batch, n = x.shape[:-1], x.shape[-1]
         center, others = x.detach().reshape(batch.numel(), n), folded_aux(_without_grad(aux), batch)
         if len(center) and self.call.value == "center" and not transforms.derivative_possible(x):
@@ -149,7 +149,7 @@ class BlackBox(nn.Module):
         _before_compiling()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = working(x).detach().reshape(-1, n).clone()
-        self._check_aux(aux)
+        check_aux(aux, self.memory, self.call.head)
         with contextlib.nullcontext() if self.memory is None else self.memory.lock:
             around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
@@ -160,14 +160,6 @@ class BlackBox(nn.Module):
             return result.reshape((*batch, *result.shape[1:]))
 
         return frozen
-
-    def _check_aux(self, aux: tuple[Tensor, ...]) -> None:
-        """Refuse auxiliary inputs of fn beside a memory: an output that depends on them serves no other call."""
-        if aux and self.memory is not None and self.call.head is None:
-            raise ValueError(
-                f"aux must be empty for a layer with a memory and no head, got {len(aux)} tensors: fn gets points "
-                "alone, and what depends on aux belongs into head"
-            )
 
     def _around(self, center: Tensor, aux: list[Tensor], *, zero: bool = True) -> Callable[[Tensor], Tensor]:
         """Evaluate around a center [B, n], and return the estimate as a function of x [B, n].

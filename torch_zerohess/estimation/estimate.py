@@ -10,7 +10,7 @@ from torch_zerohess.estimation.adaptive import MOST, Derivative, check_limits, d
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate
 from torch_zerohess.estimation.head import Head
-from torch_zerohess.estimation.inputs import checked_input, folded_aux, working
+from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.estimation.result import Estimate
 from torch_zerohess.estimation.student import student_factor
@@ -143,11 +143,7 @@ def _check_memory(call: BlackBoxCall, aux: Sequence[Tensor], memory: Memory | No
     if not call.outer.linear:
         raise ValueError("head LocalEntropy is no mean over samples, which an estimate is: use BlackBox with this head")
     check_memory(memory)
-    if memory is not None and aux and call.head is None:
-        raise ValueError(
-            f"aux must be empty with a memory and no head, got {len(aux)} tensors: fn gets points alone, and what "
-            "depends on aux belongs into head"
-        )
+    check_aux(aux, memory, call.head)
     if memory is not None and tolerance is not None:
         raise ValueError(
             f"a memory serves one batch, a tolerance asks for several: give one of the two, got tolerance {tolerance}"

@@ -1,6 +1,7 @@
 """Checks of what the caller passes, the point x and auxiliary inputs of the black box; and tensors as short text."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -66,3 +67,12 @@ def short(tensor: Tensor) -> str:
 
 def _rounded(numbers: Any) -> Any:
     return [_rounded(one) for one in numbers] if isinstance(numbers, list) else f"{numbers:.4g}"
+
+
+def check_aux(aux: Sequence[Tensor], memory: object, head: object) -> None:
+    """Raise ValueError for inputs of fn beside a memory: an output that depends on them serves no other call."""
+    if aux and memory is not None and head is None:
+        raise ValueError(
+            f"aux must be empty with a memory and no head, got {len(aux)} tensors: fn gets points alone, and what "
+            "depends on aux belongs into head"
+        )

@@ -225,8 +225,8 @@ def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: 
     """Whether pathwise derivatives of the surrogate at x [B, n] vary less than Stein's sums.
 
     Both are computed for a few elements of the batch, and the variances of the derivative of this order compared. The
-    answer depends on the surrogate and not on evaluations of the present call. A table, a tree or a model outside of
-    autograd has no derivative of use: its pathwise derivatives are 0, without variance.
+    answer depends on the surrogate and not on evaluations of the present call. The pathwise
+    derivatives of a table, a tree or a model outside of autograd are 0, without variance, and wrong: the answer is no.
     """
     surrogate = control.memory.surrogate
     if _jumps(surrogate, (x[0] + sigma * u).to(x.dtype)):
@@ -240,12 +240,14 @@ def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: 
 
 def _jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool:
     """Whether outputs at points z [Q, n] differ where their derivative says that they are constant."""
-    with torch.no_grad():
-        outputs = surrogate(z)
-    constant = bool((outputs == outputs[:1]).all())
-    try:
-        return not constant and not bool(_derivative(surrogate, z, torch.ones_like(z)).any())
-    except NotImplementedError:  # an operation that has no forward mode
-        return False
-    except RuntimeError:  # it leaves torch, for NumPy as a rule
-        return True
+    with torch.inference_mode(False), torch.enable_grad():
+        at = z.clone().requires_grad_()
+        outputs = surrogate(at).reshape(len(z), -1)
+        differ = not bool((outputs == outputs[:1]).all())
+        if not differ or not outputs.requires_grad:
+            return differ
+        weights = torch.arange(
+            1, 1 + outputs.shape[1], dtype=outputs.dtype, device=outputs.device
+        )  # their plain sum may be constant
+        (slope,) = torch.autograd.grad((outputs @ weights).sum(), at, allow_unused=True)
+    return slope is None or not bool(slope.any())

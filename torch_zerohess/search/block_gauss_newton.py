@@ -103,8 +103,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         return super().taken(replace(known, wanted=max(1, round(self.block * self.settings.n))), evaluated)
 
     def moved(self, known: BlockProgress, step: Tensor, change: Tensor) -> BlockProgress:
-        best = replace(known.best, sigma=self.distance(known.radius))
-        return replace(known, best=best, jacobian=renewed(known.jacobian, step[None], change[None]))
+        return replace(known, jacobian=renewed(known.jacobian, step[None], change[None]))
 
     def arrived(self, known: BlockProgress) -> BlockProgress:
         return super().arrived(replace(known, wanted=self.settings.n))

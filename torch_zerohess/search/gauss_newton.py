@@ -53,7 +53,7 @@ class JacobianProgress(Progress):
         return replace(known, done=True, message=f"{_ENDLESS} batches in a row had no finite value")
 
     def recorded(self: Q, evaluated: Evaluated) -> Q:
-        """Return the progress whose best point is that of the lowest loss, of samples and steps alike."""
+        """Return the progress with the lowest loss so far as the best one. Samples count as steps do."""
         finite = evaluated.those(evaluated.finite)
         k = int(finite.losses.argmin()) if len(finite) else -1
         if k < 0 or float(finite.losses[k]) >= self.best.loss:

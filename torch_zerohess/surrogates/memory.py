@@ -35,9 +35,9 @@ class Memory:
 
     The first term takes no evaluations; its derivatives come from h and g. The second term is estimated from the
     evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g, provided that
-    h(g(z), r) is differentiable in z (once for gradients, and with a continuous derivative for Hessians), or that its
-    derivative is zero everywhere, as of a tree or a table: then Stein's identity differentiates the first term. A bad g
-    costs variance, and c falls to zero.
+    h(g(z), r) is differentiable in z (once for gradients, and with a continuous derivative for Hessians). If the
+    derivative of g is zero everywhere (a tree, a table) or unknown to torch (NumPy), Stein's identity differentiates
+    the first term, and the estimate stays unbiased. A bad g costs variance, and c falls to zero.
 
     Args:
         surrogate: an object with `fit(points [P, n], outputs [P, *out])` and a differentiable

@@ -134,6 +134,34 @@ def test_a_surrogate_without_derivatives_is_smoothed_by_stein(function: Callable
     assert float(z.abs().max()) < 5, "of 8 numbers; false alarms: 1 in 5 000"
 
 
+class Sine(torch.autograd.Function):
+    """An operation without a forward mode."""
+
+    @staticmethod
+    def forward(context: Any, z: Tensor) -> Tensor:
+        context.save_for_backward(z)
+        return z.sin()
+
+    @staticmethod
+    def backward(context: Any, change: Tensor) -> Tensor:
+        result: Tensor = change * context.saved_tensors[0].cos()
+        return result
+
+
+def test_many_parameters_before_a_surrogate_without_forward_mode() -> None:
+    """Reverse mode is enough: E mean((sin(sigma u) - 1)^2) has the gradient -2 exp(-sigma^2 / 2) / n."""
+    n = 20
+    memory = zh.Memory(Fixed(Sine.apply), order=1)
+    smoothing = zh.Smoothing(sigma=SIGMA, samples=8, seed=0)
+    box = zh.BlackBox(torch.sin, smoothing, head=zh.heads.SquaredError(), memory=memory)
+    for _ in range(5):
+        x = torch.zeros(2, n, dtype=torch.float64, requires_grad=True)
+        box(x, torch.ones(2, n, dtype=torch.float64)).sum().backward()
+    assert x.grad is not None
+    assert memory.pathwise
+    assert float(x.grad.mean()) == pytest.approx(-2.0 * math.exp(-0.5 * SIGMA**2) / n, rel=0.1)
+
+
 def test_an_exact_surrogate_leaves_no_noise_of_new_samples() -> None:
     torch.manual_seed(4)
     x, r = point()

@@ -43,18 +43,25 @@ def test_looking_at_the_model_changes_nothing(name):
         search.tell(f(search.ask()))
 
 
+def after_each_batch(name):
+    """Yield a search after each of twelve batches, and all points [K, n] and losses that it was told."""
+    search, f, loss = make(name), black_box(name), loss_of(name)
+    points, values = search.ask()[:0], []
+    for _ in range(12):
+        asked = search.ask()
+        told = f(asked)
+        search.tell(told)
+        points = torch.cat([points, asked])
+        values += [float(one if loss is None else loss(one)) for one in told]
+        yield search, points, values
+
+
 @every_search
 def test_a_model_is_one_around_the_point_that_is_given(name):
     """Not a model around the best point: the value is nearer to the value at the given point."""
-    search, f, loss = make(name), black_box(name), loss_of(name)
-    points, values = [], []
-    for _ in range(12):
-        points.append(search.ask())
-        told = f(points[-1])
-        search.tell(told)
-        values += [float(one if loss is None else loss(one)) for one in told]
+    *_, (search, points, values) = after_each_batch(name)
     value = sorted(values)[len(values) // 4]
-    x = torch.cat(points)[values.index(value)]
+    x = points[values.index(value)]
     assert value > search.value
     assert search.model_at_best() is not None
     found = search.model_at_best(x)
@@ -62,19 +69,12 @@ def test_a_model_is_one_around_the_point_that_is_given(name):
         assert abs(found[0].value - value) < abs(found[0].value - search.value)
 
 
-@every_search
+@pytest.mark.parametrize("name", [name for name in SEARCHES if "noise" not in name])
 def test_the_best_point_is_the_lowest_of_samples_and_steps(name):
-    """In noise it is the point where the search believes the loss is lowest."""
-    search, f, loss = make(name), black_box(name), loss_of(name)
-    points, values = [], []
-    for _ in range(12):
-        points.append(search.ask())
-        told = f(points[-1])
-        search.tell(told)
-        values += [float(one if loss is None else loss(one)) for one in told]
-        if "noise" not in name:
-            assert search.value == pytest.approx(min(values), rel=1e-6)
-            assert torch.equal(search.x, torch.cat(points)[values.index(min(values))])
+    """In noise the best point is where the search believes that the loss is lowest."""
+    for search, points, values in after_each_batch(name):
+        assert search.value == pytest.approx(min(values), rel=1e-6)
+        assert torch.equal(search.x, points[values.index(min(values))])
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

@@ -48,6 +48,7 @@ class Memory:
             Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
             None: all of them. 0: none; the estimate is then the first term alone, and biased towards g.
+            Under `vmap` each element is a batch of its own: all of them get new evaluations, unless there are none.
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
         draws: points per element at which the surrogate's term is evaluated. None: 4 for more than 32 parameters,

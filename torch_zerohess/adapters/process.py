@@ -234,6 +234,9 @@ def _missing(shape: Sequence[int]) -> Tensor:
 
 
 def _found(command: Sequence[str]) -> Sequence[str]:
+    """Return a command whose program exists; TypeError if it is text, which a function may return by mistake."""
+    if isinstance(command, str) or not isinstance(command, Sequence) or not command:
+        raise TypeError(f"command must return a list, the program and its arguments, got {command!r}")
     if shutil.which(str(command[0])) is None:
         raise FileNotFoundError(f"command: there is no program {str(command[0])!r} that could be run, see PATH")
     return command

@@ -17,6 +17,12 @@ from torch_zerohess.autograd.curvature import CurvatureOperator
 _TOLERANCE = 1e-3
 """Relative error of the blocks against a product with A at which the loss is not a sum over the batch."""
 
+_OF_TRAINING = (
+    *(nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm),
+    *(nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout),
+)
+"""Modules that in training mode mix samples or draw random numbers."""
+
 
 def output_blocks(operator: CurvatureOperator) -> list[Tensor]:
     """Return the blocks [B, n, n] of A, symmetric and float64, for every tensor y [*batch, n] of the operator.
@@ -78,7 +84,8 @@ class SampleJacobian:
     """The Jacobian of a network whose outputs each depend on one sample of the batch, in about one backward pass.
 
     Made in a closure of `NewtonCG` with solver "dual", which otherwise takes one backward pass for every output of the
-    batch. Layers that mix samples, such as batch normalisation in training mode, have no such Jacobian.
+    batch. Batch normalisation and dropout must be in evaluation mode: in training mode, batch normalisation mixes the
+    samples, and dropout changes the network from call to call.
 
     Args:
         network: a module, samples [B, ...] -> [B, n].
@@ -98,8 +105,15 @@ class SampleJacobian:
     def __call__(self, parameters: Sequence[Tensor]) -> Tensor:
         """Return J [B n, N] by parameters of the network, N numbers in all.
 
-        Raises ValueError for a parameter that the network does not have.
+        Raises ValueError for a parameter that the network does not have, and for batch normalisation and dropout in
+        training mode.
         """
+        for name, one in self._network.named_modules():
+            if one.training and isinstance(one, _OF_TRAINING):
+                raise ValueError(
+                    f"network has a {type(one).__name__} in training mode ({name!r}), and no Jacobian per sample: call "
+                    "network.eval() first"
+                )
         names = {id(one): name for name, one in self._network.named_parameters()}
         if not all(id(one) in names for one in parameters):
             raise ValueError("parameters of the optimizer must be parameters of the network of the SampleJacobian")

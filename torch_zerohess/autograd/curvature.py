@@ -82,6 +82,8 @@ class CurvatureOperator:
 
     def __matmul__(self, v: Tensor) -> Tensor:
         """Return H v for v [N], or H V for V [N, m]."""
+        if not isinstance(v, Tensor):
+            raise TypeError(f"v must be a tensor [{self.shape[0]}], all inputs in one, got {type(v).__name__}")
         if v.dim() not in (1, 2) or len(v) != self.shape[0]:
             raise ValueError(f"v must have shape [{self.shape[0]}] or [{self.shape[0]}, m], got {list(v.shape)}")
         if v.dim() == 2:

@@ -78,22 +78,17 @@ class Control:
             added: what values [B, E, *out] add to the derivatives of the estimate, by order.
             kept: which values were not left out [B, E]; all of them if None.
         """
+        if self.learning:
+            self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
         predicted = None
         if self.memory.ready:
             with torch.no_grad():  # a module has parameters that require grad
                 predicted = Prediction(self, self.memory.surrogate, aux, encoded)(points).double()
-            if predicted.shape != values.shape:
-                raise ValueError(
-                    f"the surrogate of the memory must return [K, {_listed(outputs.shape[2:])}] like the black box, "
-                    f"got a prediction of {list(predicted.shape)} for values of {list(values.shape)}"
-                )
             if self.active and not bool(torch.isfinite(predicted).all()):
                 raise ValueError("the surrogate of the memory predicted a value that is not finite")
-        if self.learning:
-            if predicted is not None:
-                derivatives = list(zip(added(values), added(predicted), strict=True))
-                self.memory.observe(values, predicted, derivatives, kept)
-            self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
+        if self.learning and predicted is not None:
+            derivatives = list(zip(added(values), added(predicted), strict=True))
+            self.memory.observe(values, predicted, derivatives, kept)
         return predicted if self.active else None
 
 
@@ -109,7 +104,7 @@ class Prediction:
 
     def __init__(self, control: Control, surrogate: Any, aux: Sequence[Tensor], encoded: Sequence[Tensor] = ()) -> None:
         self._surrogate, self._aux, self._head = surrogate, aux, control.outer.head
-        self._scalar = control.memory.scalar
+        self._shape = control.memory.output_shape
         if type(self._head) is SquaredError and len(aux) != 1:
             raise TypeError(
                 f"aux must be the references alone, one tensor, for head SquaredError, got {len(aux)} tensors"
@@ -126,11 +121,23 @@ class Prediction:
             known, outside = self.encoded
             coordinates: Tensor = self._surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
             return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
-        outputs: Tensor = self._surrogate(z.flatten(0, 1))
-        if self._scalar and outputs.shape[1:] == (1,):
-            outputs = outputs[:, 0]
-        outputs = outputs.unflatten(0, z.shape[:2])
+        outputs = self._checked(self._surrogate(z.flatten(0, 1)), z.shape[:2].numel()).unflatten(0, z.shape[:2])
         return outputs if self._head is None else apply_head(self._head, outputs, self._aux)
+
+    def _checked(self, outputs: Tensor, count: int) -> Tensor:
+        """Return predictions in the shape of the black box, [count, *out]; for one number [count, 1] is allowed, too.
+
+        Raises ValueError for another shape.
+        """
+        shape = outputs.shape[1:] if self._shape is None else self._shape
+        if shape == () and outputs.shape[1:] == (1,):
+            outputs = outputs[:, 0]
+        if outputs.shape != (count, *shape):
+            raise ValueError(
+                f"the surrogate of the memory must return {[count, *shape]} like the black box, "
+                f"got {list(outputs.shape)}"
+            )
+        return outputs
 
     def excess(self, sigma: Tensor) -> Tensor | None:
         """Return E h(g(z + sigma u), r) - h(g(z), r) where it is the same for all z and r, else None.
@@ -150,7 +157,3 @@ def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:
     known = type(surrogate) in _WITH_COORDINATES and type(outer.head) is SquaredError
     space: LowRank | None = surrogate.space if known else None
     return space
-
-
-def _listed(shape: Sequence[int]) -> str:
-    return ", ".join(map(str, shape))

@@ -21,12 +21,15 @@ def finite_values(
     if all_finite(values):
         return values, None
     bad = ~torch.isfinite(values.reshape(*values.shape[:2], -1)).all(2)
-    if on_nonfinite != "drop" or bool(bad[:, K:].any()):
-        where = bad.nonzero()[0]
-        if on_nonfinite == "drop":  # the center cannot be dropped
-            where = torch.tensor([int(bad[:, K].nonzero()[0]), K], device="cpu")
-        rule = "raise" if on_nonfinite == "drop" else on_nonfinite
-        return replaced(values, where, points(), rule), None
+    if on_nonfinite != "drop":
+        return replaced(values, bad.nonzero()[0], points(), on_nonfinite), None
+    if bool(bad[:, K:].any()):
+        element = int(bad[:, K].nonzero()[0])
+        raise ValueError(
+            f"{_wrong(values[element, K], points()[element, K])}, which is x itself. on_nonfinite='drop' drops "
+            "perturbed points alone: choose baseline='mean' and value='smoothed', which do not need f(x), or "
+            "on_nonfinite=<a number>"
+        )
     kept = ~bad[:, :K]
     if smoothing.antithetic:
         pair = kept[:, : K // 2] & kept[:, K // 2 :]
@@ -49,12 +52,15 @@ def finite_values(
 def replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
     """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
     if isinstance(rule, str):
-        point = points[tuple(where.tolist())]
-        value = values[tuple(where.tolist())]
-        wrong = float(value.flatten()[~torch.isfinite(value.flatten())][0])
+        index = tuple(where.tolist())
         raise ValueError(
-            f"fn returned {wrong} at the point [{numbers(point)}]; choose on_nonfinite='drop' or a number to go on "
-            "without it"
+            f"{_wrong(values[index], points[index])}; choose on_nonfinite='drop' or a number to go on without it"
         )
     # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
     return torch.where(torch.isfinite(values), values.double(), float(rule))
+
+
+def _wrong(value: Tensor, point: Tensor) -> str:
+    """Say what fn returned, [*out], at a point [n]."""
+    value = value.flatten()
+    return f"fn returned {float(value[~torch.isfinite(value)][0])} at the point [{numbers(point)}]"

@@ -123,9 +123,9 @@ class Memory:
         return self._outputs[0] if self._outputs else torch.empty(0, device="cpu")
 
     @property
-    def scalar(self) -> bool:
-        """Whether the black box returns one number per point, [K]. A surrogate may then return [K] or [K, 1]."""
-        return bool(self._outputs) and self._outputs[0].dim() == 1
+    def output_shape(self) -> torch.Size | None:
+        """Shape of one output, *out; None before the first evaluation."""
+        return self._outputs[0].shape[1:] if self._outputs else None
 
     def check_parameters(self, n: int) -> None:
         """Raise ValueError if the evaluations that are kept are of another number of parameters."""

@@ -192,6 +192,8 @@ def test_arguments_are_checked():
         Program(["no-such-program", "-x"])
     with pytest.raises(ValueError, match="command must be a list"):
         Program("cat file")
+    with pytest.raises(TypeError, match="command must return a list, the program and its arguments, got 'echo 3'"):
+        Program(lambda point: "echo 3", on_failure="nan")(torch.zeros(1, 1))
     with pytest.raises(ValueError, match="format must be 'json', 'npy' or a function"):
         Program(["true"], format="xml")
     with pytest.raises(ValueError, match="server=True needs a command that is a list"):

@@ -171,6 +171,12 @@ def test_a_dense_matrix_beyond_ten_thousand_parameters_is_refused():
     torch.testing.assert_close(operator @ torch.ones(10_001), torch.full((10_001,), 2.0))
 
 
+def test_a_list_of_vectors_is_refused():
+    x = torch.ones(2, requires_grad=True)
+    with pytest.raises(TypeError, match=r"v must be a tensor \[2\], all inputs in one, got list"):
+        zh.CurvatureOperator((x**2).sum(), x) @ [torch.ones(2)]
+
+
 @pytest.mark.parametrize("mode", ["exact", "gauss_newton"])
 def test_parameters_that_the_loss_does_not_depend_on_have_no_curvature(mode):
     used, linear, unused = (torch.tensor([1.0, 2.0], requires_grad=True) for _ in range(3))

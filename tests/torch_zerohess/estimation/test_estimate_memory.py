@@ -5,6 +5,7 @@ so that F has a closed form.
 """
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -255,10 +256,13 @@ def test_a_black_box_of_one_number_per_point(fitted: bool) -> None:
     torch.testing.assert_close(scaled.value, R[0] * true["value"], rtol=0, atol=0.01)
 
 
-def test_a_surrogate_of_another_shape_says_so() -> None:
+@pytest.mark.parametrize("head", [None, SquaredError(), lambda y, r: (y - r).square().sum(1)])
+def test_a_surrogate_of_another_shape_says_so(head: Callable[[Tensor, Tensor], Tensor] | None) -> None:
+    """It is not the references that have a wrong shape."""
     memory = Memory(Model(lambda z: z[:, :1]))
-    with pytest.raises(ValueError, match=r"the surrogate of the memory must return \[K, 2\] like the black box"):
-        estimate(image, X, SMOOTHING, memory=memory)
+    aux = () if head is None else (torch.zeros(2),)
+    with pytest.raises(ValueError, match=r"surrogate of the memory must return \[\d+, 2\] .*, got \[\d+, 1\]"):
+        estimate(image, X, SMOOTHING, *aux, head=head, memory=memory)
 
 
 def test_points_that_are_dropped_leave_the_coefficient() -> None:

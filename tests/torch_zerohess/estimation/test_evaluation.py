@@ -32,10 +32,11 @@ def holes(*rows: int):
 
 def test_a_center_that_is_not_finite_cannot_be_dropped() -> None:
     """The last point is x itself. Other points are not finite either, but the message names x."""
-    with pytest.raises(ValueError, match=r"fn returned nan at the point \[0\.1, 0\.2\]"):
+    with pytest.raises(ValueError, match=r"nan at the point \[0\.1, 0\.2\], which is x itself.*choose baseline='mean'"):
         estimate(holes(0, 16), X, S, on_nonfinite="drop")
-    plain = S.replace(baseline="none")
-    assert estimate(holes(0), X, plain, value="smoothed", on_nonfinite="drop").dropped == 2
+    for baseline in ("none", "mean"):
+        without = S.replace(baseline=baseline)
+        assert estimate(holes(0), X, without, value="smoothed", on_nonfinite="drop").dropped == 2
 
 
 def test_the_other_one_of_a_dropped_pair_goes_with_it() -> None:

@@ -106,6 +106,15 @@ def test_jacobians_agree() -> None:
         SampleJacobian(net, IMAGES)([torch.zeros(3)])
 
 
+@pytest.mark.parametrize("layer", [torch.nn.BatchNorm1d(4), torch.nn.Dropout(0.5)])
+def test_a_jacobian_per_sample_is_of_evaluation_mode(layer: torch.nn.Module) -> None:
+    net = torch.nn.Sequential(torch.nn.Linear(3, 4), layer)
+    with pytest.raises(ValueError, match=rf"a {type(layer).__name__} in training mode \('1'\).*net.*eval\(\) first"):
+        SampleJacobian(net, torch.ones(6, 3))(list(net.parameters()))
+    net.eval()
+    assert SampleJacobian(net, torch.ones(6, 3))([net[0].weight]).shape == (24, 12)
+
+
 COUPLED = {
     "all elements": lambda a, b: a.sum() ** 2,
     "two elements": lambda a, b: a.square().sum() + 3.0 * (a[0] * a[2]).sum(),

@@ -15,6 +15,7 @@ LAYERS = {
     "torch_zerohess": [
         *(
             "arguments",
+            "precision",
             "choice",
             "smoothing",
             "losses",

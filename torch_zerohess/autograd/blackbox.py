@@ -52,9 +52,11 @@ class BlackBox(nn.Module):
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
 
     Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For x and aux in
-    float16 or bfloat16, as autocast makes them, fn and head get float32. A batch without points, [0, n], gives an empty
-    result, with zero gradients upstream. fn is not called for it. Without a head the shape of one output must be known,
-    from an earlier call or the memory, else ValueError.
+    float16 or bfloat16, as autocast makes them, fn and head get float32. Autocast is off while fn, head and surrogate
+    run: its rounding is larger than the differences that derivatives are made of.
+
+    A batch without points, [0, n], gives an empty result, with zero gradients upstream. fn is not called for it.
+    Without a head the shape of one output must be known, from an earlier call or the memory, else ValueError.
 
     Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch: that is
     randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch_zerohess.estimation.head import apply_head
 from torch_zerohess.estimation.outer import Outer
 from torch_zerohess.heads import SquaredError
+from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
@@ -121,7 +122,9 @@ class Prediction:
             known, outside = self.encoded
             coordinates: Tensor = self._surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
             return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
-        outputs = self._checked(self._surrogate(z.flatten(0, 1)), z.shape[:2].numel()).unflatten(0, z.shape[:2])
+        with without_autocast(z.device):
+            outputs: Tensor = self._surrogate(z.flatten(0, 1))
+        outputs = self._checked(outputs, z.shape[:2].numel()).unflatten(0, z.shape[:2])
         return outputs if self._head is None else apply_head(self._head, outputs, self._aux)
 
     def _checked(self, outputs: Tensor, count: int) -> Tensor:

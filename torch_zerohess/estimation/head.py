@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torch_zerohess.precision import without_autocast
+
 Head = Callable[..., Tensor]
 """(outputs [K, *out], *aux [K, ...]) -> [K], made of differentiable torch operations."""
 _ALONE = (
@@ -41,13 +43,8 @@ def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
 
 
 def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    if any(one.requires_grad for one in (outputs, *aux)):
-        losses = head(outputs, *aux)
-    else:
-        with torch.enable_grad():  # records nothing, unless the head has a tensor of its own that requires grad
-            losses = head(outputs, *aux)
-        if isinstance(losses, Tensor) and losses.requires_grad:
-            raise ValueError(f"head depends on a tensor that requires grad, {_ALONE}")
+    with without_autocast(outputs.device):
+        losses = _unchecked(head, outputs, aux)
     if not isinstance(losses, Tensor) or not losses.is_floating_point():
         raise TypeError(f"head must return a real floating-point tensor, got {getattr(losses, 'dtype', type(losses))}")
     if losses.shape != outputs.shape[:1]:
@@ -55,4 +52,15 @@ def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
             f"head must return one loss per output, [{len(outputs)}] for outputs {list(outputs.shape)}, "
             f"got {list(losses.shape)}"
         )
+    return losses
+
+
+def _unchecked(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Any:
+    if any(one.requires_grad for one in (outputs, *aux)):
+        losses = head(outputs, *aux)
+    else:
+        with torch.enable_grad():  # records nothing, unless the head has a tensor of its own that requires grad
+            losses = head(outputs, *aux)
+        if isinstance(losses, Tensor) and losses.requires_grad:
+            raise ValueError(f"head depends on a tensor that requires grad, {_ALONE}")
     return losses

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.arguments import checked_integer
+from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.surrogate import Surrogate, outside_inference
 
@@ -174,7 +175,7 @@ class Memory:
 
     def _fit_rows(self) -> None:
         if hasattr(self.surrogate, "fit"):
-            with outside_inference():
+            with outside_inference(), without_autocast(self.points.device):
                 self.surrogate.fit(self.points[: self._rows], self.outputs[: self._rows])
 
     def refresh(self) -> None:

@@ -11,7 +11,7 @@ from layers import AGGREGATE, BATCH, BOTH, SCALAR, N, V, X, close, counting, lea
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
-from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+from torch_zerohess import BlackBox, Memory, Smoothing, estimate, smooth
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels, stein_sums
@@ -138,6 +138,41 @@ def test_a_layer_behind_autocast() -> None:
     assert y.dtype == z.dtype == torch.bfloat16
     (gradient,) = torch.autograd.grad(y.sum(), z)
     close(gradient, estimate(SCALAR.f, z.detach().float(), AGGREGATE).gradient.bfloat16())
+
+
+class Fitted(nn.Module):
+    """A surrogate with a matrix product in it, and in its fit."""
+
+    def fit(self, points: torch.Tensor, outputs: torch.Tensor) -> None:
+        self.map = torch.linalg.lstsq(points, outputs).solution
+        self.scale = (points @ self.map).square().mean() / outputs.square().mean()
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        return self.scale * (z @ self.map)
+
+
+@pytest.mark.parametrize("what", ["fn", "head", "surrogate"])
+def test_autocast_does_not_reach_the_black_box(what: str) -> None:
+    """The same bits with and without: products of matrices in bfloat16 would round away the differences."""
+    W = spread(N * 3, -1.0, 1.0).view(N, 3).float()
+
+    def derivatives(autocast: bool) -> tuple[torch.Tensor, ...]:
+        fn = (lambda z: 100.0 + z @ W) if what == "fn" else (lambda z: z[:, :3].sin())
+        head = (lambda y: (y @ W.T).square().sum(1)) if what == "head" else (lambda y: y.square().sum(1))
+        memory = Memory(Fitted()) if what == "surrogate" else None
+        layer = BlackBox(fn, AGGREGATE.replace(seed=0, samples=8), head=head, memory=memory, value="smoothed")
+        x = X.float().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            for _ in range(3 if memory is not None else 0):  # the surrogate is fitted, and its coefficient measured
+                layer(x)
+            assert memory is None or memory.coefficient > 0.5
+            y = layer(x)
+        (gradient,) = torch.autograd.grad(y, x, create_graph=True)
+        (product,) = torch.autograd.grad(gradient.sum(), x)
+        return y, gradient, product
+
+    for expected, found in zip(derivatives(False), derivatives(True), strict=True):
+        assert torch.equal(expected, found)
 
 
 @BOTH

@@ -3,8 +3,11 @@
 import math
 import operator
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from torch import Tensor
 
 
 def check_callable(**arguments: Any) -> None:
@@ -14,11 +17,36 @@ def check_callable(**arguments: Any) -> None:
             raise TypeError(f"{name} must be callable, got {value!r}")
 
 
+def check_bool(**arguments: Any) -> None:
+    """Raise TypeError for an argument that is neither True nor False."""
+    for name, value in arguments.items():
+        if value is not True and value is not False:
+            raise TypeError(f"{name} must be True or False, got {value!r}")
+
+
+def check_tensors(**arguments: Any) -> None:
+    """Raise TypeError for an argument that is no tensor, or a tuple or list in which one is no tensor."""
+    for name, value in arguments.items():
+        for one in value if isinstance(value, (tuple, list)) else (value,):
+            if not isinstance(one, Tensor):
+                raise TypeError(f"{name} must be a tensor, got {type(one).__name__}: write torch.as_tensor(...)")
+
+
 def check_evaluator(value: Any) -> None:
     """Raise TypeError for an evaluator that is neither None nor callable, or a class in place of an object."""
+    if not callable(value) and hasattr(value, "submit"):
+        raise TypeError(f"evaluator must be callable: write torch_zerohess.evaluators.Executor(...) around {value!r}")
     check_callable(evaluator=value)
     if isinstance(value, type):
         raise TypeError(f"evaluator must be an object, got the class {value.__name__}: write {value.__name__}(...)")
+
+
+def check_state(state: Any, like: Mapping[str, Any], what: str) -> None:
+    """Raise TypeError for a state that is no dictionary, KeyError for one that lacks what `like` has."""
+    if not isinstance(state, Mapping):
+        raise TypeError(f"state must be a state_dict of {what}, got {type(state).__name__}")
+    if missing := [name for name in like if name not in state]:
+        raise KeyError(f"state must be a state_dict of {what}, this one lacks {', '.join(missing)}")
 
 
 def checked_seed(value: Any) -> int:

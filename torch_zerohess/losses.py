@@ -140,7 +140,10 @@ def _channels_first(image: Tensor, ndim: int) -> Tensor:
 
 
 def _checked(target: Any) -> Tensor:
-    target = (target if isinstance(target, Tensor) else torch.as_tensor(target, device="cpu")).detach().clone()
+    try:
+        target = (target if isinstance(target, Tensor) else torch.as_tensor(target, device="cpu")).detach().clone()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"target must be an image [h, w] or [h, w, c], got {type(target).__name__}: {error}") from None
     if target.ndim not in (2, 3) or 0 in target.shape:
         raise ValueError(f"target must be [h, w] or [h, w, c], got [{_listed(target)}]")
     if not target.is_floating_point():

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_callable, checked_file, checked_integer, checked_number
+from torch_zerohess.arguments import check_bool, check_callable, checked_file, checked_integer, checked_number
 from torch_zerohess.estimation.evaluation import BlackBoxCall
 from torch_zerohess.estimation.inputs import working
 from torch_zerohess.evaluators.finished import finished_values
@@ -128,6 +128,7 @@ def minimize(
     """
     _check_names(settings)
     check_callable(callback=callback)
+    check_bool(verbose=verbose)
     check_memory(memory)
     max_evaluations = checked_integer("max_evaluations", max_evaluations)
     batch = checked_integer("batch", batch, 1)

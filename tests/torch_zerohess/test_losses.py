@@ -245,3 +245,8 @@ def test_a_network_learns_through_an_image_and_its_loss(name) -> None:
     jacobian = torch.func.jacrev(layer)(x.detach())
     assert torch.allclose(gradient, torch.einsum("hwn,hw->n", jacobian, torch.func.grad(loss)(layer(x.detach()))))
     assert bool(torch.isfinite(torch.autograd.grad(gradient.sum(), x)[0]).all())
+
+
+def test_a_target_that_is_no_image_is_named() -> None:
+    with pytest.raises(TypeError, match=r"target must be an image \[h, w\] or \[h, w, c\], got NoneType"):
+        zh.losses.mse(None)

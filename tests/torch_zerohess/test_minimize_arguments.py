@@ -122,3 +122,34 @@ def test_a_checkpoint_that_is_none(tmp_path):
         zh.minimize(tilted, zeros(3), checkpoint=good, **settings)
     with pytest.raises(ValueError, match="checkpoint must be a file in a folder"):
         zh.minimize(tilted, zeros(2), checkpoint=tmp_path, **settings)
+
+
+def test_a_checkpoint_of_another_start_is_refused(tmp_path):
+    settings = {"sigma": 1.0, "checkpoint": tmp_path / "one.pt", "max_evaluations": 20, "seed": 0}
+    zh.minimize(tilted, zeros(2), **settings)
+    with pytest.raises(ValueError, match=r"one\.pt: x0 must be \[0, 0\] as there, got \[9, 9\]"):
+        zh.minimize(tilted, zeros(2) + 9.0, **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"verbose": "a"}, "verbose must be True or False, got 'a'")],
+)
+def test_settings_of_a_wrong_type_are_named(settings, message):
+    with pytest.raises(TypeError, match=message):
+        zh.minimize(tilted, zeros(2), sigma=1.0, **settings)
+
+
+def test_points_whose_values_differ_in_shape_are_named():
+    def one_or_two(x):
+        return torch.ones(1 if x[0] <= 0 else 2)
+
+    with pytest.raises(
+        ValueError, match=r"the same shape for every point, got \[2\] at the point \[.*\] and \[1\] before"
+    ):
+        zh.estimate(one_or_two, zeros(2), zh.Smoothing(sigma=1.0, samples=8, seed=0), vectorized=False)
+
+
+def test_many_parameters_are_no_number_in_the_text():
+    found = zh.minimize(lambda z: z.square().sum(1), zeros(10) + 1.0, sigma=1.0, max_evaluations=30, seed=0)
+    assert repr(found).startswith("Minimum(x of shape [10], value=")

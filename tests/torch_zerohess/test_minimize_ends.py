@@ -323,3 +323,40 @@ def test_verbose_says_something_once_per_second(monkeypatch, capsys):
     zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=20, verbose=True)
     seconds, lines = next(clock), len(capsys.readouterr().err.splitlines())
     assert 0 < lines <= seconds
+
+
+def fails(z: torch.Tensor) -> torch.Tensor:
+    return torch.where(z.sum(1) >= 1.0, z.square().sum(1), math.nan)
+
+
+def is_cut_off(z: torch.Tensor) -> torch.Tensor:
+    return torch.where(z.sum(1) >= 1.0, z.square().sum(1), 10.0)
+
+
+def has_steps(z: torch.Tensor) -> torch.Tensor:
+    return (10.0 * z[:, 0]).floor() / 10.0 + z[:, 1].abs() + 2.0 * z[:, 0].abs()
+
+
+@pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
+@pytest.mark.parametrize("fn", [fails, is_cut_off, has_steps])
+def test_a_search_that_ends_at_a_jump_has_not_solved(fn, engine):
+    settings = {"sigma": 0.5, "bounds": (-4.0, 4.0), "engine": engine, "restarts": 0, "max_evaluations": 200}
+    found = zh.minimize(fn, torch.tensor([2.0, 1.5]).double(), seed=0, **settings)
+    assert (found.status, found.success) == ("stalled", False)
+    assert "fn jumps or fails next to x, which may be no minimum" in found.message
+
+
+@pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda z: z.abs().sum(1),
+        lambda z: 100.0 * (z[:, 1] - z[:, 0] ** 2) ** 2 + (1.0 - z[:, 0]) ** 2,
+        lambda z: z[:, 0] ** 2 + 1e6 * z[:, 1] ** 2,
+    ],
+)
+def test_kinks_and_narrow_valleys_are_no_jumps(fn, engine):
+    settings = {"sigma": 0.5, "bounds": (-4.0, 4.0), "engine": engine, "restarts": 0, "max_evaluations": 200}
+    found = zh.minimize(fn, torch.tensor([2.0, 1.5]).double(), seed=0, **settings)
+    assert (found.status, found.success) == ("solved", True)
+    assert "jumps" not in found.message

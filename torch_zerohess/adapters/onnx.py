@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import check_tensors
+
 _TYPES = {
     "tensor(float)": torch.float32,
     "tensor(double)": torch.float64,
@@ -100,6 +102,7 @@ class OnnxFunction:
 
         Raises ValueError if x has another number of columns, or if there are not as many auxiliary inputs as names.
         """
+        check_tensors(x=x, aux=aux)
         if x.ndim != 2 or x.shape[1] != self.n:
             parts = ", ".join(f"{name} {list(shape)}" for name, shape in self.shapes.items())
             raise ValueError(f"x must have shape [K, {self.n}] for {parts}, got {list(x.shape)}")
@@ -188,6 +191,11 @@ def _again(*arguments: Any) -> OnnxFunction:
 def _session(model: Any, threads: int | None, providers: Sequence[str]) -> Any:
     if hasattr(model, "run_with_ort_values"):
         return model
+    if not isinstance(model, (str, bytes, os.PathLike)):
+        raise TypeError(
+            f"model must be a path, the bytes of a model or an InferenceSession, got {type(model).__name__}"
+            + (": export it by torch.onnx.export first" if isinstance(model, torch.nn.Module) else "")
+        )
     try:
         import onnxruntime
     except ModuleNotFoundError as error:

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import threading
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.adapters.server import Server, ended, late, shown
-from torch_zerohess.arguments import checked_timeout
+from torch_zerohess.arguments import check_tensors, checked_timeout
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
@@ -57,8 +58,8 @@ class Program(Closing):
         on_failure: "raise", or "nan" to go on without the values of a run that fails.
 
     Raises:
-        FileNotFoundError: there is no such program.
-        ValueError: an argument is wrong; or, from a call, the answer cannot be read.
+        FileNotFoundError: there is no such program or folder.
+        TypeError, ValueError: an argument is wrong; or, from a call, the answer cannot be read.
         TimeoutError, RuntimeError: from a call, the program took too long, or ended with a code other than 0. The
             message has the point, and what the program wrote to the standard error.
 
@@ -92,35 +93,37 @@ class Program(Closing):
         self.on_failure, self._shape = on_failure, torch.Size()
         self.last_failure: str | None = None
         """Message of the last run that failed, with what it wrote to the standard error; in worker processes theirs."""
-        self.folder, self.environment = folder, None if environment is None else dict(environment)
+        self.folder, self.environment = folder, _checked_environment(environment)
+        if folder is not None and not os.path.isdir(folder):
+            raise FileNotFoundError(f"folder must be a folder that exists, got {folder!r}")
         if not callable(command):
             _found(command)
         self._server: Server | None = None
+        self._end: weakref.finalize[Any, Any] | None = None
+        """Ends the server: called by `close`, when nobody refers to this object any more, or when Python ends."""
         self._asked = threading.Lock()
 
     def __repr__(self) -> str:
         return f"Program({self.command!r}, server={self.server}, format={self.format!r})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: one for name, one in vars(self).items() if name != "_asked"} | {"_server": None}
+        return {name: one for name, one in vars(self).items() if name != "_asked"} | {"_server": None, "_end": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _asked=threading.Lock())
 
     def close(self) -> None:
         """End the server, if there is one."""
-        if self._server is not None:
-            self._server.end()
-            self._server = None
-
-    def __del__(self) -> None:
-        try:  # noqa: SIM105  # at the end of the interpreter contextlib may be gone
-            self.close()
-        except Exception:
-            pass
+        if self._end is not None:
+            self._end()
+        self._server = self._end = None
 
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
-        """Evaluate at points [K, n] with auxiliary inputs [K, ...]."""
+        """Evaluate at points [K, n] with auxiliary inputs [K, ...].
+
+        Raises TypeError for what is no tensor, ValueError if the program did not print one value per point.
+        """
+        check_tensors(x=x, aux=aux)
         if callable(self.command):
             if aux:
                 raise ValueError(f"aux must be empty for a command that is a function of x, got {len(aux)} tensors")
@@ -139,6 +142,11 @@ class Program(Closing):
         values = self._unless_failed(functools.partial(answer, request, len(x)), x)
         if values is None:
             return _missing((*x.shape[:-1], *self._shape))
+        if values.shape[:1] != x.shape[:1]:
+            raise ValueError(
+                f"the program must write one value per point, a list of {len(x)} for points {list(x.shape)}, got "
+                f"{list(values.shape)}"
+            )
         self._shape = values.shape[x.dim() - 1 :]
         return values
 
@@ -162,6 +170,7 @@ class Program(Closing):
                 self.close()
             if self._server is None:
                 self._server = Server(self._start(self.command))
+                self._end = weakref.finalize(self, self._server.end)
             try:
                 answer = self._server.ask(request, self.format == "npy", self._limit(points))
                 return self._values(answer, b"".join(self._server.errors))
@@ -233,10 +242,24 @@ def _missing(shape: Sequence[int]) -> Tensor:
     return torch.full(tuple(shape), torch.nan, dtype=torch.float64, device="cpu")
 
 
+def _checked_environment(environment: Any) -> dict[str, str] | None:
+    if environment is None:
+        return None
+    if not isinstance(environment, Mapping):
+        raise TypeError(f"environment must be a mapping of names to text, got {environment!r}")
+    for name, value in environment.items():
+        if not isinstance(name, str) or not isinstance(value, str):
+            raise TypeError(f"environment must map names to text, got {name!r}: {value!r}")
+    return dict(environment)
+
+
 def _found(command: Sequence[str]) -> Sequence[str]:
     """Return a command whose program exists; TypeError if it is text, which a function may return by mistake."""
     if isinstance(command, str) or not isinstance(command, Sequence) or not command:
         raise TypeError(f"command must return a list, the program and its arguments, got {command!r}")
+    wrong = [one for one in command if not isinstance(one, (str, bytes, os.PathLike))]
+    if wrong:
+        raise TypeError(f"command must be a list of texts and paths, got {wrong[0]!r} in it: write str({wrong[0]!r})")
     if shutil.which(str(command[0])) is None:
         raise FileNotFoundError(f"command: there is no program {str(command[0])!r} that could be run, see PATH")
     return command

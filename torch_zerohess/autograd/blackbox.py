@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import control_variate, opaque, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.limit import limited
@@ -50,6 +51,7 @@ class BlackBox(nn.Module):
         evaluator: where evaluations run; in this process if None.
         value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
+            "drop" is unbiased only where fn fails at random, not where it fails in a region.
 
     Shapes: x [*batch, n], aux [*batch, ...] -> [*batch, *out], of the dtype and on the device of x. For x and aux in
     float16 or bfloat16, as autocast makes them, fn and head get float32. Autocast is off while fn, head and surrogate
@@ -227,10 +229,13 @@ class BlackBox(nn.Module):
         return settings if self.memory is None else {**settings, "memory": self.memory.state_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
+        check_state(state, {}, "a BlackBox")
         settings = dict(state)
         memory = settings.pop("memory", None)
         if memory is not None and self.memory is None:
             raise ValueError("the state has a memory, but the layer has none: make it with memory=Memory()")
+        if unknown := settings.keys() - {one.name for one in fields(Smoothing)}:
+            raise KeyError(f"state must be a state_dict of a BlackBox, this one has {', '.join(sorted(unknown))}")
         self.smoothing = Smoothing(**settings)
         if memory is not None and self.memory is not None:
             self.memory.load_state_dict(memory)

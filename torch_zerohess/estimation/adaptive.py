@@ -18,7 +18,7 @@ _STEP = 0x9E3779B97F4A7C15  # from the seed of a batch to the seed of the next
 
 def draw_until(
     draw: Callable[[Smoothing], Sums],
-    error: Callable[[list[Sums]], float],
+    error: Callable[[list[Sums]], tuple[float, bool]],
     smoothing: Smoothing,
     cost: Callable[[Smoothing], int],
     seed: int,
@@ -30,7 +30,7 @@ def draw_until(
 
     Args:
         draw: draws a batch.
-        error: relative error of the batches so far.
+        error: relative error of the batches so far, and whether an element has no differences at all.
         smoothing: settings of the first batch; the later ones have a multiple of its samples.
         cost: evaluations of a batch.
         seed: of the first batch.
@@ -45,7 +45,7 @@ def draw_until(
         ValueError: the limit does not allow for one batch.
     """
     batches: list[Sums] = []
-    used, multiple = 0, 0
+    used, multiple, name = 0, 0, _NAMES[of]
     while True:
         following = max(1, multiple)
         while following and used + cost(smoothing.replace(samples=following * smoothing.samples)) > max_evaluations:
@@ -55,16 +55,17 @@ def draw_until(
         own = smoothing.replace(samples=following * smoothing.samples, seed=(seed + len(batches) * _STEP) % 2**63)
         batches.append(draw(own))
         used, multiple = used + cost(own), multiple + following
-        found = error(batches)
+        found, flat = error(batches)
         if found <= tolerance:
-            return batches, f"tolerance: the relative error of the {_NAMES[of]} is {found:.2g}, at most {tolerance:g}"
+            still = "; it is 0 in all draws of an element, which says nothing: enlarge sigma" if flat else ""
+            return batches, f"tolerance: the relative error of the {name} is {found:.2g}, at most {tolerance:g}{still}"
     if not batches:
         raise ValueError(
             f"max_evaluations must be at least {cost(smoothing)}, one batch of the smoothing, got {max_evaluations}"
         )
     return batches, (
         f"max_evaluations: {used} of {max_evaluations} are used, another batch does not fit; the relative error of the "
-        f"{_NAMES[of]} is {found:.2g}, above the tolerance {tolerance:g}"
+        f"{name} is {found:.2g}, above the tolerance {tolerance:g}"
     )
 
 

@@ -1,5 +1,6 @@
 """Value, gradient, Hessian and Hessian-vector products of a smoothed function from one batch of evaluations."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -45,7 +46,8 @@ def estimate(
     gradient, or of `tolerance_of`, is at most the tolerance. That error is |e| / |g| in units of sigma, over the
     outputs and entries of one batch element, the largest of the batch; e are half widths of 68 % intervals, which are
     standard errors where there are many draws. Stopping when the error looks small is slightly too early on average.
-    `Estimate.reason` says what ended it.
+    `Estimate.reason` says what ended it. The relative error of an element on a plateau counts as 0; then the reason is
+    that all draws gave 0.
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out]; it may use NumPy or anything else. Without aux if there is a head.
@@ -62,7 +64,9 @@ def estimate(
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
         value: "center" returns f(x) as the value, "smoothed" an estimate of F(x).
-        on_nonfinite: "raise", "drop", or a number that replaces NaN and infinities.
+        on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
+            "drop" is unbiased only where fn fails at random. Where it fails in a region, derivatives are of a Gaussian
+            without this region, and standard errors do not tell: look at `Estimate.dropped`.
         joint: whether one evaluation takes a point of every batch element, for x [B, n]: fn is [K, B, n],
             *aux [K, B, ...] -> [K, B, *out], or [B, n] -> [B, *out] where not `vectorized`. Use it where each of B
             parts of a scene changes a loss of its own, such as the pixels near it: K evaluations then tell the
@@ -150,12 +154,16 @@ def _check_memory(call: BlackBoxCall, aux: Sequence[Tensor], memory: Memory | No
         )
 
 
-def _relative_error(batches: list[Sums], of: Derivative) -> float:
-    """Largest |e| / |g| over the elements of a batch, e the half widths of intervals of one standard deviation."""
+def _relative_error(batches: list[Sums], of: Derivative) -> tuple[float, bool]:
+    """Largest |e| / |g| over the elements of a batch, e the half widths of intervals of one standard deviation.
+
+    And whether g and e of an element are 0, as on a plateau; its relative error counts as 0.
+    """
     g = combined(batches, lambda one: one.stein.sums(of, one.a, None)).flatten(1)
     error, degrees = combined_spread(batches, of, None)
     e = (error * student_factor(_ONE_SIGMA, degrees)).flatten(1)
     size = torch.maximum(g.abs(), e).amax(1, keepdim=True)
     size = torch.where(size > 0, size, 1.0)
     g, e = (g / size).norm(dim=1), (e / size).norm(dim=1)
-    return float(torch.where(e > 0, e / g, 0.0).max())
+    error = e / g
+    return float(error.nan_to_num(nan=0.0, posinf=math.inf).max()), bool(error.isnan().any())

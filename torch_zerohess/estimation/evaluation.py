@@ -8,14 +8,14 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_evaluator
+from torch_zerohess.arguments import check_bool, check_evaluator
 from torch_zerohess.estimation.coefficients import baseline_of, coefficients_of, share_of
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
-from torch_zerohess.estimation.inputs import all_finite
+from torch_zerohess.estimation.inputs import all_finite, check_finite
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.outer import Outer, outer_of
@@ -57,8 +57,7 @@ class BlackBoxCall:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
         check_evaluator(self.evaluator)
-        if self.vectorized not in (True, False):
-            raise TypeError(f"vectorized must be True or False, got {self.vectorized!r}")
+        check_bool(vectorized=self.vectorized)
         if self.evaluator is None:
             object.__setattr__(self, "evaluator", Inline())
         object.__setattr__(self, "outer", outer_of(self.head))
@@ -218,7 +217,11 @@ def evaluate(
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    """Return f(x), [B, *out], for x [B, n]: one evaluation per batch element and nothing else."""
+    """Return f(x), [B, *out], for x [B, n]: one evaluation per batch element and nothing else.
+
+    Raises ValueError if x is not finite.
+    """
+    check_finite(x)
     values = call.values(x[:, None], [one.clone() for one in aux])[0][:, 0]
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):

@@ -21,6 +21,8 @@ def checked_input(x: Any, *, empty: bool = False) -> Tensor:
         raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
     if x.dtype not in (torch.float32, torch.float64, *_HALF):
         raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
+    if x.layout != torch.strided:
+        raise TypeError(f"x must be dense, got {x.layout}: convert by x.to_dense()")
     if x.dim() == 0 or x.shape[-1] == 0 or (x.numel() == 0 and not empty):
         wanted = "n > 0" if empty else "n and every batch dimension > 0"
         raise ValueError(f"x must have shape [*batch, n] with {wanted}, got {list(x.shape)}")
@@ -60,9 +62,21 @@ def bound(x: Tensor) -> float:
     return float(x.abs().max())
 
 
+def check_finite(x: Tensor) -> None:
+    """Raise ValueError if a number in x [B, n] is not finite."""
+    if not math.isfinite(bound(x)) and not bool((finite := torch.isfinite(x)).all()):
+        b, d = (int(index) for index in (~finite).nonzero()[0])
+        raise ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
+
+
 def short(tensor: Tensor) -> str:
     """Return the numbers of a small tensor in four digits, the shape of a large one."""
     return str(_rounded(tensor.tolist())).replace("'", "") if tensor.numel() <= _SHOWN else f"{list(tensor.shape)}"
+
+
+def named(name: str, tensor: Tensor) -> str:
+    """Return `name=[...]` for a small tensor, and its shape for a large one."""
+    return f"{name}={short(tensor)}" if tensor.numel() <= _SHOWN else f"{name} of shape {list(tensor.shape)}"
 
 
 def _rounded(numbers: Any) -> Any:

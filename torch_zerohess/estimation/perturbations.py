@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.elementwise import Elementwise
-from torch_zerohess.estimation.inputs import bound
+from torch_zerohess.estimation.inputs import bound, check_finite
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.signed_lobes import SignedLobes
 from torch_zerohess.estimation.stein import Stein
@@ -22,8 +22,9 @@ FAMILIES: dict[Proposal, type[Stein]] = {
     "optimal": Elementwise,
     "fr22": SignedLobes,
 }
-_FAR_ABOVE = 4096  # sigmas of more roundings of x need no look at the points
-_ROWS = 64  # compared with x at a time; the first few nearly always settle it
+_FAR_ABOVE = 4096  # sigmas of more roundings of the largest x need no look at the others
+_LEAST = 0.4
+"""Smallest sigma over the distance of x to the next number: the gradient is 8.5 % too small there, and 1.4 % at 0.5."""
 
 
 def family(smoothing: Smoothing) -> type[Stein]:
@@ -60,18 +61,16 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool
     if not largest + length * most < limits.max:  # an x that is not a number included
         farthest = x.abs() + length * sigma
         if not bool((farthest < limits.max).all()):
+            check_finite(x)
             raise _out_of_range(x, sigma, farthest)
-    points, stein = family(smoothing).draw(x, sigma, smoothing, seed, keep, center)
     if least < _FAR_ABOVE * limits.eps * largest:
-        _check_moved(points, x, sigma)
+        _check_rounding(x, sigma)
+    points, stein = family(smoothing).draw(x, sigma, smoothing, seed, keep, center)
     return Perturbations(points, stein, sigma)
 
 
 def _out_of_range(x: Tensor, sigma: Tensor, farthest: Tensor) -> ValueError:
-    """Return the error for an x that is not finite, or points around it that are not."""
-    if not bool(torch.isfinite(x).all()):
-        b, d = (int(index) for index in (~torch.isfinite(x)).nonzero()[0])
-        return ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
+    """Return the error for points around x that are not finite."""
     b, d = (int(index) for index in (farthest >= torch.finfo(x.dtype).max).nonzero()[0])
     return ValueError(
         f"sigma is too large: x + sigma*u is not finite in {x.dtype} for parameter {d}, x = {float(x[b, d])}, sigma = "
@@ -79,18 +78,18 @@ def _out_of_range(x: Tensor, sigma: Tensor, farthest: Tensor) -> ValueError:
     )
 
 
-def _check_moved(points: Tensor, x: Tensor, sigma: Tensor) -> None:
-    """Raise if no perturbation of some parameter survived rounding."""
-    moved = torch.zeros_like(x, dtype=torch.bool)
-    for part in points.split(_ROWS, 1):
-        moved |= (part != x[:, None]).any(1)
-        if bool(moved.all()):
-            return
-    b, d = (int(index) for index in (~moved).nonzero()[0])
+def _check_rounding(x: Tensor, sigma: Tensor) -> None:
+    """Raise ValueError if sigma is too small for rounding to act as dither."""
+    size = x.abs()
+    spacing = torch.nextafter(size, torch.full_like(size, torch.inf)).double() - size.double()
+    small = sigma < _LEAST * spacing
+    if not bool(small.any()):
+        return
+    b, d = (int(index) for index in small.nonzero()[0])
     advice = "use float64 or a larger sigma" if x.dtype == torch.float32 else "use a larger sigma or shift the origin"
     raise ValueError(
-        f"sigma is below the rounding of x: x + sigma*u == x in {x.dtype} for parameter {d}, x = {float(x[b, d])}, "
-        f"sigma = {float(sigma[d])}; {advice}"
+        f"sigma is below the rounding of x: x + sigma*u == x in {x.dtype} for most u and parameter {d}, x = "
+        f"{float(x[b, d])}, sigma = {float(sigma[d])}; {advice}"
     )
 
 

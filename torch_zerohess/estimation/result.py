@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cached_property
+from numbers import Real
 from typing import NamedTuple, get_args
 
 import torch
@@ -86,7 +87,19 @@ class Estimate:
         return self._shaped(sums, "hessian_diagonal")
 
     def hessian(self) -> Tensor:
-        """d2F/dx_i dx_j: [*batch, *out, n, n], symmetric; formed at every call."""
+        """d2F/dx_i dx_j: [*batch, *out, n, n], symmetric; formed at every call.
+
+        Raises MemoryError where there is no memory for it.
+        """
+        try:
+            return self._hessian()
+        except RuntimeError as error:
+            if "allocate" not in str(error):
+                raise
+            shape = [*self._batch, *self._out, len(self._sigma), len(self._sigma)]
+            raise MemoryError(f"there is no memory for a Hessian {shape}: use hvp or hessian_diagonal") from error
+
+    def _hessian(self) -> Tensor:
         one = float(self._sigma[0])
         if bool((self._sigma == one).all()):  # divide the coefficients: they are few, and a Hessian is large
             sums = combined(self._batches, lambda batch: batch.stein.hessian(batch.a / one / one))
@@ -137,6 +150,8 @@ class Estimate:
         Raises:
             ValueError: as `standard_error`, or a level out of its range.
         """
+        if isinstance(level, bool) or not isinstance(level, Real):
+            raise TypeError(f"level must be a number, got {level!r}")
         if not 0 < level <= _MOST_LEVEL:
             raise ValueError(f"level must be between 0 and {_MOST_LEVEL}, got {level}")
         t = self._checked(quantity, v)
@@ -237,5 +252,7 @@ class Estimate:
         if not isinstance(v, Tensor) or v.shape not in ((n,), (*self._batch, n)):
             given = list(v.shape) if isinstance(v, Tensor) else type(v).__name__
             raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")
+        if not all_finite(v):
+            raise ValueError(f"v must be finite, got {short(v)}")
         t = (v.detach().to(self._sigma) / self._sigma).reshape(-1, 1, n)
         return t.expand(self._batch.numel(), self._out.numel(), n).contiguous()

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.values import as_tensor
 
@@ -75,6 +76,11 @@ class Each:
         try:
             for one in zip(points, *aux, strict=True):
                 value = as_tensor(self.fn(*one))
+                if values and value.shape != values[0].shape:
+                    raise ValueError(
+                        f"fn must return the same shape for every point, got {list(value.shape)} at the point "
+                        f"[{numbers(one[0])}] and {list(values[0].shape)} before"
+                    )
                 values.append(value.clone())  # fn may go on writing to what it returned
         except BaseException as error:  # Ctrl-C, too
             keep_finished(error, points, dict(enumerate(values)))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.inputs import short
+from torch_zerohess.estimation.inputs import named
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,9 +61,9 @@ class Minimum:
         noise: standard deviation of repeated losses at one point, as it was given or measured at x0; 0 without noise.
         success: whether the target was reached, or x is a point at which the search has arrived.
         status: target: the value is at most the target. solved: the search has ended at a minimum, possibly a local
-            one. stalled: it has ended without one, or in noise, where a small region is no evidence of one. budget,
-            time: evaluations or seconds are used up. callback, interrupted: the caller has ended it. failed: the black
-            box, the loss or the callback has raised.
+            one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and where
+            fn jumps or fails next to x. budget, time: evaluations or seconds are used up. callback, interrupted: the
+            caller has ended it. failed: the black box, the loss or the callback has raised.
         message: why the search ended, in words.
         engine: which search it was: "gaussian_process", "descent" or "local".
     """
@@ -117,6 +117,6 @@ class Minimum:
 
     def __repr__(self) -> str:
         error = f" +- {self.value_error:.2g}" if self.value_error else ""
-        found = f"x={short(self.x)}, value={self.value:.6g}{error}, evaluations={self.evaluations}"
+        found = f"{named('x', self.x)}, value={self.value:.6g}{error}, evaluations={self.evaluations}"
         said = f"engine={self.engine!r}, success={self.success}, message={self.message!r}"
         return f"Minimum({found}, {said})"

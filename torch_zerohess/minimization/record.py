@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation.inputs import short
+
 Call = Callable[[Tensor], tuple[list[int], Tensor, BaseException | None]]
 """Evaluate points [K, n]: the numbers of those that have a value, these values [k, *out], and what was raised."""
 
@@ -92,6 +94,12 @@ class Record:
         if self.requested is not None:
             self.note(*self._interrupted)
 
+    @property
+    def flat(self) -> bool:
+        """Whether all values are equal."""
+        losses = self.told[1]
+        return bool((losses == losses[:1]).all())
+
     def state_dict(self) -> dict[str, Any]:
         """Everything, for `load_state_dict`."""
         points, losses = _joined(self._batches)
@@ -99,10 +107,12 @@ class Record:
         return {"points": points, "values": losses, "request": request}
 
     def load_state_dict(self, state: dict[str, Any], like: Tensor) -> None:
-        """Go on from a state, on the device of x `like` [n]. ValueError if its points have another type."""
+        """Go on from a state, on the device of the start `like` [n]. ValueError if it has another start or type."""
         points, losses = state["points"], state["values"]
         if points.dtype != like.dtype:
             raise ValueError(f"x0 must be {points.dtype} as there, got {like.dtype}")
+        if points.shape[1:] == like.shape and len(points) and not torch.equal(points[0].to(like.device), like):
+            raise ValueError(f"x0 must be {short(points[0])} as there, got {short(like)}")
         self._batches, self.complete = [(points.to(like.device), losses.to(like.device))], len(points)
         if state["request"] is not None:
             requested, self._numbers, values = state["request"]

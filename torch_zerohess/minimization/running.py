@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.decision import Decision, decide
+from torch_zerohess.minimization.jumps import jumps
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
 from torch_zerohess.minimization.noise import REPEATED, deviation, differs, reserved
 from torch_zerohess.minimization.record import Call, Record
@@ -69,7 +70,7 @@ class Running:
         try:
             self._resume(torch.load(path, map_location="cpu", weights_only=True))
         except Exception as error:
-            why = str(error) if isinstance(error, ValueError) else type(error).__name__
+            why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {str(error)[:100]}"
             wanted = "a new file, or one that minimize wrote with the same settings"
             raise ValueError(f"checkpoint must be {wanted}, got {path}: {why}") from error
 
@@ -110,10 +111,9 @@ class Running:
         return f"{given} allows no step after the {count} so far" if rest else f"{given} used up"
 
     @property
-    def flat(self) -> bool:
-        """Whether all values are equal."""
-        losses = self._record.told[1]
-        return bool((losses == losses[:1]).all())
+    def jumps(self) -> bool:
+        """Whether the black box jumps or fails next to the best point, which is then no minimum for sure."""
+        return jumps(*self._record.told, *self._best()[:2], self.search.unit)
 
     @property
     def iterate(self) -> Iterate:
@@ -141,8 +141,8 @@ class Running:
         self._noted(points, search.told)
 
     def ending(self, *, arrived: bool) -> Status:
-        """Return the status when the search ends by itself: in noise a small region is no evidence of a minimum."""
-        return "solved" if arrived and not self.flat and not self.noise else "stalled"
+        """Return the status when the search ends by itself: in noise or at a jump a small region is no evidence."""
+        return "solved" if arrived and not self._record.flat and not self.noise and not self.jumps else "stalled"
 
     def reaches(self, target: float) -> bool:
         """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.
@@ -168,8 +168,7 @@ class Running:
         if allowed < 1:
             return
         self._deciding = before, allowed
-        points, losses = self._record.told
-        search, believed = self.search, self._believed(before).x
+        (points, losses), search, believed = self._record.told, self.search, self._believed(before).x
         likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
         found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise, trusted=search.averages)
         if found is not None:
@@ -192,8 +191,7 @@ class Running:
         search = self.search
         (x, value, error), (points, losses) = self._best(), self._record.told
         found = self._model(x)
-        gradient = hessian = errors = None
-        unit = search.unit
+        gradient, hessian, errors, unit = None, None, None, search.unit
         if found is not None:
             model, sigma = found
             unit = unit * sigma
@@ -201,8 +199,10 @@ class Running:
             hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
             slope, bend = model.full_errors()
             errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
-        if self.flat and len(search.unit) < self.evaluations and status != "target":
+        if self._record.flat and len(search.unit) < self.evaluations and status != "target":
             message += f"; all {self.evaluations} values are equal: enlarge sigma"
+        if status == "stalled" and not self.noise and self.jumps:
+            message += "; fn jumps or fails next to x, which may be no minimum"
         success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
         if success and status in ("budget", "time"):
             message += "; the search had arrived at x, a minimum at least of its surroundings"

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import check_bool, checked_integer
 from torch_zerohess.linalg.dual import clipped
 from torch_zerohess.linalg.steihaug import Step, steihaug
 from torch_zerohess.optim.newton_step import NewtonStep
@@ -95,6 +95,7 @@ class NewtonCG(NewtonStep):
     ) -> None:
         check_radius(radius)
         check_positive(tolerance=tolerance, max_radius=max_radius)
+        check_bool(adapt=adapt)
         check_not_negative(damping=damping, noise=noise)
         if solver not in SOLVERS:
             raise ValueError(f"solver must be one of {', '.join(map(repr, SOLVERS))}, got {solver!r}")

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import nn
 
-from torch_zerohess.arguments import checked_integer, checked_number
+from torch_zerohess.arguments import check_state, checked_integer, checked_number
 from torch_zerohess.autograd.blackbox import BlackBox
 
 
@@ -65,6 +65,7 @@ class LinearSigma:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume and set the sigma of the layers."""
+        check_state(state, self.state_dict(), "a schedule")
         for name in ("start", "end", "steps", "hold", "count"):
             setattr(self, name, state[name])
         self._apply()

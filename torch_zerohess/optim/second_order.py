@@ -162,6 +162,8 @@ class SecondOrder(Optimizer):
         """Evaluate the closure where the parameters are; `separate` keeps the estimates of several losses apart."""
         curvature = self.param_groups[0]["curvature"]
         with torch.enable_grad():
+            if not callable(closure):
+                raise TypeError(f"closure must be callable, a function that returns the loss, got {closure!r}")
             losses, through, jacobian = parts_of(closure())
             if not losses.requires_grad:
                 raise ValueError("closure must return a loss with a graph, got one without: no parameter is in it")

@@ -17,8 +17,8 @@ from typing import Any, Generic
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_callable, checked_integer, checked_number, checked_seed
-from torch_zerohess.estimation.inputs import short
+from torch_zerohess.arguments import check_callable, check_state, checked_integer, checked_number, checked_seed
+from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
@@ -171,7 +171,7 @@ class AskTell(ABC, Generic[P]):
 
     def __repr__(self) -> str:
         end = f"done: {self.message}" if self.done else f"sigma={self.sigma:.4g}"
-        told = f"value={self.value:.6g}, x={short(self.x)}" if self.evaluations else f"start={short(self.x)}"
+        told = f"value={self.value:.6g}, {named('x', self.x)}" if self.evaluations else named("start", self.x)
         name = type(self).__name__
         return f"{name}(engine={self.engine!r}, n={len(self.unit)}, evaluations={self.evaluations}, {told}, {end})"
 
@@ -275,8 +275,7 @@ class AskTell(ABC, Generic[P]):
 
         ValueError for a state of another search, other parameters, sigma or bounds. KeyError if something is missing.
         """
-        if missing := [name for name in self.state_dict() if name not in state]:
-            raise KeyError(f"state must be a state_dict of a search, this one lacks {', '.join(missing)}")
+        check_state(state, self.state_dict(), "a search")
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         self._space.check_state(state)

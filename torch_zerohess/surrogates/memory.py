@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import check_state, checked_integer
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.surrogate import Surrogate, outside_inference
@@ -85,7 +85,7 @@ class Memory:
         if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):
             raise TypeError(f"surrogate must have fit(points, outputs), got {type(surrogate).__name__} without it")
         self.surrogate: Any = AutomaticSurrogate(capacity=capacity) if surrogate is None else surrogate
-        if order not in (1, 2):
+        if checked_integer("order", order) not in (1, 2):
             raise ValueError(f"order must be 1 or 2, got {order}")
         self.capacity, self.fresh, self.order, self.draws = capacity, fresh, order, draws
         self.evaluations = 0
@@ -267,6 +267,7 @@ class Memory:
 
         It is fitted to all evaluations if the memory has dropped some that it knew.
         """
+        check_state(state, self.state_dict(), "a memory")
         points, outputs = state["points"], state["outputs"]
         self._points, self._outputs = ([points], [outputs]) if len(points) else ([], [])
         self._size, self.evaluations = len(points), state["evaluations"]

@@ -121,3 +121,12 @@ def test_wrong_inputs():
         f(C, Z)
     with pytest.raises(FileNotFoundError, match=r"there is no file 'no\.onnx'"):
         OnnxFunction("no.onnx")
+
+
+def test_what_is_no_model_is_named() -> None:
+    with pytest.raises(
+        TypeError, match="model must be a path, the bytes of a model or an InferenceSession, got NoneType"
+    ):
+        OnnxFunction(None, ["x"])
+    with pytest.raises(TypeError, match=r"got Linear: export it by torch\.onnx\.export first"):
+        OnnxFunction(torch.nn.Linear(1, 1), ["x"])

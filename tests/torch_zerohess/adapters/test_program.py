@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -218,3 +219,31 @@ def test_a_program_that_takes_arguments():
     assert torch.equal(
         partial(program)(torch.tensor([[0.75]], dtype=torch.float64)), torch.tensor([0.25], dtype=torch.float64)
     )
+
+
+def test_python_ends_where_a_server_still_runs(tmp_path):
+    """With code 0, and not in an abort over the thread that listens to the server."""
+    serve = tmp_path / "serve.py"
+    serve.write_text(SERVE + ANSWER)
+    code = (
+        "import sys, torch\nfrom torch_zerohess.adapters.process import Program\n"
+        "program = Program([sys.executable, '-S', sys.argv[1]], server=True)\nprint(program(torch.ones(1, 2)).item())"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(serve)], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "2.0\n", "")
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: python(ANSWER, environment="A"), TypeError, "environment must be a mapping of names to text, got 'A'"),
+        (lambda: python(ANSWER, environment={"A": 1}), TypeError, "must map names to text, got 'A': 1"),
+        (lambda: python(ANSWER, folder="/no/such/folder"), FileNotFoundError, "folder must be a folder that exists"),
+        (lambda: Program([sys.executable, "-c", 3.0]), TypeError, r"got 3\.0 in it: write str\(3\.0\)"),
+        (lambda: python("print([1.0])")(Z), ValueError, r"one value per point, a list of 2 .*, got \[1\]"),
+        (lambda: python(ANSWER)([[1.0]]), TypeError, "x must be a tensor, got list"),
+    ],
+)
+def test_wrong_arguments_are_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()

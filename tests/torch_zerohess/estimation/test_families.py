@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
-from torch_zerohess.estimation import perturbations
 from torch_zerohess.estimation.perturbations import FAMILIES, draws, perturb, stored
 from torch_zerohess.estimation.standard_error import variance_of_draws
 from torch_zerohess.estimation.stein import (
@@ -159,16 +158,6 @@ def test_the_variance_of_optimal_sampling_is_the_textbook_formula_per_element() 
     terms = whole * v[0, 0] ** 2
     close(got.variance[0, 0], terms.sum(1))
     close(got.degrees[0, 0], 5 * terms.sum(1) ** 2 / (terms**2).sum(1))  # Welch and Satterthwaite
-
-
-def test_a_point_is_compared_with_all_of_its_perturbations() -> None:
-    """The last of 200 rows alone moves its parameter beyond rounding: no error."""
-    x = torch.zeros(1, 1, dtype=torch.float64)
-    points = torch.zeros(1, 200, 1, dtype=torch.float64)
-    with pytest.raises(ValueError, match="below the rounding of x"):
-        perturbations._check_moved(points, x, torch.ones(1))
-    points[0, -1] = 1.0
-    perturbations._check_moved(points, x, torch.ones(1))
 
 
 def test_long_totals_are_complete() -> None:

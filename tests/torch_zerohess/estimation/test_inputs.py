@@ -1,5 +1,6 @@
 """Bad inputs: the error names the argument, the value received and what would be right."""
 
+import concurrent.futures
 import math
 import sys
 
@@ -318,9 +319,11 @@ def test_first_order_samples_have_no_hessian(changes: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    ("dtype", "sigma", "hint"), [(torch.float32, 1e-7, "float64"), (torch.float64, 1e-16, "shift")]
+    ("dtype", "sigma", "hint"),
+    [(torch.float32, 1e-7, "float64"), (torch.float64, 1e-16, "shift"), (torch.float32, 0.35 * 2.0**-17, "float64")],
 )
 def test_sigma_below_the_rounding_of_x(dtype: torch.dtype, sigma: float, hint: str) -> None:
+    """Numbers of float32 near 100 are 2^-17 apart. With a third of that, the gradient would be a fifth too small."""
     x = torch.tensor([0.0, 100.0], dtype=dtype)
     message = rf"sigma is below the rounding of x: x \+ sigma\*u == x .*parameter 1, x = 100\.0, sigma = .*{hint}"
     for call in (lambda: estimate(f, x, S.replace(sigma=sigma)), lambda: BlackBox(f, S.replace(sigma=sigma)).freeze(x)):
@@ -387,3 +390,26 @@ def test_shapes_symmetry_and_linearity(
     expected = one.gradient.reshape(*batch, *[1] * len(out), n) * scale[..., None]
     tolerance = 1e-5 if single else 1e-12
     torch.testing.assert_close(e.gradient.double(), expected.double(), rtol=tolerance, atol=tolerance)
+
+
+def test_an_x_that_is_not_finite_is_named_before_fn_is_called() -> None:
+    def never(z: torch.Tensor) -> torch.Tensor:
+        raise AssertionError("fn was called")
+
+    x = torch.tensor([1.0, math.nan])
+    for call in (lambda: BlackBox(never, S)(x), lambda: BlackBox(never, S)(x.requires_grad_())):
+        with pytest.raises(ValueError, match="x must be finite, got nan for parameter 1"):
+            call()
+
+
+def test_a_sparse_x_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"x must be dense, got torch\.sparse_coo: convert by x\.to_dense\(\)"):
+        estimate(f, torch.ones(2).to_sparse(), S)
+
+
+def test_an_executor_is_no_evaluator() -> None:
+    with (
+        concurrent.futures.ThreadPoolExecutor(1) as threads,
+        pytest.raises(TypeError, match=r"evaluator must be callable: write torch_zerohess\.evaluators\.Executor"),
+    ):
+        estimate(f, X, S, evaluator=threads)

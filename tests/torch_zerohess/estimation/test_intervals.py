@@ -303,3 +303,17 @@ def test_an_estimate_says_what_it_is() -> None:
     assert repr(got).endswith("], evaluations=33)")
     large = estimate(lambda z: z.repeat(1, 30), spread(6, 0.0, 1.0).view(3, 2), PLAIN)
     assert repr(large) == "Estimate(x [3, 2], output [3, 60], value=[3, 60], gradient=[3, 60, 2], evaluations=99)"
+
+
+def test_a_tolerance_on_a_plateau_says_that_nothing_was_seen() -> None:
+    got = estimate(lambda z: (z[:, 0] > 3.0).double(), X, PLAIN, tolerance=0.1)
+    assert "it is 0 in all draws of an element, which says nothing: enlarge sigma" in got.reason
+    assert "says nothing" not in estimate(SLOPE, X, PLAIN, tolerance=0.5).reason
+
+
+def test_vectors_and_levels_are_checked() -> None:
+    got = estimate(WAVE, X, PLAIN)
+    with pytest.raises(ValueError, match=r"v must be finite, got \[nan, 1\]"):
+        got.hvp(vector(math.nan, 1.0))
+    with pytest.raises(TypeError, match="level must be a number, got 'a'"):
+        got.confidence_interval("gradient", level="a")

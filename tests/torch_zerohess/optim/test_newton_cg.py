@@ -274,3 +274,11 @@ def test_damping_is_added_to_the_curvature():
     optimizer = zh.optim.NewtonCG([x], radius=100.0, tolerance=1e-12, damping=6.0, adapt=False)
     optimizer.step(lambda: (x**2).sum())  # (2 + 6) s = -2 x
     torch.testing.assert_close(x.detach(), 0.75 * torch.tensor([3.0, -2.0], dtype=torch.float64))
+
+
+def test_a_loss_in_place_of_a_closure_is_named() -> None:
+    x = torch.ones(2, requires_grad=True)
+    with pytest.raises(TypeError, match="closure must be callable, a function that returns the loss, got None"):
+        zh.optim.NewtonCG([x]).step(None)
+    with pytest.raises(TypeError, match="adapt must be True or False, got 'x'"):
+        zh.optim.NewtonCG([x], adapt="x")

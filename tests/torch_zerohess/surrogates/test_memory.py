@@ -217,3 +217,12 @@ def test_one_call_with_large_values_does_not_decide() -> None:
         memory.observe(truth, truth, [(truth, truth)])
     memory.observe(1000.0 * truth, -1000.0 * truth, [(1e6 * truth, -1e6 * truth)])
     assert memory.coefficient > 0.7
+
+
+def test_states_of_something_else_are_named() -> None:
+    with pytest.raises(KeyError, match="state must be a state_dict of a memory, this one lacks points, outputs"):
+        Memory().load_state_dict({})
+    with pytest.raises(TypeError, match="state must be a state_dict of a memory, got NoneType"):
+        Memory().load_state_dict(None)
+    with pytest.raises(TypeError, match="order must be an integer, got True"):
+        Memory(order=True)

@@ -3,28 +3,11 @@
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from torch_zerohess.search.loss_process import LossProcess
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.process_method import ProcessMethod
-from torch_zerohess.search.process_progress import ProcessProgress
+from torch_zerohess.search.output_process import OutputProcess
 from torch_zerohess.search.protocol import AskTell
-from torch_zerohess.search.state import Evaluated
-
-
-class OutputProcess(ProcessMethod[ProcessProgress]):
-    """A process of the output, under a white-box loss."""
-
-    progress = ProcessProgress
-
-    def first(self, generator: torch.Generator) -> tuple[ProcessProgress, Tensor]:
-        return self.points(ProcessProgress(**self.begun()), generator)
-
-    def next(
-        self, known: ProcessProgress, evaluated: Evaluated, generator: torch.Generator
-    ) -> tuple[ProcessProgress, Tensor]:
-        return self.points(self.take(known, evaluated), generator)
 
 
 class GaussianProcessSearch(AskTell[Any]):

@@ -68,7 +68,9 @@ class OutputDescent(Method[OutputDescentProgress]):
         descent = self._follow.take(before, evaluated, generator)
         known = replace(known, descent=descent)
         if self._is_smooth(before, descent, evaluated):
-            smooth = self._smooth.taking_over(descent, float((evaluated.points[0] - before.center).norm()))
+            smooth = self._smooth.taking_over(
+                descent, descent.lowest, float((evaluated.points[0] - before.center).norm())
+            )
             return self._went_on(known, *self._smooth.plan(smooth, generator), generator)
         return _with(known, descent), self._follow.points(descent, generator)
 

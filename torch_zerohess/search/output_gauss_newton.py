@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
+from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.region_descent import BAD, RegionDescent, coefficients
 from torch_zerohess.search.region_progress import RegionProgress, latest
 from torch_zerohess.search.state import Best, Evaluated
@@ -65,19 +66,26 @@ class OutputProgress(RegionProgress):
 
 
 class OutputGaussNewton(RegionDescent[OutputProgress]):
-    """A local search that ends when it has arrived or failed, and never starts again. The metric is the identity."""
+    """A local search that ends when it has arrived or failed, and never starts again. The metric is the identity.
+
+    Args:
+        settings: of the search.
+        capacity: evaluations that are kept.
+        patience: refused steps in a row after which it has failed; `_PATIENCE` if None.
+    """
 
     progress = OutputProgress
 
-    def __init__(self, settings: Settings, capacity: int) -> None:
+    def __init__(self, settings: Settings, capacity: int, patience: int | None = None) -> None:
         super().__init__(settings, min(coefficients(settings.n), capacity), capacity)
+        self._patience = _PATIENCE if patience is None else patience
 
-    def taking_over(self, known: DescentProgress, sigma: float) -> OutputProgress:
+    def taking_over(self, known: DescentProgress | ProcessProgress, lowest: Best, sigma: float) -> OutputProgress:
         """Return the progress at the best point of a round of another search, with a region of the radius sigma."""
         pool = known.pool
         assert pool.outputs is not None
         shared = {one: getattr(known, one) for one in ("best", "evaluations", "iterations", "shape")}
-        begun = replace(self._begun(known.lowest), **shared)
+        begun = replace(self._begun(lowest), **shared)
         return replace(begun, points=pool.points, values=pool.values, outputs=pool.outputs, sigma=sigma)
 
     def plan(self, known: OutputProgress, generator: torch.Generator) -> tuple[OutputProgress, Tensor]:
@@ -104,7 +112,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         error = (ratio - 1.0) * known.promised  # predicted loss minus the loss at the end of the step
         other = error + (-known.curved_part if known.curved else known.curved_part)
         known = replace(known, curved=known.curved != (abs(other) < abs(error)))
-        return replace(known, failed=ratio < BAD and known.refused >= _PATIENCE), bad
+        return replace(known, failed=ratio < BAD and known.refused >= self._patience), bad
 
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
         assert self.settings.loss is not None

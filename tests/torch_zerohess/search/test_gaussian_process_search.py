@@ -121,8 +121,11 @@ def test_after_ten_batches_without_a_finite_value_it_ends():
 
 
 def test_it_arrives_after_three_short_steps_and_explores():
-    loss, moved = misfit(waves, vector(1.0)), []
-    search = GaussianProcessSearch(vector(0.5), sigma=1.0, bounds=(-2.0, 2.0), loss=loss, restarts=1, seed=0)
+    """The loss is 1 at its minimum: nothing is left for steps of Gauss-Newton."""
+    away, moved = misfit(waves, vector(1.0)), []
+    search = GaussianProcessSearch(
+        *(vector(0.5),), sigma=1.0, bounds=(-2.0, 2.0), loss=lambda y: 1.0 + away(y), restarts=1, seed=0
+    )
     while not search.done and search.evaluations < 100:
         search.tell(waves(search.ask()))
         assert search.sigma > 0.0

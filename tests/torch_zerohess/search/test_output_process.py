@@ -1,0 +1,120 @@
+"""A Gaussian process of the output that Gauss-Newton finishes: when it begins, when it ends, what is told to whom."""
+
+import pytest
+import torch
+from searches import misfit, waves
+
+from torch_zerohess.optim import GaussianProcessSearch
+from torch_zerohess.search.output_process import OutputProcess
+from truths import vector
+
+TIMES = torch.linspace(0.0, 6.0, 25, dtype=torch.float64)
+SOLUTION = vector(1.0, 0.4, 2.0, 0.3)
+
+
+def swing(x):
+    """A damped swing [K, 25] of amplitude, damping, frequency and phase."""
+    a, b, c, d = (one[:, None] for one in x.unbind(1))
+    return a * torch.exp(-b * TIMES) * torch.cos(c * TIMES + d)
+
+
+def search(fn=swing, solution=SOLUTION, shift=0.0, **settings):
+    away = misfit(fn, solution)
+    given = {"sigma": 0.3, "bounds": (0.0, 3.0), "restarts": 0, "seed": 0, **settings}
+    return GaussianProcessSearch(torch.ones_like(solution), loss=lambda y: shift + away(y), **given)
+
+
+def finishing(found):
+    return found.state_dict()["progress"]["finishing"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_arrives_at_the_last_digit_of_a_smooth_output(seed):
+    found = search(seed=seed)
+    while not found.done and found.evaluations < 150:
+        found.tell(swing(found.ask()))
+    assert found.solved
+    assert found.value < 1e-20
+    torch.testing.assert_close(found.x, SOLUTION, rtol=0, atol=1e-8)
+
+
+def test_the_process_alone_does_not(monkeypatch):
+    monkeypatch.setattr("torch_zerohess.search.output_process._WORTH", float("inf"))
+    found = search()
+    while not found.done and found.evaluations < 150:
+        found.tell(swing(found.ask()))
+    assert found.value > 1e-9
+
+
+def test_it_does_not_begin_where_little_is_left_to_gain():
+    found, seen = search(shift=1.0), []
+    while not found.done and found.evaluations < 100:
+        found.tell(swing(found.ask()))
+        seen.append(finishing(found))
+    assert not any(seen)
+
+
+def steps(x):
+    """The swing, as a gauge with a scale shows it."""
+    return torch.round(16.0 * swing(x)) / 16.0
+
+
+def test_where_the_output_jumps_the_process_goes_on_after_two_refused_steps():
+    found, lengths, begun = search(restarts=100), [0], []
+    while found.evaluations < 150:
+        found.tell(steps(found.ask()))
+        if finishing(found):
+            begun += [found.x] * (lengths[-1] == 0)
+            lengths[-1] += 1
+        elif lengths[-1]:
+            lengths.append(0)
+    assert lengths == [2, 2, 0]
+    assert float((begun[0] - begun[1]).norm()) > 0.05 * 0.3  # it does not begin twice at one point
+
+
+def test_values_that_are_not_finite_count_in_both():
+    """Three of them end Gauss-Newton, and seven more the search."""
+    found = search(restarts=100)
+    while not finishing(found):
+        found.tell(swing(found.ask()))
+    batches = 0
+    while not found.done and batches < 30:
+        found.tell(torch.full((len(found.ask()), 25), torch.nan).double())
+        batches += 1
+    assert batches == 10
+
+
+def test_a_state_while_gauss_newton_works_goes_on_as_before():
+    one, other = search(), search()
+    while not finishing(one):
+        one.tell(swing(one.ask()))
+    one.tell(swing(one.ask()))
+    other.load_state_dict(one.state_dict())
+    for _ in range(4):
+        points = one.ask()
+        assert torch.equal(other.ask(), points)
+        one.tell(swing(points))
+        other.tell(swing(points))
+    assert torch.equal(one.x, other.x)
+
+
+def test_batches_are_asked_for_while_gauss_newton_works():
+    found = search()
+    while not finishing(found):
+        found.tell(swing(found.ask(batch=4)))
+    points = found.ask(batch=4)
+    assert len(points) == 4
+    assert float(torch.pdist(points).min()) > 0.0
+
+
+def test_the_search_is_made_of_it():
+    assert isinstance(search(waves, vector(0.5, 0.2))._method, OutputProcess)
+
+
+def test_a_process_that_finds_nothing_better_is_finished():
+    """Without an arrival: so wide a search has not settled when Gauss-Newton begins."""
+    for seed in range(4):
+        found = search(seed=seed, tolerance=1e-6)
+        while not found.done and found.evaluations < 100 and found.value > 1e-12:
+            found.tell(swing(found.ask()))
+        assert found.value <= 1e-12

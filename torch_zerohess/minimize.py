@@ -93,22 +93,21 @@ def minimize(
         verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this.
-        xtol: the search ends when its region is within this of the best point in every parameter.
-        ftol: the search ends when its model, where it holds, promises a decrease of at most this.
+        xtol: the search ends when the region in which it looks is at most this wide on either side of the best point,
+            in every parameter.
+        ftol: the search ends when its quadratic model, tested by the last step, promises a decrease of at most this.
         time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but a
             prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
             from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
-            file.
+            file, or of another x0, sigma, bounds or engine.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up or three rounds in a row have arrived at the same point.
-        noise: standard deviation of repeated losses at one point. If None it is measured: x0 is evaluated twice, and
-            six times more if the values differ. So fn counts as exact if it is so at x0, as on a plateau: give `noise`
-            then, its size where the minimum may be. Noise is taken to be the same everywhere. If it grows towards the
-            minimum, `value_error` is too small until the evaluations there outweigh those at x0; the mean at the end
-            has the noise at x. If fn is noisy, an eighth of `max_evaluations` (4 to 48) is kept for
-            the end. The best candidates are then evaluated again, and x is the one with the lowest mean. `value` is
-            that mean and `value_error` its standard error.
+        noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
+            evaluations, and six more if the two differ. Give it if fn is noisy elsewhere but not at x0, as on a
+            plateau. The noise is taken to be the same everywhere. In noise, an eighth of `max_evaluations` (4 to 48) is
+            kept for the end: the best candidates are evaluated again, and x is the one with the lowest mean. `value` is
+            this mean and `value_error` its standard error.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
             in it. The search does not read the memory: the result is the same as without one. The next `estimate`

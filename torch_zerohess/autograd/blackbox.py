@@ -60,9 +60,9 @@ class BlackBox(nn.Module):
     A batch without points, [0, n], gives an empty result, with zero gradients upstream. fn is not called for it.
     Without a head the shape of one output must be known, from an earlier call or the memory, else ValueError.
 
-    Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch: that is
-    randomness="different", also where "error" is asked for. With seed=None, "same" raises ValueError, and so does
-    "different" where neither x nor aux is mapped over.
+    Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch. So vmap works as
+    with randomness="different", and does not raise with its default, "error". With seed=None, "same" raises ValueError,
+    and so does "different" where neither x nor aux is mapped over.
 
     `state_dict` has all settings of the smoothing, not sigma alone, and the contents of the memory. `load_state_dict`
     replaces the settings that the layer was made with. To change a setting, set it after loading:

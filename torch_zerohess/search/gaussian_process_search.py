@@ -15,13 +15,15 @@ class GaussianProcessSearch(AskTell[Any]):
 
     - With an output [K, *out] and a white-box `loss`, the process predicts the output anywhere in the box from all
       evaluations. The next point is the one where the loss of the prediction, with some optimism, is lowest; or where
-      the process knows least, if that point is known already.
+      the process knows least, if that point is known already. Gauss-Newton finishes in a basin, where its first step
+      promises to take away a tenth of the loss.
     - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds.
       Where the process finds nothing better, quadratics begin at a random point of the box.
 
     One evaluation follows another, unless `ask` gets a batch. The search has arrived when three steps in a row are
-    shorter than `tolerance`, or when quadratics have ended; these go on to a thousandth of the tolerance. After each of
-    up to `restarts` arrivals it is more optimistic for some steps; of the loss alone it looks where it knows least.
+    shorter than `tolerance`, or when Gauss-Newton or quadratics have ended; these go on to a millionth of the
+    tolerance. After each of up to `restarts` arrivals it is more optimistic for some steps; of the loss alone it looks
+    where it knows least.
 
     In noise `x` is the point whose predicted output has the lowest loss, or with the loss alone the lowest predicted
     loss, and `value` is that prediction. Noise in outputs is detected after some 10 (n + 1) of them; noise in a plain

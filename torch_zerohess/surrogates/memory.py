@@ -196,8 +196,8 @@ class Memory:
         evaluations. They differ: a surrogate may explain values and no curvature. c is the smallest coefficient, so
         that no derivative becomes noisier.
 
-        Calls are weighted by the inverse of their sum of squares, var h(f) + var h(g). Losses at the edge of a plateau
-        are a thousand times as large as elsewhere: without the weights one call there would decide alone.
+        Each call has the weight 1 / (var h(f) + var h(g)). Losses at the edge of a plateau are a thousand times as
+        large as elsewhere: without the weights one call there would decide alone.
         """
         if self.fresh == 0:
             return 1.0

@@ -146,8 +146,8 @@ def _checked(target: Any) -> Tensor:
         raise TypeError(f"target must be an image [h, w] or [h, w, c], got {type(target).__name__}: {error}") from None
     if target.ndim not in (2, 3) or 0 in target.shape:
         raise ValueError(
-            f"target must be [h, w] or [h, w, c], got [{_listed(target)}]; for an output that is no image write the loss "
-            "as a function, such as lambda y: (y - target).square().mean()"
+            f"target must be [h, w] or [h, w, c], got [{_listed(target)}]; for an output that is no image write "
+            "the loss as a function, such as lambda y: (y - target).square().mean()"
         )
     if not target.is_floating_point():
         raise TypeError(f"target must be floating-point, in the scale of the image, got {target.dtype}")

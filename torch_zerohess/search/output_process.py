@@ -2,7 +2,9 @@
 
 The process crosses plateaus and leaves local minima (`ProcessMethod`). It leaves a millionth of a smooth output
 unexplained, and the loss stops there. Outputs interpolated next to the minimum leave nothing (`OutputGaussNewton`). If
-steps of Gauss-Newton do not keep their promise, as where outputs jump, the process goes on alone.
+steps of Gauss-Newton do not keep their promise, as where outputs jump, the process goes on alone. On a plateau with
+ripples each step finds something a little better. Where nothing much better comes, the process looks where it knows
+least.
 """
 
 import math
@@ -13,12 +15,14 @@ from torch import Tensor
 
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
-from torch_zerohess.search.process_method import APART, FLOOR, ProcessMethod
+from torch_zerohess.search.process_method import APART, FLOOR, ROUND, ProcessMethod
 from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.state import Evaluated
 
 _PATIENCE = 3
 """Evaluations over n + 1 in which the process must find something better."""
+_STUCK, _BETTER = 4, 0.1
+"""Evaluations over n + 1 after which it looks elsewhere, if none of them took away this part of the loss."""
 _REFUSED = 2
 """Refused steps in a row of Gauss-Newton after which the process goes on."""
 _WORTH = 0.1
@@ -39,6 +43,12 @@ class OutputProcessProgress(ProcessProgress):
     """Where Gauss-Newton has ended [n]; infinite before."""
     waited: int = 0
     """Evaluations since something better was found."""
+    stuck: int = 0
+    """Evaluations since something much better was found."""
+    looks: int = 0
+    """Times that it has looked elsewhere since then; each time it waits twice as long."""
+    lost: bool = False
+    """Whether it looks where it knows least, because nothing much better was found."""
     due: str = ""
     """Why the process has arrived; empty if it has not."""
 
@@ -74,13 +84,22 @@ class OutputProcess(ProcessMethod[OutputProcessProgress]):
         """Note it: Gauss-Newton may go on from there."""
         return replace(known, due=reason)
 
+    def explores(self, known: OutputProcessProgress) -> bool:
+        return super().explores(known) or (known.exploring > 0 and known.lost)
+
     def _after_process(
         self, known: OutputProcessProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[OutputProcessProgress, Tensor]:
         before, nothing = known.best.loss, evaluated.points[:0]
         known = self.take(replace(known, due=""), evaluated)
-        better = known.best.loss < before
-        known = replace(known, waited=0 if better else known.waited + len(evaluated.needed))
+        now, count = known.best.loss, len(evaluated.needed)
+        better = now < before - _BETTER * abs(before)
+        known = replace(
+            known,
+            waited=0 if now < before else known.waited + count,
+            stuck=0 if better else known.stuck + count,
+            looks=0 if better else known.looks,
+        )
         n = self.settings.n
         turn = bool(known.due) or known.waited >= _PATIENCE * (n + 1)
         new = float((known.best.point - known.tried).norm()) > APART
@@ -92,7 +111,13 @@ class OutputProcess(ProcessMethod[OutputProcessProgress]):
             if len(points) and newton.promised > _WORTH * abs(known.best.loss):
                 return replace(known, newton=newton, finishing=True, waited=0), points
             known = replace(known, tried=known.best.point)
-        return (super().arrived(known, known.due) if known.due else known), nothing
+        if known.due:
+            return super().arrived(known, known.due), nothing
+        if known.stuck == 0 or known.exploring == 0:
+            known = replace(known, lost=False)
+        if known.stuck < (_STUCK * (n + 1)) << known.looks:
+            return known, nothing
+        return replace(known, exploring=ROUND * n, stuck=0, lost=True, looks=known.looks + 1), nothing
 
     def _after_newton(
         self, known: OutputProcessProgress, before: OutputProgress, evaluated: Evaluated, generator: torch.Generator

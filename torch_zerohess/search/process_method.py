@@ -65,8 +65,7 @@ class ProcessMethod(Method[Q]):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        n = settings.n
-        self.capacity = max(settings.pool or _POOL, 2 * n + 2)  # at least the start, its samples and steps
+        self.capacity = max(settings.pool or _POOL, 2 * settings.n + 2)  # at least the start, its samples and steps
         self._latest: tuple[Pool, LossModel] | None = None  # what `_model` would make again
 
     def take(self, known: Q, evaluated: Evaluated) -> Q:
@@ -100,12 +99,14 @@ class ProcessMethod(Method[Q]):
             return known, torch.cat([best[None], around]) if known.phase == "start" else around
         known, model, x = self._modelled(known, generator)
         process, best = model.process, known.best.point
-        # A process of the loss has less to go by: after an arrival it looks where it knows least.
-        explores = known.exploring > 0 and not known.expands
-        moved = math.inf if explores else self._length(x - best)
+        moved = math.inf if (explores := self.explores(known)) else self._length(x - best)
         if explores or torch.equal(x, best) or is_known(process, x):
             x = least_known(process, settings.lower, settings.upper, generator)
         return replace(known, moved=moved), x[None]
+
+    def explores(self, known: Q) -> bool:
+        """Whether to look where least is known: after an arrival if the process is one of the loss."""
+        return known.exploring > 0 and not known.expands
 
     def more(self, known: Q, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Return points around the first one, and points chosen as if the process was right about those before."""

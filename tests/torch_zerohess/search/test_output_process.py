@@ -68,8 +68,8 @@ def test_where_the_output_jumps_the_process_goes_on_after_two_refused_steps():
             lengths[-1] += 1
         elif lengths[-1]:
             lengths.append(0)
-    assert lengths == [2, 2, 0]
-    assert float((begun[0] - begun[1]).norm()) > 0.05 * 0.3  # it does not begin twice at one point
+    assert set(lengths[:-1]) == {2}
+    assert len({tuple(one.tolist()) for one in begun}) == len(begun)  # it does not begin twice at one point
 
 
 def test_values_that_are_not_finite_count_in_both():
@@ -118,3 +118,31 @@ def test_a_process_that_finds_nothing_better_is_finished():
         while not found.done and found.evaluations < 100 and found.value > 1e-12:
             found.tell(swing(found.ask()))
         assert found.value <= 1e-12
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_leaves_a_plateau_with_ripples(seed):
+    """A wall between the start and the target, at which everything comes to rest within a tenth."""
+
+    def behind_a_wall(x):
+        ripples = 0.1 * torch.sin(40.0 * x[:, :1]) * torch.cos(31.0 * x[:, 1:2])
+        return torch.where(x[:, 1:2] > 1.5, x[:, :2], torch.cat([1.0 + ripples, 0.1 * ripples], 1))
+
+    target = vector(2.5, 2.5)
+    settings = {"sigma": 0.4, "bounds": (0.0, 3.0), "restarts": 100, "seed": seed}
+    found = GaussianProcessSearch(vector(1.0, 0.2, 1.0, 1.0), loss=lambda y: (y - target).square().sum(), **settings)
+    while found.value > 0.01 and found.evaluations < 100:
+        found.tell(behind_a_wall(found.ask()))
+    assert found.value <= 0.01
+
+
+def test_it_looks_elsewhere_more_and_more_rarely():
+    """At a minimum where nothing is left to gain: after four evaluations per coefficient of a line, then eight."""
+    found, looks, at = search(shift=1.0, restarts=100), 0, []
+    while len(at) < 3 and found.evaluations < 300:
+        found.tell(swing(found.ask()))
+        now = found.state_dict()["progress"]["looks"]
+        at += [found.evaluations] * (now > looks)
+        looks = now
+    assert at[1] - at[0] == 40
+    assert at[2] - at[1] == 80

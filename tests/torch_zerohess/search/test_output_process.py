@@ -146,3 +146,12 @@ def test_it_looks_elsewhere_more_and_more_rarely():
         looks = now
     assert at[1] - at[0] == 40
     assert at[2] - at[1] == 80
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_does_not_look_elsewhere_while_it_converges(seed):
+    found = search(seed=seed)
+    while found.value > 1e-12 and found.evaluations < 150:
+        found.tell(swing(found.ask()))
+        assert found.state_dict()["progress"]["looks"] == 0
+    assert found.value <= 1e-12

@@ -10,6 +10,7 @@ import statistics
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -72,6 +73,10 @@ def hard_cases() -> list[HardCase]:
         value = (z + 1.0).square().sum(1) / 8
         return torch.where((z.abs() < 0.4).all(1), torch.nan, value)
 
+    def cut(z: Tensor, beyond: float) -> Tensor:
+        value = (z.square().sum(1) - 0.5) / 5.75
+        return torch.where(z.sum(1) < 1.0, beyond, value)
+
     def bowl(z: Tensor) -> Tensor:
         return z.square().sum(1) / 18
 
@@ -82,6 +87,8 @@ def hard_cases() -> list[HardCase]:
         HardCase("start on a saddle", saddle, torch.zeros(2, dtype=torch.float64)),
         HardCase("NaN in a half-plane beside the start", half, 0 * two),
         HardCase("NaN between start and minimum", beside, two),
+        HardCase("NaN beyond the minimum", partial(cut, beyond=torch.nan), 1.75 * two, bounds=(-4.0, 4.0)),
+        HardCase("jump beyond the minimum", partial(cut, beyond=2.0), 1.75 * two, bounds=(-4.0, 4.0)),
         HardCase("noise as large as the signal, not told", bowl, 3 * two, 0.1, 1.0),
         HardCase("noise as large as the signal, told", bowl, 3 * two, 0.1, 1.0, settings={"noise": 1.0}),
     ]

@@ -360,3 +360,16 @@ def test_kinks_and_narrow_valleys_are_no_jumps(fn, engine):
     found = zh.minimize(fn, torch.tensor([2.0, 1.5]).double(), seed=0, **settings)
     assert (found.status, found.success) == ("solved", True)
     assert "jumps" not in found.message
+
+
+@pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
+def test_a_better_point_of_a_round_that_goes_on_is_no_arrival(engine):
+    """Beside a jump every round ends at another point of its edge. The last one has not ended."""
+    settings = {"sigma": 1.0, "bounds": (-4.0, 4.0), "engine": engine, "max_evaluations": 200}
+    wrong = [
+        seed
+        for seed in range(5)
+        if (found := zh.minimize(is_cut_off, torch.tensor([1.75, 1.75]).double(), seed=seed, **settings)).success
+        and found.value > 0.51
+    ]
+    assert not wrong

@@ -3,10 +3,8 @@
 import torch
 from torch import Tensor
 
-_NEXT = 1e-5
-"""Distance, in units of sigma, within which evaluations are next to a point."""
-_JUMP = 1e-3
-"""Difference to the value at the point that is a jump, relative to the range of all values."""
+_NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
+"""Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
 
 
 def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:
@@ -21,8 +19,8 @@ def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor)
         value: the loss at x.
         unit: sigma of every parameter [n].
     """
-    near = losses[((points - x) / unit).square().sum(1) <= _NEXT**2]
     finite = losses[torch.isfinite(losses)]
-    if not len(near) or not len(finite):
+    if not len(finite):
         return False
-    return not bool((near - value <= _JUMP * (finite.max() - finite.min())).all())
+    distance, range_ = ((points - x) / unit).norm(dim=1), finite.max() - finite.min()
+    return not all(bool((losses[distance <= near] - value <= part * range_).all()) for near, part in _NEXT)

@@ -12,7 +12,7 @@ from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
 from torch_zerohess.search.random_points import further_start, normal, reflect
-from torch_zerohess.search.state import Best, Evaluated, agreeing
+from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
 
@@ -162,7 +162,7 @@ class LocalQuadratics(Method[DescentProgress]):
         """End, or start another round: at a random point and around the best one in turn."""
         settings, rounds = self.settings, known.rounds + 1
         if known.refused < _REFUSED and known.sigma < settings.tolerance:
-            known = replace(self._agreeing(known), arrived=min(known.arrived, known.lowest.loss))
+            known = arriving(self._agreeing(known), known.lowest)
         if last or rounds > settings.restarts:
             return replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
         center = known.best.point

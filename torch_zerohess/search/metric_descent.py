@@ -21,7 +21,7 @@ from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import further_start, normal, uniform
 from torch_zerohess.search.region_descent import LOST, RegionDescent, coefficients
 from torch_zerohess.search.region_progress import RegionProgress
-from torch_zerohess.search.state import Best, Evaluated, agreeing
+from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_values
@@ -119,7 +119,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         settings, rounds = self.settings, known.rounds + 1
         if known.lost < LOST:
             known = agreeing(known, known.lowest.point, settings.tolerance)
-            known = replace(known, arrived=min(known.arrived, known.lowest.loss))
+            known = arriving(known, known.lowest)
         if last or rounds > settings.restarts:
             known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
             return known, known.points[:0]

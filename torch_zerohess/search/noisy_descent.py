@@ -20,7 +20,7 @@ from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import further_start, normal, reflect
 from torch_zerohess.search.region_progress import latest
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.state import Best, Evaluated, Progress, arriving
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -179,7 +179,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
     ) -> tuple[NoisyProgress, Tensor]:
         """End, or start another round at a random point."""
         settings, rounds = self.settings, known.rounds + 1
-        known = replace(known, arrived=min(known.arrived, known.best.loss), rounds=rounds)
+        known = replace(arriving(known, known.best), rounds=rounds)
         if last or rounds > settings.restarts:
             return replace(known, done=True, message=f"{reason}, in round {rounds}"), known.points[:0]
         center = further_start(generator, known.first, settings.lower, settings.upper)

@@ -6,7 +6,7 @@ from typing import Literal, TypeVar
 
 from torch import Tensor
 
-from torch_zerohess.search.state import Best, Progress, agreeing
+from torch_zerohess.search.state import Best, Progress, agreeing, arriving
 from torch_zerohess.surrogates.pool import Pool
 
 _LOOKING = 10
@@ -57,7 +57,7 @@ class ProcessProgress(Progress):
         then: beside a minimum that was hard to find there may be a lower one that is as hard to find.
         """
         if not self.pool.ties(self.best.point, self.best.loss, tolerance):  # a plateau is no minimum
-            self = replace(self, arrived=min(self.arrived, self.best.loss))
+            self = arriving(self, self.best)
         if not self.is_minimum(tolerance):
             return self
         looked, least = self.evaluations - self.counted, _LOOKING * (len(self.center) + 1)

@@ -21,7 +21,7 @@ from torch_zerohess.arguments import check_callable, check_state, checked_intege
 from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
-from torch_zerohess.search.state import Evaluated, P, State, plain, restored
+from torch_zerohess.search.state import Evaluated, P, State, are_same, plain, restored
 from torch_zerohess.search.told import converted, joined
 from torch_zerohess.search.told import evaluated as told
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -141,8 +141,10 @@ class AskTell(ABC, Generic[P]):
     @property
     def solved(self) -> bool:
         """Whether the best point is one at which the search has arrived: a minimum, possibly a local one."""
-        progress = self._state.progress
-        return progress.rounds > 0 and progress.best.loss <= progress.arrived < math.inf
+        progress, arrived = self._state.progress, self._state.progress.arrived
+        if arrived is None or progress.rounds == 0 or progress.best.loss > arrived.loss:
+            return False
+        return are_same(progress.best.point, arrived.point, self._method.settings.tolerance)
 
     @property
     def agreed(self) -> int:

@@ -37,8 +37,8 @@ class Progress:
     """Steps tried."""
     rounds: int = 0
     """Times the search has arrived."""
-    arrived: float = math.inf
-    """Lowest loss at which it has arrived."""
+    arrived: Best | None = None
+    """The lowest point at which it has arrived."""
     agreed: int = 0
     """Rounds in a row that have arrived at one point, the best one."""
     place: Tensor | None = None
@@ -53,16 +53,26 @@ class Progress:
 P = TypeVar("P", bound=Progress)
 
 
+def arriving(known: P, end: Best) -> P:
+    """Note that the search has arrived."""
+    lower = end.loss < (math.inf if known.arrived is None else known.arrived.loss)
+    return dataclasses.replace(known, arrived=end) if lower else known
+
+
+def are_same(one: Tensor, other: Tensor, tolerance: float) -> bool:
+    """Whether points [n] are within the tolerance, root mean square over the parameters."""
+    return float((one - other).norm()) < tolerance * math.sqrt(len(one))
+
+
 def agreeing(known: P, end: Tensor, tolerance: float) -> P:
     """Count a round that has arrived at a point [n] whose loss is the lowest of the round.
 
-    It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point. Points
-    are the same within the tolerance, root mean square over the parameters.
+    It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point.
     """
-    best, tolerance = known.best.point, tolerance * math.sqrt(len(end))
-    if float((end - best).norm()) >= tolerance:
+    best = known.best.point
+    if not are_same(end, best, tolerance):
         return dataclasses.replace(known, agreed=0)
-    if known.place is not None and float((best - known.place).norm()) < tolerance:
+    if known.place is not None and are_same(best, known.place, tolerance):
         return dataclasses.replace(known, agreed=known.agreed + 1)
     return dataclasses.replace(known, agreed=1, place=best)
 

@@ -365,11 +365,11 @@ def test_kinks_and_narrow_valleys_are_no_jumps(fn, engine):
 @pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
 def test_a_better_point_of_a_round_that_goes_on_is_no_arrival(engine):
     """Beside a jump every round ends at another point of its edge. The last one has not ended."""
+
+    def cut(z):
+        return torch.where(z.sum(1) < 1.0, 2.0, (z.square().sum(1) - 0.5) / 5.75)
+
     settings = {"sigma": 1.0, "bounds": (-4.0, 4.0), "engine": engine, "max_evaluations": 200}
-    wrong = [
-        seed
-        for seed in range(5)
-        if (found := zh.minimize(is_cut_off, torch.tensor([1.75, 1.75]).double(), seed=seed, **settings)).success
-        and found.value > 0.51
-    ]
-    assert not wrong
+    for seed in range(5):
+        found = zh.minimize(cut, torch.tensor([1.75, 1.75]).double(), seed=seed, **settings)
+        assert not found.success or found.value <= 1e-3

@@ -363,11 +363,12 @@ def test_kinks_and_narrow_valleys_are_no_jumps(fn, engine):
 
 
 @pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
-def test_a_better_point_of_a_round_that_goes_on_is_no_arrival(engine):
+@pytest.mark.parametrize("beyond", [2.0, math.nan])
+def test_a_better_point_of_a_round_that_goes_on_is_no_arrival(beyond, engine):
     """Beside a jump every round ends at another point of its edge. The last one has not ended."""
 
     def cut(z):
-        return torch.where(z.sum(1) < 1.0, 2.0, (z.square().sum(1) - 0.5) / 5.75)
+        return torch.where(z.sum(1) < 1.0, beyond, (z.square().sum(1) - 0.5) / 5.75)
 
     settings = {"sigma": 1.0, "bounds": (-4.0, 4.0), "engine": engine, "max_evaluations": 200}
     for seed in range(5):

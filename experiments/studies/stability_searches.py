@@ -74,7 +74,7 @@ def hard_cases() -> list[HardCase]:
         return torch.where((z.abs() < 0.4).all(1), torch.nan, value)
 
     def cut(z: Tensor, beyond: float) -> Tensor:
-        value = (z.square().sum(1) - 0.5) / 5.75
+        value = (z.square().sum(1) - 0.5) / 5.625
         return torch.where(z.sum(1) < 1.0, beyond, value)
 
     def bowl(z: Tensor) -> Tensor:

@@ -368,7 +368,7 @@ def test_a_better_point_of_a_round_that_goes_on_is_no_arrival(beyond, engine):
     """Beside a jump every round ends at another point of its edge. The last one has not ended."""
 
     def cut(z):
-        return torch.where(z.sum(1) < 1.0, beyond, (z.square().sum(1) - 0.5) / 5.75)
+        return torch.where(z.sum(1) < 1.0, beyond, (z.square().sum(1) - 0.5) / 5.625)
 
     settings = {"sigma": 1.0, "bounds": (-4.0, 4.0), "engine": engine, "max_evaluations": 200}
     for seed in range(5):

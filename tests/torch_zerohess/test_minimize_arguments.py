@@ -140,6 +140,13 @@ def test_settings_of_a_wrong_type_are_named(settings, message):
         zh.minimize(tilted, zeros(2), sigma=1.0, **settings)
 
 
+@pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
+def test_a_grid_is_refused_where_no_engine_uses_it(engine):
+    message = rf"grid is for the engines 'local' and 'auto', got \(1, 2\) with '{engine}'"
+    with pytest.raises(ValueError, match=message):
+        zh.minimize(tilted, zeros(2), sigma=1.0, bounds=(-1, 1), engine=engine, grid=(1, 2))
+
+
 def test_points_whose_values_differ_in_shape_are_named():
     def one_or_two(x):
         return torch.ones(1 if x[0] <= 0 else 2)

@@ -102,6 +102,8 @@ class TrustRegion(AskTell[Any]):
         return known.reason if isinstance(known, EvidenceProgress) else self._reason
 
     def _make(self, settings: Settings) -> Method[Any]:
+        if self._grid is not None and self._wanted in ("descent", "gaussian_process"):
+            raise ValueError(f"grid is for the engines 'local' and 'auto', got {self._grid} with {self._wanted!r}")
         engine, self._reason = _chosen(settings) if self._wanted == "auto" else (self._wanted, "the caller chose it")
         if engine == "gaussian_process":
             return process_method(settings)

@@ -18,9 +18,9 @@ def check_callable(**arguments: Any) -> None:
 
 
 def check_bool(**arguments: Any) -> None:
-    """Raise TypeError for an argument that is neither True nor False."""
+    """Raise TypeError for an argument that is neither True nor False, of Python or NumPy."""
     for name, value in arguments.items():
-        if value is not True and value is not False:
+        if type(value).__name__ not in ("bool", "bool_"):
             raise TypeError(f"{name} must be True or False, got {value!r}")
 
 

@@ -5,6 +5,7 @@ inputs are never copied: the head is called once per sample with the whole batch
 expanded views, whichever takes fewer calls.
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -43,24 +44,17 @@ def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
 
 
 def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    with without_autocast(outputs.device):
-        losses = _unchecked(head, outputs, aux)
+    graph = any(one.requires_grad for one in (outputs, *aux))
+    # Recording finds a tensor of the head's own that requires grad.
+    with without_autocast(outputs.device), contextlib.nullcontext() if graph else torch.enable_grad():
+        losses = head(outputs, *aux)
     if not isinstance(losses, Tensor) or not losses.is_floating_point():
         raise TypeError(f"head must return a real floating-point tensor, got {getattr(losses, 'dtype', type(losses))}")
+    if losses.requires_grad and not graph:
+        raise ValueError(f"head depends on a tensor that requires grad, {_ALONE}")
     if losses.shape != outputs.shape[:1]:
         raise ValueError(
             f"head must return one loss per output, [{len(outputs)}] for outputs {list(outputs.shape)}, "
             f"got {list(losses.shape)}"
         )
-    return losses
-
-
-def _unchecked(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Any:
-    if any(one.requires_grad for one in (outputs, *aux)):
-        losses = head(outputs, *aux)
-    else:
-        with torch.enable_grad():  # records nothing, unless the head has a tensor of its own that requires grad
-            losses = head(outputs, *aux)
-        if isinstance(losses, Tensor) and losses.requires_grad:
-            raise ValueError(f"head depends on a tensor that requires grad, {_ALONE}")
     return losses

@@ -1,9 +1,7 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
-The process crosses plateaus and leaves local minima (`ProcessMethod`). Quadratics finish (`MetricQuadratics`): a
-process of the whole box leaves a millionth of the loss unexplained, a quadratic around a smooth minimum next to
-nothing. If a function has more minima than the process can tell apart, the process finds nothing better. Then
-quadratics begin at a random point of the box.
+Quadratics are fitted next to the minimum (`MetricQuadratics`). If a function has more minima than the process can tell
+apart, the process finds nothing better. Then quadratics begin at a random point of the box.
 """
 
 import math
@@ -12,10 +10,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.finished_process import PATIENCE, FinishedProcess, FinishedProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_descent import MetricProgress, MetricQuadratics
-from torch_zerohess.search.process_method import APART, ROUND, ProcessMethod
-from torch_zerohess.search.process_progress import ProcessProgress
+from torch_zerohess.search.process_method import APART, ROUND
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -25,66 +23,39 @@ _STEPS = 2
 """this many in a row, have found a basin."""
 _WIDTH = 0.3
 """First sigma of the quadratics."""
-_PATIENCE, _QUADRATIC_PATIENCE = 3, 5
-"""Evaluations over n + 1 in which the process, and the quadratics, must find something better: a curved valley refuses
-several steps in a row."""
+_PATIENCE = 5
+"""Evaluations over n + 1 in which the quadratics must find something better: a curved valley refuses several steps."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LossProgress(ProcessProgress):
+class LossProgress(FinishedProgress):
     """What the process knows, and what the quadratics know."""
 
-    quadratics: MetricProgress | None = None
-    """Also when they have ended."""
-    finishing: bool = False
-    """Whether it is the turn of the quadratics."""
-    finished: Tensor
-    """Where quadratics have ended [n]; infinite before."""
+    local: MetricProgress | None = None
     steps: int = 0
     """Short steps of the process in a row."""
-    waited: int = 0
-    """Evaluations since something better was found."""
 
     def is_minimum(self, tolerance: float) -> bool:
-        return torch.equal(self.solved, self.best.point) and ProcessProgress.is_minimum(self, tolerance)
+        return torch.equal(self.solved, self.best.point) and super().is_minimum(tolerance)
 
 
-class LossProcess(ProcessMethod[LossProgress]):
+class LossProcess(FinishedProcess[LossProgress]):
     """A process of the loss and quadratics in turn."""
 
     progress = LossProgress
+    local: MetricQuadratics
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        self._finish = MetricQuadratics(replace(settings, restarts=0))
-        self._patience = _PATIENCE * (settings.n + 1)
-
-    def first(self, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
-        nowhere = torch.full_like(self.settings.start, math.inf)
-        known = LossProgress(**self.begun(), finished=nowhere)
-        return self.points(known, generator)
-
-    def next(
-        self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
-    ) -> tuple[LossProgress, Tensor]:
-        if known.quadratics is not None and known.finishing:
-            known, points = self._after_quadratics(known, known.quadratics, evaluated, generator)
-        else:
-            known, points = self._after_process(known, evaluated, generator)
-        return (known, points) if known.finishing else self.points(known, generator)
-
-    def more(self, known: LossProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        if known.quadratics is not None and known.finishing:
-            return self._finish.more(known.quadratics, points, count, generator)
-        return super().more(known, points, count, generator)
+        self.local = MetricQuadratics(replace(settings, restarts=0))
 
     def model_at_best(self, known: LossProgress) -> tuple[LocalModel, float] | None:
-        quadratics = known.quadratics
+        quadratics = known.local
         if quadratics is not None and torch.equal(quadratics.best.point, known.best.point):
-            return self._finish.model_at_best(quadratics)
+            return self.local.model_at_best(quadratics)
         return super().model_at_best(known)
 
-    def _after_process(
+    def after_process(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
         """Let quadratics finish a new basin; where the process finds none, let them begin elsewhere in the box."""
@@ -95,42 +66,26 @@ class LossProcess(ProcessMethod[LossProgress]):
             steps=known.steps + 1 if known.moved < _NEAR else 0,
             waited=0 if known.best.loss < before else known.waited + count,
         )
-        nothing = evaluated.points[:0]
-        new = float((known.best.point - known.finished).norm()) > APART
-        turn = known.steps >= _STEPS or known.waited >= self._patience
+        turn = known.steps >= _STEPS or known.waited >= PATIENCE * (self.settings.n + 1)
         if not turn or known.noisy or known.done:
-            return known, nothing
-        if new:
-            begun = self._finish.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
-            quadratics, points = self._finish.plan(begun, generator)
+            return known, evaluated.points[:0]
+        if self.is_new(known):
+            begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
+            quadratics, points = self.local.plan(begun, generator)
         else:
-            quadratics, points = self._finish.elsewhere(generator)
-        return replace(known, quadratics=quadratics, finishing=True, steps=0, waited=0), points
+            quadratics, points = self.local.elsewhere(generator)
+        return replace(known, local=quadratics, finishing=True, steps=0, waited=0), points
 
-    def _after_quadratics(
-        self, known: LossProgress, before: MetricProgress, evaluated: Evaluated, generator: torch.Generator
+    def after_local(
+        self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
         """Let quadratics go on, and return to the process where they find nothing better."""
-        finite = evaluated.finite
-        now, points = self._finish.next(before, evaluated, generator)
-        known = self.avoiding(known, evaluated.points[~finite])
-        for k in finite.nonzero().flatten().tolist():  # what tells the process something new
-            if float((known.pool.points - evaluated.points[k]).norm(dim=1).min()) > APART:
-                known = self.remembered(known, evaluated.those(slice(k, k + 1)))
-        best = now.best if now.best.loss <= known.best.loss else known.best
-        known = replace(
-            known,
-            best=best,
-            record=best if best is now.best else known.record,
-            center=now.center,
-            sigma=now.sigma,
-            quadratics=now,
-            evaluations=known.evaluations + len(evaluated),
-            iterations=known.iterations + now.iterations - before.iterations,
-            waited=0 if now.best.loss < before.best.loss else known.waited + len(evaluated.needed),
-        )
+        assert known.local is not None
+        now, points = self.local.next(known.local, evaluated, generator)
+        known = self.told(known, now, evaluated)
+        best = known.best
         plateau = now.wide is not None  # the process leaves it sooner
-        patient = known.waited < _QUADRATIC_PATIENCE * (self.settings.n + 1)
+        patient = known.waited < _PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
         converged = now.done and not now.lost

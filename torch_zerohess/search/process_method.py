@@ -37,7 +37,7 @@ _BESIDE = 0.5
 """Spread of points around the end of a step that are evaluated with it, over the distance of the nearest evaluation."""
 _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
-FLOOR = 1e-2
+_FLOOR = 1e-2
 """Least sigma, over the tolerance."""
 ROUND = 2
 """Steps after an arrival, over n, that are more optimistic."""
@@ -189,7 +189,7 @@ class ProcessMethod(Method[Q]):
         tolerance = self.settings.tolerance
         known = replace(
             known,
-            sigma=min(max(known.moved, FLOOR * tolerance), 1.0),
+            sigma=min(max(known.moved, _FLOOR * tolerance), 1.0),
             exploring=max(known.exploring - 1, 0),
             settled=known.settled + 1 if known.moved < tolerance else 0,
         )

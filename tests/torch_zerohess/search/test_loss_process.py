@@ -135,14 +135,14 @@ def test_process_and_quadratics_take_turns(seed):
         search.tell(well(points))
         now = search.state_dict()["progress"]
         if before["finishing"]:
-            better = now["quadratics"]["best"]["loss"] < before["quadratics"]["best"]["loss"]
+            better = now["local"]["best"]["loss"] < before["local"]["best"]["loss"]
             waited = 0 if better else waited + len(points)
-            converged = now["quadratics"]["done"]
-            assert now["finishing"] == (not converged and waited < 15 and now["quadratics"]["wide"] is None)
+            converged = now["local"]["done"]
+            assert now["finishing"] == (not converged and waited < 15 and now["local"]["wide"] is None)
             if not now["finishing"]:
                 waited = 0
-                assert now["quadratics"]["sigma"] < 1e-7 or not converged
-                if now["quadratics"]["best"]["loss"] == search.value:
+                assert now["local"]["sigma"] < 1e-7 or not converged
+                if now["local"]["best"]["loss"] == search.value:
                     finished = search.x
                     assert torch.equal(now["solved"], search.x) == converged
         else:
@@ -151,10 +151,10 @@ def test_process_and_quadratics_take_turns(seed):
             new = float((search.x - finished).norm()) > 0.05
             assert now["finishing"] == (short >= 2 or waited >= 9)
             if now["finishing"]:
-                assert 0.0 < now["quadratics"]["sigma"] <= 0.3 if new else now["quadratics"]["sigma"] == 1.0
+                assert 0.0 < now["local"]["sigma"] <= 0.3 if new else now["local"]["sigma"] == 1.0
                 short = waited = 0
                 handed += new
-                elsewhere += [] if new else [now["quadratics"]["center"]]
+                elsewhere += [] if new else [now["local"]["center"]]
         lowest = search.value
     assert handed >= 1
     assert len(elsewhere) >= 2
@@ -186,8 +186,8 @@ def test_a_minimum_elsewhere_that_is_higher_agrees_with_nothing():
         before = search.state_dict()["progress"]
         search.tell(bowls(search.ask()))
         now = search.state_dict()["progress"]
-        if before["finishing"] and not now["finishing"] and now["quadratics"]["best"]["loss"] > 0.9:
-            higher += now["quadratics"]["done"]
-            assert now["agreed"] == 0 or not now["quadratics"]["done"]
+        if before["finishing"] and not now["finishing"] and now["local"]["best"]["loss"] > 0.9:
+            higher += now["local"]["done"]
+            assert now["agreed"] == 0 or not now["local"]["done"]
     assert higher >= 1
     assert search.value < 1e-9

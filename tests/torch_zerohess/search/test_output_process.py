@@ -4,6 +4,7 @@ import pytest
 import torch
 from searches import misfit, waves
 
+import torch_zerohess as zh
 from torch_zerohess.optim import GaussianProcessSearch
 from torch_zerohess.search.output_process import OutputProcess
 from truths import vector
@@ -155,3 +156,21 @@ def test_it_does_not_look_elsewhere_while_it_converges(seed):
         found.tell(swing(found.ask()))
         assert found.state_dict()["progress"]["looks"] == 0
     assert found.value <= 1e-12
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.1])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_hessian_at_the_end_is_told_by_the_nearest_outputs(seed, shift):
+    """Whoever has found the best point: the process, Gauss-Newton, or a look elsewhere."""
+    target = swing(SOLUTION[None])[0] + shift * torch.cos(7.0 * TIMES)
+
+    def loss(y):
+        return (y - target).square().mean()
+
+    found = zh.minimize(
+        *(swing, torch.ones(4).double()),
+        **{"sigma": 0.3, "bounds": (0.0, 3.0), "loss": loss, "seed": seed, "max_evaluations": 80},
+    )
+    expected = torch.func.hessian(lambda x: loss(swing(x[None])[0]))(found.x)
+    assert found.engine == "gaussian_process"
+    assert float((found.hessian - expected).norm()) < 0.04 * float(expected.norm())

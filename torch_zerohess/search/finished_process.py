@@ -1,0 +1,93 @@
+"""A Gaussian process that a local search finishes: whose turn it is, and what one tells the other.
+
+The process crosses plateaus and leaves local minima (`ProcessMethod`). It leaves a millionth of a smooth function
+unexplained, where models of the nearest evaluations leave next to nothing. A subclass says which local search it is
+(`RegionDescent`), when its turn comes, and what follows where it ends.
+"""
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.process_method import APART, ProcessMethod
+from torch_zerohess.search.process_progress import ProcessProgress
+from torch_zerohess.search.region_descent import RegionDescent
+from torch_zerohess.search.region_progress import RegionProgress
+from torch_zerohess.search.state import Evaluated
+
+PATIENCE = 3
+"""Evaluations over n + 1 in which the process must find something better."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FinishedProgress(ProcessProgress):
+    """What the process knows, and what the local search knows."""
+
+    local: RegionProgress | None = None
+    """Of the local search, also when it has ended."""
+    finishing: bool = False
+    """Whether it is the turn of the local search."""
+    finished: Tensor
+    """Where the local search has ended [n]; infinite before."""
+    waited: int = 0
+    """Evaluations since something better was found."""
+
+
+F = TypeVar("F", bound=FinishedProgress)
+
+
+class FinishedProcess(ProcessMethod[F]):
+    """A process and a local search in turn."""
+
+    local: RegionDescent[Any]
+
+    @abstractmethod
+    def after_process(self, known: F, evaluated: Evaluated, generator: torch.Generator) -> tuple[F, Tensor]:
+        """Let the process learn, and return the first points of the local search if its turn has come."""
+
+    @abstractmethod
+    def after_local(self, known: F, evaluated: Evaluated, generator: torch.Generator) -> tuple[F, Tensor]:
+        """Let the local search learn, and return its next points if it is still its turn."""
+
+    def first(self, generator: torch.Generator) -> tuple[F, Tensor]:
+        nowhere = torch.full_like(self.settings.start, math.inf)
+        return self.points(self.progress(**self.begun(), finished=nowhere), generator)
+
+    def next(self, known: F, evaluated: Evaluated, generator: torch.Generator) -> tuple[F, Tensor]:
+        after = self.after_local if known.finishing else self.after_process
+        known, points = after(known, evaluated, generator)
+        return (known, points) if known.finishing else self.points(known, generator)
+
+    def more(self, known: F, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        if known.finishing:
+            return self.local.more(known.local, points, count, generator)
+        return super().more(known, points, count, generator)
+
+    def is_new(self, known: F) -> bool:
+        """Whether the best point is apart from the point where the local search has ended last."""
+        return float((known.best.point - known.finished).norm()) > APART
+
+    def told(self, known: F, now: RegionProgress, evaluated: Evaluated) -> F:
+        """Return the progress after the local search has come to `now`. The process gets what is new to it."""
+        before = known.local
+        assert before is not None
+        known = self.avoiding(known, evaluated.points[~evaluated.finite])
+        for k in evaluated.finite.nonzero().flatten().tolist():
+            if float((known.pool.points - evaluated.points[k]).norm(dim=1).min()) > APART:
+                known = self.remembered(known, evaluated.those(slice(k, k + 1)))
+        best = now.best if now.best.loss <= known.best.loss else known.best
+        return replace(
+            known,
+            best=best,
+            record=best if best is now.best else known.record,
+            center=now.center,
+            sigma=now.sigma,
+            local=now,
+            evaluations=known.evaluations + len(evaluated),
+            iterations=known.iterations + now.iterations - before.iterations,
+            waited=0 if now.best.loss < before.best.loss else known.waited + len(evaluated.needed),
+        )

@@ -167,10 +167,8 @@ def test_the_hessian_at_the_end_is_told_by_the_nearest_outputs(seed, shift):
     def loss(y):
         return (y - target).square().mean()
 
-    found = zh.minimize(
-        *(swing, torch.ones(4).double()),
-        **{"sigma": 0.3, "bounds": (0.0, 3.0), "loss": loss, "seed": seed, "max_evaluations": 80},
-    )
+    settings = {"sigma": 0.3, "bounds": (0.0, 3.0), "max_evaluations": 80}
+    found = zh.minimize(swing, torch.ones(4).double(), loss=loss, seed=seed, **settings)
     expected = torch.func.hessian(lambda x: loss(swing(x[None])[0]))(found.x)
     assert found.engine == "gaussian_process"
     assert float((found.hessian - expected).norm()) < 0.04 * float(expected.norm())

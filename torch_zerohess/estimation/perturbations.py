@@ -22,7 +22,7 @@ FAMILIES: dict[Proposal, type[Stein]] = {
     "optimal": Elementwise,
     "fr22": SignedLobes,
 }
-_FAR_ABOVE = 4096  # sigmas of more roundings of the largest x need no look at the others
+_FAR_ABOVE = 4096  # roundings of the largest x: with a sigma of more than this, spacings are not computed
 _LEAST = 0.4
 """Smallest sigma over the distance of x to the next number: the gradient is 8.5 % too small there, and 1.4 % at 0.5."""
 

@@ -38,7 +38,7 @@ class OutputProcessProgress(FinishedProgress):
     """Evaluations since something much better was found."""
     looks: int = 0
     """Times that it has looked elsewhere since then; each time it waits twice as long."""
-    lost: bool = False
+    looking: bool = False
     """Whether it looks where it knows least, because nothing much better was found."""
     due: str = ""
     """Why the process has arrived; empty if it has not."""
@@ -68,7 +68,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         return replace(known, due=reason)
 
     def explores(self, known: OutputProcessProgress) -> bool:
-        return super().explores(known) or (known.exploring > 0 and known.lost)
+        return super().explores(known) or (known.exploring > 0 and known.looking)
 
     def after_process(
         self, known: OutputProcessProgress, evaluated: Evaluated, generator: torch.Generator
@@ -126,8 +126,8 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         if known.due:
             return super().arrived(known, known.due)
         if known.stuck == 0 or known.exploring == 0:
-            known = replace(known, lost=False)
+            known = replace(known, looking=False)
         n = self.settings.n
         if known.stuck < (_STUCK * (n + 1)) << known.looks:
             return known
-        return replace(known, exploring=ROUND * n, stuck=0, lost=True, looks=known.looks + 1)
+        return replace(known, exploring=ROUND * n, stuck=0, looking=True, looks=known.looks + 1)

@@ -113,7 +113,7 @@ def test_the_search_is_made_of_it():
 
 
 def test_a_process_that_finds_nothing_better_is_finished():
-    """Without an arrival: so wide a search has not settled when Gauss-Newton begins."""
+    """The tolerance is so small that the process has not arrived when Gauss-Newton begins."""
     for seed in range(4):
         found = search(seed=seed, tolerance=1e-6)
         while not found.done and found.evaluations < 100 and found.value > 1e-12:

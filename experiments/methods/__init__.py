@@ -13,6 +13,7 @@ from experiments.methods import (
     ours,
     paper,
     quasi_newton,
+    rendered_pairs,
     turbo,
 )
 from experiments.methods.method import Method
@@ -20,7 +21,7 @@ from experiments.methods.method import Method
 METHODS: dict[str, Method] = {
     method.name: method
     for family in (
-        *(paper, ours, memory_networks, gauss_newton, derivative_free, quasi_newton),
+        *(paper, ours, memory_networks, rendered_pairs, gauss_newton, derivative_free, quasi_newton),
         *(bayesian, turbo, learned, analytic, meshes, mesh_levels, mitsuba),
     )
     for method in family.METHODS

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def with_settings(solve: Callable[..., None], **fixed: Any) -> Callable[[Any, Mapping[str, Any] | None], None]:
+def with_settings(solve: Callable[..., object], **fixed: Any) -> Callable[[Any, Mapping[str, Any] | None], None]:
     """Return `solve` as a function of a trial and a dictionary of its other arguments (None: its defaults)."""
 
     def solve_with(trial: Any, settings: Mapping[str, Any] | None = None) -> None:

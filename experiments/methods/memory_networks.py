@@ -33,7 +33,7 @@ _STEPS = 1000
 """Steps at most; larger budgets get more fresh images per step."""
 _STEPS_ALONE = 4000
 """Steps where all evaluations are used before the first step."""
-_ROWS = 200
+ROWS = 200
 """Rows of the log, about."""
 
 
@@ -57,8 +57,8 @@ def through_memory(
     many_rate: tuple[float, float] = (1e-2, 3e-4),
     warm_up: float = 0.05,
     temperature: float = 0.15,
-) -> None:
-    """Train until the evaluations are used.
+) -> zh.Memory:
+    """Train until the evaluations are used, and return what has been rendered.
 
     The first renders are around the predictions of the first images, at distances of sigma. A tenth of the evaluations
     is used for them, 20 to 64; of many parameters n + 76, so that an affine map is known. If none are left, training
@@ -109,12 +109,13 @@ def through_memory(
     }[steps]()
     for step in range(total):
         share = min(step / (ANNEALED * total), 1.0)
-        sigma = _annealed(task.sigma, share)
+        sigma = annealed(task.sigma, share)
         layer.smoothing = layer.smoothing.replace(sigma=sigma)
         loss = update(trial.batch(step, batch), share, sigma)
-        every, last = max(1, total // _ROWS), step == total - 1
+        every, last = max(1, total // ROWS), step == total - 1
         if step % every == 0 or last:
             trial.report(sigma=sigma, loss=loss, measured=last or step % (10 * every) == 0)
+    return memory
 
 
 def _newton(
@@ -136,7 +137,7 @@ def _newton(
             return layer(y, images).mean(), y, zh.optim.SampleJacobian(network, images)
 
         group = optimizer.param_groups[0]
-        group["radius"], group["output_radius"] = _annealed(radius, share), output_radius * sigma
+        group["radius"], group["output_radius"] = annealed(radius, share), output_radius * sigma
         return optimizer.step(closure)
 
     return update
@@ -163,7 +164,7 @@ def _many_targets(
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         y = network(images)
         ends = newton(lambda at: layer(at, images), y)
-        _step(optimizer, _annealed(rate, share) * min(share / warm_up, 1.0), (y - ends).square().mean())
+        descend(optimizer, annealed(rate, share) * min(share / warm_up, 1.0), (y - ends).square().mean())
         assert newton.losses is not None
         return newton.losses.mean()
 
@@ -175,29 +176,31 @@ def _adam(network: nn.Module, layer: zh.BlackBox, rate: tuple[float, float]) -> 
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         loss = layer(network(images), images).mean()
-        _step(optimizer, _annealed(rate, share), loss)
+        descend(optimizer, annealed(rate, share), loss)
         return loss.detach()
 
     return update
 
 
-def _step(optimizer: torch.optim.Optimizer, rate: float, objective: Tensor) -> None:
+def descend(optimizer: torch.optim.Optimizer, rate: float, objective: Tensor) -> None:
+    """Take a step along the gradient of an objective."""
     optimizer.param_groups[0]["lr"] = rate
     optimizer.zero_grad()
     objective.backward()
     optimizer.step()
 
 
-def _annealed(ends: tuple[float, float], share: float) -> float:
+def annealed(ends: tuple[float, float], share: float) -> float:
     """Return a number that falls from the first to the last one, by equal ratios."""
     start, end = ends
     return start * (end / start) ** share
 
 
-def _few(task: NetworkTask) -> str | None:
+def few_outputs(task: NetworkTask) -> str | None:
+    """For methods that need the curvature of each image as a small matrix."""
     if task.n <= MOST:
         return None
-    return f"Newton steps on the weights: up to {MOST} outputs of the network, the task has {task.n}"
+    return f"for up to {MOST} outputs of the network, the task has {task.n}"
 
 
 METHODS = (
@@ -205,7 +208,7 @@ METHODS = (
         "memory_newton",
         "ours: Newton steps on the weights, through a layer that remembers its renders",
         train=with_settings(through_memory, steps="newton"),
-        trains=_few,
+        trains=few_outputs,
         uses="image",
     ),
     Method(

@@ -113,7 +113,7 @@ def test_where_methods_apply():
     }
     assert METHODS["memory_newton"].unusable(catalogue.load("quad")) == "trains networks only"
     many = METHODS["memory_newton"].unusable(catalogue.load("cnn_texture"))
-    assert many == "Newton steps on the weights: up to 10 outputs of the network, the task has 1024"
+    assert many == "for up to 10 outputs of the network, the task has 1024"
     assert METHODS["memory_targets"].unusable(catalogue.load("cnn_texture")) is None
     assert METHODS["cobyqa"].unusable(BUMP) == "trains no networks"
     with pytest.raises(AssertionError, match="cobyqa trains no networks"):

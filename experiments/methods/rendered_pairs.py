@@ -44,7 +44,7 @@ def fit_to_pairs(
     *,
     fits: int = 8000,
     batch: int = 32,
-    rate: tuple[float, float] = (2e-3, 3e-5),
+    rate: tuple[float, float] = (4e-3, 3e-5),
     warm_up: int = 100,
     softness: float = 0.01,
 ) -> None:

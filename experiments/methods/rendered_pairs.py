@@ -21,7 +21,7 @@ plus `softness`: a mean of squares would be ruled by the few images that are sti
 settings below were chosen for `memory_pairs` on runs 200 and 201 of CNN5. No table reports one of these runs.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -84,8 +84,8 @@ def output_metric(surrogate: Callable[[Tensor], Tensor], points: Tensor) -> Tens
     return metric / metric.diagonal(dim1=1, dim2=2).mean()
 
 
-def _memory_pairs(trial: NetworkTrial, **settings: Any) -> None:
-    fit_to_pairs(trial, through_memory(trial, steps="newton"), **settings)
+def _memory_pairs(trial: NetworkTrial, *, newton: Mapping[str, Any] | None = None, **settings: Any) -> None:
+    fit_to_pairs(trial, through_memory(trial, steps="newton", **(newton or {})), **settings)
 
 
 def _drawn_pairs(trial: NetworkTrial, *, draw: Callable[[NetworkTrial], Tensor], **settings: Any) -> None:

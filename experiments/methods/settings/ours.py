@@ -26,6 +26,9 @@ LOCAL: dict[str, dict[str, Any]] = {
 
 NETWORKS: dict[str, dict[str, Any]] = {
     # By hand on runs 100 to 102 with 1 000 simulations, beside the default radius.
-    "cnn_throw": {"memory_newton": {"radius": (0.3, 0.01)}},
+    "cnn_throw": {
+        "memory_newton": {"radius": (0.3, 0.01)},
+        "memory_pairs": {"newton": {"radius": (0.3, 0.01)}},
+    },
 }
 """Radii on the weights, where the default ends before the outputs have moved."""

@@ -43,7 +43,7 @@ def fit_to_pairs(
     memory: zh.Memory,
     *,
     fits: int = 8000,
-    batch: int = 32,
+    batch: int = 16,
     rate: tuple[float, float] = (4e-3, 3e-5),
     warm_up: int = 100,
     softness: float = 0.01,

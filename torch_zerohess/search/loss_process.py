@@ -1,7 +1,7 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
 Quadratics are fitted next to the minimum (`MetricQuadratics`). If a function has more minima than the process can tell
-apart, the process finds nothing better. Then quadratics begin at a random point of the box.
+apart, the process finds nothing better. Then quadratics begin at a random point of the box, or beside the best point.
 """
 
 import math
@@ -73,7 +73,7 @@ class LossProcess(FinishedProcess[LossProgress]):
             begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
             quadratics, points = self.local.plan(begun, generator)
         else:
-            quadratics, points = self.local.elsewhere(generator)
+            quadratics, points = self.local.elsewhere(known, known.local, generator)
         return replace(known, local=quadratics, finishing=True, steps=0, waited=0), points
 
     def after_local(
@@ -95,6 +95,8 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = replace(known, finishing=False, waited=0)
         if plateau or (best is not now.best and not converged):  # they have found no minimum
             return replace(known, settled=0, exploring=ROUND * self.settings.n), points
+        agreed = known.agreed
         known = self.arrived(known, "quadratics have arrived or found nothing better for a while")
-        other = float((now.best.point - best.point).norm()) > APART
-        return (replace(known, agreed=0) if other else known), points
+        if float((now.best.point - best.point).norm()) > APART:  # at another minimum
+            return replace(known, agreed=0), points
+        return (replace(known, agreed=min(agreed, known.agreed)) if now.beside else known), points

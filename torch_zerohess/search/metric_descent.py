@@ -4,6 +4,9 @@ The quadratic is the one of least change through the nearest evaluations (`least
 region (`RegionDescent`) moves towards |H|^(-1/2) (`learned`), so a narrow valley is as wide as long in u, and no
 evaluation is spent on its walls.
 
+A function with many minima often falls towards the lowest one over several of them. Where rounds have arrived at
+different points, every other round therefore begins beside the best point (basin hopping: Wales and Doye 1997).
+
 On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
 grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
 """
@@ -18,10 +21,10 @@ from torch_zerohess.linalg.metric import learned
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.random_points import further_start, normal, uniform
+from torch_zerohess.search.random_points import further_start, normal
 from torch_zerohess.search.region_descent import LOST, RegionDescent, coefficients
 from torch_zerohess.search.region_progress import RegionProgress
-from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.state import Best, Evaluated, Progress, agreeing, arriving
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_values
@@ -38,6 +41,10 @@ _RATE, _FIRST_RATE = 0.3, 0.7
 """Rate at which the metric is learned from a full quadratic, and from the first one."""
 _CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
+_HOPS = (0.5, 2.0)
+"""Shortest and longest standard deviation of a hop from the best point,"""
+_HOP_WIDTH = 0.3
+"""and first sigma of the round that begins there, over this deviation."""
 _ROUNDED = 1e15
 """A Hessian of values that were larger than those of now by this factor is made of their roundings."""
 
@@ -49,6 +56,8 @@ _SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place")
 class MetricProgress(RegionProgress):
     """The progress of a descent in a learned metric."""
 
+    beside: bool = False
+    """Whether the round has begun beside the best point. Such a round confirms no minimum."""
     wide: DescentProgress | None = None
     """Isotropic descent on the smoothed loss, which takes over on a plateau."""
 
@@ -69,10 +78,17 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         known = replace(self._begun(best), points=points, values=values, lowest=best, sigma=sigma)
         return replace(known, phase="geometry")
 
-    def elsewhere(self, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
-        """Return a round that begins at a random point of the box, and its first points."""
-        center = uniform(generator, self.settings.lower, self.settings.upper, 1)[0]
-        return self._started(self._begun(Best(center)), generator)
+    def elsewhere(
+        self, known: Progress, before: MetricProgress | None, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        """Return a round that begins at a random point or beside the best one, and its first points.
+
+        Args:
+            known: of the search as a whole; the rounds disagree if `agreed` is 0.
+            before: of the round before, if there was one.
+            generator: of the random points.
+        """
+        return self._started(self._further(known, before, generator), generator)
 
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
@@ -118,17 +134,27 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """End, or start another round at a random point."""
         settings, rounds = self.settings, known.rounds + 1
         if known.lost < LOST:
-            known = agreeing(known, known.lowest.point, settings.tolerance)
+            counted = agreeing(known, known.lowest.point, settings.tolerance)
+            known = replace(counted, agreed=min(counted.agreed, known.agreed)) if known.beside else counted
             known = arriving(known, known.lowest)
         if last or rounds > settings.restarts:
             known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
             return known, known.points[:0]
-        center = further_start(generator, known.first, settings.lower, settings.upper)
         fresh = replace(
-            self._begun(Best(center)),
+            self._further(known, known, generator),
             **{name: getattr(known, name) for name in ("iterations", *_SHARED)} | {"rounds": rounds},
         )
         return self._started(fresh, generator)
+
+    def _further(self, known: Progress, before: MetricProgress | None, generator: torch.Generator) -> MetricProgress:
+        settings, best = self.settings, known.best
+        hops = known.agreed == 0 and math.isfinite(best.loss) and not (before is not None and before.beside)
+        if not hops:
+            return self._begun(Best(further_start(generator, settings.start, settings.lower, settings.upper)))
+        shortest, longest = _HOPS
+        hop = shortest * (longest / shortest) ** float(torch.rand((), generator=generator, device="cpu"))
+        center = self._inside(best.point + hop * normal(generator, best.point, 1, self._n))[0]
+        return replace(self._begun(Best(center)), sigma=_HOP_WIDTH * hop, beside=True)
 
     # Plateaus.
 

@@ -6,6 +6,7 @@ from searches import well
 
 from torch_zerohess import minimize
 from torch_zerohess.optim import GaussianProcessSearch
+from torch_zerohess.search import metric_descent
 from truths import vector
 
 
@@ -191,3 +192,23 @@ def test_a_minimum_elsewhere_that_is_higher_agrees_with_nothing():
             assert now["agreed"] == 0 or not now["local"]["done"]
     assert higher >= 1
     assert search.value < 1e-9
+
+
+def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch):
+    """They fall back into its basin, and hardly any other round finds it."""
+    monkeypatch.setattr(metric_descent, "_HOPS", (1e-3, 2e-3))
+
+    def ripples(z):
+        return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)
+
+    search = GaussianProcessSearch(vector(0.0, 0.0), sigma=1.0, seed=1, restarts=1000, bounds=(-10.0, 10.0))
+    hops = agreed = 0
+    while search.evaluations < 300:
+        before = search._state.progress
+        search.tell(ripples(search.ask()))
+        after = search._state.progress
+        if before.finishing and not after.finishing and before.local.beside:
+            hops += 1
+            agreed = max(agreed, after.agreed)
+    assert hops > 3
+    assert agreed == 0

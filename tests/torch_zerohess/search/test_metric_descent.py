@@ -1,5 +1,6 @@
 """Descent in a learned metric: narrow valleys, curved ones, plateaus, holes and rounds."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -175,3 +176,45 @@ def test_a_wall_near_the_largest_number_is_forgotten(seed):
     slopes = vector(1.0, -0.5, 2.0)
     run(search, lambda x: (x - slopes).square().sum(1) + (800 * (x[:, 1] - 1.2)).clamp(max=600).exp() * 1e-20, 200)
     assert search.value < 1e-12
+
+
+def starts_of_rounds(f, seed):
+    """Of 30 rounds: whether each began beside the best point, how far from it, and its first sigma."""
+    search = Descent(zeros(2), sigma=1.0, seed=seed, restarts=30, bounds=(-100.0, 100.0))
+    starts = []
+    while len(starts) < 30:
+        search.tell(f(search.ask()))
+        known = search._state.progress
+        if known.rounds > len(starts):
+            starts.append((known.beside, float((known.center - known.best.point).norm()), known.sigma))
+    return starts
+
+
+def ripples(z):
+    return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_where_rounds_disagree_every_other_one_begins_beside_the_best_point(seed):
+    starts = starts_of_rounds(ripples, seed)
+    beside, distances, sigmas = zip(*starts, strict=True)
+    assert not any(one and other for one, other in itertools.pairwise(beside))
+    assert 10 <= sum(beside) <= 15
+    near = [distance for one, distance in zip(beside, distances, strict=True) if one]
+    assert 0.3 < sum(near) / len(near) < 3.0  # the box is 200 wide
+    assert all((sigma < 1.0) == one for one, sigma in zip(beside, sigmas, strict=True))
+    assert not any(one for one, _, _ in starts_of_rounds(ellipsoid(10.0, 2, 0), seed))
+
+
+def test_a_round_that_begins_beside_the_best_point_confirms_nothing(monkeypatch):
+    """In a box where hardly any round finds the best basin, the hops that fall back into it do not count."""
+    monkeypatch.setattr(metric_descent, "_HOPS", (1e-3, 2e-3))
+    search = Descent(zeros(2), sigma=1.0, seed=0, restarts=40, bounds=(-100.0, 100.0))
+    hops = 0
+    while not search.done:
+        before = search._state.progress
+        search.tell(ripples(search.ask()))
+        if before.beside and search._state.progress.rounds != before.rounds:
+            hops += 1
+            assert search.agreed == 0
+    assert hops > 10

@@ -112,3 +112,8 @@ def raising(fn, call, error=ZeroDivisionError):
         return fn(argument)
 
     return counting
+
+
+def cosine_bowl(z):
+    """A wide bowl with its minimum beside 0 and a local minimum in every turn of a cosine."""
+    return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)

@@ -58,7 +58,7 @@ class LossProcess(FinishedProcess[LossProgress]):
     def after_process(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
-        """Let quadratics finish a new basin; where the process finds none, let them begin elsewhere in the box."""
+        """Let quadratics finish a new basin; where it finds none, let them begin beside the best or elsewhere."""
         before, count = known.best.loss, len(evaluated.needed)
         known = self.take(known, evaluated)
         known = replace(
@@ -73,7 +73,8 @@ class LossProcess(FinishedProcess[LossProgress]):
             begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
             quadratics, points = self.local.plan(begun, generator)
         else:
-            quadratics, points = self.local.elsewhere(known, known.local, generator)
+            assert known.local is not None  # the best point is where quadratics have ended
+            quadratics, points = self.local.further(known, known.local, generator)
         return replace(known, local=quadratics, finishing=True, steps=0, waited=0), points
 
     def after_local(
@@ -95,8 +96,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = replace(known, finishing=False, waited=0)
         if plateau or (best is not now.best and not converged):  # they have found no minimum
             return replace(known, settled=0, exploring=ROUND * self.settings.n), points
-        agreed = known.agreed
         known = self.arrived(known, "quadratics have arrived or found nothing better for a while")
-        if float((now.best.point - best.point).norm()) > APART:  # at another minimum
+        if now.beside or float((now.best.point - best.point).norm()) > APART:
             return replace(known, agreed=0), points
-        return (replace(known, agreed=min(agreed, known.agreed)) if now.beside else known), points
+        return known, points

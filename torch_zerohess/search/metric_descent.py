@@ -4,8 +4,8 @@ The quadratic is the one of least change through the nearest evaluations (`least
 region (`RegionDescent`) moves towards |H|^(-1/2) (`learned`), so a narrow valley is as wide as long in u, and no
 evaluation is spent on its walls.
 
-A function with many minima often falls towards the lowest one over several of them. Where rounds have arrived at
-different points, every other round therefore begins beside the best point (basin hopping: Wales and Doye 1997).
+Lower minima are often close to each other. While rounds arrive at different points, every other round therefore begins
+beside the best point (monotonic basin hopping: Wales and Doye 1997, Leary 2000).
 
 On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
 grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
@@ -42,7 +42,7 @@ _RATE, _FIRST_RATE = 0.3, 0.7
 _CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
 _HOPS = (0.5, 2.0)
-"""Shortest and longest standard deviation of a hop from the best point,"""
+"""Shortest and longest standard deviation of a hop from the best point, in units of the first sigma,"""
 _HOP_WIDTH = 0.3
 """and first sigma of the round that begins there, over this deviation."""
 _ROUNDED = 1e15
@@ -78,17 +78,17 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         known = replace(self._begun(best), points=points, values=values, lowest=best, sigma=sigma)
         return replace(known, phase="geometry")
 
-    def elsewhere(
-        self, known: Progress, before: MetricProgress | None, generator: torch.Generator
+    def further(
+        self, known: Progress, before: MetricProgress, generator: torch.Generator
     ) -> tuple[MetricProgress, Tensor]:
         """Return a round that begins at a random point or beside the best one, and its first points.
 
         Args:
-            known: of the search as a whole; the rounds disagree if `agreed` is 0.
-            before: of the round before, if there was one.
+            known: of the search as a whole. Rounds disagree if it has arrived and `agreed` is 0.
+            before: of the round before.
             generator: of the random points.
         """
-        return self._started(self._further(known, before, generator), generator)
+        return self._started(self._round(known, before, generator), generator)
 
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
@@ -131,24 +131,24 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _arrived(
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[MetricProgress, Tensor]:
-        """End, or start another round at a random point."""
+        """End, or start another round: at a random point, or beside the best one."""
         settings, rounds = self.settings, known.rounds + 1
         if known.lost < LOST:
             counted = agreeing(known, known.lowest.point, settings.tolerance)
-            known = replace(counted, agreed=min(counted.agreed, known.agreed)) if known.beside else counted
+            known = replace(counted, agreed=0) if known.beside else counted
             known = arriving(known, known.lowest)
         if last or rounds > settings.restarts:
             known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
             return known, known.points[:0]
         fresh = replace(
-            self._further(known, known, generator),
+            self._round(known, known, generator),
             **{name: getattr(known, name) for name in ("iterations", *_SHARED)} | {"rounds": rounds},
         )
         return self._started(fresh, generator)
 
-    def _further(self, known: Progress, before: MetricProgress | None, generator: torch.Generator) -> MetricProgress:
+    def _round(self, known: Progress, before: MetricProgress, generator: torch.Generator) -> MetricProgress:
         settings, best = self.settings, known.best
-        hops = known.agreed == 0 and math.isfinite(best.loss) and not (before is not None and before.beside)
+        hops = known.arrived is not None and known.agreed == 0 and not before.beside
         if not hops:
             return self._begun(Best(further_start(generator, settings.start, settings.lower, settings.upper)))
         shortest, longest = _HOPS
@@ -167,6 +167,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def _widely(self, known: MetricProgress, wide: DescentProgress, points: Tensor) -> tuple[MetricProgress, Tensor]:
         """Return the progress of isotropic quadratics, and their points."""
+        if known.beside and wide.rounds > known.rounds:  # the round beside the best point is over
+            known, wide = replace(known, beside=False), replace(wide, agreed=0)
         names = (*_SHARED, "center", "sigma", "iterations", "done", "message")
         return replace(known, wide=wide, **{name: getattr(wide, name) for name in names}), points
 

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small import SIZE, Bump, trained
+from small import SIZE, Bump, bump, trained
 
-from experiments.methods.rendered_pairs import output_metric
+from experiments.methods.rendered_pairs import _in_prior, _in_range, output_metric
+from experiments.problems.network_task import Encoder
+from experiments.runs.network_trial import NetworkTrial
 
 
 @pytest.mark.parametrize(("method", "left"), [("memory_pairs", 0.1), ("random_pairs", 0.1), ("prior_pairs", 0.02)])
@@ -33,3 +35,41 @@ def test_metric_of_a_surrogate_is_its_gauss_newton_matrix():
     truth = torch.stack([torch.stack([y * y, x * y], 1), torch.stack([x * y, x * x + 4 * y * y], 1)], 1)
     expected = truth / (x * x + 5 * y * y).mean() * 2
     torch.testing.assert_close(output_metric(surrogate, points), expected)
+
+
+def test_where_the_pairs_of_the_rivals_lie():
+    trial = NetworkTrial(Bump(replace(SIZE, evaluations=200)), "random_pairs", 0)
+    everywhere, known = _in_range(trial), _in_prior(trial)
+    assert everywhere.shape == known.shape == (200, 1)
+    assert 4.5 <= float(everywhere.min()) < 6.0 < 21.0 < float(everywhere.max()) <= 22.5  # of the network's outputs
+    assert 11.5 <= float(known.min()) < float(known.max()) <= 15.5  # of the training images
+
+
+class Dim(Bump):
+    """Two columns of light, the second a hundred times dimmer, at places that hardly fit into one small network."""
+
+    name = "dim"
+    n = 2
+
+    def encoder(self):
+        return Encoder(self.size, (4.5, 4.5), (22.5, 22.5))
+
+    def load(self):
+        return lambda x: bump(x[:, :1]) + 0.01 * bump(x[:, 1:]).transpose(1, 2)
+
+    def parameters(self, count, generator, *, held_out):
+        return 11.5 + 4 * torch.rand(count, 2, generator=generator)
+
+
+def test_a_parameter_that_changes_the_render_more_counts_more(monkeypatch):
+    def errors():
+        _, trial = trained("prior_pairs", Dim(replace(SIZE, evaluations=60)), fits=60)
+        images, x = trial.task.held_out
+        with torch.no_grad():
+            return (trial.encoder(images) - x).square().mean(0)
+
+    weighted = errors()
+    monkeypatch.setattr(
+        "experiments.methods.rendered_pairs.output_metric", lambda _, points: torch.eye(2).expand(60, 2, 2)
+    )
+    assert weighted[0] < errors()[0]

@@ -1,8 +1,10 @@
 """The search in a small box from the loss alone: over plateaus as the process, to the last digit as quadratics."""
 
+import itertools
+
 import pytest
 import torch
-from searches import well
+from searches import cosine_bowl, well
 
 from torch_zerohess import minimize
 from torch_zerohess.optim import GaussianProcessSearch
@@ -197,18 +199,16 @@ def test_a_minimum_elsewhere_that_is_higher_agrees_with_nothing():
 def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch):
     """They fall back into its basin, and hardly any other round finds it."""
     monkeypatch.setattr(metric_descent, "_HOPS", (1e-3, 2e-3))
-
-    def ripples(z):
-        return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)
-
     search = GaussianProcessSearch(vector(0.0, 0.0), sigma=1.0, seed=1, restarts=1000, bounds=(-10.0, 10.0))
-    hops = agreed = 0
+    agreed, beside = 0, []
     while search.evaluations < 300:
         before = search._state.progress
-        search.tell(ripples(search.ask()))
+        search.tell(cosine_bowl(search.ask()))
         after = search._state.progress
         if before.finishing and not after.finishing and before.local.beside:
-            hops += 1
             agreed = max(agreed, after.agreed)
-    assert hops > 3
+        if after.finishing and not before.finishing:
+            beside.append(after.local.beside)
+    assert sum(beside) > 3
+    assert not any(one and other for one, other in itertools.pairwise(beside))
     assert agreed == 0

@@ -32,7 +32,7 @@ class Descent(AskTell[Any]):
     Where sigma is below `tolerance` (with the loss alone a millionth of it, in noise a thousandth) the search has
     arrived at a minimum, possibly a local one. In noise it has also arrived where three steps in a row are within their
     errors and the quadratic takes no more evaluations. The search then starts again, up to `restarts` times: from a
-    random point or around the best one, in the latter case with an output with more samples per iteration.
+    random point, or in turn from a random point and around the best one with more samples per iteration.
 
     It has the settings of `AskTell`. With an output and with more than 40 parameters, decreases below twice the `noise`
     do not count. By default the pool keeps three times the evaluations that the quadratic of a loss is fitted to, in

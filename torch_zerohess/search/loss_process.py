@@ -1,7 +1,9 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
 Quadratics are fitted next to the minimum (`MetricQuadratics`). If a function has more minima than the process can tell
-apart, the process finds nothing better. Then quadratics begin at a random point of the box, or beside the best point.
+apart, the process finds nothing better. Then quadratics begin at a random point of the box. Lower minima are often
+close to each other: while arrivals disagree, quadratics begin beside the best point every other time (monotonic basin
+hopping: Wales and Doye 1997, Leary 2000).
 """
 
 import math
@@ -14,6 +16,7 @@ from torch_zerohess.search.finished_process import PATIENCE, FinishedProcess, Fi
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_descent import MetricProgress, MetricQuadratics
 from torch_zerohess.search.process_method import APART, ROUND
+from torch_zerohess.search.random_points import uniform
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -23,6 +26,10 @@ _STEPS = 2
 """this many in a row, have found a basin."""
 _WIDTH = 0.3
 """First sigma of the quadratics."""
+_HOPS = (0.5, 2.0)
+"""Shortest and longest standard deviation of a hop from the best point, in units of the first sigma,"""
+_HOP_WIDTH = 0.3
+"""and first sigma of the quadratics that begin there, over this deviation."""
 _PATIENCE = 5
 """Evaluations over n + 1 in which the quadratics must find something better: a curved valley refuses several steps."""
 
@@ -34,6 +41,8 @@ class LossProgress(FinishedProgress):
     local: MetricProgress | None = None
     steps: int = 0
     """Short steps of the process in a row."""
+    beside: bool = False
+    """Whether the latest quadratics have begun beside the best point. Such quadratics confirm no minimum."""
 
     def is_minimum(self, tolerance: float) -> bool:
         return torch.equal(self.solved, self.best.point) and super().is_minimum(tolerance)
@@ -72,10 +81,23 @@ class LossProcess(FinishedProcess[LossProgress]):
         if self.is_new(known):
             begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
             quadratics, points = self.local.plan(begun, generator)
+            beside = False
         else:
-            assert known.local is not None  # the best point is where quadratics have ended
-            quadratics, points = self.local.further(known, known.local, generator)
-        return replace(known, local=quadratics, finishing=True, steps=0, waited=0), points
+            beside = known.arrived is not None and known.agreed == 0 and not known.beside
+            quadratics, points = self._hop(known, generator) if beside else self._elsewhere(generator)
+        return replace(known, local=quadratics, finishing=True, beside=beside, steps=0, waited=0), points
+
+    def _elsewhere(self, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
+        """Let quadratics begin at a random point of the box."""
+        center = uniform(generator, self.settings.lower, self.settings.upper, 1)[0]
+        return self.local.begin(center, 1.0, generator)
+
+    def _hop(self, known: LossProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
+        """Let quadratics begin beside the best point."""
+        shortest, longest = _HOPS
+        hop = shortest * (longest / shortest) ** float(torch.rand((), generator=generator, device="cpu"))
+        (center,) = self._drawn(known.best.point, hop, 1, generator)
+        return self.local.begin(center, _HOP_WIDTH * hop, generator)
 
     def after_local(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
@@ -97,6 +119,6 @@ class LossProcess(FinishedProcess[LossProgress]):
         if plateau or (best is not now.best and not converged):  # they have found no minimum
             return replace(known, settled=0, exploring=ROUND * self.settings.n), points
         known = self.arrived(known, "quadratics have arrived or found nothing better for a while")
-        if now.beside or float((now.best.point - best.point).norm()) > APART:
+        if known.beside or float((now.best.point - best.point).norm()) > APART:
             return replace(known, agreed=0), points
         return known, points

@@ -4,9 +4,6 @@ The quadratic is the one of least change through the nearest evaluations (`least
 region (`RegionDescent`) moves towards |H|^(-1/2) (`learned`), so a narrow valley is as wide as long in u, and no
 evaluation is spent on its walls.
 
-Lower minima are often close to each other. While rounds arrive at different points, every other round therefore begins
-beside the best point (monotonic basin hopping: Wales and Doye 1997, Leary 2000).
-
 On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
 grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
 """
@@ -24,7 +21,7 @@ from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import further_start, normal
 from torch_zerohess.search.region_descent import LOST, RegionDescent, coefficients
 from torch_zerohess.search.region_progress import RegionProgress
-from torch_zerohess.search.state import Best, Evaluated, Progress, agreeing, arriving
+from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_values
@@ -41,10 +38,6 @@ _RATE, _FIRST_RATE = 0.3, 0.7
 """Rate at which the metric is learned from a full quadratic, and from the first one."""
 _CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
-_HOPS = (0.5, 2.0)
-"""Shortest and longest standard deviation of a hop from the best point, in units of the first sigma,"""
-_HOP_WIDTH = 0.3
-"""and first sigma of the round that begins there, over this deviation."""
 _ROUNDED = 1e15
 """A Hessian of values that were larger than those of now by this factor is made of their roundings."""
 
@@ -56,8 +49,6 @@ _SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place")
 class MetricProgress(RegionProgress):
     """The progress of a descent in a learned metric."""
 
-    beside: bool = False
-    """Whether the round has begun beside the best point. Such a round confirms no minimum."""
     wide: DescentProgress | None = None
     """Isotropic descent on the smoothed loss, which takes over on a plateau."""
 
@@ -78,17 +69,9 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         known = replace(self._begun(best), points=points, values=values, lowest=best, sigma=sigma)
         return replace(known, phase="geometry")
 
-    def further(
-        self, known: Progress, before: MetricProgress, generator: torch.Generator
-    ) -> tuple[MetricProgress, Tensor]:
-        """Return a round that begins at a random point or beside the best one, and its first points.
-
-        Args:
-            known: of the search as a whole. Rounds disagree if it has arrived and `agreed` is 0.
-            before: of the round before.
-            generator: of the random points.
-        """
-        return self._started(self._round(known, before, generator), generator)
+    def begin(self, center: Tensor, sigma: float, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
+        """Return a round that begins at a point [n] with this sigma, and its first points."""
+        return self._started(replace(self._begun(Best(center)), sigma=sigma), generator)
 
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
@@ -131,30 +114,20 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _arrived(
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[MetricProgress, Tensor]:
-        """End, or start another round: at a random point, or beside the best one."""
+        """End, or start another round at a random point."""
         settings, rounds = self.settings, known.rounds + 1
         if known.lost < LOST:
-            counted = agreeing(known, known.lowest.point, settings.tolerance)
-            known = replace(counted, agreed=0) if known.beside else counted
+            known = agreeing(known, known.lowest.point, settings.tolerance)
             known = arriving(known, known.lowest)
         if last or rounds > settings.restarts:
             known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
             return known, known.points[:0]
+        center = further_start(generator, known.first, settings.lower, settings.upper)
         fresh = replace(
-            self._round(known, known, generator),
+            self._begun(Best(center)),
             **{name: getattr(known, name) for name in ("iterations", *_SHARED)} | {"rounds": rounds},
         )
         return self._started(fresh, generator)
-
-    def _round(self, known: Progress, before: MetricProgress, generator: torch.Generator) -> MetricProgress:
-        settings, best = self.settings, known.best
-        hops = known.arrived is not None and known.agreed == 0 and not before.beside
-        if not hops:
-            return self._begun(Best(further_start(generator, settings.start, settings.lower, settings.upper)))
-        shortest, longest = _HOPS
-        hop = shortest * (longest / shortest) ** float(torch.rand((), generator=generator, device="cpu"))
-        center = self._inside(best.point + hop * normal(generator, best.point, 1, self._n))[0]
-        return replace(self._begun(Best(center)), sigma=_HOP_WIDTH * hop, beside=True)
 
     # Plateaus.
 
@@ -167,8 +140,6 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def _widely(self, known: MetricProgress, wide: DescentProgress, points: Tensor) -> tuple[MetricProgress, Tensor]:
         """Return the progress of isotropic quadratics, and their points."""
-        if known.beside and wide.rounds > known.rounds:  # the round beside the best point is over
-            known, wide = replace(known, beside=False), replace(wide, agreed=0)
         names = (*_SHARED, "center", "sigma", "iterations", "done", "message")
         return replace(known, wide=wide, **{name: getattr(wide, name) for name in names}), points
 

@@ -8,7 +8,7 @@ from searches import cosine_bowl, well
 
 from torch_zerohess import minimize
 from torch_zerohess.optim import GaussianProcessSearch
-from torch_zerohess.search import metric_descent
+from torch_zerohess.search import loss_process
 from truths import vector
 
 
@@ -196,19 +196,32 @@ def test_a_minimum_elsewhere_that_is_higher_agrees_with_nothing():
     assert search.value < 1e-9
 
 
-def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch):
-    """They fall back into its basin, and hardly any other round finds it."""
-    monkeypatch.setattr(metric_descent, "_HOPS", (1e-3, 2e-3))
+def turns_of_quadratics(evaluations):
+    """Of a search on a bowl of cosines: (progress before, after the first points) for every turn of quadratics."""
     search = GaussianProcessSearch(vector(0.0, 0.0), sigma=1.0, seed=1, restarts=1000, bounds=(-10.0, 10.0))
-    agreed, beside = 0, []
-    while search.evaluations < 300:
+    turns = []
+    while search.evaluations < evaluations:
         before = search._state.progress
         search.tell(cosine_bowl(search.ask()))
-        after = search._state.progress
-        if before.finishing and not after.finishing and before.local.beside:
-            agreed = max(agreed, after.agreed)
-        if after.finishing and not before.finishing:
-            beside.append(after.local.beside)
+        turns.append((before, search._state.progress))
+    return turns
+
+
+def test_a_search_whose_arrivals_disagree_hops_every_other_time():
+    starts = [after for before, after in turns_of_quadratics(500) if after.finishing and not before.finishing]
+    beside = [one.beside for one in starts]
     assert sum(beside) > 3
     assert not any(one and other for one, other in itertools.pairwise(beside))
-    assert agreed == 0
+    hops = [one for one in starts if one.beside]
+    distances = [float((one.local.center - one.best.point).norm()) for one in hops]
+    assert 0.3 < sum(distances) / len(distances) < 4.0
+    assert all(one.local.sigma < 1.0 for one in hops)
+
+
+def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch):
+    """They fall back into its basin, and hardly any others find it."""
+    monkeypatch.setattr(loss_process, "_HOPS", (1e-3, 2e-3))
+    ends = [after for before, after in turns_of_quadratics(300) if before.finishing and not after.finishing]
+    agreed = [one.agreed for one in ends if one.beside]
+    assert len(agreed) > 3
+    assert max(agreed) == 0

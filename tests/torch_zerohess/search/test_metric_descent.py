@@ -1,12 +1,11 @@
 """Descent in a learned metric: narrow valleys, curved ones, plateaus, holes and rounds."""
 
-import itertools
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from searches import cosine_bowl, plateau, rosenbrock, run, zeros
+from searches import plateau, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import metric_descent
@@ -176,64 +175,3 @@ def test_a_wall_near_the_largest_number_is_forgotten(seed):
     slopes = vector(1.0, -0.5, 2.0)
     run(search, lambda x: (x - slopes).square().sum(1) + (800 * (x[:, 1] - 1.2)).clamp(max=600).exp() * 1e-20, 200)
     assert search.value < 1e-12
-
-
-def starts_of_rounds(f, seed, bounds=(-100.0, 100.0)):
-    """Of 30 rounds: whether each began beside the best point, how far from it, and its first sigma."""
-    search = Descent(zeros(2), sigma=1.0, seed=seed, restarts=30, bounds=bounds)
-    starts = []
-    while len(starts) < 30:
-        search.tell(f(search.ask()))
-        known = search._state.progress
-        if known.rounds > len(starts):
-            starts.append((known.beside, float((known.center - known.best.point).norm()), known.sigma))
-    return starts
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_where_rounds_disagree_every_other_one_begins_beside_the_best_point(seed):
-    starts = starts_of_rounds(cosine_bowl, seed)
-    beside, distances, sigmas = zip(*starts, strict=True)
-    assert not any(one and other for one, other in itertools.pairwise(beside))
-    assert 10 <= sum(beside) <= 15
-    near = [distance for one, distance in zip(beside, distances, strict=True) if one]
-    assert 0.3 < sum(near) / len(near) < 3.0  # the box is 200 wide
-    assert all((sigma < 1.0) == one for one, sigma in zip(beside, sigmas, strict=True))
-    assert any(one for one, _, _ in starts_of_rounds(cosine_bowl, seed, None))
-    assert not any(one for one, _, _ in starts_of_rounds(ellipsoid(10.0, 2, 0), seed))
-
-
-def test_a_round_that_begins_beside_the_best_point_confirms_nothing(monkeypatch):
-    """In a box where hardly any round finds the best basin, the hops that fall back into it do not count."""
-    monkeypatch.setattr(metric_descent, "_HOPS", (1e-3, 2e-3))
-    search = Descent(zeros(2), sigma=1.0, seed=0, restarts=40, bounds=(-100.0, 100.0))
-    hops = 0
-    while not search.done:
-        before = search._state.progress
-        search.tell(cosine_bowl(search.ask()))
-        if before.beside and search._state.progress.rounds != before.rounds:
-            hops += 1
-            assert search.agreed == 0
-    assert hops > 10
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_hop_onto_a_plateau_confirms_nothing(seed, monkeypatch):
-    """Isotropic quadratics take over there, and count rounds of their own."""
-
-    def moat(z):
-        distance = z.norm(dim=1)
-        flat = torch.where(distance < 6.0, -1.5, cosine_bowl(z))
-        return torch.where(distance < 0.4, 20.0 * distance.square() - 5.0, flat)
-
-    monkeypatch.setattr(metric_descent, "_HOPS", (1.5, 2.5))
-    search = Descent(zeros(2) + 0.1, sigma=0.3, seed=seed, restarts=40, bounds=(-30.0, 30.0))
-    while not search.done:
-        before = search._state.progress
-        search.tell(moat(search.ask()))
-        after = search._state.progress
-        if before.beside and before.wide is not None and after.rounds != before.rounds:
-            assert after.agreed == 0
-            assert not after.beside
-            return
-    raise AssertionError("no hop onto the plateau")

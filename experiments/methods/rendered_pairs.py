@@ -98,15 +98,17 @@ def _drawn_pairs(trial: NetworkTrial, *, draw: Callable[[NetworkTrial], Tensor],
 
 
 def _in_range(trial: NetworkTrial) -> Tensor:
+    """Return a point for every evaluation left, uniform in the range of the network's outputs."""
     (encoder,) = (module for module in trial.encoder.modules() if isinstance(module, Encoder))
     return encoder.lower + (encoder.upper - encoder.lower) * torch.rand(trial.remaining, trial.task.n)
 
 
 def _in_prior(trial: NetworkTrial) -> Tensor:
+    """Return a point for every evaluation left, drawn as those of the training images."""
     return trial.task.parameters(trial.remaining, torch.Generator().manual_seed(trial.seed), held_out=False)
 
 
-def _known(task: NetworkTask) -> str | None:
+def _prior_known(task: NetworkTask) -> str | None:
     """For methods that draw parameters as those of the training images."""
     if task.name == "cnn_throw":
         return "the distribution of the training targets is known through simulations alone"
@@ -132,7 +134,7 @@ METHODS = (
         "prior_pairs",
         "fits the network to renders of parameters that are distributed as those of the training images",
         train=with_settings(_drawn_pairs, draw=_in_prior),
-        trains=_known,
+        trains=_prior_known,
         uses="image, distribution",
     ),
 )

@@ -18,7 +18,8 @@ class GaussianProcessSearch(AskTell[Any]):
       the process knows least, if that point is known already. Gauss-Newton finishes in a basin, where its first step
       promises to take away a tenth of the loss.
     - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds.
-      Where the process finds nothing better, quadratics begin at a random point of the box, or beside the best point.
+      Where the process finds nothing better, quadratics begin at a random point of the box. While arrivals disagree,
+      quadratics begin beside the best point every other time.
 
     One evaluation follows another, unless `ask` gets a batch. The search has arrived when three steps in a row are
     shorter than `tolerance`, or when Gauss-Newton or quadratics have ended; these go on to a millionth of the

@@ -67,7 +67,7 @@ class LossProcess(FinishedProcess[LossProgress]):
     def after_process(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
-        """Let quadratics finish a new basin; where it finds none, let them begin beside the best or elsewhere."""
+        """Let quadratics finish a new basin; if there is none, let them begin elsewhere or beside the best point."""
         before, count = known.best.loss, len(evaluated.needed)
         known = self.take(known, evaluated)
         known = replace(

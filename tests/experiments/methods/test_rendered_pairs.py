@@ -6,7 +6,9 @@ import pytest
 import torch
 from small import SIZE, Bump, bump, trained
 
+from experiments.methods import METHODS
 from experiments.methods.rendered_pairs import _in_prior, _in_range, output_metric
+from experiments.problems import catalogue
 from experiments.problems.network_task import Encoder
 from experiments.runs.network_trial import NetworkTrial
 
@@ -45,8 +47,14 @@ def test_where_the_pairs_of_the_rivals_lie():
     assert 11.5 <= float(known.min()) < float(known.max()) <= 15.5  # of the training images
 
 
+def test_a_prior_that_takes_simulations_to_draw_from_is_refused():
+    reason = METHODS["prior_pairs"].unusable(catalogue.load("cnn_throw"))
+    assert reason == "the distribution of the training targets is known through simulations alone"
+    assert METHODS["random_pairs"].unusable(catalogue.load("cnn_throw")) is None
+
+
 class Dim(Bump):
-    """Two columns of light, the second a hundred times dimmer, at places that hardly fit into one small network."""
+    """A column of light and a row of light, which is a hundred times dimmer."""
 
     name = "dim"
     n = 2

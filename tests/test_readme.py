@@ -47,6 +47,8 @@ def test_code_runs(name, tmp_path, monkeypatch):
         assert names["calibrated"].value < 0.5 * names["missed"]([0.3, 0.8])
         assert names["wrong"] < 0.5  # a guess has log 2
         assert names["writer"][0].weight.grad.abs().sum() > 0
+        spot, images = names["spot"], names["images"]
+        assert (spot(names["encoder"](images)) - images).square().mean() < 0.5 * names["before"]
         assert (names["fitted"].x - torch.tensor([0.6, 0.3])).abs().max() < 0.01
 
 

@@ -6,22 +6,13 @@ Sampled matrices are often indefinite. "abs" replaces the eigenvalues of each by
 positive (saddle-free Newton: Dauphin et al. 2014).
 """
 
-from collections.abc import Sequence
-
 import torch
-from torch import Tensor, nn
-from torch.func import functional_call
+from torch import Tensor
 
 from torch_zerohess.autograd.curvature import CurvatureOperator
 
 _TOLERANCE = 1e-3
 """Relative error of the blocks against a product with A at which the loss is not a sum over the batch."""
-
-_OF_TRAINING = (
-    *(nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm),
-    *(nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout),
-)
-"""Modules that in training mode mix samples or draw random numbers."""
 
 
 def output_blocks(operator: CurvatureOperator) -> list[Tensor]:
@@ -78,51 +69,3 @@ def _rows(operator: CurvatureOperator, index: int) -> Tensor:
         d[index].view(-1)[element] = 1.0
         rows.append(operator.pull(d))
     return torch.stack(rows)
-
-
-class SampleJacobian:
-    """The Jacobian of a network whose outputs each depend on one sample of the batch, in about one backward pass.
-
-    Made in a closure of `NewtonCG` with solver "dual", which otherwise takes one backward pass for every output of the
-    batch. Batch normalisation and dropout must be in evaluation mode: in training mode, batch normalisation mixes the
-    samples, and dropout changes the network from call to call.
-
-    Args:
-        network: a module, samples [B, ...] -> [B, n].
-        samples: the batch that the closure evaluates, [B, ...].
-
-    Example:
-        >>> network, x = torch.nn.Linear(3, 2), torch.ones(4, 3)
-        >>> SampleJacobian(network, x)(list(network.parameters())).shape
-        torch.Size([8, 8])
-    """
-
-    def __init__(self, network: nn.Module, samples: Tensor) -> None:
-        if not isinstance(network, nn.Module):
-            raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
-        self._network, self._samples = network, samples
-
-    def __call__(self, parameters: Sequence[Tensor]) -> Tensor:
-        """Return J [B n, N] by parameters of the network, N numbers in all.
-
-        Raises ValueError for a parameter that the network does not have, and for batch normalisation and dropout in
-        training mode.
-        """
-        for name, one in self._network.named_modules():
-            if one.training and isinstance(one, _OF_TRAINING):
-                raise ValueError(
-                    f"network has a {type(one).__name__} in training mode ({name!r}), and no Jacobian per sample: call "
-                    "network.eval() first"
-                )
-        names = {id(one): name for name, one in self._network.named_parameters()}
-        if not all(id(one) in names for one in parameters):
-            raise ValueError("parameters of the optimizer must be parameters of the network of the SampleJacobian")
-        chosen = {names[id(one)]: one.detach() for one in parameters}
-
-        def output(values: dict[str, Tensor], sample: Tensor) -> Tensor:
-            result: Tensor = functional_call(self._network, values, (sample[None],))
-            return result[0]
-
-        jacobians = torch.func.vmap(torch.func.jacrev(output), in_dims=(None, 0))(chosen, self._samples)
-        count = next(iter(jacobians.values())).shape[:2].numel()
-        return torch.cat([jacobians[name].reshape(count, -1) for name in chosen], 1)

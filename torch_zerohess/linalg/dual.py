@@ -10,10 +10,11 @@ a system of M equations in place of N. Its exact solution takes one product J J^
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.jacobians import Jacobian
 from torch_zerohess.linalg.steihaug import Step
 
 
-def dual_step(J: Tensor, A: Tensor, g: Tensor, radius: float, damping: float) -> Step:
+def dual_step(J: Jacobian, A: Tensor, g: Tensor, radius: float, damping: float) -> Step:
     """Return s = -(J^T A J + damping I)^-1 J^T g, shortened to |s| <= radius.
 
     Args:
@@ -23,7 +24,7 @@ def dual_step(J: Tensor, A: Tensor, g: Tensor, radius: float, damping: float) ->
         radius: of the ball.
         damping: positive.
     """
-    gram = (J @ J.mT).double()
+    gram = J.gram().double()
     system = A @ gram
     system.diagonal().add_(damping)
     w = torch.linalg.solve(system, g)
@@ -31,7 +32,7 @@ def dual_step(J: Tensor, A: Tensor, g: Tensor, radius: float, damping: float) ->
     scale = min(1.0, radius / length) if length > 0.0 else 1.0
     moved = -scale * (gram @ w)  # J s
     decrease = -float(g @ moved + 0.5 * moved @ A @ moved)
-    return Step(-scale * (J.mT @ w.to(J)), decrease, "boundary" if scale < 1.0 else "converged")
+    return Step(-scale * J.pull(w), decrease, "boundary" if scale < 1.0 else "converged")
 
 
 def clipped(step: Step, gradient: Tensor, radius: float, length: float | None = None) -> Step:

@@ -1,6 +1,6 @@
 """Second-order optimizers: for losses that carry a graph, and for black boxes whose evaluations the caller owns."""
 
-from torch_zerohess.autograd.blocks import SampleJacobian
+from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.optim.move_outputs import move_outputs
 from torch_zerohess.optim.newton import Newton
 from torch_zerohess.optim.newton_cg import NewtonCG

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.autograd.blocks import SampleJacobian
+from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.optim.second_order import check_positive
 
 
@@ -44,20 +44,20 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
         raise ValueError("network must have weights that require grad, got none")
     if not len(samples):
         raise ValueError("samples must be at least one, got none")
-    J = SampleJacobian(network, samples)(weights)
-    shape = [len(samples), len(J) // len(samples)]
+    J = SampleJacobian(network, samples).products(weights)
+    gram = J.gram().double()
+    shape = [len(samples), len(gram) // len(samples)]
     if list(change.shape) != shape:
         raise ValueError(f"change must be {shape}, one for each output, got {list(change.shape)}")
     if not bool(torch.isfinite(change).all()):
         raise ValueError("change must be finite")
-    gram = (J @ J.mT).double()
     h = float(gram.diagonal().mean())
     if not math.isfinite(h):
         raise ValueError("the Jacobian of the network is not finite")
     if h == 0.0:
         raise ValueError("the outputs of the network do not change with its weights: all are saturated")
     gram.diagonal().add_(damping * h)
-    step = J.mT @ torch.linalg.solve(gram, change.detach().reshape(-1).double()).to(J)
+    step = J.pull(torch.linalg.solve(gram, change.detach().reshape(-1).double()))
     _add(weights, step)
 
 

@@ -13,12 +13,14 @@ from torch_zerohess.arguments import checked_number
 from torch_zerohess.autograd.blocks import jacobian as white_box_jacobian
 from torch_zerohess.autograd.blocks import magnitudes, output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
+from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.dual import dual_step
+from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.steihaug import Step
 
-Jacobian = Callable[[Sequence[Tensor]], Tensor]
+JacobianOf = Callable[[Sequence[Tensor]], Tensor]
 """Parameters -> J [M, N] of the outputs of the white box, see `SampleJacobian`."""
-Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], Jacobian]
+Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], JacobianOf]
 """Result of a closure: the loss, or with it the tensors at which its white box ends, or with both their Jacobian."""
 Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
@@ -41,7 +43,7 @@ class Model:
         losses: Tensor,
         operators: Sequence[CurvatureOperator],
         modification: str | None = None,
-        jacobian: Jacobian | None = None,
+        jacobian: JacobianOf | None = None,
     ) -> None:
         self.loss = losses.detach().mean()
         """[], the mean of the losses."""
@@ -91,7 +93,7 @@ class Model:
         slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
         g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
         J = self._white_box
-        if float((self.gradient - (J.mT @ g.to(J)).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
+        if float((self.gradient - J.pull(g).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
             raise ValueError(
                 "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone: "
                 "use solver 'steihaug' or 'clip'"
@@ -103,10 +105,12 @@ class Model:
         return dual_step(J, A, g, radius, damping)
 
     @cached_property
-    def _white_box(self) -> Tensor:
-        """J [M, N] of all outputs of the white box."""
-        operator = self._operators[0]
-        return white_box_jacobian(operator) if self._jacobian is None else self._jacobian(operator.inputs)
+    def _white_box(self) -> Jacobian:
+        """J of all outputs of the white box."""
+        operator, given = self._operators[0], self._jacobian
+        if isinstance(given, SampleJacobian):
+            return given.products(operator.inputs)
+        return Rows(white_box_jacobian(operator) if given is None else given(operator.inputs))
 
     def longest_move(self, s: Tensor) -> float:
         """Return how far a step s [N] moves the input [n] of a black box, for the element that moves farthest."""
@@ -115,7 +119,7 @@ class Model:
             moved = operator.output_step(s)
         else:
             sizes = [one.numel() for one in operator.through]
-            flat = (self._white_box @ s.to(self._white_box)).split(sizes)
+            flat = self._white_box.push(s).split(sizes)
             moved = [one.view_as(y) for one, y in zip(flat, operator.through, strict=True)]
         return max(float(one.norm(dim=-1).max()) for one in moved)
 
@@ -200,7 +204,7 @@ class SecondOrder(Optimizer):
                 one.copy_(before)
 
 
-def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, Jacobian | None]:
+def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, JacobianOf | None]:
     """Return the loss, the tensors at which the white box ends, and their Jacobian, as far as the closure gave them."""
     loss, through, jacobian = (*result, None, None)[:3] if isinstance(result, tuple) else (result, None, None)
     if not isinstance(loss, Tensor) or loss.numel() == 0:

@@ -1,0 +1,187 @@
+"""Jacobians per sample and their products, against one backward pass for every output."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import register_parametrization
+
+from torch_zerohess.autograd.sample_jacobian import SampleJacobian
+from torch_zerohess.linalg.jacobians import Blocks, OuterProducts, Rows
+
+SAMPLES = torch.randn(5, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+class Net(nn.Module):
+    """A network whose forward function is given."""
+
+    def __init__(self, forward: Callable[..., Tensor], **parts: nn.Module) -> None:
+        super().__init__()
+        self._forward = forward
+        for name, part in parts.items():
+            self.add_module(name, part)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self._forward(self, x)
+
+
+class OwnProduct(torch.autograd.Function):
+    """A product whose derivative is its own: half of the true one."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x: Tensor, weight: Tensor) -> Tensor:
+        return nn.functional.linear(x, weight)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx, slope: Tensor) -> tuple[Tensor, Tensor]:
+        x, weight = ctx.saved_tensors
+        return 0.5 * slope @ weight, 0.5 * slope.mT @ x
+
+
+def linear(p: int = 3, q: int = 4, **settings: bool) -> nn.Linear:
+    return nn.Linear(q, p, **settings)
+
+
+def in_rows(x: Tensor) -> Tensor:
+    """Each sample as two vectors of two numbers."""
+    return x.view(-1, 2, 2)
+
+
+# Network, and the weights that are used as one product with a vector.
+NETWORKS = {
+    "two layers": lambda: (nn.Sequential(linear(6), nn.Tanh(), linear(2, 6)), {"0.weight", "2.weight"}),
+    "no bias": lambda: (nn.Sequential(linear(bias=False), nn.Tanh()), {"0.weight"}),
+    "a convolution before": lambda: (
+        nn.Sequential(nn.Unflatten(1, (1, 4)), nn.Conv1d(1, 2, 3), nn.Tanh(), nn.Flatten(), linear(3)),
+        {"4.weight"},
+    ),
+    "arguments by name": lambda: (
+        Net(lambda net, x: nn.functional.linear(weight=net.a.weight, input=x).tanh(), a=linear(bias=False)),
+        {"a.weight"},
+    ),
+    "a weight in two layers": lambda: (
+        Net(lambda net, x: net.b(net.a(x).tanh()) + net.a(x), a=linear(4), b=linear(4)),
+        {"b.weight"},
+    ),
+    "one layer as two": lambda: (
+        (lambda one: Net(lambda net, x: net.b(net.a(x).tanh()), a=one, b=one))(linear(4)),
+        set(),
+    ),
+    "one weight of two layers": lambda: (tied(), set()),
+    "a weight used elsewhere too": lambda: (
+        Net(lambda net, x: net.a(x).tanh() + net.a.weight.square().sum(), a=linear()),
+        set(),
+    ),
+    "a weight in a list": lambda: (
+        Net(
+            lambda net, x: net.a(x).tanh() + torch.stack([net.a.weight, net.b.weight]).sum() + net.b(x),
+            a=linear(),
+            b=linear(),
+        ),
+        set(),
+    ),
+    "two vectors per sample": lambda: (
+        Net(lambda net, x: net.b(net.a(in_rows(x)).tanh().sum(1)), a=linear(3, 2), b=linear(2, 3)),
+        {"b.weight"},
+    ),
+    "a derivative of its own": lambda: (
+        Net(lambda net, x: OwnProduct.apply(x, net.a.weight).tanh(), a=linear(bias=False)),
+        set(),
+    ),
+    "a weight made from another": lambda: (parametrized(), {"2.weight"}),
+    "attention": lambda: (
+        Net(
+            lambda net, x: net.b(net.a(*(in_rows(x),) * 3)[0].flatten(1)),
+            a=nn.MultiheadAttention(2, 1, batch_first=True),
+            b=linear(2),
+        ),
+        {"b.weight"},
+    ),
+    "a hook that changes the result": lambda: (hooked(), {"0.weight"}),
+}
+
+
+def parametrized() -> nn.Module:
+    net = nn.Sequential(linear(), nn.Tanh(), linear(2, 3))
+    register_parametrization(net[0], "weight", nn.Tanh())
+    return net
+
+
+def tied() -> nn.Module:
+    net = nn.Sequential(linear(4), nn.Tanh(), linear(4))
+    net[2].weight = net[0].weight
+    return net
+
+
+def hooked() -> nn.Module:
+    net = nn.Sequential(linear(), nn.Tanh())
+    net[0].register_forward_hook(lambda module, given, result: 3.0 * result)
+    return net
+
+
+def backward(net: nn.Module, parameters: list[nn.Parameter]) -> Tensor:
+    outputs = net(SAMPLES).flatten()
+    rows = [torch.autograd.grad(one, parameters, retain_graph=True, materialize_grads=True) for one in outputs]
+    return torch.stack([torch.cat([one.flatten() for one in row]) for row in rows])
+
+
+@pytest.mark.parametrize("make", NETWORKS.values(), ids=NETWORKS.keys())
+def test_rows_and_products_are_those_of_backward_passes(make) -> None:
+    torch.manual_seed(0)
+    net, outer = make()
+    net.double().eval()
+    named = dict(net.named_parameters())
+    jacobian = SampleJacobian(net, SAMPLES)
+    expected = backward(net, list(named.values()))
+    torch.testing.assert_close(jacobian(list(named.values())), expected)
+    products = jacobian.products(list(named.values()))
+    assert isinstance(products, Blocks)
+    found = {name for name, part in zip(named, products.parts, strict=True) if isinstance(part, OuterProducts)}
+    assert found == outer
+    M, N = expected.shape
+    w, v = torch.randn(M, dtype=torch.float64), torch.randn(N, dtype=torch.float64)
+    assert all(one is named[name] for name, one in net.named_parameters())  # the network keeps its parameters
+    torch.testing.assert_close(products.gram(), expected @ expected.mT)
+    torch.testing.assert_close(products.pull(w), expected.mT @ w)
+    torch.testing.assert_close(products.push(v), expected @ v)
+
+
+def test_it_is_of_the_parameters_that_are_given_in_their_order() -> None:
+    torch.manual_seed(0)
+    net = nn.Sequential(linear(6), nn.Tanh(), linear(2, 6)).double()
+    some = [net[2].weight, net[0].bias]
+    torch.testing.assert_close(SampleJacobian(net, SAMPLES)(some), backward(net, some))
+
+
+def test_parameters_of_two_precisions() -> None:
+    torch.manual_seed(0)
+    net = Net(lambda net, x: net.b(net.a(x.float()).double()), a=linear(3).float(), b=linear(2, 3).double())
+    parameters = list(net.parameters())
+    products = SampleJacobian(net, SAMPLES).products(parameters)
+    expected = backward(net, parameters).double()
+    w, v = torch.randn(expected.shape[0], dtype=torch.float64), torch.randn(expected.shape[1], dtype=torch.float64)
+    near = {"rtol": 1e-5, "atol": 1e-5}
+    torch.testing.assert_close(products.gram().double(), expected @ expected.mT, **near)
+    torch.testing.assert_close(products.pull(w).double(), expected.mT @ w, **near)
+    torch.testing.assert_close(products.push(v).double(), expected @ v, **near)
+
+
+def test_rows_of_an_outer_product_are_not_formed() -> None:
+    """A weight of 25 million numbers has rows of 4 GB, for 10 samples and 4 outputs."""
+    net = nn.Sequential(nn.Linear(5000, 5000), nn.ReLU(), nn.Linear(5000, 4))
+    samples = torch.randn(10, 5000)
+    parameters = list(net.parameters())
+    products = SampleJacobian(net, samples).products(parameters)
+    assert isinstance(products, Blocks)
+    assert sum(part.rows.numel() for part in products.parts if isinstance(part, Rows)) == 40 * (5000 + 4)
+    y = net(samples)
+    w = torch.randn_like(y)
+    expected = torch.cat([one.flatten() for one in torch.autograd.grad(y, parameters, w)])
+    torch.testing.assert_close(products.pull(w.flatten()), expected, rtol=1e-3, atol=1e-4)

@@ -1,0 +1,173 @@
+"""The Jacobian of a network whose outputs each depend on one sample of the batch."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+from torch.overrides import TorchFunctionMode
+
+from torch_zerohess.linalg.jacobians import Blocks, Jacobian, OuterProducts, Rows
+
+_OF_TRAINING = (
+    *(nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm),
+    *(nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout),
+)
+"""Modules that in training mode mix samples or draw random numbers."""
+
+
+Places = tuple[str, ...]
+"""Names of a parameter."""
+
+
+class SampleJacobian:
+    """The Jacobian of a network whose outputs each depend on one sample of the batch, in about one backward pass.
+
+    Made in a closure of `NewtonCG` with solver "dual", which otherwise takes one backward pass for every output of the
+    batch. Batch normalisation and dropout must be in evaluation mode: in training mode, batch normalisation mixes the
+    samples, and dropout changes the network from call to call.
+
+    Args:
+        network: a module, samples [B, ...] -> [B, n].
+        samples: the batch that the closure evaluates, [B, ...].
+
+    Example:
+        >>> network, x = torch.nn.Linear(3, 2), torch.ones(4, 3)
+        >>> SampleJacobian(network, x)(list(network.parameters())).shape
+        torch.Size([8, 8])
+    """
+
+    def __init__(self, network: nn.Module, samples: Tensor) -> None:
+        if not isinstance(network, nn.Module):
+            raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
+        self._network, self._samples = network, samples
+
+    def __call__(self, parameters: Sequence[Tensor]) -> Tensor:
+        """Return J [B n, N] by parameters of the network, N numbers in all.
+
+        Raises ValueError for a parameter that the network does not have, and for batch normalisation and dropout in
+        training mode.
+        """
+        return self.products(parameters).dense()
+
+    def products(self, parameters: Sequence[Tensor]) -> Jacobian:
+        """Return J as its products. Raises as a call does.
+
+        A weight whose only use is one product with a vector per sample, as in `torch.nn.Linear`, needs no row of J.
+        """
+        for name, one in self._network.named_modules():
+            if one.training and isinstance(one, _OF_TRAINING):
+                raise ValueError(
+                    f"network has a {type(one).__name__} in training mode ({name!r}), and no Jacobian per sample: call "
+                    "network.eval() first"
+                )
+        places = self._places()
+        if not all(id(one) in places for one in parameters):
+            raise ValueError("parameters of the optimizer must be parameters of the network of the SampleJacobian")
+        chosen = {places[id(one)]: one.detach() for one in parameters}
+        outer = self._outer(chosen)
+        slopes = {at: one.new_zeros(len(one)) for at, one in chosen.items() if at in outer}
+        rows = {at: one for at, one in chosen.items() if at not in outer}
+
+        def output(
+            rows: dict[Places, Tensor], slopes: dict[Places, Tensor], sample: Tensor
+        ) -> tuple[Tensor, dict[Places, Tensor]]:
+            with _Products({id(chosen[at]): (at, zeros) for at, zeros in slopes.items()}) as products:
+                result = self._called({**chosen, **rows}, sample[None])
+            return result[0], products.inputs
+
+        differentiated = torch.func.vmap(
+            torch.func.jacrev(output, argnums=(0, 1), has_aux=True), in_dims=(None, None, 0)
+        )
+        (by_rows, by_slopes), inputs = differentiated(rows, slopes, self._samples)
+
+        def part(at: Places) -> Jacobian:
+            if at in outer:
+                return OuterProducts(by_slopes[at], inputs[at])
+            return Rows(by_rows[at].flatten(2).flatten(0, 1))
+
+        return Blocks([part(at) for at in chosen], [one.numel() for one in chosen.values()])
+
+    def _places(self) -> dict[int, Places]:
+        """Return the names of every parameter by its identity: several if modules share it, one if a module repeats."""
+        found: dict[int, Places] = {}
+        for prefix, module in self._network.named_modules():
+            for name, one in module.named_parameters(prefix, recurse=False, remove_duplicate=False):
+                found[id(one)] = (*found.get(id(one), ()), name)
+        return found
+
+    def _called(self, values: Mapping[Places, Tensor], samples: Tensor) -> Tensor:
+        """Return the outputs with other values of parameters."""
+        # torch's own handling of shared parameters (tie_weights) loses a parameter of a module with two names.
+        given = {name: one for names, one in values.items() for name in names}
+        result: Tensor = functional_call(self._network, given, (samples,), tie_weights=False)
+        return result
+
+    def _outer(self, chosen: Mapping[Places, Tensor]) -> set[Places]:
+        """Return the weights [p, q] whose only use, for one sample, is one product with a vector."""
+        with torch.enable_grad(), _Uses(chosen.values()) as uses:
+            self._called(chosen, self._samples[:1])
+        return {at for at, one in chosen.items() if uses.count[id(one)] == 1 and id(one) in uses.products}
+
+
+class _Uses(TorchFunctionMode):
+    """Counts how often weights are arguments of functions of torch, and notes which are weights of a product."""
+
+    def __init__(self, weights: Iterable[Tensor]) -> None:
+        super().__init__()
+        self.count = Counter(dict.fromkeys(map(id, weights), 0))
+        self.products: set[int] = set()
+
+    def __torch_function__(
+        self, function: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: Any = None
+    ) -> Any:
+        given = kwargs or {}
+        self.count.update(id(one) for one in _tensors((args, given)) if id(one) in self.count)
+        if function is nn.functional.linear and torch.is_grad_enabled():  # not within a function of its own derivative
+            x, weight = _of_product(args, given)
+            if x.numel() == x.shape[-1]:
+                self.products.add(id(weight))
+        return function(*args, **given)
+
+
+class _Products(TorchFunctionMode):
+    """Adds zeros to the products with some weights, whose gradient is the slope there, and keeps what was multiplied.
+
+    zeros: by the identity of the weight, its names and a tensor [p].
+    """
+
+    def __init__(self, zeros: Mapping[int, tuple[Places, Tensor]]) -> None:
+        super().__init__()
+        self._zeros = zeros
+        self.inputs: dict[Places, Tensor] = {}
+
+    def __torch_function__(
+        self, function: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: Any = None
+    ) -> Any:
+        given = kwargs or {}
+        result = function(*args, **given)
+        if function is nn.functional.linear:
+            x, weight = _of_product(args, given)
+            if id(weight) in self._zeros:
+                at, zeros = self._zeros[id(weight)]
+                self.inputs[at] = x.reshape(-1)
+                result = result + zeros
+        return result
+
+
+def _of_product(args: Sequence[Any], given: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    """Return input and weight among the arguments of `torch.nn.functional.linear`."""
+    both = {**dict(zip(("input", "weight"), args, strict=False)), **given}
+    return both["input"], both["weight"]
+
+
+def _tensors(value: object) -> Iterator[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from _tensors(one)
+    elif isinstance(value, dict):
+        yield from _tensors(list(value.values()))

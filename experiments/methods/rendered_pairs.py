@@ -1,8 +1,9 @@
 """Networks that are fitted to renders of known parameters.
 
 A network of a network task maps an output of the black box to parameters. Each evaluation is therefore a labelled
-example: the render, and the parameters of which it is the render. Labels need no further evaluation. A point beyond
-the bounds of a task is rendered as the nearest point within, which is then its label. The methods are
+example: the render, and the parameters of which it is the render. Labels need no further evaluation. They are exact
+within the bounds of a task. A point beyond is rendered as the nearest point within: the render does not change with
+that parameter, and the parameter does not count (see J below). The methods are
 
 - `memory_pairs`: trains as `memory_newton` does and then fits the network to the evaluations that its memory has kept.
   They lie around the predictions, which approach the parameters of the training images.
@@ -61,9 +62,6 @@ def fit_to_pairs(
         softness: added to the squared errors.
     """
     points, images = memory.points, memory.outputs
-    if trial.task.bounds:
-        lower, upper = (points.new_tensor(side) for side in trial.task.bounds)
-        points = points.clamp(lower, upper)
     memory.fit()
     metric = output_metric(memory.surrogate, points)
     optimizer = torch.optim.Adam(trial.encoder.parameters())

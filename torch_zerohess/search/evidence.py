@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalProgress, LocalSettings
+from torch_zerohess.search.local_method import LocalMethod, LocalProgress, LocalSettings
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
 from torch_zerohess.search.state import Best, Evaluated, Progress

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_zerohess.search.descent_search import descent_method
 from torch_zerohess.search.evidence import FEWEST, EvidenceMethod, EvidenceProgress
 from torch_zerohess.search.gaussian_process_search import process_method
-from torch_zerohess.search.local_gauss_newton import LocalMethod, LocalSettings
+from torch_zerohess.search.local_method import LocalMethod, LocalSettings
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds

@@ -82,8 +82,126 @@ def test_samples_are_doubled_after_a_small_gain_and_halved_after_a_large_one(sam
     search = search_for(image, normal(N))
     search.tell(image(search.ask()))
     known = search._state.progress
-    told = Evaluated(known.center[None], vector((1 - gain) * known.loss), known.output[None], known.shape)
-    assert search._method.taken(replace(known, samples=samples), told).samples == after
+    assert stepped(search, replace(known, samples=samples), gain).samples == after
+
+
+def stepped(search, known, gain):
+    """The progress after a step that lowers the loss by a share of it."""
+    told = Evaluated(known.center[None] + 0.1, vector((1 - gain) * known.loss), known.output[None], known.shape)
+    return search._method.taken(known, told)
+
+
+def two_minima(x):
+    """Two pixels of each texel: zero at 0.2, and a local minimum of their squares at -0.2."""
+    return torch.cat([10 * (image(x).square() - 0.04), image(x) - 0.2], 1)
+
+
+def test_hops_leave_local_minima():
+    """Without them the loss is 0.067 or more."""
+    search = LocalGaussNewton(torch.full((N,), -0.3).double(), sigma=1.0, loss=square(0.0), seed=0, restarts=100)
+    assert run(search, two_minima, 600).value < 0.05
+
+
+def slow(search, black_box=image):
+    """The progress after the first samples and one step of a small gain."""
+    search.tell(black_box(search.ask()))
+    return stepped(search, search._state.progress, 0.01)
+
+
+def test_after_two_small_gains_it_hops():
+    search = search_for(image, normal(N))
+    once = slow(search)
+    assert once.home is None
+    assert stepped(search, stepped(search, once, 0.05), 0.01).home is None  # not in a row
+    twice = stepped(search, once, 0.01)
+    known, points = search._method.samples(twice, torch.Generator().manual_seed(0))
+    assert torch.equal(points[0], known.center)
+    steps = points[0] - twice.home.center
+    assert float(steps.square().mean().sqrt()) == pytest.approx(0.3, rel=0.2)
+    distances = (points[1:] - points[0]).square().mean(1).sqrt()
+    torch.testing.assert_close(distances, known.sigma * torch.ones(32).double(), rtol=0.3, atol=0.0)
+
+
+def test_a_hop_leaves_parameters_that_no_output_depends_on():
+    search = LocalGaussNewton(torch.zeros(N + 10).double(), sigma=1.0, loss=square(image(normal(1, N))[0]), seed=0)
+    hopped = stepped(search, slow(search, lambda x: image(x[:, :N])), 0.01)
+    left = hopped.jacobian.untouched
+    known, _ = search._method.samples(hopped, torch.Generator().manual_seed(0))
+    assert bool(left.any())
+    assert bool((known.center == hopped.home.center)[left].all())
+    assert not bool((known.center == hopped.home.center)[~left].any())
+
+
+def hopping(search, finished=False):
+    """The progress at the start of a hop, whose loss is twice the one before."""
+    home = replace(slow(search), finished=finished)
+    return replace(home, home=home, loss=2.0 * home.loss, hopped=2.0 * home.loss)
+
+
+def test_a_hop_that_finds_nothing_better_is_undone_and_slow_steps_go_on():
+    search = search_for(image, normal(N))
+    known = hopping(search)
+    back = stepped(search, known, 0.01)
+    assert torch.equal(back.center, known.home.center)
+    assert back.loss == known.home.loss
+    assert back.evaluations == known.evaluations
+    assert back.iterations == known.iterations + 1
+    on = stepped(search, stepped(search, back, 0.01), 0.01)
+    assert on.home is None
+    assert on.rounds == 0
+
+
+def test_a_hop_that_finds_something_better_is_kept():
+    search = search_for(image, normal(N))
+    known = hopping(search)
+    after = stepped(search, stepped(search, known, 0.6), 0.01)
+    assert after.loss < known.home.loss
+    assert stepped(search, after, 0.01).home.loss < known.home.loss  # it hops from there
+
+
+@pytest.mark.parametrize(("above", "agreed"), [(0.005, 2), (0.02, 0)])
+def test_a_hop_that_returns_to_a_minimum_confirms_it(above, agreed):
+    search = search_for(image, normal(N))
+    known = hopping(search, finished=True)
+    home = replace(known.home, best=replace(known.best, point=known.home.center))
+    known = replace(known, home=home, best=home.best, place=home.center, agreed=1, loss=(1.0 + above) * home.loss)
+    after = search._method.arrived(known)
+    assert after.agreed == agreed
+    assert after.rounds == 1
+    assert torch.equal(after.home.center, home.center)  # the next hop is from the same point
+
+
+def test_a_hop_to_where_there_is_no_value_is_undone():
+    search = search_for(image, normal(N))
+    known = replace(stepped(search, slow(search), 0.01), evaluations=33)
+    points = known.center.expand(33, N)
+    outputs = image(points).flatten(1).clone()
+    outputs[0] = math.nan
+    told = Evaluated(points, outputs.square().mean(1), outputs, known.shape)
+    back = search._method.sampled(known, told)
+    assert back.home is None
+    assert torch.equal(back.center, known.home.center)
+    assert back.agreed == 0
+
+
+def test_the_model_is_one_of_the_minimum_while_the_search_hops():
+    search = search_for(image, normal(N))
+    known = hopping(search)
+    away = replace(known, center=known.center + 5.0, best=replace(known.best, point=known.home.center))
+    model, _ = search._method.model_at_best(away)
+    assert model.value == pytest.approx(known.home.loss)
+
+
+def test_a_state_in_a_hop_can_be_saved():
+    search = LocalGaussNewton(torch.full((N,), -0.3).double(), sigma=1.0, loss=square(0.0), seed=0)
+    while search._state.progress.home is None:
+        search.tell(two_minima(search.ask()))
+    again = LocalGaussNewton(torch.full((N,), -0.3).double(), sigma=1.0, loss=square(0.0), seed=5)
+    again.load_state_dict(search.state_dict())
+    until = search.evaluations + 100
+    for one in (search, again):
+        run(one, two_minima, until)
+    assert torch.equal(search.ask(), again.ask())
 
 
 def test_steps_are_solved_where_sizes_of_texels_differ():

@@ -1,0 +1,280 @@
+"""Gauss-Newton on a sparse Jacobian that samples tell, and hops out of local minima: the method of `LocalGaussNewton`.
+
+The start and a few dozen samples of all parameters at once tell a sparse Jacobian of the smoothed output, row by row
+(`surrogates.sparse_fit`). It takes about s log n samples for s parameters per row, where a dense Jacobian takes n.
+
+An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths then minimise
+the model g J s + s J^T H J s / 2 by conjugate gradients, where g and H are gradient and Hessian of the loss after the
+output; see `gauss_newton`. If the output at the end of the step was predicted well, the next steps use the same J.
+Sigma is a share of the radius.
+
+Where steps hardly lower the loss, the search hops: it goes on from a random point close by, with the J that it has. It
+stays with what the hop leads to if the loss is lower there. Otherwise it returns: to another hop if it had arrived,
+else to its slow steps until it arrives (monotonic basin hopping: Wales and Doye 1997, Leary 2000).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.krylov import krylov_steps
+from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, check_share
+from torch_zerohess.search.method import Settings
+from torch_zerohess.search.random_points import normal, reflect
+from torch_zerohess.search.state import Best, Evaluated, agreeing
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+
+_TRUSTED = 0.9
+"""Share of the held-out change. If the Jacobian predicts more, the first radius is at least 1, as for the samples."""
+_FAITHFUL = 0.1
+"""Squared error of a predicted output, over its squared change, up to which the Jacobian needs no new samples."""
+_SLOW, _FAST, _MOST = 0.02, 0.1, 2
+"""The next batch has twice the samples if the loss fell by less than the first share of it, and half of them if it fell
+by more than the second. It has so many times the first number of samples at most."""
+_PREDICTED = 0.5
+"""Share of the held-out change from which on the end of a round is a minimum."""
+_STALLED = 2
+"""Such small gains in a row are followed by a hop."""
+_HOP = 0.3
+"""Standard deviation of a hop, in units of the first sigma."""
+_SAME = 0.01
+"""A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
+_ITERATIONS = 100
+"""Products of the Hessian for a step."""
+_FULL = 1000
+"""Parameters up to which `model_at_best` forms the Hessian."""
+
+_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "refused")
+"""What a search that returns from a hop keeps."""
+
+
+@dataclass(frozen=True)
+class LocalSettings:
+    """Settings that only this search has; see `LocalGaussNewton`."""
+
+    sparse: SparseSettings
+    samples: int = 32
+    radius: float = 0.5
+    share: float = 0.35
+    least_sigma: float = 0.03
+
+    @classmethod
+    def checked(
+        cls,
+        settings: Settings,
+        *,
+        keep: int | None = None,
+        rate: float = 0.1,
+        grid: tuple[int, ...] | None = None,
+        **own: Any,
+    ) -> "LocalSettings":
+        """Check what a caller gave; ValueError for a setting out of range."""
+        if not callable(settings.loss):
+            raise ValueError(
+                f"loss must be a function of one output for the engine 'local', got {settings.loss!r}: without one use "
+                "engine='descent'"
+            )
+        result = cls(SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid), **own)
+        for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
+            check_share(name, getattr(result, name), most)
+        check_samples(result.samples, result.sparse.keep)
+        return result
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalProgress(JacobianProgress):
+    """The output at the center, the sparse Jacobian there, and the samples asked for next."""
+
+    jacobian: SparseJacobian | None = None
+    """float32: errors of sampling are far above its rounding."""
+    samples: int
+    """Of the next batch."""
+    slow: int = 0
+    """Steps in a row that hardly lowered the loss."""
+    finished: bool = False
+    """Whether the search has arrived at the center."""
+    patient: bool = False
+    """Whether slow steps go on, because a hop from here has found nothing better."""
+    home: "LocalProgress | None" = None
+    """The search before the hop that has led here."""
+    hopped: float = math.inf
+    """Loss at the start of this hop."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether the search has hopped and is not below the loss before."""
+        return self.home is not None and self.loss >= self.home.loss
+
+
+class LocalMethod(GaussNewton[LocalProgress]):
+    """The search of `LocalGaussNewton`, in units of its sigma."""
+
+    engine = "local"
+    progress = LocalProgress
+
+    def __init__(self, settings: Settings, own: LocalSettings) -> None:
+        super().__init__(settings)
+        self.own, self.radius = own, own.radius
+
+    def begun(self) -> LocalProgress:
+        start = self.settings.start
+        return LocalProgress(
+            best=Best(start),
+            center=start,
+            radius=self.radius,
+            output=start.new_empty(0),
+            samples=self.own.samples,
+        )
+
+    def started(self, evaluated: Evaluated) -> LocalProgress | None:
+        """Return the progress after the start and samples around it at sigma; None if they give no Jacobian."""
+        if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
+            return None
+        known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated)).recorded(evaluated)
+        known = self.sampled(known, evaluated)
+        return known if known.phase == "trial" else None
+
+    def samples(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
+        """Draw samples from N(center, sigma^2), mirrored into the bounds; after a hop, draw the center first."""
+        hops = known.home is not None and not len(known.output)
+        if hops:
+            assert known.jacobian is not None
+            step = _HOP * ~known.jacobian.untouched * normal(generator, known.center, self.settings.n)
+            known = replace(known, center=self._inside(known.center + step))
+        points = self._inside(
+            known.center + known.sigma * normal(generator, known.center, known.samples, self.settings.n)
+        )
+        return known, torch.cat([known.center[None], points]) if hops else points
+
+    def _inside(self, points: Tensor) -> Tensor:
+        return reflect(points, self.settings.lower, self.settings.upper)
+
+    def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        if known.home is None or len(known.output):
+            return super().sampled(known, evaluated)
+        if not bool(evaluated.finite[0]):
+            return self._returned(known)
+        return super().sampled(replace(known, hopped=float(evaluated.losses[0])), evaluated)
+
+    def renewed(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Fit the Jacobian to samples; too few of them are drawn again."""
+        if len(known.output) == 1:
+            raise ValueError(
+                "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
+                "number: use engine='descent'"
+            )
+        first, told = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
+        assert told.outputs is not None
+        if len(told) < FEWEST_SAMPLES:
+            return known
+        u = ((told.points - known.center) / known.sigma).float()
+        changes = ((told.outputs - known.output) / known.sigma).float()
+        jacobian = fit_sparse(u, changes, known.shape, self.own.sparse, known.jacobian)
+        if first and jacobian.explained > _TRUSTED:
+            known = replace(known, radius=max(1.0, known.radius))
+        return replace(known, jacobian=jacobian, phase="trial")
+
+    def steps(self, known: LocalProgress, radii: Tensor) -> Tensor:
+        """Solve the model by conjugate gradients, over the parameters that no bound holds."""
+        gradient, product = self._derivatives(known)
+        lower, upper, x = self.settings.lower, self.settings.upper, known.center
+        held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+        free = (~held).to(gradient)
+        return krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
+
+    def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Take the best step; double the samples after a small gain, and halve them after a large one; or hop."""
+        after = super().taken(known, evaluated)
+        if after.home is not known.home or after.rounds > known.rounds:  # it has ended a round or hopped
+            return after
+        before, gain = known.loss, known.loss - after.loss
+        count = known.samples * (2 if gain < _SLOW * abs(before) else 1) // (2 if gain > _FAST * abs(before) else 1)
+        count = min(max(count, self.own.samples), _MOST * self.own.samples)
+        after = replace(after, samples=count, slow=known.slow + 1 if gain < _SLOW * abs(before) else 0)
+        return self._stalled(after) if after.slow >= _STALLED else after
+
+    def moved(self, known: LocalProgress, step: Tensor, change: Tensor) -> LocalProgress:
+        """Keep the Jacobian, without new samples, if it predicted the change of the output."""
+        assert known.jacobian is not None
+        miss = change - known.jacobian.matvec(step).flatten()
+        faithful = float(miss.square().sum()) <= _FAITHFUL * float(change.square().sum())
+        return replace(known, phase="trial" if faithful else "sample")
+
+    def arrived(self, known: LocalProgress) -> LocalProgress:
+        """End, hop, or begin again with the first radius where the Jacobian does not predict."""
+        if known.failed:
+            return self._returned(known)
+        predicts = known.jacobian is not None and known.jacobian.explained > _PREDICTED
+        if predicts:
+            known = agreeing(known, known.center, self.settings.tolerance)
+        known = super().arrived(known)
+        return self._hopping(replace(known, finished=True)) if predicts and not known.done else known
+
+    def _stalled(self, known: LocalProgress) -> LocalProgress:
+        """Hop, or return from a hop; go on where neither may help."""
+        if known.failed:
+            return self._returned(known)
+        predicts = known.jacobian is not None and known.jacobian.explained > _PREDICTED
+        if known.patient or known.rounds >= self.settings.restarts or not predicts:
+            return known
+        return self._hopping(known)
+
+    def _hopping(self, known: LocalProgress) -> LocalProgress:
+        """Ask for a point close by, and samples around it."""
+        return replace(
+            known,
+            home=replace(known, home=None),
+            output=known.output[:0],
+            loss=math.inf,
+            radius=self.radius,
+            sigma=self.distance(self.radius),
+            phase="sample",
+            samples=self.own.samples,
+            slow=0,
+            finished=False,
+            patient=False,
+        )
+
+    def _returned(self, known: LocalProgress) -> LocalProgress:
+        """Return from a hop that has found nothing better; hop again if the search had arrived before."""
+        home = known.home
+        assert home is not None
+        same = known.loss < math.inf and known.loss - home.loss <= _SAME * (known.hopped - home.loss)
+        known = replace(home, **{name: getattr(known, name) for name in _SHARED}, phase="sample", patient=True)
+        if not home.finished:
+            return known
+        known = agreeing(known, known.center, self.settings.tolerance) if same else replace(known, agreed=0)
+        known = super().arrived(known)
+        return known if known.done else self._hopping(known)
+
+    def distance(self, radius: float) -> float:
+        return min(1.0, max(self.own.share * radius, self.own.least_sigma))
+
+    def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
+        home = known.home
+        return super().model_at_best(known if home is None or not known.failed else replace(home, best=known.best))
+
+    def derivatives_at_center(self, known: LocalProgress) -> tuple[Tensor, Tensor] | None:
+        """None before the first Jacobian, and for more than a thousand parameters."""
+        n = self.settings.n
+        if known.jacobian is None or n > _FULL:
+            return None
+        gradient, product = self._derivatives(known)
+        eye = torch.eye(n, dtype=torch.float64, device=known.center.device)
+        return gradient, torch.stack([product(one) for one in eye])
+
+    def _derivatives(self, known: LocalProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
+        jacobian = known.jacobian
+        assert jacobian is not None
+        assert self.settings.loss is not None
+        loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
+        gradient = jacobian.rmatvec(loss.slope)
+        return gradient, lambda v: jacobian.rmatvec(loss.product(jacobian.matvec(v)))

@@ -15,6 +15,7 @@ Baseline = Literal["center", "mean", "none", "auto"]
 Sampler = Literal["random", "sobol", "orthogonal", "auto"]
 Signs = bool | Literal["auto"]
 _CHOSEN = ("proposal", "sampler", "baseline", "antithetic")  # what may be "auto"
+_STRIDE = 0x9E3779B97F4A7C15  # between seeds: generators of near seeds begin alike
 _SHOWN = 2048  # parameters up to which a repr says what was chosen; beyond the choice stays as it is
 
 
@@ -45,7 +46,8 @@ class Smoothing:
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
-            perturbations: every call uses the same ones, whatever the number of threads.
+            perturbations: every call uses the same ones, whatever the number of threads. With a `Memory` they also
+            depend on the number of evaluations that it has taken.
         scrambles: independent scrambles of sampler "sobol", a divisor of samples. Fewer ones have a smaller error, and
             a standard error with fewer degrees of freedom. None takes 8 of at least 8 points, else 4, 2 or 1.
         order: highest derivative that is wanted; 1 leaves out the lobes made for the second. Second derivatives stay
@@ -209,9 +211,14 @@ class Smoothing:
             ranges[-1][1] + (" beyond" if ranges[1:] else "")
         ]
 
-    def drawn_seed(self) -> int:
-        """Return the seed; from torch's global generator if it is None."""
-        return int(torch.randint(2**63 - 1, (), device="cpu")) if self.seed is None else self.seed
+    def drawn_seed(self, taken: int = 0) -> int:
+        """Return the seed of a call; from torch's global generator if `seed` is None.
+
+        taken: evaluations that a memory has taken before the call.
+        """
+        if self.seed is None:
+            return int(torch.randint(2**63 - 1, (), device="cpu"))
+        return (self.seed + _STRIDE * taken) % 2**63
 
     def sigma_vector(self, n: int, device: torch.device) -> Tensor:
         """Return sigma as float64 [n]; ValueError for a tensor that has not n elements."""

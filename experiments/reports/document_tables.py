@@ -136,7 +136,7 @@ def _fitted(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     """Rows are methods, columns tasks: evaluations and seconds until an error is reduced, and the share of starts."""
     table, tasks, methods = _selected(table, query)
     metric = query.take("metric", "image", ("image", "parameter"))
-    level = query.take("level", "99", ("90", "99", "99.9"))
+    level = query.take("level", "99", [f"{one:g}" for one in table["level"].unique()])
     show = query.take("show", "both", ("both", "evaluations", "seconds"))
     interval = query.take("share", "plain", ("plain", "interval")) == "interval"
     quartiles = query.take("quartiles", "hide", ("hide", "show")) == "show"

@@ -17,18 +17,21 @@ from experiments.runs.trial import LEVELS
 MEASURES = ("evaluations", "seconds")
 
 
-def reached(cells: Iterable[tuple[Sequence[object], Sequence[Run]]], keys: Sequence[str]) -> pd.DataFrame:
+def reached(
+    cells: Iterable[tuple[Sequence[object], Sequence[Run]]], keys: Sequence[str], levels: Sequence[float] = LEVELS
+) -> pd.DataFrame:
     """Return a row per run, error and level: evaluations and seconds until then, NaN where it never got there.
 
     Args:
         cells: names of a cell, one for each of `keys`, and its runs.
         keys: columns of the names.
+        levels: by how much an error is reduced, as a share of the first one.
     """
     rows = []
     for names, runs in cells:
         for run in runs:
             for metric in METRICS:
-                for level in LEVELS:
+                for level in levels:
                     record = run.reached(metric, level)
                     found = (np.nan, np.nan) if record is None else (record.evaluations, record.seconds)
                     rows.append((*names, metric, level, *found))

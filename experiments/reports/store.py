@@ -16,6 +16,7 @@ from experiments.reports import result_files
 from experiments.reports.medians import medians, reached
 from experiments.reports.networks import HELD_OUT, per_method
 from experiments.reports.results import Results, Run, load
+from experiments.runs.trial import LEVELS
 
 _ALIKE = ("preset", "limit", "clock", "first_run", "runs", "commit", "machine")
 """What rows of one table have in common."""
@@ -26,6 +27,7 @@ def store(
     /,
     name: str,
     tasks: tuple[str, ...] = (),
+    levels: tuple[float, ...] = LEVELS,
     add: bool = False,
 ) -> None:
     """Write the medians of a folder of results, with their origin, to experiments/results/NAME.csv.
@@ -38,8 +40,11 @@ def store(
         folder: written by `run` or `robustness`.
         name: of the table.
         tasks: only these; all of the folder if not given.
+        levels: by how much an error is reduced, as a share of the first one; for tasks that are fitted.
         add: keep the other tasks of a stored table; refused if its commit, machine or protocol is another one.
     """
+    if not levels or not all(0.0 < one <= LEVELS[-1] for one in levels):
+        raise SystemExit(f"levels must be above 0 and at most {LEVELS[-1]:g}, where runs end, got {levels}")
     there = load(folder)
     wanted = chosen("tasks", tasks, list(there.runs)) if tasks else list(there.runs)
     results = _ordered(load(folder, wanted))
@@ -50,7 +55,7 @@ def store(
         raise SystemExit(f"{count} runs in {folder} are unfinished: the same `run` goes on with them")
     known = read_command(folder)
     whence = result_files.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
-    table = (trained(results) if networks else fitted(results)).assign(**whence)
+    table = (trained(results) if networks else fitted(results, levels)).assign(**whence)
     table = table[[*(one for one in table if one not in result_files.ORIGIN), *result_files.ORIGIN]]
     print(result_files.write(_added(table, name) if add else table, name))
     if left := [task for task in there.runs if task not in wanted]:
@@ -107,10 +112,10 @@ def _clock(settings: dict[str, Any]) -> str:
     return "processor" if alone else "wall"
 
 
-def fitted(results: Results) -> pd.DataFrame:
+def fitted(results: Results, levels: Sequence[float] = LEVELS) -> pd.DataFrame:
     """Return a row per task, method, error and level."""
     cells = [((task, method), runs) for task, methods in results.runs.items() for method, runs in methods.items()]
-    found = medians(reached(cells, ("task", "method")), ("task", "method", "metric", "level"))
+    found = medians(reached(cells, ("task", "method"), levels), ("task", "method", "metric", "level"))
     found["level"] = (100 * found["level"]).round(6)
     about = pd.DataFrame([_about(task, method, runs) for (task, method), runs in cells])
     measures = [f"{one}{end}" for one in ("evaluations", "seconds") for end in ("", "_low", "_high")]

@@ -177,7 +177,7 @@ class BlackBox(nn.Module):
         self.memory.check_parameters(center.shape[1])
         with transforms.outside(), transforms.random_numbers_allowed():
             self.control = Control.of(self.memory, self.call.outer, learning=self.training)
-            seed = self.smoothing.drawn_seed()
+            seed = self.smoothing.drawn_seed(self.control.taken)
         try:
             return control_variate.around(
                 self.control,

@@ -36,6 +36,9 @@ class Control:
     """What the surrogate's values are multiplied by."""
     learning: bool
     """Whether evaluations are kept."""
+    taken: int
+    """Evaluations that the memory had taken when the call began. A fixed seed gives other samples as they grow: the
+    surrogate knows the evaluations of earlier calls, and explains new evaluations at the same points too well."""
 
     @classmethod
     def of(cls, memory: Memory, outer: Outer, *, learning: bool) -> "Control":
@@ -45,7 +48,7 @@ class Control:
         c = outer.share(memory.coefficient if memory.ready else 0.0)
         if memory.fresh == 0 and not memory.ready:
             raise ValueError("memory with fresh=0 has no surrogate yet: add evaluations and call memory.fit()")
-        return cls(memory, outer, c > 0.0, c, learning)
+        return cls(memory, outer, c > 0.0, c, learning, memory.evaluations)
 
     def parted(self, aux: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor], Tensor | None]:
         """Return the auxiliary inputs of the head, `Prediction.encoded` of them, and the scales [B, 2] if any.

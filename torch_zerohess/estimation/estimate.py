@@ -124,7 +124,8 @@ def estimate(
             control = Control.of(memory, call.outer, learning=True)
             if control.active:  # before this call's evaluations, which it must not know
                 sigma = smoothing.sigma_vector(n, flat.device)
-                term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, smoothing.drawn_seed(), smoothing.order)
+                seed = smoothing.drawn_seed(control.taken)
+                term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, seed, smoothing.order)
                 aux_rows = [*aux_rows, *term.encoded]
             return made([draw(smoothing)], alone)
     if tolerance is None:

@@ -161,7 +161,7 @@ def evaluate(
         control: control variate, subtracted from the values before they become coefficients.
     """
     smoothing = smoothing.resolved(x.shape[1])
-    seed = smoothing.drawn_seed()
+    seed = smoothing.drawn_seed(0 if control is None else control.taken)
     with_center = call.value == "center" or smoothing.baseline == "center"
     perturbations = perturb(x, smoothing, seed, keep, with_center)
     stein, sigma, outer = perturbations.stein, perturbations.sigma, call.outer

@@ -38,7 +38,8 @@ class Memory:
     evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g, provided that
     h(g(z), r) is differentiable in z (once for gradients, and with a continuous derivative for Hessians). If the
     derivative of g is zero everywhere (a tree, a table) or unknown to torch (NumPy), Stein's identity differentiates
-    the first term, and the estimate stays unbiased. A bad g costs variance, and c falls to zero.
+    the first term, and the estimate stays unbiased. A bad g costs variance, and c falls to zero. A `Smoothing` with a
+    fixed seed draws other samples at every call that adds evaluations: g would explain the old samples too well.
 
     Args:
         surrogate: an object with `fit(points [P, n], outputs [P, *out])` and a differentiable

@@ -81,6 +81,19 @@ def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
     assert float(theirs["share_high"]) == pytest.approx(interval.high, rel=1e-5)
 
 
+def test_other_levels_can_be_stored(folder, results):
+    store(folder, name="bowls", levels=(0.5, 0.95))
+    there = {one["level"]: one for one in rows(results, "bowls") if one["method"] == "descent"}
+    assert sorted(there) == ["50", "95"]
+    ours = {
+        one["level"]: one for one in rows(results, "bowls") if (one["method"], one["metric"]) == ("descent", "image")
+    }
+    assert [float(ours[level]["evaluations"]) for level in ("50", "95")] == [3.0, 7.5]
+    assert "reduced by 50 %" in table_of("bowls", Query.of(["level=50"]))
+    with pytest.raises(SystemExit, match=r"levels must be above 0 and at most 0.999, where runs end, got \(1.5,\)"):
+        store(folder, name="bowls", levels=(1.5,))
+
+
 def test_networks_have_a_row_per_method(tmp_path, results):
     folder = tmp_path / "runs"
     for run in range(3):

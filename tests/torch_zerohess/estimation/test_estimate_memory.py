@@ -172,10 +172,33 @@ def test_the_memory_keeps_every_evaluation_whatever_fresh_is() -> None:
     estimated(memory, 1, batch=5)  # fits
     assert memory.ready
     assert memory.coefficient > 0.0
+    own = SMOOTHING.replace(seed=2).drawn_seed(memory.evaluations)
     found = estimated(memory, 2, batch=5)
-    plain = estimated(None, 2, batch=5)
+    plain = estimated(None, own, batch=5)
     assert torch.equal(found.points, plain.points), "the same points as without a memory"
     torch.testing.assert_close(found.values, plain.values)
+
+
+def test_a_fixed_seed_gives_other_samples_as_the_memory_grows() -> None:
+    """With the same samples the surrogate would explain them all, and the estimate would be the surrogate's."""
+    x, sigma = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64), 0.5
+    truth = torch.exp(-0.5 * (x / sigma) ** 2) / (sigma * (2 * torch.pi) ** 0.5)
+    deviations = []
+    for seed in SEEDS[:8]:
+        memory = Memory()
+        own = Smoothing(sigma=sigma, samples=16, seed=seed)
+        found = [estimate(lambda z: (z > 0).double().sum(1), x, own, memory=memory) for _ in range(5)]
+        assert not torch.equal(found[0].points, found[1].points)
+        deviations.append((found[-1].gradient - truth) / found[-1].standard_error("gradient"))
+    assert float(torch.stack(deviations).square().mean()) < 3.0  # 200 with the same samples
+
+
+def test_a_fixed_seed_gives_the_same_results_from_the_same_start() -> None:
+    def third() -> Tensor:
+        memory = Memory()
+        return [estimated(memory, 0).gradient for _ in range(3)][-1]
+
+    assert torch.equal(third(), third())
 
 
 def test_a_head_gets_aux_by_views() -> None:

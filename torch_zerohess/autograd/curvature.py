@@ -36,8 +36,8 @@ class CurvatureOperator:
             between `inputs` and `outputs` if None.
 
     Raises:
-        ValueError: `outputs` has no graph or more than one element; nothing to go through was found, or one black box
-            stands behind another.
+        ValueError: `outputs` has no graph or more than one element; nothing to go through was found, one black box
+            stands behind another, or the loss is not computed from `through`.
 
     Example:
         >>> w = torch.tensor([1.0, 2.0], requires_grad=True)
@@ -74,11 +74,21 @@ class CurvatureOperator:
             self.gradient = self._flat([one.detach() for one in self._slopes])
         else:
             self._through = black_box_inputs(outputs) if through is None else _listed(through)
+            self._check_path(outputs)
             self._slopes = _grad([outputs], self._through, None, create_graph=True)
             self.gradient = self._flat(_grad([outputs], self._inputs, None))
 
     gradient: Tensor
     """Gradient of the loss, [N]."""
+
+    def _check_path(self, outputs: Tensor) -> None:
+        """Raise ValueError if the loss does not go through any of the tensors at which the white box ends."""
+        ends = {_edge(one) for one in self._through if one.requires_grad}
+        if not ends & {_edge(outputs), *_edges_before(outputs.grad_fn)}:
+            raise ValueError(
+                f"outputs must be computed from through, but no tensor of {[list(one.shape) for one in self._through]} "
+                "is on the path to the loss: give the tensors themselves, not copies and not a second forward pass"
+            )
 
     def __matmul__(self, v: Tensor) -> Tensor:
         """Return H v for v [N], or H V for V [N, m]."""

@@ -23,11 +23,11 @@ Places = tuple[str, ...]
 
 
 class SampleJacobian:
-    """The Jacobian of a network whose outputs each depend on one sample of the batch, in about one backward pass.
+    """The Jacobian of a network whose outputs each depend on one sample of the batch: n backward passes for n outputs.
 
-    Made in a closure of `NewtonCG` with solver "dual", which otherwise takes one backward pass for every output of the
-    batch. Batch normalisation and dropout must be in evaluation mode: in training mode, batch normalisation mixes the
-    samples, and dropout changes the network from call to call.
+    Made in a closure of `NewtonCG` with solver "dual", which otherwise takes one backward pass for every output of
+    every sample. Batch normalisation and dropout must be in evaluation mode: in training mode, batch normalisation
+    mixes the samples, and dropout changes the network from call to call.
 
     Args:
         network: a module, samples [B, ...] -> [B, n].
@@ -47,8 +47,8 @@ class SampleJacobian:
     def __call__(self, parameters: Sequence[Tensor]) -> Tensor:
         """Return J [B n, N] by parameters of the network, N numbers in all.
 
-        Raises ValueError for a parameter that the network does not have, and for batch normalisation and dropout in
-        training mode.
+        Raises ValueError for a parameter that the network does not have, for outputs that are not [B, n], for batch
+        normalisation and dropout in training mode, and for batch normalisation without running statistics.
         """
         return self.products(parameters).dense()
 
@@ -58,6 +58,11 @@ class SampleJacobian:
         A weight whose only use is one product with a vector per sample, as in `torch.nn.Linear`, needs no row of J.
         """
         for name, one in self._network.named_modules():
+            if isinstance(one, _OF_TRAINING) and getattr(one, "running_mean", 0) is None:
+                raise ValueError(
+                    f"network has a {type(one).__name__} without running statistics ({name!r}), which mixes samples in "
+                    "evaluation mode, too: it has no Jacobian per sample"
+                )
             if one.training and isinstance(one, _OF_TRAINING):
                 raise ValueError(
                     f"network has a {type(one).__name__} in training mode ({name!r}), and no Jacobian per sample: call "
@@ -75,7 +80,7 @@ class SampleJacobian:
             rows: dict[Places, Tensor], slopes: dict[Places, Tensor], sample: Tensor
         ) -> tuple[Tensor, dict[Places, Tensor]]:
             with _Products({id(chosen[at]): (at, zeros) for at, zeros in slopes.items()}) as products:
-                result = self._called({**chosen, **rows}, sample[None])
+                result = _checked(self._called({**chosen, **rows}, sample[None]))
             return result[0], products.inputs
 
         differentiated = torch.func.vmap(
@@ -98,18 +103,26 @@ class SampleJacobian:
                 found[id(one)] = (*found.get(id(one), ()), name)
         return found
 
-    def _called(self, values: Mapping[Places, Tensor], samples: Tensor) -> Tensor:
+    def _called(self, values: Mapping[Places, Tensor], samples: Tensor) -> object:
         """Return the outputs with other values of parameters."""
         # torch's own handling of shared parameters (tie_weights) loses a parameter of a module with two names.
         given = {name: one for names, one in values.items() for name in names}
-        result: Tensor = functional_call(self._network, given, (samples,), tie_weights=False)
-        return result
+        return functional_call(self._network, given, (samples,), tie_weights=False)
 
     def _outer(self, chosen: Mapping[Places, Tensor]) -> set[Places]:
         """Return the weights [p, q] whose only use, for one sample, is one product with a vector."""
         with torch.enable_grad(), _Uses(chosen.values()) as uses:
             self._called(chosen, self._samples[:1])
         return {at for at, one in chosen.items() if uses.count[id(one)] == 1 and id(one) in uses.products}
+
+
+def _checked(outputs: object) -> Tensor:
+    """Return outputs [1, n] of a network; ValueError for another shape, TypeError for what is no tensor."""
+    if not isinstance(outputs, Tensor):
+        raise TypeError(f"network must return a tensor [B, n], got {type(outputs).__name__}")
+    if outputs.ndim != 2 or len(outputs) != 1:
+        raise ValueError(f"network must return [1, n] for one sample, got {list(outputs.shape)}: flatten the outputs")
+    return outputs
 
 
 class _Uses(TorchFunctionMode):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torch_zerohess.arguments import check_tensors
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.optim.second_order import check_positive
 
@@ -39,6 +40,9 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
         True
     """
     check_positive(damping=damping)
+    if not isinstance(network, nn.Module):
+        raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
+    check_tensors(samples=samples, change=change)
     weights = [one for one in network.parameters() if one.requires_grad]
     if not weights:
         raise ValueError("network must have weights that require grad, got none")

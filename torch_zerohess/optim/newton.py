@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import check_bool
 from torch_zerohess.linalg.steihaug import Step
 from torch_zerohess.linalg.subproblem import diagonal_step
 from torch_zerohess.optim.newton_step import NewtonStep
@@ -65,6 +66,7 @@ class Newton(NewtonStep):
     ) -> None:
         check_radius(radius)
         check_positive(max_radius=max_radius)
+        check_bool(adapt=adapt)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'shift' or 'abs', got {modification!r}")
         defaults = {

@@ -56,7 +56,7 @@ class NewtonCG(NewtonStep):
         adapt: whether to test the step and adapt the radius.
         max_radius: the radius never grows beyond it.
         noise: number of standard errors by which residual and curvature must differ from zero, if there are several
-            losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact.
+            losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact, and so does solver "dual".
         output_radius: longest move of the input y [n] of a black box, for every element of the batch, in units of y;
             None: any. Sampled derivatives describe a black box within about sigma of y. Steps of the weights that are
             short can still move y far beyond it. Needs curvature "gauss_newton".
@@ -151,4 +151,6 @@ class NewtonCG(NewtonStep):
             tolerance=group["tolerance"],
             noise=group["noise"],
         )
+        decrease = step.decrease + 0.5 * damping * float(step.s.dot(step.s))  # of the loss, which damping is no part of
+        step = step._replace(decrease=decrease)
         return step if solver == "steihaug" else clipped(step, model.gradient, radius)

@@ -38,7 +38,7 @@ class NewtonStep(SecondOrder):
         as they were.
         """
         group: dict[str, Any] = self.param_groups[0]
-        model = self._model(closure, separate=group.get("noise", 0.0) > 0.0)
+        model = self._model(closure, separate=group.get("noise", 0.0) > 0.0 and group.get("solver") != "dual")
         if not model.finite:
             raise ValueError(f"the loss ({float(model.loss)}) or its gradient is not finite; no step was taken")
         radius = group["radius"]

@@ -30,8 +30,9 @@ class NewtonTargets:
     condition of the black box. For a batch much smaller than the weights this needs no curvature of the network.
 
     Up to 16 outputs H is formed, and the magnitudes of its eigenvalues are used. For more outputs the system is solved
-    by conjugate gradients on Hessian-vector products. Their preconditioner is a mixture of the Hessians of one batch,
-    made again when the solution takes too many iterations. An affine black box with a quadratic loss takes one.
+    by conjugate gradients on Hessian-vector products, and h is |v^T H v| / n with random signs v (Hutchinson 1989). The
+    preconditioner is one matrix: column i is from the Hessian over h of element i modulo B. It is made again when the
+    solution takes too many iterations. An affine black box with a quadratic loss takes one.
 
     Args:
         damping: relative to h; positive.
@@ -102,52 +103,61 @@ class NewtonTargets:
         units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
         columns = [product(unit.expand_as(gradient)) for unit in units]
         h = _magnitudes(torch.stack(columns, 2).double())
-        h = h + self._shift(h)[:, None, None] * torch.eye(n, dtype=h.dtype, device=h.device)
+        h = h + self._shift(h.diagonal(dim1=1, dim2=2).abs().mean(1))[:, None, None] * torch.eye(
+            n, dtype=h.dtype, device=h.device
+        )
         return torch.linalg.solve(h, gradient.double()).to(gradient.dtype)
 
-    def _shift(self, h: Tensor) -> Tensor:
-        """Return the damping [...] of Hessians [..., n, n]; 1 for a Hessian of zeros."""
-        size = h.diagonal(dim1=-2, dim2=-1).abs().mean(-1)
+    def _shift(self, size: Tensor) -> Tensor:
+        """Return the damping for h; 1 for a Hessian of zeros."""
         return torch.where(size > 0, self.damping * size, 1.0)
 
     def _iterate(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
-        if self._factor is None or self._factor.shape[0] != gradient.shape[1]:
-            self._precondition(product, gradient)
-        step, converged = self._solve(product, gradient)
+        n = gradient.shape[1]
+        coins = torch.rand(n, generator=torch.Generator().manual_seed(0), device="cpu")
+        signs = torch.where(coins < 0.5, -1.0, 1.0).to(gradient)
+        size = (product(signs.expand_as(gradient)) @ signs)[:, None].abs() / n
+        _check(size)
+        if self._factor is None or self._factor.shape[0] != n:
+            self._precondition(product, gradient, size)
+        step, converged = self._solve(product, gradient, size)
         self._age += 1
         if not converged and self._age > _PATIENCE:
-            self._precondition(product, gradient)
-            step, _ = self._solve(product, gradient)
+            self._precondition(product, gradient, size)
+            step, _ = self._solve(product, gradient, size)
         return step
 
-    def _precondition(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> None:
-        """Factorise a mixture of the Hessians of the batch: column i is of element i modulo B."""
+    def _precondition(self, product: Callable[[Tensor], Tensor], gradient: Tensor, size: Tensor) -> None:
+        """Factorise a mixture of the Hessians of the batch over h, [B, 1]: column i is of element i modulo B."""
         n = gradient.shape[1]
         units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
         columns = []
         for part in units.split(len(gradient)):
             v = torch.zeros_like(gradient)
             v[: len(part)] = part
-            columns.append(product(v)[: len(part)])
+            columns.append((product(v) / torch.where(size > 0, size, 1.0))[: len(part)])
         h = _magnitudes(torch.cat(columns).double())
-        self._damping = float(self._shift(h))
-        self._factor = torch.linalg.cholesky(h + self._damping * torch.eye(n, dtype=h.dtype, device=h.device))
+        shift = self._shift(h.diagonal().abs().mean())
+        self._factor = torch.linalg.cholesky(h + shift * torch.eye(n, dtype=h.dtype, device=h.device))
         self._age = 0
 
-    def _solve(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> tuple[Tensor, bool]:
-        """Solve (H + damping I) s = g for all elements; an element ends at its tolerance or at negative curvature."""
-        factor = self._factor
+    def _solve(self, product: Callable[[Tensor], Tensor], gradient: Tensor, size: Tensor) -> tuple[Tensor, bool]:
+        """Solve (H + damping h I) s = g for all elements; an element ends at its tolerance or at negative curvature.
+
+        size: h, [B, 1].
+        """
+        factor, shift, unit = self._factor, self._shift(size), torch.where(size > 0, size, 1.0)
         assert factor is not None
 
         def precondition(r: Tensor) -> Tensor:
-            return torch.cholesky_solve(r.double().mT, factor).mT.to(r.dtype)
+            return torch.cholesky_solve(r.double().mT, factor).mT.to(r.dtype) / unit
 
         s, r = torch.zeros_like(gradient), gradient
         z = precondition(r)
         p, rz = z, (r * z).sum(1, keepdim=True)
         going = gradient.norm(dim=1, keepdim=True) > 0
         for iteration in range(self.iterations):
-            hp = product(p) + self._damping * p
+            hp = product(p) + shift * p
             bend = (p * hp).sum(1, keepdim=True)
             if not iteration:
                 s = torch.where(going & (bend <= 0), p, s)  # the gradient, in the metric of the preconditioner

@@ -147,9 +147,14 @@ class SecondOrder(Optimizer):
             raise ValueError("params must have a parameter that requires grad, got none")
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """Refuse a second group of parameters: the quadratic model has one Hessian."""
+        """Refuse a second group of parameters, because the quadratic model has one Hessian, and settings in a group."""
         if self.param_groups:
             raise ValueError("params must be one group: the quadratic model has one Hessian")
+        if own := param_group.keys() - {"params", "param_names"}:
+            raise ValueError(
+                f"params must have no settings of their own, got {', '.join(sorted(own))}: give them to "
+                f"{type(self).__name__}"
+            )
         super().add_param_group(param_group)
 
     @property

@@ -123,7 +123,7 @@ def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
     """Return lower and upper of bounds in any form; ValueError if two forms are possible.
 
     A list of tuples is a list of pairs. An array or tensor is read as the list of its rows. Two rows of two numbers are
-    taken where only one reading has lower < upper, or both are the same.
+    taken where only one reading has lower < upper, or both are the same. A tuple of two lists is never taken for pairs.
     """
     if hasattr(bounds, "lb") and hasattr(bounds, "ub"):  # scipy.optimize.Bounds
         return bounds.lb, bounds.ub
@@ -133,6 +133,7 @@ def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
         raise TypeError(f"bounds must be (lower, upper) or a list of {n} pairs, got {bounds!r}")
     if not isinstance(bounds, (tuple, list)):
         bounds = tuple(bounds)
+    sides = isinstance(bounds, tuple) and len(bounds) == 2 and all(isinstance(one, list) for one in bounds)
     pairs = len(bounds) == n and all(isinstance(one, (tuple, list)) and len(one) == 2 for one in bounds)
     columns = [list(one) for one in zip(*bounds, strict=True)] if pairs else []
     if pairs and isinstance(bounds, list) and all(isinstance(one, tuple) for one in bounds):
@@ -144,7 +145,7 @@ def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
             f"bounds of 2 parameters can be read in two ways, got {bounds}: write {as_pairs} if each parameter has a "
             f"pair, or {as_sides} if lower = {rows[0]} and upper = {rows[1]}"
         )
-    if pairs and (n != 2 or not _in_order(*rows)):
+    if pairs and (n != 2 or not (sides or _in_order(*rows))):
         return columns[0], columns[1]
     if len(bounds) != 2:
         raise ValueError(f"bounds must be (lower, upper) or a list of {n} pairs, got {len(bounds)} entries")

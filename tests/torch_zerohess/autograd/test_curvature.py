@@ -187,3 +187,14 @@ def test_parameters_that_the_loss_does_not_depend_on_have_no_curvature(mode):
     assert torch.equal(operator.to_dense(), torch.diag(torch.tensor([2.0, 2.0, 0.0, 0.0, 0.0, 0.0])))
     alone = zh.CurvatureOperator(linear.sum(), linear)  # its gradient has no graph at all
     assert torch.equal(alone.to_dense(), torch.zeros(2, 2))
+
+
+@pytest.mark.parametrize("through", ["a second pass", "a copy", "a new leaf"])
+def test_a_loss_that_is_not_computed_from_through_is_refused(through):
+    """Its curvature would be zero."""
+    net, x = torch.nn.Linear(3, 2), torch.ones(4, 3)
+    y = net(x)
+    other = {"a second pass": net(x), "a copy": y.clone(), "a new leaf": y.detach().requires_grad_()}[through]
+    with pytest.raises(ValueError, match=r"no tensor of \[\[4, 2\]\] is on the path to the loss"):
+        zh.CurvatureOperator(y.square().sum(), list(net.parameters()), mode="gauss_newton", through=other)
+    zh.CurvatureOperator(y.square().sum(), list(net.parameters()), mode="gauss_newton", through=[other, y])

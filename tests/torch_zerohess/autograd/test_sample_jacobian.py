@@ -185,3 +185,29 @@ def test_rows_of_an_outer_product_are_not_formed() -> None:
     w = torch.randn_like(y)
     expected = torch.cat([one.flatten() for one in torch.autograd.grad(y, parameters, w)])
     torch.testing.assert_close(products.pull(w.flatten()), expected, rtol=1e-3, atol=1e-4)
+
+
+class Pair(nn.Module):
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return x, x
+
+
+@pytest.mark.parametrize(
+    ("last", "error", "message"),
+    [
+        (nn.Flatten(0), ValueError, r"network must return \[1, n\] for one sample, got \[3\]: flatten the outputs"),
+        (nn.Unflatten(1, (1, 3)), ValueError, r"got \[1, 1, 3\]"),
+        (Pair(), TypeError, r"network must return a tensor \[B, n\], got tuple"),
+    ],
+)
+def test_outputs_of_other_forms_are_refused(last: nn.Module, error: type[Exception], message: str) -> None:
+    net = nn.Sequential(linear(), last).double()
+    with pytest.raises(error, match=message):
+        SampleJacobian(net, SAMPLES).products(list(net.parameters()))
+
+
+def test_batch_normalisation_without_running_statistics_is_refused() -> None:
+    """It mixes samples also in evaluation mode."""
+    net = nn.Sequential(linear(), nn.BatchNorm1d(3, track_running_stats=False)).double().eval()
+    with pytest.raises(ValueError, match=r"a BatchNorm1d without running statistics \('1'\), which mixes samples"):
+        SampleJacobian(net, SAMPLES).products(list(net.parameters()))

@@ -178,6 +178,56 @@ def test_the_decrease_is_the_decrease_of_the_model() -> None:
     assert float(short.s.norm()) == pytest.approx(0.1)
 
 
+def decrease_and_step(solver: str, radius: float) -> tuple[float, Tensor]:
+    net, found = network(), []
+    optimizer = zh.optim.NewtonCG(
+        net.parameters(),
+        curvature="gauss_newton",
+        solver=solver,
+        modification="abs",
+        damping=0.1,
+        radius=radius,
+        iterations=500,
+        tolerance=1e-13,
+        adapt=False,
+    )
+    inner = optimizer._minimise
+    optimizer._minimise = lambda *given: found.append(inner(*given)) or found[-1]  # type: ignore[method-assign]
+
+    def closure() -> tuple[Tensor, Tensor]:
+        y = net(IMAGES)
+        return losses(y).mean(), y
+
+    optimizer.step(closure)
+    return found[0].decrease, found[0].s
+
+
+@pytest.mark.parametrize("radius", [1e6, 0.05])
+def test_solvers_promise_the_same_decrease_for_the_same_step(radius) -> None:
+    """The decrease of the loss: damping is no part of it."""
+    (dual, s), (clip, other) = decrease_and_step("dual", radius), decrease_and_step("clip", radius)
+    torch.testing.assert_close(s, other, rtol=1e-5, atol=1e-8)
+    assert clip == pytest.approx(dual, rel=1e-5)
+
+
+def test_losses_of_elements_are_one_operator_for_the_dual_solver() -> None:
+    net, operators = network(), []
+    optimizer = zh.optim.NewtonCG(net.parameters(), curvature="gauss_newton", solver="dual", damping=1e-2, adapt=False)
+    optimizer._minimise = lambda model, *rest: (
+        operators.append(len(model._operators))
+        or Step(  # type: ignore
+            torch.zeros_like(model.gradient), 0.0, "converged"
+        )
+    )
+
+    def closure() -> tuple[Tensor, Tensor]:
+        y = net(IMAGES)
+        return losses(y), y
+
+    optimizer.step(closure)
+    assert operators == [1]
+
+
 def test_wrong_settings_say_so() -> None:
     net = network()
     for message, settings in (
@@ -191,3 +241,9 @@ def test_wrong_settings_say_so() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             zh.optim.NewtonCG(net.parameters(), **settings)  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError, match="params must have no settings of their own, got solver: give them to NewtonCG"
+    ):
+        zh.optim.NewtonCG([{"params": list(net.parameters()), "solver": "stehaug"}])  # type: ignore[list-item]
+    with pytest.raises(TypeError, match="adapt must be True or False, got 'no'"):
+        zh.optim.Newton(net.parameters(), adapt="no")  # type: ignore[arg-type]

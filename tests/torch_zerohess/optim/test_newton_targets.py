@@ -109,3 +109,12 @@ def test_losses_and_outputs_are_checked():
         targets(lambda y: y.detach().square().sum(1), torch.ones(2, 3))
     with pytest.raises(ValueError, match="is not finite"):
         targets(lambda y: (y * torch.inf).square().sum(1), torch.ones(2, 3))
+
+
+def test_many_outputs_are_damped_by_the_size_of_their_own_hessian() -> None:
+    """Quadratics a |y - 3|^2 with h = 2 a, one object for all calls: t = 3 (1 - damping / (1 + damping))."""
+    targets, y = NewtonTargets(damping=0.1), torch.zeros(4, 20)
+    for size in (100.0, 1.0, 0.01):
+        a = size * torch.tensor([1e-2, 1.0, 1e2, 10.0])
+        found = targets(lambda y, a=a: a * (y - 3.0).square().sum(1), y)
+        torch.testing.assert_close(found, torch.full_like(y, 3.0 / 1.1), rtol=1e-3, atol=0.0)

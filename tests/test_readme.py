@@ -52,6 +52,15 @@ def test_code_runs(name, tmp_path, monkeypatch):
         assert (names["fitted"].x - torch.tensor([0.6, 0.3])).abs().max() < 0.01
 
 
+@pytest.mark.parametrize("name", TEXTS)
+def test_every_row_of_a_table_has_the_cells_of_its_header(name):
+    cells = 0
+    for line in TEXTS[name].splitlines():
+        count = len(re.findall(r"(?<!\\)\|", line)) if line.startswith("|") else 0
+        assert not (cells and count) or count == cells, line
+        cells = count
+
+
 def searches(path: Path) -> list[str]:
     """The commands in comments of a file of settings, with lines that end in a backslash joined, cut at `;`."""
     text = re.sub(r"\\\n *# *", "", path.read_text())

@@ -55,6 +55,7 @@ class LocalEntropy:
     the valley, so that the gradient points to it from as far as it is hit at all (Chaudhari et al. 2017, "Entropy-SGD",
     equation 5). T = `temperature` times the mean loss under the smoothing, for each element of the batch: it needs no
     scale, and vanishes with the loss. T is not differentiated. For a large temperature the local entropy is the mean.
+    The estimate is the logarithm of a sample mean, hence biased if the samples are few.
 
     Args:
         head: outputs [K, *out], *aux [K, ...] -> losses [K].

@@ -2,8 +2,8 @@
 
 The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory`). New renders are made for few images
 of a batch. With up to 10 parameters the loss is the local entropy, which leaves plateaus where the mean does not. With
-more, no few draws hit a valley, and the loss is the mean. This is what a user would write: everything comes from the
-public names of the library. All tasks have the same settings, the defaults below, but for the radius of
+more parameters a few draws never hit a valley, and the loss is the mean. This is what a user would write: everything
+comes from the public names of the library. All tasks have the same settings, the defaults below, but for the radius of
 `memory_newton` on CNN-THROW. They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
 runs 100 to 107 of CNN-THROW. The weights in the coefficient of `zh.Memory` were chosen on runs 14, 16 and 17 of CNN
 with 1 200 renders, `output_radius` on runs 17, 33 and 36, and `warm_up` on run 8 of CNN-TEXTURE. No table reports one
@@ -30,7 +30,7 @@ from experiments.problems.network_task import NetworkTask
 from experiments.runs.network_trial import NetworkTrial
 
 _STEPS = 1000
-"""Steps at most; larger budgets get more fresh images per step."""
+"""Steps, about: larger budgets get more fresh images per step, a whole number of them."""
 _STEPS_ALONE = 4000
 """Steps where all evaluations are used before the first step."""
 ROWS = 200

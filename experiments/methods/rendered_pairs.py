@@ -1,9 +1,9 @@
 """Networks that are fitted to renders of known parameters.
 
 A network of a network task maps an output of the black box to parameters. Each evaluation is therefore a labelled
-example: the render, and the parameters of which it is the render. Labels need no further evaluation. They are exact
-within the bounds of a task. A point beyond is rendered as the nearest point within: the render does not change with
-that parameter, and the parameter does not count (see J below). The methods are
+example: the render, and the parameters of which it is the render. Labels need no further evaluation. A colour beyond
+its range is rendered as the nearest one within: where the render does not change with a parameter, J is about zero and
+the parameter hardly counts (see below). The methods are
 
 - `memory_pairs`: trains as `memory_newton` does and then fits the network to the evaluations that its memory has kept.
   They lie around the predictions, which approach the parameters of the training images.

@@ -91,8 +91,6 @@ class NetworkTask(ABC):
     n: ClassVar[int]
     sigma: ClassVar[tuple[float, float]]
     """First and last."""
-    bounds: ClassVar[tuple[tuple[float, ...], tuple[float, ...]] | None] = None
-    """Lower and upper, [n] or for all [1], if a point beyond is rendered as the nearest point within."""
     measure: ClassVar[str]
     """Name of what `measured` returns."""
 

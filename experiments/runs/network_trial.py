@@ -9,7 +9,7 @@ returns, or goes on until `trial.loss` or `trial.image` raise `Finished`. It has
     trial.loss(x, images)         black box with the loss after it: [K, n], [K, 3, h, w] -> [K], for K evaluations
     trial.image(x)                the black box alone: [K, n] -> [K, 3, h, w], for K evaluations
     trial.remaining               evaluations left; a call that needs more ends the run
-    trial.task                    n, sigma (first, last), bounds, evaluations (the budget) and size; its `image` and
+    trial.task                    n, sigma (first, last), evaluations (the budget) and size; its `image` and
                                   `loss` are not counted and not for methods
     trial.run, trial.seed         number of the run, and a seed for generators of the method; the global generator of
                                   torch is seeded

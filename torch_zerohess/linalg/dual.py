@@ -33,16 +33,3 @@ def dual_step(J: Jacobian, A: Tensor, g: Tensor, radius: float, damping: float) 
     moved = -scale * (gram @ w)  # J s
     decrease = -float(g @ moved + 0.5 * moved @ A @ moved)
     return Step(-scale * J.pull(w), decrease, "boundary" if scale < 1.0 else "converged")
-
-
-def clipped(step: Step, gradient: Tensor, radius: float, length: float | None = None) -> Step:
-    """Return a step of a quadratic model with this gradient [N], shortened to the radius.
-
-    length: of the step, in the units of the radius; its Euclidean norm if None.
-    """
-    length = float(step.s.norm()) if length is None else length
-    if length <= radius:
-        return step
-    slope, scale = float(gradient.dot(step.s.to(gradient))), radius / length
-    bend = -2.0 * (step.decrease + slope)  # s.Hs
-    return Step(scale * step.s, -scale * (slope + 0.5 * scale * bend), "boundary")

@@ -102,3 +102,16 @@ def _to_boundary(s: Tensor, direction: Tensor, radius: float) -> Tensor:
     a, b, c = direction.dot(direction), s.dot(direction), s.dot(s) - radius**2
     root = (b * b - a * c).clamp_min(0.0).sqrt()
     return -c / (b + root) if float(b) >= 0.0 else (root - b) / a
+
+
+def clipped(step: Step, gradient: Tensor, radius: float, length: float | None = None) -> Step:
+    """Return a step of a quadratic model with this gradient [N], shortened to the radius.
+
+    length: of the step, in the units of the radius; its Euclidean norm if None.
+    """
+    length = float(step.s.norm()) if length is None else length
+    if length <= radius:
+        return step
+    slope, scale = float(gradient.dot(step.s.to(gradient))), radius / length
+    bend = -2.0 * (step.decrease + slope)  # s.Hs
+    return Step(scale * step.s, -scale * (slope + 0.5 * scale * bend), "boundary")

@@ -7,8 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, checked_integer
-from torch_zerohess.linalg.dual import clipped
-from torch_zerohess.linalg.steihaug import Step, steihaug
+from torch_zerohess.linalg.steihaug import Step, clipped, steihaug
 from torch_zerohess.optim.newton_step import NewtonStep
 from torch_zerohess.optim.second_order import Model, check_not_negative, check_positive, check_radius
 

@@ -18,10 +18,8 @@ from torch_zerohess.linalg.dual import dual_step
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.steihaug import Step
 
-JacobianOf = Callable[[Sequence[Tensor]], Tensor]
-"""Parameters -> J [M, N] of the outputs of the white box, see `SampleJacobian`."""
-Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], JacobianOf]
-"""Result of a closure: the loss, or with it the tensors at which its white box ends, or with both their Jacobian."""
+Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], SampleJacobian]
+"""What a closure returns: loss, (loss, y), or (loss, y, jacobian), with the inputs y of the black boxes."""
 Closure = Callable[[], Loss]
 CURVATURES = ("exact", "gauss_newton")
 _OUTSIDE = 1e-4
@@ -43,7 +41,7 @@ class Model:
         losses: Tensor,
         operators: Sequence[CurvatureOperator],
         modification: str | None = None,
-        jacobian: JacobianOf | None = None,
+        jacobian: SampleJacobian | None = None,
     ) -> None:
         self.loss = losses.detach().mean()
         """[], the mean of the losses."""
@@ -107,10 +105,10 @@ class Model:
     @cached_property
     def _white_box(self) -> Jacobian:
         """J of all outputs of the white box."""
-        operator, given = self._operators[0], self._jacobian
-        if isinstance(given, SampleJacobian):
-            return given.products(operator.inputs)
-        return Rows(white_box_jacobian(operator) if given is None else given(operator.inputs))
+        operator = self._operators[0]
+        if self._jacobian is None:
+            return Rows(white_box_jacobian(operator))
+        return self._jacobian.products(operator.inputs)
 
     def longest_move(self, s: Tensor) -> float:
         """Return how far a step s [N] moves the input [n] of a black box, for the element that moves farthest."""
@@ -209,11 +207,13 @@ class SecondOrder(Optimizer):
                 one.copy_(before)
 
 
-def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, JacobianOf | None]:
+def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, SampleJacobian | None]:
     """Return the loss, the tensors at which the white box ends, and their Jacobian, as far as the closure gave them."""
     loss, through, jacobian = (*result, None, None)[:3] if isinstance(result, tuple) else (result, None, None)
     if not isinstance(loss, Tensor) or loss.numel() == 0:
         raise TypeError(f"closure must return the loss, a tensor with a graph, got {loss!r}")
+    if jacobian is not None and not isinstance(jacobian, SampleJacobian):
+        raise TypeError(f"closure must return a SampleJacobian after the loss and y, got {type(jacobian).__name__}")
     return loss, through, jacobian
 
 

@@ -25,9 +25,10 @@ class Descent(AskTell[Any]):
       loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises for a
       while. Where a step was predicted well (up to 40 parameters, no noise), Gauss-Newton by interpolation goes on in a
       trust region, until its steps fail.
-    - On a plateau, with the loss alone of more parameters, and with an output in noise the quadratic is one of the
-      smoothed loss, and sigma grows on the plateau. New samples around x are asked for where the model has predicted
-      badly.
+      With one or two parameters Gauss-Newton comes first, and after it the loss alone is modelled.
+    - The smoothed loss is modelled in three cases: on a plateau, with the loss alone and more than 40 parameters, and
+      with an output in noise. On a plateau sigma grows. New samples around x are asked for where the model has
+      predicted badly.
 
     Where sigma is below `tolerance` (with the loss alone a millionth of it, in noise a thousandth) the search has
     arrived at a minimum, possibly a local one. In noise it has also arrived where three steps in a row are within their

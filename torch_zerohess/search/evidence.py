@@ -1,8 +1,8 @@
 """The choice between a dense and a sparse model of the output, by how well each predicts held-out samples.
 
 The first batch has the points of the first batch of `Descent`, in two parts. The search goes on as `LocalGaussNewton`
-if the sparse Jacobian of the first part predicts most of the change of held-out samples, or if the sparse Jacobian of
-the whole batch predicts clearly more than the dense Jacobian of least norm. Otherwise it goes on as `Descent` with all
+if the sparse Jacobian predicts more of the change of held-out samples than the dense Jacobian of least norm does, by
+`_MORE`. After the first part it must also predict more than `_MOST` of it. Otherwise it goes on as `Descent` with all
 evaluations, and asks for the points that `Descent` alone would ask for.
 """
 

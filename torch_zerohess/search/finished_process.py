@@ -34,7 +34,7 @@ class FinishedProgress(ProcessProgress):
     finished: Tensor
     """Where the local search has ended [n]; infinite before."""
     waited: int = 0
-    """Evaluations since something better was found."""
+    """Evaluations since something better was found, or since the turn has changed."""
 
 
 F = TypeVar("F", bound=FinishedProgress)

@@ -23,8 +23,9 @@ class GaussianProcessSearch(AskTell[Any]):
 
     One evaluation follows another, unless `ask` gets a batch. The search has arrived when three steps in a row are
     shorter than `tolerance`, or when Gauss-Newton or quadratics have ended; these go on to a millionth of the
-    tolerance. After each of up to `restarts` arrivals it is more optimistic for some steps; of the loss alone it looks
-    where it knows least. With an output it does so if 4 (n + 1) evaluations took away less than a tenth of the loss.
+    tolerance. After each of up to `restarts` arrivals its next steps are more optimistic. With the loss alone they go
+    to points that it knows least. With an output they go there only if 4 (n + 1) evaluations have lowered the loss by
+    less than a tenth.
 
     In noise `x` is the point whose predicted output has the lowest loss, or with the loss alone the lowest predicted
     loss, and `value` is that prediction. Noise in outputs is detected after some 10 (n + 1) of them; noise in a plain

@@ -36,7 +36,7 @@ class Progress:
     iterations: int = 0
     """Steps tried."""
     rounds: int = 0
-    """Times the search has arrived."""
+    """Rounds that have ended, most of them where the search has arrived."""
     arrived: Best | None = None
     """The lowest point at which it has arrived."""
     agreed: int = 0

@@ -21,7 +21,7 @@ _EXCESS = 1.05
 """Evaluations over the capacity at which they are thinned."""
 _BLOCK = 1024
 """Points whose distances to others are held at once."""
-_FORGET = 0.9
+_KEPT = 0.9
 """Weight of what the coefficient knows, at every new call."""
 
 
@@ -233,7 +233,7 @@ class Memory:
         if len(self._moments) != len(new):
             self._moments = [[0.0, 0.0] for _ in new]
         self._moments = [
-            [_FORGET * old + (1.0 - _FORGET) * one for old, one in zip(kept, moments, strict=True)]
+            [_KEPT * old + (1.0 - _KEPT) * one for old, one in zip(kept, moments, strict=True)]
             for kept, moments in zip(self._moments, new, strict=True)
         ]
 

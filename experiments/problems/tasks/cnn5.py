@@ -5,8 +5,6 @@ the handle in 20 degrees, diffuse reflectance (r, g, b) in 0.1. The network is t
 268 773 weights, as in the source. Positions are U(-2, 2) cm, rotations as in CNN, reflectances U(0.1, 0.9).
 """
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -31,7 +29,6 @@ class PoseAndColor(NetworkTask):
     title = "a network that predicts position, rotation and colour of a mug"
     n = 5
     sigma = (1.0, 0.05)
-    bounds = (-math.inf, -math.inf, 0.0, 0.0, 0.0), (math.inf, math.inf, 10.0, 10.0, 10.0)
     measure = "rms error [units]"
 
     def encoder(self) -> Encoder:

@@ -71,7 +71,6 @@ class Texture(NetworkTask):
     title = "a network that emits the 32x32 texture on a mug"
     n = LABEL_SIDE**2
     sigma = (0.2, 0.02)
-    bounds = (0.0,), (1.0,)
     measure = "PSNR of the texture [dB]"
 
     def encoder(self) -> nn.Module:

@@ -8,9 +8,9 @@ import torch_zerohess as zh
 from torch_zerohess.autograd.blocks import jacobian, output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
-from torch_zerohess.linalg.dual import clipped, dual_step
+from torch_zerohess.linalg.dual import dual_step
 from torch_zerohess.linalg.jacobians import Rows
-from torch_zerohess.linalg.steihaug import Step
+from torch_zerohess.linalg.steihaug import Step, clipped
 
 
 def network() -> nn.Module:
@@ -226,6 +226,14 @@ def test_losses_of_elements_are_one_operator_for_the_dual_solver() -> None:
 
     optimizer.step(closure)
     assert operators == [1]
+
+
+def test_a_jacobian_of_another_kind_is_refused() -> None:
+    net = network()
+    optimizer = zh.optim.NewtonCG(net.parameters(), curvature="gauss_newton", solver="dual", damping=1e-2, adapt=False)
+    y = net(IMAGES)
+    with pytest.raises(TypeError, match="closure must return a SampleJacobian after the loss and y, got Tensor"):
+        optimizer.step(lambda: (losses(y).mean(), y, torch.ones(10, 44)))  # type: ignore[arg-type, return-value]
 
 
 def test_wrong_settings_say_so() -> None:

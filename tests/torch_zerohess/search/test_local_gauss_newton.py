@@ -33,7 +33,7 @@ def blur(x):
 
 
 def search_for(f, truth, **settings):
-    settings = {"sigma": 1.0, "loss": square(f(truth[None])[0]), "seed": 0} | settings
+    settings = {"sigma": 1.0, "loss": square(f(truth[None])[0]), "seed": 7} | settings  # samples are not the truth
     return LocalGaussNewton(torch.zeros(len(truth)).double(), **settings)
 
 
@@ -270,7 +270,7 @@ def test_bounds_are_kept_and_hold_parameters():
 
 def test_parameters_that_no_pixel_depends_on_stay_and_are_named():
     truth, start = normal(N), torch.full((N + 10,), 0.25).double()
-    search = LocalGaussNewton(start, sigma=1.0, loss=square(image(truth[None])[0]), seed=0)
+    search = LocalGaussNewton(start, sigma=1.0, loss=square(image(truth[None])[0]), seed=7)
     run(search, lambda x: image(x[:, :N]), 39)
     assert search.value < 0.05
     assert set(search.jacobian.untouched.nonzero()[:, 0].tolist()) <= set(range(N, N + 10))
@@ -371,7 +371,7 @@ def test_a_dense_jacobian_costs_no_evaluation_more_than_before(n):
 def test_minimize_takes_it():
     truth = normal(N)
     fit = zh.minimize(
-        image, torch.zeros(N).double(), sigma=1.0, loss=square(image(truth[None])[0]), target=1e-4, seed=0
+        image, torch.zeros(N).double(), sigma=1.0, loss=square(image(truth[None])[0]), target=1e-4, seed=7
     )
     assert fit.engine == "local"
     assert fit.evaluations <= 45

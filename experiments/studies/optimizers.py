@@ -2,8 +2,8 @@
 
 A pair is a function instance and one of 51 precisions, 1e2 to 1e-8. A method reaches a pair once it has evaluated a
 point whose value is within the precision of the minimum. The table has the share of pairs reached after 10 n, 30 n and
-100 n evaluations. Every method gets the same starts, the same box and the same size of the first step. A method that
-ends by itself starts again from a random point of the box.
+100 n evaluations, and after 500 n if runs may use so many. Every method gets the same starts, the same box and the same
+size of the first step. A method that ends by itself starts again from a random point of the box.
 
 Instances 11 to 15 are for tuning, 1 to 5 for tables. `--over` compares settings of a method; rivals have those of
 `experiments.methods.settings.rivals`.
@@ -36,9 +36,23 @@ from torch_zerohess.optim import TrustRegion
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search, output=False))
 RIVALS = ("cobyqa", "py_bobyqa", "lbfgs_fd", "cma_es_bounded")
 BUDGETS = (10, 30, 100)
-"""Evaluations over n after which the table counts."""
-HEADERS = ("n", "method", *(f"{budget} n" for budget in BUDGETS), "ms per evaluation", "runs")
-SUITE = Suite(OURS, RIVALS, ON_BBOB, HEADERS, "targets reached", "n")
+"""Evaluations over n after which the table counts,"""
+LARGE = 500
+"""and also after this many where runs may use them."""
+
+
+def budgets(most: int) -> tuple[int, ...]:
+    """Return the evaluations over n after which the table of runs of so many evaluations counts."""
+    return (*BUDGETS, LARGE) if most >= LARGE else BUDGETS
+
+
+def suite(most: int) -> Suite:
+    """Return what is compared, with the headers of the table for runs of so many evaluations over n."""
+    headers = ("n", "method", *(f"{budget} n" for budget in budgets(most)), "ms per evaluation", "runs")
+    return Suite(OURS, RIVALS, ON_BBOB, headers, "targets reached", "n")
+
+
+SUITE = suite(BUDGETS[-1])
 
 
 @dataclass(frozen=True)
@@ -110,7 +124,7 @@ def optimizers(
     parts, done = KeptParts(out), dict[Job, Reached]()
     for job in progress(jobs, "runs"):
         (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Reached, partial(_run, job, limit))
-    SUITE.conclude(rows(done), profiles(done), budget, out, store)
+    suite(budget).conclude(rows(done), profiles(done), budget, out, store)
 
 
 def _run(job: Job, limit: float) -> list[Reached]:
@@ -174,7 +188,7 @@ def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> It
         most = group[0][0].budget
         shares = [
             sum(one.share(budget * n) for _, one in group) / len(group) if budget <= most else None
-            for budget in BUDGETS
+            for budget in budgets(most)
         ]
         # A run that has reached the finest target has ended there.
         used = sum(

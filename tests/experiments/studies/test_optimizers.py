@@ -7,7 +7,7 @@ import torch
 
 from experiments.methods import METHODS
 from experiments.problems import bbob
-from experiments.studies.optimizers import OURS, Job, Reached, optimizers, profiles, reached, rows
+from experiments.studies.optimizers import OURS, Job, Reached, optimizers, profiles, reached, rows, suite
 
 
 @pytest.mark.parametrize("function", [1, 10, 24])
@@ -83,6 +83,11 @@ def test_the_table_has_shares():
     assert profiles(jobs) == {"n = 2": {"ours: gaussian_process": ([2.5] * 51, 102)}}
     (short,) = rows({replace(job, budget=20): found for job, found in jobs.items()})
     assert short[2:5] == [0.5, None, None]  # these runs could not use 30 n evaluations
+    late = {replace(job, budget=500): Reached((900,) * 51, 1.0) for job in jobs}
+    assert rows(late)[0][2:6] == [0.0, 0.0, 0.0, 1.0]
+    assert suite(500).headers[2:6] == ("10 n", "30 n", "100 n", "500 n")
+    assert suite(499).headers[2:5] == ("10 n", "30 n", "100 n")
+    assert len(suite(499).headers) == len(short)
 
 
 def test_what_is_not_on_the_platform_is_said(tmp_path):

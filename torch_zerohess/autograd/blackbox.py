@@ -236,9 +236,10 @@ class BlackBox(nn.Module):
             raise ValueError("the state has a memory, but the layer has none: make it with memory=Memory()")
         if unknown := settings.keys() - {one.name for one in fields(Smoothing)}:
             raise KeyError(f"state must be a state_dict of a BlackBox, this one has {', '.join(sorted(unknown))}")
-        self.smoothing = Smoothing(**settings)
+        smoothing = Smoothing(**settings)
         if memory is not None and self.memory is not None:
             self.memory.load_state_dict(memory)
+        self.smoothing = smoothing  # after what may fail
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]

@@ -56,6 +56,7 @@ class SampleJacobian:
         """Return J as its products. Raises as a call does.
 
         A weight whose only use is one product with a vector per sample, as in `torch.nn.Linear`, needs no row of J.
+        Where torch's `vmap` does not know an operation of the network, as of GRU, there are B n backward passes.
         """
         for name, one in self._network.named_modules():
             if isinstance(one, _OF_TRAINING) and getattr(one, "running_mean", 0) is None:
@@ -86,7 +87,12 @@ class SampleJacobian:
         differentiated = torch.func.vmap(
             torch.func.jacrev(output, argnums=(0, 1), has_aux=True), in_dims=(None, None, 0)
         )
-        (by_rows, by_slopes), inputs = differentiated(rows, slopes, self._samples)
+        try:
+            (by_rows, by_slopes), inputs = differentiated(rows, slopes, self._samples)
+        except RuntimeError as error:  # torch's vmap does not know the operations of GRU and PReLU, among others
+            if "random" in str(error):
+                raise
+            return Rows(self._one_by_one(parameters))
 
         def part(at: Places) -> Jacobian:
             if at in outer:
@@ -94,6 +100,17 @@ class SampleJacobian:
             return Rows(by_rows[at].flatten(2).flatten(0, 1))
 
         return Blocks([part(at) for at in chosen], [one.numel() for one in chosen.values()])
+
+    def _one_by_one(self, parameters: Sequence[Tensor]) -> Tensor:
+        """Return the rows by a backward pass for every output of every sample."""
+        rows = []
+        for sample in self._samples:
+            with torch.enable_grad():
+                outputs = _checked(self._network(sample[None]))[0]
+            for one in outputs:
+                parts = torch.autograd.grad(one, parameters, retain_graph=True, materialize_grads=True)
+                rows.append(torch.cat([part.reshape(-1) for part in parts]))
+        return torch.stack(rows)
 
     def _places(self) -> dict[int, Places]:
         """Return the names of every parameter by its identity: several if modules share it, one if a module repeats."""

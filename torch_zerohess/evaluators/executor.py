@@ -59,6 +59,10 @@ class Executor(Closing):
     def __repr__(self) -> str:
         return f"Executor({self.executor!r})"
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Executor":
+        """Return another one of the same executor, which is the caller's: a copy of a model goes on using it."""
+        return Executor(self.executor)
+
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Tensor:
         """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
         if self._closed:

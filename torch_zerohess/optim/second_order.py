@@ -93,8 +93,9 @@ class Model:
         J = self._white_box
         if float((self.gradient - J.pull(g).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
             raise ValueError(
-                "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone: "
-                "use solver 'steihaug' or 'clip'"
+                "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone, "
+                "samples of the Jacobian in the order of the loss, and a network in single or double precision: use "
+                "solver 'steihaug' or 'clip'"
             )
         if self._blocks is None:
             values = torch.linalg.eigvalsh(A)

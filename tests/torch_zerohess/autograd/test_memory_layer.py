@@ -310,6 +310,15 @@ def test_state_dict_carries_the_memory() -> None:
         layer(None).load_state_dict(first.state_dict())
 
 
+def test_a_state_whose_memory_is_wrong_changes_nothing() -> None:
+    first, second = layer(zh.Memory()), layer(zh.Memory())
+    state = first.state_dict()
+    settings = {**next(iter(state.values())), "sigma": 0.2, "memory": {"points": torch.zeros(0, 0)}}
+    with pytest.raises(KeyError):
+        second.set_extra_state(settings)
+    assert second.smoothing.sigma == SIGMA
+
+
 @pytest.mark.parametrize("door", ["layer", "freeze", "estimate"])
 def test_calls_of_two_threads_with_one_memory_follow_one_another(door: str) -> None:
     """The second call begins while the black box of the first one is called."""

@@ -211,3 +211,28 @@ def test_batch_normalisation_without_running_statistics_is_refused() -> None:
     net = nn.Sequential(linear(), nn.BatchNorm1d(3, track_running_stats=False)).double().eval()
     with pytest.raises(ValueError, match=r"a BatchNorm1d without running statistics \('1'\), which mixes samples"):
         SampleJacobian(net, SAMPLES).products(list(net.parameters()))
+
+
+class Last(nn.Module):
+    """The last output of a recurrent network over two vectors per sample."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = nn.GRU(2, 3, batch_first=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.inner(in_rows(x))[0][:, -1]
+
+
+@pytest.mark.parametrize("make", [Last, lambda: nn.Sequential(linear(), nn.PReLU(), linear(2, 3))])
+def test_networks_that_vmap_does_not_know_have_a_jacobian(make: Callable[[], nn.Module]) -> None:
+    torch.manual_seed(0)
+    net = make().double()
+    parameters = list(net.parameters())
+    torch.testing.assert_close(SampleJacobian(net, SAMPLES)(parameters), backward(net, parameters))
+
+
+def test_a_network_that_draws_random_numbers_is_refused() -> None:
+    net = Net(lambda net, x: nn.functional.dropout(net.a(x), training=True), a=linear()).double()
+    with pytest.raises(RuntimeError, match="random"):
+        SampleJacobian(net, SAMPLES).products(list(net.parameters()))

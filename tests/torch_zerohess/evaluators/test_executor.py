@@ -1,6 +1,7 @@
 """Executors of others: the same bits, one error, one making of the black box per process."""
 
 import concurrent.futures
+import copy
 import multiprocessing
 import threading
 import warnings
@@ -65,6 +66,15 @@ def test_threads_serve_a_layer_and_any_function(threads):
         for one in (None, Executor(threads))
     ]
     assert torch.equal(*slopes)
+
+
+def test_a_copy_of_a_layer_uses_the_same_executor(threads):
+    layer = zh.BlackBox(lambda z: (z**3).sum(1), zh.Smoothing(sigma=0.3, samples=8), evaluator=Executor(threads))
+    other = copy.deepcopy(layer)
+    assert other.call.evaluator is not layer.call.evaluator
+    assert other.call.evaluator.executor is threads
+    x = vector(0.3, 0.7)
+    assert torch.equal(other(x), layer(x))
 
 
 def test_the_error_is_that_of_the_first_point(threads):

@@ -216,7 +216,7 @@ class BlackBox(nn.Module):
         if transforms.watched(x):
             result: Tensor = torch.ops.torch_zerohess.evaluate_center(self._handle, x, aux)
             return result
-        return opaque.expand_center(self, x, aux)
+        return opaque.center(self, x, aux)
 
     @property
     def fn(self) -> Callable[..., Any]:

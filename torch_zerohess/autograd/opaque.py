@@ -31,6 +31,7 @@ class Owner(Protocol):
     memory: Memory | None
     control: Control | None
     output_shapes: dict[tuple[int | torch.Size, ...], torch.Size]
+    training: bool
 
 
 def expand(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Expansion:
@@ -39,6 +40,18 @@ def expand(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Expans
         expansion = evaluate(owner.call, x, aux, owner.smoothing, keep, owner.control).expansion
     owner.output_shapes[_signature(x.shape[1], aux)] = expansion.base.shape[1:]
     return expansion
+
+
+def center(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    """Return `expand_center`, after a random number that nobody needs.
+
+    A reentrant checkpoint calls this in its first pass, and draws in its second pass from a copy of the generator.
+    Without a draw in the first pass the generator would stay where it is, and all checkpoints would draw the same.
+    """
+    if owner.training:
+        with transforms.outside(), transforms.random_numbers_allowed():
+            owner.smoothing.drawn_seed()
+    return expand_center(owner, x, aux)
 
 
 def expand_center(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> Tensor:

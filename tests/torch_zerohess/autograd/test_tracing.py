@@ -42,6 +42,25 @@ def test_two_calls_of_a_noisy_function_in_compiled_code_are_two_calls() -> None:
     assert float(difference.detach()) == -1.0
 
 
+@pytest.mark.parametrize("reentrant", [True, False])
+def test_every_checkpoint_draws_new_samples(reentrant: bool) -> None:
+    layer, gradients = BlackBox(F, S.replace(seed=None)), []
+    for _ in range(3):
+        x = X.clone().requires_grad_()
+        checkpoint(layer, x, use_reentrant=reentrant).sum().backward()
+        gradients.append(x.grad)
+    assert not torch.equal(gradients[0], gradients[1])
+    assert not torch.equal(gradients[1], gradients[2])
+
+
+def test_evaluation_draws_nothing() -> None:
+    layer = BlackBox(F, S.replace(seed=None)).eval()
+    before = torch.get_rng_state()
+    with torch.no_grad():
+        layer(X)
+    assert torch.equal(before, torch.get_rng_state())
+
+
 def test_compiled_checkpoints_draw_the_same_again() -> None:
     layer = BlackBox(F, S.replace(seed=None))
 

@@ -21,11 +21,11 @@ class Jacobian(Protocol):
         """Return J J^T [M, M]."""
         ...
 
-    def pull(self, w: Tensor) -> Tensor:
+    def rmatvec(self, w: Tensor) -> Tensor:
         """Return J^T w [N] for w [M]."""
         ...
 
-    def push(self, v: Tensor) -> Tensor:
+    def matvec(self, v: Tensor) -> Tensor:
         """Return J v [M] for v [N]."""
         ...
 
@@ -44,10 +44,10 @@ class Rows:
     def gram(self) -> Tensor:
         return self.rows @ self.rows.mT
 
-    def pull(self, w: Tensor) -> Tensor:
+    def rmatvec(self, w: Tensor) -> Tensor:
         return self.rows.mT @ w.to(self.rows)
 
-    def push(self, v: Tensor) -> Tensor:
+    def matvec(self, v: Tensor) -> Tensor:
         return self.rows @ v.to(self.rows)
 
     def dense(self) -> Tensor:
@@ -69,11 +69,11 @@ class OuterProducts:
         of_inputs = (self.inputs @ self.inputs.mT).repeat_interleave(n, 0).repeat_interleave(n, 1)
         return (flat @ flat.mT) * of_inputs
 
-    def pull(self, w: Tensor) -> Tensor:
+    def rmatvec(self, w: Tensor) -> Tensor:
         slopes = (w.to(self.slopes).view(*self.slopes.shape[:2], 1) * self.slopes).sum(1)
         return (slopes.mT @ self.inputs).reshape(-1)
 
-    def push(self, v: Tensor) -> Tensor:
+    def matvec(self, v: Tensor) -> Tensor:
         moved = self.inputs @ v.to(self.inputs).view(self.slopes.shape[2], -1).mT
         return torch.einsum("bp,bnp->bn", moved, self.slopes).reshape(-1)
 
@@ -92,11 +92,11 @@ class Blocks:
     def gram(self) -> Tensor:
         return torch.stack([one.gram() for one in self.parts]).sum(0)
 
-    def pull(self, w: Tensor) -> Tensor:
-        return torch.cat([one.pull(w) for one in self.parts])
+    def rmatvec(self, w: Tensor) -> Tensor:
+        return torch.cat([one.rmatvec(w) for one in self.parts])
 
-    def push(self, v: Tensor) -> Tensor:
-        moved = [one.push(part) for one, part in zip(self.parts, v.split(list(self.sizes)), strict=True)]
+    def matvec(self, v: Tensor) -> Tensor:
+        moved = [one.matvec(part) for one, part in zip(self.parts, v.split(list(self.sizes)), strict=True)]
         return torch.stack(moved).sum(0)
 
     def dense(self) -> Tensor:

@@ -61,7 +61,7 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
     if h == 0.0:
         raise ValueError("the outputs of the network do not change with its weights: all are saturated")
     gram.diagonal().add_(damping * h)
-    step = J.pull(torch.linalg.solve(gram, change.detach().reshape(-1).double()))
+    step = J.rmatvec(torch.linalg.solve(gram, change.detach().reshape(-1).double()))
     _add(weights, step)
 
 

@@ -91,7 +91,7 @@ class Model:
         slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
         g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
         J = self._white_box
-        if float((self.gradient - J.pull(g).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
+        if float((self.gradient - J.rmatvec(g).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
             raise ValueError(
                 "solver 'dual' needs a loss that depends on the parameters through the inputs of black boxes alone, "
                 "samples of the Jacobian in the order of the loss, and a network in single or double precision: use "
@@ -118,7 +118,7 @@ class Model:
             moved = operator.output_step(s)
         else:
             sizes = [one.numel() for one in operator.through]
-            flat = self._white_box.push(s).split(sizes)
+            flat = self._white_box.matvec(s).split(sizes)
             moved = [one.view_as(y) for one, y in zip(flat, operator.through, strict=True)]
         return max(float(one.norm(dim=-1).max()) for one in moved)
 

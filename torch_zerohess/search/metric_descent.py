@@ -19,12 +19,12 @@ from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import further_start, normal
-from torch_zerohess.search.region_descent import LOST, RegionDescent, coefficients
+from torch_zerohess.search.region_descent import LOST, RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool
-from torch_zerohess.surrogates.quadratic import LocalModel, fit_values
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
 MOST = 40
 """Parameters up to which a metric is learned. A step costs O(n^3 + P^3) for n parameters and P evaluations."""

@@ -22,7 +22,7 @@ from torch_zerohess.search.random_points import further_start, normal, reflect
 from torch_zerohess.search.region_progress import latest
 from torch_zerohess.search.state import Best, Evaluated, Progress, arriving
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
-from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
 _FITTED = 3
 """Evaluations per coefficient that a quadratic is fitted to, at least."""
@@ -99,7 +99,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
         n = settings.n
-        self._coefficients = (n + 1) * (n + 2) // 2
+        self._coefficients = coefficients(n)
         self._least = _FITTED * self._coefficients
         most = max(self._least, min(_MORE * self._coefficients, _ENOUGH))
         self._most = min(most, max(settings.pool // 2, 1)) if settings.pool else most

@@ -20,11 +20,12 @@ from torch import Tensor
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.process_progress import ProcessProgress
-from torch_zerohess.search.region_descent import BAD, RegionDescent, coefficients
+from torch_zerohess.search.region_descent import BAD, RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress, latest
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.least_change import LeastNorm
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.quadratic import coefficients
 
 _PATIENCE = 5
 """Refused steps in a row after which the method has failed."""

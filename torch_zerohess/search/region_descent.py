@@ -17,7 +17,7 @@ from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal, reflect
 from torch_zerohess.search.region_progress import R
 from torch_zerohess.search.state import Best, Evaluated
-from torch_zerohess.surrogates.quadratic import LocalModel, fit_values
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
 _FINEST = 1e-6
 """Sigma at which a round ends, over the tolerance of the search."""
@@ -45,11 +45,6 @@ LOST = 10
 """Batches in a row with values that are not finite, after which a round ends."""
 _HALVING = 0.5
 """Factor for sigma after points of which no value is finite."""
-
-
-def coefficients(n: int) -> int:
-    """Return the number of coefficients of a quadratic."""
-    return (n + 1) * (n + 2) // 2
 
 
 class RegionDescent(Method[R]):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.surrogates.gaussian_process import DEVIATION_DEGREES
-from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
 _SPARE = 5
 """Evaluations beyond the coefficients of a quadratic, at least: the residuals give the standard errors."""
@@ -43,12 +43,12 @@ def quadratic_around(
     finite = torch.isfinite(values)
     points, values = points[finite], values[finite]
     n = len(x)
-    coefficients = (n + 1) * (n + 2) // 2
+    determined = coefficients(n)
     distance, order = (points - x).norm(dim=1).sort()
     best, least = None, math.inf
     narrower: list[tuple[Tensor, Tensor]] = []
-    count = coefficients + max(_SPARE, n)
-    most = len(order) if noise else min(len(order), _MOST * coefficients + _SPARE + n)
+    count = determined + max(_SPARE, n)
+    most = len(order) if noise else min(len(order), _MOST * determined + _SPARE + n)
     while count <= most:
         sigma = float(distance[count - 1]) / _REACH
         near = order[:count]

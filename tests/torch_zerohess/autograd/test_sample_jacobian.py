@@ -149,8 +149,8 @@ def test_rows_and_products_are_those_of_backward_passes(make) -> None:
     w, v = torch.randn(M, dtype=torch.float64), torch.randn(N, dtype=torch.float64)
     assert all(one is named[name] for name, one in net.named_parameters())  # the network keeps its parameters
     torch.testing.assert_close(products.gram(), expected @ expected.mT)
-    torch.testing.assert_close(products.pull(w), expected.mT @ w)
-    torch.testing.assert_close(products.push(v), expected @ v)
+    torch.testing.assert_close(products.rmatvec(w), expected.mT @ w)
+    torch.testing.assert_close(products.matvec(v), expected @ v)
 
 
 def test_it_is_of_the_parameters_that_are_given_in_their_order() -> None:
@@ -169,8 +169,8 @@ def test_parameters_of_two_precisions() -> None:
     w, v = torch.randn(expected.shape[0], dtype=torch.float64), torch.randn(expected.shape[1], dtype=torch.float64)
     near = {"rtol": 1e-5, "atol": 1e-5}
     torch.testing.assert_close(products.gram().double(), expected @ expected.mT, **near)
-    torch.testing.assert_close(products.pull(w).double(), expected.mT @ w, **near)
-    torch.testing.assert_close(products.push(v).double(), expected @ v, **near)
+    torch.testing.assert_close(products.rmatvec(w).double(), expected.mT @ w, **near)
+    torch.testing.assert_close(products.matvec(v).double(), expected @ v, **near)
 
 
 def test_rows_of_an_outer_product_are_not_formed() -> None:
@@ -184,7 +184,7 @@ def test_rows_of_an_outer_product_are_not_formed() -> None:
     y = net(samples)
     w = torch.randn_like(y)
     expected = torch.cat([one.flatten() for one in torch.autograd.grad(y, parameters, w)])
-    torch.testing.assert_close(products.pull(w.flatten()), expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(products.rmatvec(w.flatten()), expected, rtol=1e-3, atol=1e-4)
 
 
 class Pair(nn.Module):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import check_tensors, checked_integer
 from torch_zerohess.autograd.blocks import magnitudes
 from torch_zerohess.optim.second_order import check_positive
 
@@ -63,15 +63,25 @@ class NewtonTargets:
     def __call__(self, losses: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
         """Return the targets [B, n], without a graph.
 
-        Raises ValueError for y that is not [B, n], for losses that are not [B] or have no graph, and for a gradient or
-        curvature that is not finite.
+        Raises TypeError for y that is no tensor, and RuntimeError in inference mode. Raises ValueError for y that is
+        not [B, n], for losses that are not [B] or have no graph, and for a gradient or curvature that is not finite.
 
         Args:
             losses: outputs [B, n] -> losses [B], twice differentiable, each of its own element.
             y: outputs [B, n].
         """
+        check_tensors(y=y)
         if y.ndim != 2:
             raise ValueError(f"y must be [B, n], got {list(y.shape)}")
+        if not y.is_floating_point():
+            raise ValueError(f"y must be of floating point, got {y.dtype}")
+        if torch.is_inference_mode_enabled():
+            raise RuntimeError(
+                "targets need derivatives of the losses, which inference mode forbids: use torch.no_grad"
+            )
+        if not y.numel():
+            self.losses = y.new_zeros(len(y))
+            return y.detach().clone()
         at = y.detach().requires_grad_()
         with torch.enable_grad():
             values = losses(at)

@@ -118,3 +118,23 @@ def test_many_outputs_are_damped_by_the_size_of_their_own_hessian() -> None:
         a = size * torch.tensor([1e-2, 1.0, 1e2, 10.0])
         found = targets(lambda y, a=a: a * (y - 3.0).square().sum(1), y)
         torch.testing.assert_close(found, torch.full_like(y, 3.0 / 1.1), rtol=1e-3, atol=0.0)
+
+
+def test_wrong_outputs_say_so_and_none_have_no_targets() -> None:
+    targets = NewtonTargets()
+    for y, error, message in (
+        ([[1.0]], TypeError, "y must be a tensor, got list"),
+        (
+            torch.zeros(2, 3, dtype=torch.long),
+            ValueError,
+            r"y must be of floating point, got torch.int64",
+        ),
+        (torch.zeros(2), ValueError, r"y must be \[B, n\], got \[2\]"),
+    ):
+        with pytest.raises(error, match=message):
+            targets(lambda y: y.sum(1), y)
+    with torch.inference_mode(), pytest.raises(RuntimeError, match=r"inference mode forbids: use torch\.no_grad"):
+        targets(lambda y: y.square().sum(1), torch.zeros(2, 3))
+    for shape in ((0, 17), (0, 2), (2, 0)):
+        assert targets(lambda y: y.square().sum(1), torch.zeros(shape)).shape == shape
+        assert targets.losses.shape == shape[:1]

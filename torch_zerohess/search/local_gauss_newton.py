@@ -54,6 +54,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     Raises ValueError for settings out of range, and from the first `tell` for outputs of one number.
 
     Example:
+        >>> import torch
         >>> target = torch.rand(20, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         >>> loss = lambda image: (image - target).square().mean()
         >>> search = LocalGaussNewton(torch.zeros(400).double(), sigma=1.0, loss=loss, seed=0)

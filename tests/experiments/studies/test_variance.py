@@ -124,7 +124,8 @@ def test_problems_have_lower_case_names_too_and_both_tables_are_kept(tmp_path, n
 def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path, no_figures) -> None:
     methods = tuple(OURS + more for more in ("", ", memory", ", untrained network"))
     problems = ("BOX2", "WAVE2")
-    report = variance(runs=8, budgets=(32,), problems=problems, methods=methods, side=16, out=tmp_path, rivals=0)
+    # Estimates with and without a memory have other samples: few runs would compare noise.
+    report = variance(runs=96, budgets=(32,), problems=problems, methods=methods, side=16, out=tmp_path, rivals=0)
     for quantity in ("value", "gradient", "hessian", "hvp"):
         for problem, gain in (("WAVE2", 0.2), ("BOX2", 1.2)):  # images of BOX2 are hard to predict
             plain, memory, untrained = (measured(report, problem, name, 32, quantity).rmse for name in methods)

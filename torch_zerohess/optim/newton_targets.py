@@ -113,9 +113,8 @@ class NewtonTargets:
         units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
         columns = [product(unit.expand_as(gradient)) for unit in units]
         h = _magnitudes(torch.stack(columns, 2).double())
-        h = h + self._shift(h.diagonal(dim1=1, dim2=2).abs().mean(1))[:, None, None] * torch.eye(
-            n, dtype=h.dtype, device=h.device
-        )
+        shift = self._shift(h.diagonal(dim1=1, dim2=2).abs().mean(1))
+        h = h + shift[:, None, None] * torch.eye(n, dtype=h.dtype, device=h.device)
         return torch.linalg.solve(h, gradient.double()).to(gradient.dtype)
 
     def _shift(self, size: Tensor) -> Tensor:

@@ -18,14 +18,13 @@ from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation, Status
 from torch_zerohess.minimization.running import Running
+from torch_zerohess.minimization.stopping import Stopping
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 __all__ = ["Iterate", "Minimum", "Observation", "minimize"]
 
-_AGREED = 3
-"""Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
 _OTHER_NAMES = {
     "maxiter": "max_evaluations",
     "max_iter": "max_evaluations",
@@ -95,7 +94,8 @@ def minimize(
         target: the search ends when the value is at most this.
         xtol: the search ends when the region in which it looks is at most this wide on either side of the best point,
             in every parameter.
-        ftol: the search ends when its quadratic model, tested by the last step, promises a decrease of at most this.
+        ftol: the search ends when its quadratic model promises a decrease of at most this. Without `loss` the latest
+            2 (n + 1) evaluations must have lowered the loss by no more, too: such a model may be wrong.
         time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but a
             prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
@@ -181,34 +181,13 @@ def minimize(
 
     running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, verbose=verbose)
 
-    def ended() -> tuple[Status, str] | None:
-        search = running.search
-        if not running.begun:
-            return ("budget", running.budget) if running.spent else None
-        if search.done:
-            return running.ending(arrived=search.solved), search.message
-        if target is not None and running.reaches(target):
-            return "target", f"the value is at most the target {target}"
-        if xtol is not None and bool((search.width <= xtol).all()):
-            return running.ending(arrived=True), f"the region is within xtol ({xtol}) of x"
-        if ftol is not None and search.promise <= ftol:
-            return running.ending(arrived=True), f"the model promises a decrease of at most ftol ({ftol})"
-        if search.solved and (xtol, ftol) != (None, None):
-            return running.ending(arrived=True), "the search has arrived at x, within xtol and ftol"
-        if restarts is None and not running.noise and search.agreed >= _AGREED:
-            return "solved", f"{search.agreed} rounds in a row have arrived at x"
-        if running.spent:
-            return "budget", running.budget
-        if time_limit is not None and running.seconds > time_limit:
-            return "time", f"time_limit ({time_limit} s) used up"
-        return None
-
+    stopping = Stopping(target, xtol, ftol, time_limit, agrees=restarts is None)
     end: tuple[Status, str]
     black_box = blamed = "fn" if loss is None else "fn or loss"
     asked: tuple[Status, str] | None = None
     try:
         while True:
-            reached = ended() or asked
+            reached = stopping.reason(running) or asked
             if reached is None:
                 running.step()
                 blamed = "callback"
@@ -219,7 +198,7 @@ def minimize(
             end = reached
             if end[0] != "time":
                 running.decide()
-            if end[0] != "target" or ended() == end:  # in noise the decision may refute it
+            if end[0] != "target" or stopping.reason(running) == end:  # in noise the decision may refute it
                 break
     except KeyboardInterrupt:
         if not running.evaluations:

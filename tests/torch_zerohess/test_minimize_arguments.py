@@ -46,7 +46,7 @@ REFUSED = [
     ({"noise": "a"}, TypeError, "noise must be a number, got 'a'"),
     ({"noise": math.inf}, ValueError, "noise must be finite and at least 0, got inf"),
     ({"tolerance": 2.0}, ValueError, "tolerance must be between 0 and 1"),
-    ({"tolerance": None}, TypeError, "tolerance must be a number, got None"),
+    ({"tolerance": "fine"}, TypeError, "tolerance must be a number, got 'fine'"),
     ({"pool": 10.5}, TypeError, "pool must be an integer, got 10.5"),
     ({"sigma": 0.0}, ValueError, "sigma must be positive"),
     ({"sigma": None}, TypeError, r"sigma must be a number, or one per parameter \[2\], got None"),

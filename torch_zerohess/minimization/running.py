@@ -64,7 +64,7 @@ class Running:
         self._deciding: tuple[int, int] | None = None
         """Evaluations before the decision that is being made, and those that it gets."""
         self.search = make(self.noise or 0.0)
-        self._record = Record(call, lambda values: self.search.losses(values), self.search.x)
+        self.record = Record(call, lambda values: self.search.losses(values), self.search.x)
         if path is None or not path.exists():
             return
         try:
@@ -82,17 +82,17 @@ class Running:
     @property
     def begun(self) -> bool:
         """Whether the first batch has been evaluated."""
-        return self._record.complete > 0
+        return self.record.complete > 0
 
     @property
     def evaluations(self) -> int:
         """Evaluations so far, including the measurement of noise and the finished part of an interrupted batch."""
-        return self._record.evaluations
+        return self.record.evaluations
 
     @property
     def spent(self) -> bool:
         """Whether the evaluations that are left are too few for a step, or for the rest of an interrupted batch."""
-        return self.left < max(self._record.due, 1)
+        return self.left < max(self.record.due, 1)
 
     @property
     def left(self) -> int:
@@ -107,19 +107,19 @@ class Running:
         given, count = f"max_evaluations ({self._most})", self.evaluations
         if count > self._most:
             return f"{given} allows no more than the {count} so far"
-        rest = count < self._most and (self._record.due or self._last is not None)  # a decision uses up the others
+        rest = count < self._most and (self.record.due or self._last is not None)  # a decision uses up the others
         return f"{given} allows no step after the {count} so far" if rest else f"{given} used up"
 
     @property
     def jumps(self) -> bool:
         """Whether the black box jumps or fails next to the best point, which is then no minimum for sure."""
-        return jumps(*self._record.told, *self._best()[:2], self.search.unit)
+        return jumps(*self.record.told, *self._best()[:2], self.search.unit)
 
     @property
     def iterate(self) -> Iterate:
         """The best point and the values of the latest batch."""
         x, value, _ = self._best()
-        points, losses = self._record.last
+        points, losses = self.record.last
         return Iterate(self.evaluations, value, x, points.clone(), losses.clone())
 
     def step(self) -> None:
@@ -127,7 +127,7 @@ class Running:
 
         A step that was interrupted is completed.
         """
-        search, points, self._deciding = self.search, self._record.requested, None
+        search, points, self._deciding = self.search, self.record.requested, None
         if points is None:
             measured = self.noise is None and self.left > max(len(search.ask()), self._batch) + 1
             points = search.ask(max(self._batch - 1, 1)) if measured else search.ask(self._batch, limit=self.left)
@@ -137,12 +137,12 @@ class Running:
             self._first(points)
             return
         self.noise = self.noise or 0.0
-        search.tell(self._record.values(points))
+        search.tell(self.record.values(points))
         self._noted(points, search.told)
 
     def ending(self, *, arrived: bool) -> Status:
         """Return the status when the search ends by itself: in noise or at a jump a small region is no evidence."""
-        return "solved" if arrived and not self._record.flat and not self.noise and not self.jumps else "stalled"
+        return "solved" if arrived and not self.record.flat and not self.noise and not self.jumps else "stalled"
 
     def reaches(self, target: float) -> bool:
         """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.
@@ -153,14 +153,14 @@ class Running:
             return self._last.value <= target
         value, decided = self.search.value, self._decided
         if decided is not None:
-            value = float(self._record.told[1][decided.evaluations :].nan_to_num(nan=torch.inf).min())
+            value = float(self.record.told[1][decided.evaluations :].nan_to_num(nan=torch.inf).min())
         return value <= target - _LUCK * (self.noise or 0.0)
 
     def decide(self) -> None:
         """In noise, find out which of the best points has the lowest mean, with the evaluations kept for that."""
         if not self.noise or not self.begun or self._last is not None:
             return
-        self._record.note_known()
+        self.record.note_known()
         before, most = self._deciding or (self.evaluations, 0)
         allowed = min(reserved(self._most), self._most - before)
         if most != allowed:  # there is none to go on with
@@ -168,7 +168,7 @@ class Running:
         if allowed < 1:
             return
         self._deciding = before, allowed
-        (points, losses), search, believed = self._record.told, self.search, self._believed(before).x
+        (points, losses), search, believed = self.record.told, self.search, self._believed(before).x
         likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
         found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise, trusted=search.averages)
         if found is not None:
@@ -177,19 +177,19 @@ class Running:
 
     def write(self) -> None:
         """Write the file; it is never half written."""
-        if self._path is None or not (self.begun or self._record.known):  # there is nothing to go on with
+        if self._path is None or not (self.begun or self.record.known):  # there is nothing to go on with
             return
         self._written = time.monotonic()
         draft = self._path.with_name(f"{self._path.name}.part")
         decided = None if self._decided is None else vars(self._decided)
-        saved = {"noise": self.noise, "decided": decided, "deciding": self._deciding, **self._record.state_dict()}
+        saved = {"noise": self.noise, "decided": decided, "deciding": self._deciding, **self.record.state_dict()}
         torch.save(saved | {"search": self.search.state_dict()}, draft)
         draft.replace(self._path)
 
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""
         search = self.search
-        (x, value, error), (points, losses) = self._best(), self._record.told
+        (x, value, error), (points, losses) = self._best(), self.record.told
         found = self._model(x)
         gradient, hessian, errors, unit = None, None, None, search.unit
         if found is not None:
@@ -199,7 +199,7 @@ class Running:
             hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
             slope, bend = model.full_errors()
             errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
-        if self._record.flat and len(search.unit) < self.evaluations and status != "target":
+        if self.record.flat and len(search.unit) < self.evaluations and status != "target":
             message += f"; all {self.evaluations} values are equal: enlarge sigma"
         if status == "stalled" and not self.noise and self.jumps:
             message += "; fn jumps or fails next to x, which may be no minimum"
@@ -228,7 +228,7 @@ class Running:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
         self.noise = saved["noise"]
         self.search = self._make(self.noise or 0.0)
-        self._record.load_state_dict(saved, x := self.search.x)
+        self.record.load_state_dict(saved, x := self.search.x)
         self.search.load_state_dict(saved["search"])
         self._deciding = saved["deciding"]
         if saved["decided"] is not None:
@@ -245,9 +245,9 @@ class Running:
         if self._last is not None:
             return Belief(self._last.x, self._last.value, self._last.error)
         search = self.search
-        if not self.noise and search.evaluations and self._record.requested is None:
+        if not self.noise and search.evaluations and self.record.requested is None:
             return Belief(search.x, search.value, 0.0)
-        points, losses = self._record.told  # with the interrupted batch, which was not told to the search
+        points, losses = self.record.told  # with the interrupted batch, which was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):
             return self._believed(self.evaluations)
         return lowest(points, losses, search.x)
@@ -255,7 +255,7 @@ class Running:
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
         assert self.noise
-        points, losses = self._record.told
+        points, losses = self.record.told
         return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise)
 
     def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
@@ -266,7 +266,7 @@ class Running:
         found = self.search.model_at_best(x)
         if len(x) > _FITTED:
             return found
-        unit, (points, losses), noise = self.search.unit, self._record.told, self.noise or 0.0
+        unit, (points, losses), noise = self.search.unit, self.record.told, self.noise or 0.0
         around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
         if around is None or (found is not None and not noise and around[2] > _EXACT):
             return found
@@ -274,7 +274,7 @@ class Running:
 
     def _first(self, points: Tensor) -> None:
         """Evaluate the first points [K, n], and the start again; where its values differ, as often as noise needs."""
-        start, record = points[:1], self._record
+        start, record = points[:1], self.record
         every = torch.cat([points, start])
         known = record.known - len(every)  # of a measurement that was interrupted
         values = record.values(every)
@@ -301,16 +301,16 @@ class Running:
         losses = []
         for part in points.split(max(self._batch, self._least - 1)):  # no more at once than in the first batch
             try:
-                losses.append(self.search.losses(self._record.values(part)))
+                losses.append(self.search.losses(self.record.values(part)))
             except BaseException:  # Ctrl-C, too
-                self._record.note_known()
+                self.record.note_known()
                 raise
             self._noted(part, losses[-1])
         return torch.cat(losses)
 
     def _noted(self, points: Tensor, losses: Tensor) -> None:
         """Add a batch at points [K, n] with losses [K] to the record, and write it where it is due."""
-        self._record.note(points, losses)
+        self.record.note(points, losses)
         now = time.monotonic()
         if self._verbose and now - self._said >= _PAUSE:
             self._said = now

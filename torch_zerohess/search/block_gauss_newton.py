@@ -26,7 +26,7 @@ from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, ch
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Best, Evaluated, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 
 _SHIFTS = (1e-8, 1e8)
@@ -102,10 +102,14 @@ class BlockMethod(GaussNewton[BlockProgress]):
     def taken(self, known: BlockProgress, evaluated: Evaluated) -> BlockProgress:
         return super().taken(replace(known, wanted=max(1, round(self.block * self.settings.n))), evaluated)
 
+    def gradient(self, known: BlockProgress) -> Tensor:
+        return self._derivatives(known)[0]
+
     def moved(self, known: BlockProgress, step: Tensor, change: Tensor) -> BlockProgress:
         return replace(known, jacobian=renewed(known.jacobian, step[None], change[None]))
 
     def arrived(self, known: BlockProgress) -> BlockProgress:
+        known = arriving(known, Best(known.center, known.loss, known.sigma))
         return super().arrived(replace(known, wanted=self.settings.n))
 
     def distance(self, radius: float) -> float:

@@ -12,7 +12,7 @@ from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
 from torch_zerohess.search.random_points import further_start, normal, reflect
-from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
 
@@ -26,8 +26,6 @@ _SHARPNESS = 0.1
 """Mean squared distance, in units of sigma^2, within which evaluations weigh the same in a faithful model."""
 _BESIDE = 0.3
 """Spread, over sigma, of samples around the end of a step that are evaluated with it."""
-_REFUSED = 10
-"""Batches in a row with values that are not finite, after which a round ends."""
 _HALVING = 0.5
 """Factor for sigma after a step to a point whose value is not finite."""
 _RESTART = 1.5
@@ -71,9 +69,8 @@ class LocalQuadratics(Method[DescentProgress]):
     def take(self, known: DescentProgress, evaluated: Evaluated, generator: torch.Generator) -> DescentProgress:
         """Return the progress after an evaluation, with a step or the number of samples to ask for next."""
         known = self._remembered(known, evaluated)
-        if known.refused >= _REFUSED:
-            reason = f"{_REFUSED} batches in a row had values that are not finite"
-            known = replace(known, refused=0)  # a later round may have started where nothing is finite
+        if known.lost >= LOST:
+            reason = f"{LOST} batches in a row had values that are not finite"
             return self.arrive(known, reason, generator, last=known.rounds == 0)
         loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
         if known.phase == "trial":
@@ -145,7 +142,7 @@ class LocalQuadratics(Method[DescentProgress]):
             lowest=lowest,
             shape=evaluated.shape,
             evaluations=known.evaluations + len(evaluated),
-            refused=0 if bool(evaluated.needed.finite.all()) else known.refused + 1,
+            lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,
         )
 
     def _judged(self, known: DescentProgress, evaluated: Evaluated, loss: float) -> DescentProgress:
@@ -160,20 +157,21 @@ class LocalQuadratics(Method[DescentProgress]):
         self, known: DescentProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> DescentProgress:
         """End, or start another round: at a random point and around the best one in turn."""
-        settings, rounds = self.settings, known.rounds + 1
-        if known.refused < _REFUSED and known.sigma < settings.tolerance:
+        settings = self.settings
+        if known.lost < LOST and known.sigma < settings.tolerance:
             known = arriving(self._agreeing(known), known.lowest)
-        if last or rounds > settings.restarts:
-            return replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
+        known = known.ended_round(reason, 0 if last else settings.restarts)
+        if known.done:
+            return known
         center = known.best.point
-        if rounds % 2:
+        if known.rounds % 2:
             center = further_start(generator, known.first, settings.lower, settings.upper)
         return replace(
             known,
             phase="start",
             center=center,
             sigma=_RESTART,
-            rounds=rounds,
+            lost=0,
             lowest=Best(center),
             patience=0,
             faithful=False,

@@ -13,7 +13,7 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 BATCH = 64
 """Points asked for at a time, at most."""
 WIDEST = 1.6
-"""Largest sigma, in units of the first one."""
+"""Largest sigma to which plateaus and faithful models of the output widen it. Other good steps may widen it further."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -36,8 +36,6 @@ class DescentProgress(Progress):
     """Samples that are asked for; 0 once there is a model of them."""
     paired: bool = False
     """Whether these come in pairs x + d, x - d."""
-    refused: int = 0
-    """Batches in a row with values that were not finite at points that the search needed."""
     patience: int = 0
     """How often a plateau has been met in a row."""
     faithful: bool = False

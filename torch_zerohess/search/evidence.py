@@ -6,17 +6,17 @@ if the sparse Jacobian predicts more of the change of held-out samples than the 
 evaluations, and asks for the points that `Descent` alone would ask for.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LocalMethod, LocalProgress, LocalSettings
+from torch_zerohess.search.local_method import LocalMethod, LocalProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
+from torch_zerohess.search.relay import Relay
 from torch_zerohess.search.state import Best, Evaluated, Progress
-from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
 
 FEWEST = 20
@@ -48,18 +48,15 @@ class EvidenceProgress(Progress):
     local: LocalProgress | None = None
 
 
-_SHARED = tuple(field.name for field in fields(Progress))
-
-
-class EvidenceMethod(Method[EvidenceProgress]):
+class EvidenceMethod(Relay[EvidenceProgress]):
     """`OutputDescent` or `LocalMethod`, for outputs with a loss."""
 
     engine = "descent or local"
     progress = EvidenceProgress
 
-    def __init__(self, settings: Settings, own: LocalSettings) -> None:
+    def __init__(self, settings: Settings, local: LocalMethod) -> None:
         super().__init__(settings)
-        self.descent, self.local = OutputDescent(settings), LocalMethod(settings, own)
+        self.descent, self.local = OutputDescent(settings), local
 
     def first(self, generator: torch.Generator) -> tuple[EvidenceProgress, Tensor]:
         """Ask for the start and the first part of the samples."""
@@ -84,11 +81,11 @@ class EvidenceMethod(Method[EvidenceProgress]):
         if known.chosen == "local":
             assert known.local is not None
             local, points = self.local.next(known.local, evaluated, generator)
-            return _with(replace(known, local=local), local), points
+            return replace(known, local=local).taking(local), points
         if known.chosen == "descent":
             assert known.descent is not None
             descent, points = self.descent.next(known.descent, evaluated, generator)
-            return _with(replace(known, descent=descent), descent), points
+            return replace(known, descent=descent).taking(descent), points
         known = _gathered(known, evaluated)
         every = Evaluated(known.points, known.losses, known.outputs, known.shape)
         start = self.local.started(every)
@@ -99,25 +96,19 @@ class EvidenceMethod(Method[EvidenceProgress]):
             if sparse > dense + _MORE and (sparse > _MOST or not len(known.rest)):
                 local, points = self.local.step(start)
                 known = replace(_emptied(known), chosen="local", reason=f"a sparse Jacobian predicts {told}")
-                return _with(replace(known, local=local, descent=None), local), points
+                return replace(known, local=local, descent=None).taking(local), points
         if len(known.rest):
             return replace(known, rest=known.rest[:0]), known.rest
         known = replace(_emptied(known), chosen="descent", reason=f"a sparse Jacobian predicts {told}")
         assert known.descent is not None
         descent, points = self.descent.next(known.descent, every, generator)
-        return _with(replace(known, descent=descent), descent), points
+        return replace(known, descent=descent).taking(descent), points
 
     def more(self, known: EvidenceProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        if known.chosen != "descent" or known.descent is None:
-            return points[:0]
-        return self.descent.more(known.descent, points, count, generator)
+        return super().more(known, points, count, generator) if known.chosen else points[:0]
 
-    def model_at_best(self, known: EvidenceProgress) -> tuple[LocalModel, float] | None:
-        if known.local is not None:
-            return self.local.model_at_best(replace(known.local, best=known.best))
-        if known.descent is None:
-            return None
-        return self.descent.model_at_best(replace(known.descent, best=known.best))
+    def turn(self, known: EvidenceProgress) -> tuple[Method[Any], Any]:
+        return (self.descent, known.descent) if known.local is None else (self.local, known.local)
 
 
 def _gathered(known: EvidenceProgress, evaluated: Evaluated) -> EvidenceProgress:
@@ -141,8 +132,3 @@ def _gathered(known: EvidenceProgress, evaluated: Evaluated) -> EvidenceProgress
 def _emptied(known: EvidenceProgress) -> EvidenceProgress:
     """Forget the batch that the search has been given."""
     return replace(known, points=known.points[:0], losses=known.losses[:0], outputs=known.outputs[:0])
-
-
-def _with(known: EvidenceProgress, inner: Progress) -> EvidenceProgress:
-    """Copy the fields that every search has from the chosen search."""
-    return replace(known, **{name: getattr(inner, name) for name in _SHARED})

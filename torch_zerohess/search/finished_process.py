@@ -67,6 +67,21 @@ class FinishedProcess(ProcessMethod[F]):
             return self.local.more(known.local, points, count, generator)
         return super().more(known, points, count, generator)
 
+    def promise(self, known: F) -> float:
+        local = self._at_best(known)
+        return math.inf if local is None else self.local.promise(local)
+
+    def width(self, known: F) -> Tensor:
+        local = self._at_best(known)
+        return super().width(known) if local is None else self.local.width(local)
+
+    def _at_best(self, known: F) -> RegionProgress | None:
+        """Return the progress of the local search if it is at the best point, and its turn has come."""
+        local = known.local
+        if local is None or not known.finishing or not torch.equal(local.best.point, known.best.point):
+            return None
+        return local
+
     def is_new(self, known: F) -> bool:
         """Whether the best point is apart from the point where the local search has ended last."""
         return float((known.best.point - known.finished).norm()) > APART

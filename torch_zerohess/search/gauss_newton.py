@@ -14,17 +14,17 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.method import Method
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
-_REFUSED = 0.4
+_SHRINKING = 0.4
 """Factor of the radius where no step lowers the loss."""
+_INNER = 0.99
+"""Length of a step, over the radius, below which the radius did not shorten it."""
 _AROUND = 2.0
 """Distance from the center, over sigma sqrt(n), up to which the model at the center is one of the best point."""
-_ENDLESS = 10
-"""Batches in a row with values that are not finite, after which the search ends."""
 
 Q = TypeVar("Q", bound="JacobianProgress")
 
@@ -41,16 +41,12 @@ class JacobianProgress(Progress):
     """At the center [m], float64; empty before the first values."""
     loss: float = math.inf
     """At the center. The best point may be a sample with a lower loss."""
-    refused: int = 0
-    """Batches in a row without a finite value."""
 
     def counted(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with a batch counted; it is done after too many batches without a finite value."""
-        refused = 0 if bool(evaluated.finite.any()) else self.refused + 1
-        known = replace(self, shape=evaluated.shape, evaluations=self.evaluations + len(evaluated), refused=refused)
-        if refused < _ENDLESS:
-            return known
-        return replace(known, done=True, message=f"{_ENDLESS} batches in a row had no finite value")
+        lost = 0 if bool(evaluated.finite.any()) else self.lost + 1
+        known = replace(self, shape=evaluated.shape, evaluations=self.evaluations + len(evaluated), lost=lost)
+        return known if lost < LOST else known.ended_round(f"{LOST} batches in a row had no finite value", 0)
 
     def recorded(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with the lowest loss so far as the best one. Samples count as steps do."""
@@ -82,6 +78,10 @@ class GaussNewton(Method[Q]):
     @abstractmethod
     def steps(self, known: Q, radii: Tensor) -> Tensor:
         """Return a step [k, n] within each of the radii [k]."""
+
+    @abstractmethod
+    def gradient(self, known: Q) -> Tensor:
+        """Return the gradient [n] of the loss at the center."""
 
     @abstractmethod
     def moved(self, known: Q, step: Tensor, change: Tensor) -> Q:
@@ -136,18 +136,28 @@ class GaussNewton(Method[Q]):
             loss, radius = float(evaluated.losses[k]), float(step.norm()) / math.sqrt(self.settings.n)
             known = self.moved(replace(known, center=point, loss=loss, radius=radius, output=output), step, change)
         else:
-            known = replace(known, radius=_REFUSED * known.radius)
+            known = replace(known, radius=_SHRINKING * known.radius)
         if known.radius < self.settings.tolerance:
             known = self.arrived(known)
         return replace(known, sigma=self.distance(known.radius))
 
     def arrived(self, known: Q) -> Q:
         """Start again with the first radius, or end."""
-        rounds = known.rounds + 1
-        if rounds > self.settings.restarts:
-            message = f"steps were below {self.settings.tolerance} of sigma, {rounds} times"
-            return replace(known, rounds=rounds, done=True, message=message)
-        return replace(known, rounds=rounds, radius=self.radius, phase="sample")
+        known = known.ended_round(f"steps were below {self.settings.tolerance} of sigma", self.settings.restarts)
+        return known if known.done else replace(known, radius=self.radius, phase="sample")
+
+    def promise(self, known: Q) -> float:
+        """Return what the longest step that would be tried promises, if the model has its minimum there."""
+        longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
+        if known.phase != "trial":
+            return math.inf
+        (step,) = self.steps(known, known.center.new_tensor([longest]))
+        # At the minimum of a quadratic the decrease is half of what the gradient promises.
+        return -0.5 * float(self.gradient(known) @ step) if float(step.norm()) < _INNER * longest else math.inf
+
+    def width(self, known: Q) -> Tensor:
+        """Return the radius, for every parameter."""
+        return torch.full_like(known.center, known.radius)
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
         """The model of the latest Jacobian, moved from the center to the best point, without standard errors.

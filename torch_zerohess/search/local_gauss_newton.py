@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LocalMethod, LocalProgress, LocalSettings
+from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalProgress, LocalSettings
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
@@ -79,7 +79,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         share: float = 0.35,
         least_sigma: float = 0.03,
         restarts: int = 10,
-        tolerance: float = 5e-4,
+        tolerance: float = LOCAL_TOLERANCE,
         seed: int | None = None,
     ) -> None:
         self._own: dict[str, Any] = {"grid": grid, "keep": keep, "samples": samples, "rate": rate}

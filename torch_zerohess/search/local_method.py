@@ -25,7 +25,7 @@ from torch_zerohess.linalg.krylov import krylov_steps
 from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, check_share
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal, reflect
-from torch_zerohess.search.state import Best, Evaluated, agreeing
+from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
@@ -46,12 +46,14 @@ _HOP = 0.3
 """Standard deviation of a hop, in units of the first sigma."""
 _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
+LOCAL_TOLERANCE = 5e-4
+"""Radius, in units of sigma, at which the search has arrived, if the caller says nothing."""
 _ITERATIONS = 100
 """Products of the Hessian for a step."""
 _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
-_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "refused")
+_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "lost")
 """What a search that returns from a hop keeps."""
 
 
@@ -111,6 +113,11 @@ class LocalProgress(JacobianProgress):
     def failed(self) -> bool:
         """Whether the search has hopped and is not below the loss before."""
         return self.home is not None and self.loss >= self.home.loss
+
+    @property
+    def predicts(self) -> bool:
+        """Whether the Jacobian predicts so much that the end of a round is a minimum."""
+        return self.jacobian is not None and self.jacobian.explained > _PREDICTED
 
 
 class LocalMethod(GaussNewton[LocalProgress]):
@@ -200,6 +207,9 @@ class LocalMethod(GaussNewton[LocalProgress]):
         after = replace(after, samples=count, slow=known.slow + 1 if gain < _SLOW * abs(before) else 0)
         return self._stalled(after) if after.slow >= _STALLED else after
 
+    def gradient(self, known: LocalProgress) -> Tensor:
+        return self._derivatives(known)[0]
+
     def moved(self, known: LocalProgress, step: Tensor, change: Tensor) -> LocalProgress:
         """Keep the Jacobian, without new samples, if it predicted the change of the output."""
         assert known.jacobian is not None
@@ -211,18 +221,17 @@ class LocalMethod(GaussNewton[LocalProgress]):
         """End, hop, or begin again with the first radius where the Jacobian does not predict."""
         if known.failed:
             return self._returned(known)
-        predicts = known.jacobian is not None and known.jacobian.explained > _PREDICTED
-        if predicts:
-            known = agreeing(known, known.center, self.settings.tolerance)
-        known = super().arrived(known)
-        return self._hopping(replace(known, finished=True)) if predicts and not known.done else known
+        if not known.predicts:
+            return super().arrived(known)
+        known = arriving(known, Best(known.center, known.loss, known.sigma))
+        known = super().arrived(agreeing(known, known.center, self.settings.tolerance))
+        return known if known.done else self._hopping(replace(known, finished=True))
 
     def _stalled(self, known: LocalProgress) -> LocalProgress:
         """Hop, or return from a hop; go on where neither may help."""
         if known.failed:
             return self._returned(known)
-        predicts = known.jacobian is not None and known.jacobian.explained > _PREDICTED
-        if known.patient or known.rounds >= self.settings.restarts or not predicts:
+        if known.patient or known.rounds >= self.settings.restarts or not known.predicts:
             return known
         return self._hopping(known)
 
@@ -247,7 +256,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         home = known.home
         assert home is not None
         same = known.loss < math.inf and known.loss - home.loss <= _SAME * (known.hopped - home.loss)
-        known = replace(home, **{name: getattr(known, name) for name in _SHARED}, phase="sample", patient=True)
+        known = replace(home.taking(known, *_SHARED), phase="sample", patient=True)
         if not home.finished:
             return known
         known = agreeing(known, known.center, self.settings.tolerance) if same else replace(known, agreed=0)
@@ -256,6 +265,13 @@ class LocalMethod(GaussNewton[LocalProgress]):
 
     def distance(self, radius: float) -> float:
         return min(1.0, max(self.own.share * radius, self.own.least_sigma))
+
+    def promise(self, known: LocalProgress) -> float:
+        """Return the promise of a step at the best point, infinite after a hop from it."""
+        return super().promise(known) if known.predicts and known.home is None else math.inf
+
+    def width(self, known: LocalProgress) -> Tensor:
+        return super().width(known) if known.home is None else torch.full_like(known.center, math.inf)
 
     def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
         home = known.home

@@ -39,7 +39,8 @@ def after_loss(known: DescentProgress, point: Tensor, loss: float, noise: float)
         return known.sampling(unknown, paired=False) if ratio > _TRUSTED and unknown else known.trying()
     if model.significance < 0.0 and known.patience < _PATIENCE:
         patience = known.patience + (known.sigma >= WIDEST)
-        known = replace(known, sigma=min(_PLATEAU * known.sigma, WIDEST), patience=patience)
+        wider = max(known.sigma, min(_PLATEAU * known.sigma, WIDEST))
+        known = replace(known, sigma=wider, patience=patience)
     else:
         known = replace(known, sigma=_SHRINKING * known.sigma)
     return known.sampling(min(2**known.rounds, known.n))

@@ -19,9 +19,9 @@ from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import further_start, normal
-from torch_zerohess.search.region_descent import LOST, RegionDescent
+from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
-from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
@@ -38,6 +38,8 @@ _RATE, _FIRST_RATE = 0.3, 0.7
 """Rate at which the metric is learned from a full quadratic, and from the first one."""
 _CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
+_LATEST = 2
+"""Evaluations over n + 1 that must have gained no more than the model promises, for the promise to count."""
 _ROUNDED = 1e15
 """A Hessian of values that were larger than those of now by this factor is made of their roundings."""
 
@@ -91,7 +93,14 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         return super().model_at_best(known)
 
     def promise(self, known: MetricProgress) -> float:
-        return math.inf if known.wide is not None else super().promise(known)
+        """Return what the model promises, but no less than the latest evaluations have achieved: it may be wrong."""
+        before = known.values[: -_LATEST * (self._n + 1)]
+        if known.wide is not None or not len(before):
+            return math.inf
+        return max(super().promise(known), float(before.min() - known.values.min()))
+
+    def width(self, known: MetricProgress) -> Tensor:
+        return super().width(known) if known.wide is None else self._wide.width(known.wide)
 
     # Rounds.
 
@@ -115,33 +124,29 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[MetricProgress, Tensor]:
         """End, or start another round at a random point."""
-        settings, rounds = self.settings, known.rounds + 1
+        settings = self.settings
         if known.lost < LOST:
             known = agreeing(known, known.lowest.point, settings.tolerance)
             known = arriving(known, known.lowest)
-        if last or rounds > settings.restarts:
-            known = replace(known, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
+        known = known.ended_round(reason, 0 if last else settings.restarts)
+        if known.done:
             return known, known.points[:0]
         center = further_start(generator, known.first, settings.lower, settings.upper)
-        fresh = replace(
-            self._begun(Best(center)),
-            **{name: getattr(known, name) for name in ("iterations", *_SHARED)} | {"rounds": rounds},
-        )
-        return self._started(fresh, generator)
+        return self._started(self._begun(Best(center)).taking(known, "iterations", *_SHARED), generator)
 
     # Plateaus.
 
     def _on_plateau(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let isotropic quadratics go on from the best point."""
         pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
-        shared = {name: getattr(known, name) for name in ("first", *_SHARED)}
-        wide = replace(self._wide.go_on(pool, known.lowest, 1.0), **shared).sampling(self._n, paired=False)
+        wide = self._wide.go_on(pool, known.lowest, 1.0).taking(known, "first", *_SHARED)
+        wide = wide.sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
     def _widely(self, known: MetricProgress, wide: DescentProgress, points: Tensor) -> tuple[MetricProgress, Tensor]:
         """Return the progress of isotropic quadratics, and their points."""
-        names = (*_SHARED, "center", "sigma", "iterations", "done", "message")
-        return replace(known, wide=wide, **{name: getattr(wide, name) for name in names}), points
+        known = replace(known, wide=wide)
+        return known.taking(wide, *_SHARED, "center", "sigma", "iterations", "done", "message"), points
 
     # Models.
 

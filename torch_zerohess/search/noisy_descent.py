@@ -20,7 +20,7 @@ from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import further_start, normal, reflect
 from torch_zerohess.search.region_progress import latest
-from torch_zerohess.search.state import Best, Evaluated, Progress, arriving
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, arriving
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
@@ -48,8 +48,8 @@ _STILL = 3
 """Iterations in a row, in noise and with as many evaluations in the region as a fit takes, that are an arrival."""
 _FINEST = 1e-3
 """Sigma at which a round ends, over the tolerance of the search."""
-_LOST, _HALVING = 10, 0.5
-"""Batches in a row without a finite value that end a round, and the factor for sigma after each of them."""
+_HALVING = 0.5
+"""Factor for sigma after a batch without a finite value."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,8 +82,6 @@ class NoisyProgress(Progress):
     """Of the last step, in units of the region."""
     still: int = 0
     """Iterations in a row that told nothing new."""
-    lost: int = 0
-    """Batches in a row without a finite value."""
 
 
 class NoisyQuadratics(Method[NoisyProgress]):
@@ -114,8 +112,8 @@ class NoisyQuadratics(Method[NoisyProgress]):
         self, known: NoisyProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[NoisyProgress, Tensor]:
         known = self._remembered(known, evaluated)
-        if known.lost >= _LOST:
-            reason = f"{_LOST} batches in a row had values that are not finite"
+        if known.lost >= LOST:
+            reason = f"{LOST} batches in a row had values that are not finite"
             return self._arrived(known, reason, generator, last=known.rounds == 0)
         values = evaluated.losses[evaluated.finite]
         if known.lost or float(values.min()) > known.highest + _LOW * self._noise:
@@ -178,14 +176,13 @@ class NoisyQuadratics(Method[NoisyProgress]):
         self, known: NoisyProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[NoisyProgress, Tensor]:
         """End, or start another round at a random point."""
-        settings, rounds = self.settings, known.rounds + 1
-        known = replace(arriving(known, known.best), rounds=rounds)
-        if last or rounds > settings.restarts:
-            return replace(known, done=True, message=f"{reason}, in round {rounds}"), known.points[:0]
+        settings = self.settings
+        known = arriving(known, known.best).ended_round(reason, 0 if last else settings.restarts)
+        if known.done:
+            return known, known.points[:0]
         center = further_start(generator, known.first, settings.lower, settings.upper)
-        names = ("first", "evaluations", "iterations", "rounds", "arrived")
-        fresh = replace(self._begun(center, known.best), **{name: getattr(known, name) for name in names})
-        return self._started(fresh, generator)
+        fresh = self._begun(center, known.best)
+        return self._started(fresh.taking(known, "first", "evaluations", "iterations", "rounds", "arrived"), generator)
 
     # An iteration.
 

@@ -6,7 +6,8 @@ is a step that lowers the loss and whose output was predicted well. Where Gauss-
 from the best point, with the sigma that it had.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_descent import MOST
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
+from torch_zerohess.search.relay import Relay
 from torch_zerohess.search.state import Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -32,10 +34,7 @@ class OutputDescentProgress(Progress):
     smooth: OutputProgress | None = None
 
 
-_SHARED = tuple(field.name for field in fields(Progress))
-
-
-class OutputDescent(Method[OutputDescentProgress]):
+class OutputDescent(Relay[OutputDescentProgress]):
     """The method of `Descent` for an output under a loss. In noise, and above 40 parameters, it only follows.
 
     With one or two parameters it begins with Gauss-Newton: a quadratic of the loss, by which the descent goes on
@@ -53,7 +52,7 @@ class OutputDescent(Method[OutputDescentProgress]):
 
     def first(self, generator: torch.Generator) -> tuple[OutputDescentProgress, Tensor]:
         descent, points = self._follow.first(generator)
-        known = _with(OutputDescentProgress(best=descent.best, center=descent.center, descent=descent), descent)
+        known = OutputDescentProgress(best=descent.best, center=descent.center, descent=descent).taking(descent)
         if not self._may or self._follow.follows:
             return known, points
         smooth, points = self._smooth.first(generator)
@@ -72,22 +71,14 @@ class OutputDescent(Method[OutputDescentProgress]):
                 descent, descent.lowest, float((evaluated.points[0] - before.center).norm())
             )
             return self._went_on(known, *self._smooth.plan(smooth, generator), generator)
-        return _with(known, descent), self._follow.points(descent, generator)
+        return known.taking(descent), self._follow.points(descent, generator)
 
-    def more(self, known: OutputDescentProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        if known.smooth is not None:
-            return self._smooth.more(known.smooth, points, count, generator)
-        return self._follow.more(known.descent, points, count, generator)
+    def turn(self, known: OutputDescentProgress) -> tuple[Method[Any], Any]:
+        return (self._follow, known.descent) if known.smooth is None else (self._smooth, known.smooth)
 
     def model_at_best(self, known: OutputDescentProgress) -> tuple[LocalModel, float] | None:
         descent = known.descent if known.smooth is None else self._told(known.descent, known.smooth)
         return self._follow.model_at_best(replace(descent, best=known.best))
-
-    def promise(self, known: OutputDescentProgress) -> float:
-        return super().promise(known) if known.smooth is None else self._smooth.promise(known.smooth)
-
-    def width(self, known: OutputDescentProgress) -> Tensor:
-        return super().width(known) if known.smooth is None else self._smooth.width(known.smooth)
 
     def _is_smooth(self, before: DescentProgress, descent: DescentProgress, evaluated: Evaluated) -> bool:
         """Whether the end of a step had the output that was predicted, and a lower loss."""
@@ -103,9 +94,9 @@ class OutputDescent(Method[OutputDescentProgress]):
         self, known: OutputDescentProgress, smooth: OutputProgress, points: Tensor, generator: torch.Generator
     ) -> tuple[OutputDescentProgress, Tensor]:
         """Return the progress of Gauss-Newton and its points, or of the descent where Gauss-Newton is at its end."""
-        rounds = {one: getattr(known, one) for one in ("rounds", "arrived", "agreed", "place")}
         if not (smooth.done or smooth.failed):
-            return replace(_with(replace(known, smooth=smooth), smooth), **rounds), points
+            now = replace(known, smooth=smooth).taking(smooth)
+            return now.taking(known, "rounds", "arrived", "agreed", "place"), points
         descent = self._told(known.descent, smooth)
         if smooth.done:
             descent = replace(descent, sigma=min(smooth.sigma, 0.5 * self.settings.tolerance))
@@ -113,17 +104,12 @@ class OutputDescent(Method[OutputDescentProgress]):
         else:
             descent = replace(descent, center=smooth.lowest.point, value=smooth.lowest.loss, faithful=False)
             descent = descent.sampling(2)
-        return _with(replace(known, descent=descent, smooth=None), descent), self._follow.points(descent, generator)
+        return replace(known, descent=descent, smooth=None).taking(descent), self._follow.points(descent, generator)
 
     def _told(self, descent: DescentProgress, smooth: OutputProgress) -> DescentProgress:
         """Return the descent with the evaluations of Gauss-Newton."""
         pool = Pool.empty(descent.n, smooth.points.device)
         outputs = smooth.outputs if len(smooth.points) else None
         pool = pool.add(smooth.points, smooth.values, outputs, smooth.lowest.point, 1.0)
-        shared = {one: getattr(smooth, one) for one in ("best", "lowest", "evaluations", "iterations", "shape")}
-        return replace(descent, pool=pool, **shared)
-
-
-def _with(known: OutputDescentProgress, inner: Progress) -> OutputDescentProgress:
-    """Copy the fields that every search has."""
-    return replace(known, **{name: getattr(inner, name) for name in _SHARED})
+        descent = replace(descent, pool=pool)
+        return descent.taking(smooth, "best", "lowest", "evaluations", "iterations", "shape")

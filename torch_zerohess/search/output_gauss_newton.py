@@ -28,7 +28,7 @@ from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import coefficients
 
 _PATIENCE = 5
-"""Refused steps in a row after which the method has failed."""
+"""Rejected steps in a row after which the method has failed."""
 _HOLES = 3
 """Values in a row that are not finite, after which it has failed."""
 
@@ -72,7 +72,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     Args:
         settings: of the search.
         capacity: evaluations that are kept.
-        patience: refused steps in a row after which it has failed; `_PATIENCE` if None.
+        patience: rejected steps in a row after which it has failed; `_PATIENCE` if None.
     """
 
     progress = OutputProgress
@@ -85,8 +85,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         """Return the progress at the best point of a round of another search, with a region of the radius sigma."""
         pool = known.pool
         assert pool.outputs is not None
-        shared = {one: getattr(known, one) for one in ("best", "evaluations", "iterations", "shape")}
-        begun = replace(self._begun(lowest), **shared)
+        begun = self._begun(lowest).taking(known, "best", "evaluations", "iterations", "shape")
         return replace(begun, points=pool.points, values=pool.values, outputs=pool.outputs, sigma=sigma)
 
     def plan(self, known: OutputProgress, generator: torch.Generator) -> tuple[OutputProgress, Tensor]:
@@ -113,7 +112,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         error = (ratio - 1.0) * known.promised  # predicted loss minus the loss at the end of the step
         other = error + (-known.curved_part if known.curved else known.curved_part)
         known = replace(known, curved=known.curved != (abs(other) < abs(error)))
-        return replace(known, failed=ratio < BAD and known.refused >= self._patience), bad
+        return replace(known, failed=ratio < BAD and known.rejected >= self._patience), bad
 
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
         assert self.settings.loss is not None

@@ -21,8 +21,8 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 
 _STUCK, _BETTER = 4, 0.1
 """Evaluations over n + 1 after which it looks elsewhere, if none of them took away this part of the loss."""
-_REFUSED = 2
-"""Refused steps in a row of Gauss-Newton after which the process goes on."""
+_PATIENCE = 2
+"""Rejected steps in a row of Gauss-Newton after which the process goes on."""
 _WORTH = 0.1
 """Part of the loss that the first step of Gauss-Newton must promise to take away."""
 _WIDEST = 0.3
@@ -52,7 +52,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        self.local = OutputGaussNewton(replace(settings, restarts=0), self.capacity, _REFUSED)
+        self.local = OutputGaussNewton(replace(settings, restarts=0), self.capacity, _PATIENCE)
 
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:
         newton, best = known.local, known.best
@@ -97,7 +97,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         """Let Gauss-Newton go on, and return to the process where it ends."""
         assert known.local is not None
         now, points = self.local.next(known.local, evaluated, generator)
-        known = replace(self.told(known, now, evaluated), refused=now.lost)
+        known = replace(self.told(known, now, evaluated), lost=now.lost)
         if not now.done and not now.failed:
             return known, points
         best = known.best.point

@@ -22,7 +22,7 @@ from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.random_points import normal, reflect
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import LOST, Best, Evaluated
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -41,8 +41,6 @@ _FLOOR = 1e-2
 """Least sigma, over the tolerance."""
 ROUND = 2
 """Steps after an arrival, over n, that are more optimistic."""
-_REFUSED = 10
-"""Batches in a row with values that are not finite, after which the search ends."""
 _TELLING = 10
 """Evaluations over n + 1 from which high noise is told from fast variation."""
 _PROPORTION = 1e3
@@ -77,11 +75,11 @@ class ProcessMethod(Method[Q]):
             shape=evaluated.shape,
             evaluations=known.evaluations + len(evaluated),
             iterations=known.iterations + trial,
-            refused=0 if bool(evaluated.needed.finite.all()) else known.refused + 1,
+            lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,
         )
         before = known.best.point
-        if known.refused >= _REFUSED:
-            return replace(known, done=True, message=f"{_REFUSED} batches in a row had values that are not finite")
+        if known.lost >= LOST:
+            return known.ended_round(f"{LOST} batches in a row had values that are not finite", 0)
         known = self.remembered(known, evaluated.those(finite))
         known = self.avoiding(known, evaluated.points[~finite])
         if evaluated.extra:
@@ -178,11 +176,8 @@ class ProcessMethod(Method[Q]):
 
     def arrived(self, known: Q, reason: str) -> Q:
         """End, or explore."""
-        known = replace(known, settled=0, exploring=ROUND * self.settings.n, rounds=known.rounds + 1)
-        known = known.agreeing(self.settings.tolerance)
-        if known.rounds > self.settings.restarts:
-            return replace(known, done=True, message=f"{reason}, {known.rounds} times")
-        return known
+        known = replace(known, settled=0, exploring=ROUND * self.settings.n).agreeing(self.settings.tolerance)
+        return known.ended_round(reason, self.settings.restarts)
 
     def _settled(self, known: Q) -> Q:
         """Arrive where step after step stays at the best point."""

@@ -41,8 +41,6 @@ class ProcessProgress(Progress):
     """Steps in a row that stayed at the best point."""
     exploring: int = 0
     """Steps that are still to be more optimistic than others."""
-    refused: int = 0
-    """Batches in a row with values that were not finite at points that the search needed."""
     holes: Tensor
     """Points [H, n] whose values were not finite."""
     solved: Tensor

@@ -22,7 +22,7 @@ from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, are_same, plain, restored
-from torch_zerohess.search.told import converted, joined
+from torch_zerohess.search.told import check_start, converted, joined
 from torch_zerohess.search.told import evaluated as told
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -239,23 +239,19 @@ class AskTell(ABC, Generic[P]):
             raise RuntimeError("ask for points before telling their values")
         if which is not None or self._early:
             early = joined(self._early, values, self.missing if which is None else which, len(points))
-            if 0 in early.keys() - self._early.keys():
-                self._check_start(self._evaluated(early[0][None], points[:1]))
+            if 0 in early.keys() - self._early.keys() and not self.evaluations:
+                check_start(self._evaluated(early[0][None], points[:1]))
             if not early.keys() >= set(range(len(points))):
                 self._out, self._early = points, early
                 return
             values = torch.stack([early[k] for k in range(len(points))])
         evaluated = self._evaluated(values, points)
-        self._check_start(evaluated)
+        if not self.evaluations:
+            check_start(evaluated)
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
         self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.losses
-
-    def _check_start(self, evaluated: Evaluated) -> None:
-        """Raise ValueError for a start without a finite value."""
-        if self.evaluations == 0 and not bool(torch.isfinite(evaluated.losses[0])):
-            raise ValueError(f"the black box is not finite at the start x0: {float(evaluated.losses[0])}")
 
     def losses(self, values: Any) -> Tensor:
         """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""

@@ -16,7 +16,7 @@ from torch_zerohess.linalg.metric import region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal, reflect
 from torch_zerohess.search.region_progress import R
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import LOST, Best, Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
 _FINEST = 1e-6
@@ -24,9 +24,9 @@ _FINEST = 1e-6
 _FAR, _RELATIVELY = 3.0, 2.0
 """Evaluations farther than this, and than this times the distance of the n + 2 nearest ones, are left out."""
 BAD, _GOOD, _LONG = 0.1, 0.7, 0.8
-"""Part of its promise that a refused step achieves; a good step, and its length in units of the region."""
+"""Part of its promise that a rejected step achieves; a good step, and its length in units of the region."""
 _GROWTH, _SHRINKING = 2.0, 0.6
-"""Factors for sigma after a good long step and after a refused one."""
+"""Factors for sigma after a good long step and after a rejected one."""
 _OTHER_LENGTHS = (2.0, 0.5, 4.0, 0.25)
 """Sizes of the region, over sigma, for further steps that are evaluated at the same time."""
 _STILL, _CLOSING = 1e-3, 0.3
@@ -34,15 +34,13 @@ _STILL, _CLOSING = 1e-3, 0.3
 _LEAPING, _CONFIRMED = 1e-3, 0.1
 """The same where a point of the region was as predicted, within this part of its difference from the best point."""
 _CLOSE, _NEAR = 1.5, 2.0
-"""Distance within which n + 1 evaluations allow sigma to shrink after a refused step, and after one of no length."""
+"""Distance within which n + 1 evaluations allow sigma to shrink after a rejected step, and after one of no length."""
 _ROUNDING = 4 * torch.finfo(torch.float64).eps
 """Decrease, relative to the value, that is rounding."""
 _TOLD = 0.1
 """Distance, in units of the width of the model at the best point, from which an evaluation says something about it."""
 _TIES = 3
 """Steps in a row to exactly the same value that are a plateau."""
-LOST = 10
-"""Batches in a row with values that are not finite, after which a round ends."""
 _HALVING = 0.5
 """Factor for sigma after points of which no value is finite."""
 
@@ -163,7 +161,8 @@ class RegionDescent(Method[R]):
         return fit_values(u, values, torch.ones_like(values)), sigma
 
     def promise(self, known: R) -> float:
-        return known.promised if known.phase == "trial" and known.length < _LONG else math.inf
+        tested = known.phase == "trial" and known.iterations > 0 and known.rejected == 0
+        return known.promised if tested and known.length < _LONG else math.inf
 
     def width(self, known: R) -> Tensor:
         return known.sigma * known.root.norm(dim=0)
@@ -197,11 +196,11 @@ class RegionDescent(Method[R]):
         """Change sigma by the part of its promise that a step achieved; or return where the model knows least [n]."""
         if ratio >= BAD:
             grows = ratio > _GOOD and known.length > _LONG
-            return replace(known, refused=0, sigma=_GROWTH * known.sigma if grows else known.sigma), None
-        known = replace(known, refused=known.refused + 1)
+            return replace(known, rejected=0, sigma=_GROWTH * known.sigma if grows else known.sigma), None
+        known = replace(known, rejected=known.rejected + 1)
         u = known.scaled
         distance = u.norm(dim=1)
-        if int((distance <= _CLOSE).sum()) > self._n or known.refused % 2 == 0:
+        if int((distance <= _CLOSE).sum()) > self._n or known.rejected % 2 == 0:
             return replace(known, sigma=_SHRINKING * known.sigma), None
         nearest = u[distance.argsort()[: self._fitted]]
         return known, torch.linalg.eigh(nearest.mT @ nearest)[1][:, 0]

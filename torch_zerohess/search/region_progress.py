@@ -42,12 +42,10 @@ class RegionProgress(Progress):
     """Loss that the model predicts at a point for the model."""
     confirmed: bool = False
     """Whether the last such point was as predicted."""
-    refused: int = 0
-    """Steps in a row that were refused."""
+    rejected: int = 0
+    """Steps in a row that were rejected."""
     tied: int = 0
     """Steps in a row whose end has exactly the value of the best point."""
-    lost: int = 0
-    """Batches in a row with values that were not finite at points that the search needed."""
 
     @property
     def scaled(self) -> Tensor:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
 import torch
@@ -10,6 +10,9 @@ from torch import Tensor
 
 T = TypeVar("T")
 _SCALAR = torch.Size()
+
+LOST = 10
+"""Batches in a row with values that are not finite, after which a round ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +46,27 @@ class Progress:
     """Rounds in a row that have arrived at one point, the best one."""
     place: Tensor | None = None
     """Where the first of them arrived [n]."""
+    lost: int = 0
+    """Batches in a row with values that were not finite at points that the search needed."""
     done: bool = False
     message: str = ""
     """Why the search is done."""
     shape: torch.Size = _SCALAR
     """Of an output, [*out]; empty before the first one and where the black box returns the loss."""
 
+    def taking(self: "P", other: "Progress", *names: str) -> "P":
+        """Return this progress with fields of another one: those of the names, or all that every search has."""
+        return replace(self, **{name: getattr(other, name) for name in names or _COMMON})
+
+    def ended_round(self: "P", reason: str, restarts: int) -> "P":
+        """Count a round that ends. The search is done after `restarts` further rounds."""
+        rounds = self.rounds + 1
+        if rounds <= restarts:
+            return replace(self, rounds=rounds)
+        return replace(self, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
+
+
+_COMMON = tuple(field.name for field in fields(Progress))
 
 P = TypeVar("P", bound=Progress)
 
@@ -56,7 +74,7 @@ P = TypeVar("P", bound=Progress)
 def arriving(known: P, end: Best) -> P:
     """Note that the search has arrived."""
     lower = end.loss < (math.inf if known.arrived is None else known.arrived.loss)
-    return dataclasses.replace(known, arrived=end) if lower else known
+    return replace(known, arrived=end) if lower else known
 
 
 def are_same(one: Tensor, other: Tensor, tolerance: float) -> bool:
@@ -71,10 +89,10 @@ def agreeing(known: P, end: Tensor, tolerance: float) -> P:
     """
     best = known.best.point
     if not are_same(end, best, tolerance):
-        return dataclasses.replace(known, agreed=0)
+        return replace(known, agreed=0)
     if known.place is not None and are_same(best, known.place, tolerance):
-        return dataclasses.replace(known, agreed=known.agreed + 1)
-    return dataclasses.replace(known, agreed=1, place=best)
+        return replace(known, agreed=known.agreed + 1)
+    return replace(known, agreed=1, place=best)
 
 
 @dataclass(frozen=True, eq=False)

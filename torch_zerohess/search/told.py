@@ -1,5 +1,6 @@
 """The values that a caller tells about the points of a search: checked, and kept until all of them are known."""
 
+import math
 import reprlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -68,3 +69,17 @@ def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count
         if other.shape != values.shape[1:]:
             raise ValueError(f"values must have outputs {list(other.shape)} as before, got {list(values.shape[1:])}")
     return early | {one: value.clone() for one, value in zip(numbers, values, strict=True)}
+
+
+def check_start(start: Evaluated) -> None:
+    """Raise ValueError if the first point, which is the start, has no finite value."""
+    if bool(start.finite[0]):
+        return
+    loss = float(start.losses[0])
+    if start.outputs is None or not math.isfinite(loss):
+        raise ValueError(f"the black box is not finite at the start x0: {loss}")
+    count = int((~torch.isfinite(start.outputs[0])).sum())
+    raise ValueError(
+        f"{count} of {start.outputs.shape[1]} numbers of the output at the start x0 are not finite: the search "
+        f"models every number, also those that the loss ignores; return finite numbers there"
+    )

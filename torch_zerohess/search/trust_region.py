@@ -1,6 +1,7 @@
 """The choice of a search by the number of parameters, their bounds, and the first evaluations."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 from torch import Tensor
@@ -8,11 +9,13 @@ from torch import Tensor
 from torch_zerohess.search.descent_search import descent_method
 from torch_zerohess.search.evidence import FEWEST, EvidenceMethod, EvidenceProgress
 from torch_zerohess.search.gaussian_process_search import process_method
-from torch_zerohess.search.local_method import LocalMethod, LocalSettings
+from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalSettings
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
 
+_TOLERANCE = 1e-2
+"""Length, in units of the first sigma, below which a search has arrived, if the caller says nothing."""
 _MOST = 4
 """Parameters up to which random candidates cover a box."""
 
@@ -39,7 +42,8 @@ class TrustRegion(AskTell[Any]):
             networks in it. None if the black box returns the loss.
         engine: "auto", "gaussian_process", "descent" or "local".
         restarts: how often to go on after the search has arrived at a minimum. 0 for a local search.
-        tolerance: length, in units of the first sigma, below which the search has arrived.
+        tolerance: length, in units of the first sigma, below which the search has arrived; 0.01 if None, for the
+            engine "local" 0.0005.
         noise: standard deviation of repeated losses at one point, if it is known.
         pool: evaluations kept; a default by the number of parameters if None.
         grid: rows and columns in which the parameters lie, for the engine "local": see `LocalGaussNewton`.
@@ -68,7 +72,7 @@ class TrustRegion(AskTell[Any]):
         loss: Callable[[Tensor], Tensor] | None = None,
         engine: Engine = "auto",
         restarts: int = 10,
-        tolerance: float = 1e-2,
+        tolerance: float | None = None,
         noise: float = 0.0,
         pool: int | None = None,
         grid: tuple[int, ...] | None = None,
@@ -76,14 +80,14 @@ class TrustRegion(AskTell[Any]):
     ) -> None:
         if engine not in ENGINES:
             raise ValueError(f"engine must be one of {ENGINES}, got {engine!r}")
-        self._wanted, self._grid = engine, grid
+        self._wanted, self._grid, self._tolerance = engine, grid, tolerance
         super().__init__(
             x0,
             sigma=sigma,
             bounds=bounds,
             loss=loss,
             restarts=restarts,
-            tolerance=tolerance,
+            tolerance=_TOLERANCE if tolerance is None else tolerance,
             noise=noise,
             pool=pool,
             seed=seed,
@@ -109,8 +113,10 @@ class TrustRegion(AskTell[Any]):
             return process_method(settings)
         if self._wanted == "descent" or (engine == "descent" and (settings.loss is None or settings.n < FEWEST)):
             return descent_method(settings)
+        tolerance = LOCAL_TOLERANCE if self._tolerance is None else settings.tolerance
         own = LocalSettings.checked(settings, grid=self._grid)
-        return LocalMethod(settings, own) if engine == "local" else EvidenceMethod(settings, own)
+        local = LocalMethod(replace(settings, tolerance=tolerance), own)
+        return local if engine == "local" else EvidenceMethod(settings, local)
 
 
 def _chosen(settings: Settings) -> tuple[str, str]:

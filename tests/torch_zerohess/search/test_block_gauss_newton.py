@@ -201,7 +201,7 @@ def test_where_no_step_lowers_the_loss_the_radius_shrinks_until_it_arrives():
         rounds.append(search.rounds)
     assert search.rounds == 2
     assert search.value == 0.0
-    assert "below 0.05 of sigma, 2 times" in search.message
+    assert "below 0.05 of sigma, in round 2" in search.message
     # 0.5 x 0.4^3 < 0.05: three refusals, and again from the first radius with a whole basis.
     once = [0.05, 0.02, 0.02, 0.008, 0.008, 0.05]
     assert sigmas[:6] == pytest.approx(once)

@@ -1,6 +1,7 @@
 """Descent on functions with known minima, and past values that are not finite."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -172,7 +173,7 @@ def test_a_wall_of_values_that_are_not_finite(wrong, output):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_a_refused_step_is_shortened(noise):
+def test_a_rejected_step_is_shortened(noise):
     search = Descent(zeros(1), sigma=1.0, noise=noise, seed=0)
     search.tell((search.ask()[:, 0] - 5) ** 2)
     sigma, x = search.sigma, search.x
@@ -339,6 +340,17 @@ def test_after_ten_batches_without_a_finite_value_it_ends(noise):
         batches += 1
     assert batches == 10
     assert "10 batches in a row had values that are not finite" in search.message
+
+
+@pytest.mark.parametrize(("lost", "arrives"), [(9, True), (10, False)])
+def test_a_round_without_finite_values_has_not_arrived(lost, arrives):
+    """However small sigma is: such a round ends beside a wall."""
+    search = Descent(zeros(3), sigma=1.0, loss=torch.sum, noise=0.1, seed=0)
+    search.tell(bowl(search.ask())[:, None])
+    method, known = search._method._follow, search._state.progress.descent
+    ended = method.arrive(replace(known, lost=lost, sigma=1e-9), "it ends", torch.Generator())
+    assert (ended.arrived is not None) == arrives
+    assert (ended.rounds, ended.lost) == (1, 0)
 
 
 @pytest.mark.parametrize(("n", "follows"), [(1, False), (2, False), (3, True)])

@@ -94,11 +94,6 @@ CASES = {
     "a well": Case(process(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0)), well, 1e-6, 205),
     "a curved valley in a box": Case(process(zeros(2) - 1.2, sigma=0.5, bounds=(-2.0, 2.0)), rosenbrock, 1e-6, 270),
     "ripples": Case(process(vector(-4.0, 4.0), sigma=1.0, bounds=(-5.0, 5.0)), ripples, 1e-3, 340, 8),
-    "ripples beside a penalty": Case(
-        process(vector(-4.0, 4.0), sigma=1.0, bounds=(-5.0, 5.0)),
-        lambda z: torch.where(z[:, 1] > 4.1, 1e12, ripples(z)),
-        *(1e-3, 560, 8),
-    ),
     "a bowl in a box": Case(process(zeros(3), sigma=1.0, bounds=(-4.0, 5.0)), bowl, 1e-6, 140),
 }
 

@@ -135,7 +135,7 @@ def test_it_arrives_after_three_short_steps_and_explores():
             assert search.state_dict()["progress"]["exploring"] == 2
             moved = []
     assert search.rounds == 2
-    assert search.message == "3 steps in a row were below 0.01 of sigma, 2 times"
+    assert search.message == "3 steps in a row were below 0.01 of sigma, in round 2"
     assert abs(float(search.x[0]) - 1.0) < 0.02
 
 
@@ -296,3 +296,21 @@ def test_close_to_a_minimum_that_is_solved_the_step_is_to_the_minimum(distance, 
     x = search._method._lowest(known, lambda z: (z - other).square().sum(-1), torch.Generator().manual_seed(0))
     assert torch.equal(x, best) == stays
     assert stays or float((x - other).norm()) < 0.01
+
+
+def test_a_penalty_hides_no_differences():
+    """Values of a bowl up to 50, and one of 1e12: the process tells the others apart as without it."""
+
+    def predicted(penalty):
+        search = GaussianProcessSearch(vector(-1.0, 1.0), sigma=1.0, bounds=(-5.0, 5.0), seed=0)
+        while search.evaluations < 12:
+            points = search.ask()
+            search.tell(torch.where(points[:, 0] > 0.5, penalty, points.square().sum(1)))
+        known = search._state.progress
+        low = known.pool.values < 50.0
+        model = search._method._of_losses(known)[1]
+        return model.process.predict(known.pool.points[low])[:, 0], known.pool.values[low]
+
+    outputs, values = predicted(1e12)
+    assert float(torch.corrcoef(torch.stack([outputs, values]))[0, 1]) > 0.99
+    assert float(outputs.max() - outputs.min()) > 1e-4

@@ -94,3 +94,8 @@ def test_on_a_plateau_sigma_grows_for_a_while(sigma, patience, then):
     after = after_loss(step(significance=-1.0, sigma=sigma, patience=patience), END, 10.0, 0.0)
     assert (after.sigma, after.patience) == (pytest.approx(then[0]), then[1])
     assert after.phase == "sample"
+
+
+def test_a_plateau_never_narrows_sigma():
+    """Good steps may have widened it beyond what a plateau widens it to."""
+    assert after_loss(step(significance=-1.0, sigma=5.0), END, 11.0, 0.0).sigma == 5.0

@@ -144,7 +144,7 @@ def test_sigma_grows_after_a_long_step_that_keeps_its_promise(ratio, length, fac
     search = Descent(zeros(2), sigma=1.0, seed=0)
     for _ in range(3):
         search.tell(search.ask() @ vector(1.0, 2.0))
-    known = replace(search._state.progress, length=length, refused=1)
+    known = replace(search._state.progress, length=length, rejected=1)
     after, nowhere = search._method._judged(known, ratio)
     assert after.sigma / known.sigma == factor
     assert nowhere is None

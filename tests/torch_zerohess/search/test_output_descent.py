@@ -73,7 +73,7 @@ def test_where_the_output_has_steps_the_descent_follows_again():
     assert search.value < 0.5  # of 200
 
 
-def test_after_five_refused_steps_gauss_newton_has_failed(monkeypatch):
+def test_after_five_rejected_steps_gauss_newton_has_failed(monkeypatch):
     def count(patience=None):
         if patience is not None:
             monkeypatch.setattr(output_gauss_newton, "_PATIENCE", patience)

@@ -60,7 +60,7 @@ def steps(x):
     return torch.round(16.0 * swing(x)) / 16.0
 
 
-def test_where_the_output_jumps_the_process_goes_on_after_two_refused_steps():
+def test_where_the_output_jumps_the_process_goes_on_after_two_rejected_steps():
     found, lengths, begun = search(restarts=100), [0], []
     while found.evaluations < 150:
         found.tell(steps(found.ask()))
@@ -167,7 +167,7 @@ def test_the_hessian_at_the_end_is_told_by_the_nearest_outputs(seed, shift):
     def loss(y):
         return (y - target).square().mean()
 
-    settings = {"sigma": 0.3, "bounds": (0.0, 3.0), "max_evaluations": 80}
+    settings = {"sigma": 0.3, "bounds": (0.0, 3.0), "max_evaluations": 120}
     found = zh.minimize(swing, torch.ones(4).double(), loss=loss, seed=seed, **settings)
     expected = torch.func.hessian(lambda x: loss(swing(x[None])[0]))(found.x)
     assert found.engine == "gaussian_process"

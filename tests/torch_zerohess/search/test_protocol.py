@@ -418,6 +418,16 @@ def test_a_start_on_a_decimal_bound():
         TrustRegion(torch.tensor([0.30001]), sigma=0.1, bounds=(0, 0.3))
 
 
+@pytest.mark.parametrize("name", [name for name, (_, _, with_loss) in SEARCHES.items() if with_loss])
+def test_an_output_that_is_not_finite_at_the_start(name):
+    """The loss ignores the number that is not."""
+    search, f = make(name, loss=lambda y: y.nan_to_num().square().sum()), black_box(name)
+    values = f(search.ask())
+    values.view(len(values), -1)[0, 0] = math.nan
+    with pytest.raises(ValueError, match=r"1 of \d+ numbers of the output at the start x0 are not finite"):
+        search.tell(values)
+
+
 def test_a_start_that_is_not_finite_can_be_told_again():
     search = Descent(zeros(2), sigma=1.0, seed=0)
     values = bowl(search.ask())

@@ -1,0 +1,44 @@
+"""What ends a search before its evaluations are used up, and what it is called."""
+
+from dataclasses import dataclass
+
+from torch_zerohess.minimization.minimum import Status
+from torch_zerohess.minimization.running import Running
+
+_AGREED = 3
+"""Rounds from random points that arrive at one point, after which it is the solution, if there is no other limit."""
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """Limits of `minimize`, None where there is none."""
+
+    target: float | None
+    xtol: float | None
+    ftol: float | None
+    time_limit: float | None
+    agrees: bool
+    """Whether rounds that arrive at one point end the search."""
+
+    def reason(self, running: Running) -> tuple[Status, str] | None:
+        """Return the status of a search that has come to its end, and why it has; None if it goes on."""
+        search = running.search
+        if not running.begun:
+            return ("budget", running.budget) if running.spent else None
+        if search.done:
+            return running.ending(arrived=search.solved), search.message
+        if self.target is not None and running.reaches(self.target):
+            return "target", f"the value is at most the target {self.target}"
+        if self.xtol is not None and bool((search.width <= self.xtol).all()):
+            return running.ending(arrived=True), f"the region is within xtol ({self.xtol}) of x"
+        if self.ftol is not None and search.promise <= self.ftol:
+            return running.ending(arrived=True), f"the model promises a decrease of at most ftol ({self.ftol})"
+        if search.solved and (self.xtol, self.ftol) != (None, None):
+            return running.ending(arrived=True), "the search has arrived at x"
+        if self.agrees and not running.noise and search.agreed >= _AGREED:
+            return "solved", f"{search.agreed} rounds in a row have arrived at x"
+        if running.spent:
+            return "budget", running.budget
+        if self.time_limit is not None and running.seconds > self.time_limit:
+            return "time", f"time_limit ({self.time_limit} s) used up"
+        return None

@@ -6,7 +6,10 @@
 
 *Handles* are the vertices of a coarser mesh, as in `experiments.methods.meshes`. Subdivision makes their displacements
 smooth, so that no other prior on the mesh is needed. Each stage is one `zh.optim.LocalGaussNewton` over the handles of
-a level. Samples tell which pixels a handle changes: no camera and no footprint is given. A coarse level may come again.
+a level. Samples tell which pixels a handle changes: no camera and no footprint is given.
+
+Fine handles stretch triangles between the ears and the back into a dark web. Its two sides hide each other: the
+silhouette changes only if both move. In one stage the handles are therefore points in space, each of which moves both.
 
 The output is the image after two white-box operations. A *tone curve* raises dark pixels: shading is a quarter at
 least where there is a mesh, and the background is 0. With the shading alone, a dark part that is missing is a small
@@ -31,12 +34,12 @@ DARKEST = 0.25
 class Stage(NamedTuple):
     """One search over the handles of a level."""
 
-    level: int
-    """Of the mesh whose vertices are the handles."""
+    level: int | None
+    """Of the mesh whose vertices are the handles; None for handles in space."""
     evaluations: int
     """After which no further batch is asked for."""
     sigma: float
-    """In units of the mean distance of the handles at the start of the run."""
+    """In units of the distance of the handles, for vertices the mean one at the start of the run."""
     block: int
     """Pixels along the side of the blocks that are averaged."""
     silhouette: float = 0.5
@@ -47,11 +50,12 @@ STAGES = (
     Stage(1, 150, 0.2, 8),
     Stage(2, 850, 0.3, 4),
     Stage(3, 500, 0.3, 4, 0.6),
-    Stage(2, 450, 0.3, 4, 0.9),
+    Stage(None, 450, 0.3, 4, 0.9),
     Stage(3, 400, 0.25, 4, 0.9),
 )
-"""Chosen by hand on runs 1000 to 1003, as the defaults of `levels_local`. Fine handles stretch triangles between the
-ears and the back into a dark web. Coarse handles and silhouettes, a second time, take the web away."""
+"""Chosen by hand on runs 1000 to 1005, as the defaults of `levels_local`."""
+_APART = 0.2
+"""Distance of handles in space, in units of the parameters."""
 
 
 def levels_local(
@@ -81,13 +85,16 @@ def levels_local(
     black = torch.zeros_like(trial.image(x[None])[0])
     target = -task.output.residuals(black).view_as(black)
     for stage in stages:
-        control, start = mesh.control(stage.level), x
-        unit = torch.full((mesh.channels,), mesh.spacing(trial.start, stage.level), dtype=torch.float64)
-        unit[3:] = color
+        start = x
+        if stage.level is None:
+            handles, apart = mesh.lattice(start, _APART), _APART
+        else:
+            handles, apart = mesh.control(stage.level), mesh.spacing(trial.start, stage.level)
+        unit = torch.tensor(3 * [apart] + (mesh.channels - 3) * [color], dtype=torch.float64)
         goal = toned(target[None], stage.silhouette, stage.block)[0]
         search = zh.optim.LocalGaussNewton(
-            torch.zeros(len(control) * mesh.channels, dtype=torch.float64),
-            sigma=stage.sigma * unit.repeat(len(control)),
+            torch.zeros(len(handles) * mesh.channels, dtype=torch.float64),
+            sigma=stage.sigma * unit.repeat(len(handles)),
             loss=zh.losses.mse(goal),
             keep=keep,
             samples=samples,
@@ -97,10 +104,10 @@ def levels_local(
         )
         while search.evaluations < stage.evaluations and not search.done:
             z = search.ask()
-            images = trial.image(control.displaced(start, mesh.rows(z)))
+            images = trial.image(handles.displaced(start, mesh.rows(z)))
             search.tell(toned(images, stage.silhouette, stage.block))
-            x = control.displaced(start, mesh.rows(search.x)[None])[0]
-            trial.report(x, sigma=float(search.sigma * stage.sigma * unit[0]), loss=search.value)
+            x = handles.displaced(start, mesh.rows(search.x)[None])[0]
+            trial.report(x, sigma=float(search.sigma * stage.sigma * apart), loss=search.value)
 
 
 def toned(images: Tensor, silhouette: float, block: int) -> Tensor:

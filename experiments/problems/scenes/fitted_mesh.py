@@ -16,6 +16,8 @@ from experiments.problems.scenes.subdivision import bumps
 
 _FAINT = 0.01
 """Share of a displacement that counts as none."""
+_REACHED = 0.02
+"""Share of its displacement from which on a handle in space reaches the mesh."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,45 @@ class FittedMesh:
         """Return the vertices of a coarser level, as handles for bumps."""
         return Control(self, level)
 
+    def lattice(self, x: Tensor, spacing: float) -> "Handles":
+        """Return handles on a lattice in space around the mesh x [n], this far apart.
 
-class Control:
+        A handle moves whatever is near it, also both sides of a thin sheet (free-form deformation: Sederberg and Parry
+        1986), with the weights of cubic B-splines.
+        """
+        vertices = self.rows(x)[:, :3]
+        first = vertices.amin(0) - spacing
+        counts = ((vertices.amax(0) - first) / spacing).ceil().long() + 2
+        along = [_cubic((vertices[:, k, None] - first[k]) / spacing - torch.arange(int(counts[k]))) for k in range(3)]
+        weights = torch.einsum("ma,mb,mc->mabc", *along).flatten(1)
+        return Handles(weights[:, weights.amax(0) > _REACHED])
+
+
+def _cubic(distance: Tensor) -> Tensor:
+    """Cubic B-spline at a distance in units of the spacing of its knots."""
+    t = distance.abs()
+    return torch.where(t < 1.0, 2.0 / 3.0 - t**2 + 0.5 * t**3, (2.0 - t).clamp(min=0.0) ** 3 / 6.0)
+
+
+class Handles:
+    """Points whose displacements move the vertices of a mesh.
+
+    Args:
+        matrix: [m, handles], share of the displacement of a handle that a vertex takes.
+    """
+
+    def __init__(self, matrix: Tensor) -> None:
+        self.matrix = matrix
+
+    def __len__(self) -> int:
+        return self.matrix.shape[1]
+
+    def displaced(self, x: Tensor, z: Tensor) -> Tensor:
+        """Parameters [K, n] of the mesh x [n] with its handles displaced by z [K, handles, channels]."""
+        return x + (self.matrix @ z).flatten(1)
+
+
+class Control(Handles):
     """Displacements of the vertices of a coarser level, made smooth by subdivision.
 
     Args:
@@ -88,20 +127,12 @@ class Control:
 
     def __init__(self, mesh: FittedMesh, level: int) -> None:
         self._mesh = mesh
-        matrix = bumps(level, mesh.level)
-        self.matrix = torch.from_numpy(matrix.toarray())
-        """[m, handles]."""
-        moved = [np.flatnonzero(column > _FAINT) for column in matrix.toarray().T]
+        matrix = bumps(level, mesh.level).toarray()
+        super().__init__(torch.from_numpy(matrix))
+        moved = [np.flatnonzero(column > _FAINT) for column in matrix.T]
         widest = max(map(len, moved))
         # Rows of one length: shorter ones are repeated, which changes no least or greatest coordinate.
         self._moved = torch.from_numpy(np.stack([np.resize(one, widest) for one in moved]))
-
-    def __len__(self) -> int:
-        return self.matrix.shape[1]
-
-    def displaced(self, x: Tensor, z: Tensor) -> Tensor:
-        """Parameters [K, n] of the mesh x [n] with its handles displaced by z [K, handles, channels]."""
-        return x + (self.matrix @ z).flatten(1)
 
     def sums(self, x: Tensor, margin: float) -> "BoxSums":
         """Return sums over what every handle can change of the views of x [n]: a box in every view.

@@ -26,12 +26,12 @@ def test_the_curve_raises_what_is_dark_and_blocks_are_averaged():
 
 @pytest.mark.parametrize("name", ["meshfit", "meshfit_color"])
 def test_a_sphere_becomes_more_like_a_bunny_without_cameras(name):
-    """Two Jacobians and their steps, on a mesh that does not know who sees it."""
+    """A few Jacobians and their steps, on a mesh that does not know who sees it; then handles in space."""
     task = catalogue.load(name)
     blind = replace(task, mesh=replace(task.mesh, cameras=None))
     trial = Trial(blind, "levels_local", 1000)
-    METHODS["levels_local"].solve(trial, {"stages": (Stage(1, 120, 0.15, 2),), "samples": 48})
-    assert trial.evaluations <= 1 + 120 + 48
+    METHODS["levels_local"].solve(trial, {"stages": (Stage(1, 120, 0.15, 2), Stage(None, 60, 0.3, 4)), "samples": 48})
+    assert trial.evaluations <= 1 + 120 + 48 + 1 + 60 + 48
     assert trial.rows[-1].image_error < 0.7 * trial.rows[0].image_error
     before, after = (task.truth.measures(x)["least silhouette IoU"] for x in (trial.start, trial.x))
     assert after > before + 0.05

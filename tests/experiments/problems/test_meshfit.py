@@ -73,6 +73,21 @@ def test_chamfer_is_the_squared_distance_of_parallel_surfaces() -> None:
     assert fit.chamfer(torch.full((fit.mesh.n,), math.nan)) == math.inf
 
 
+def test_handles_in_space_move_what_is_near_them() -> None:
+    """All of them by one vector: the whole mesh by it. One of them: both sides of a sheet, however thin."""
+    mesh = meshfit.task().mesh
+    assert mesh is not None
+    sheet = (mesh.sphere * torch.tensor([1.0, 1.0, 1e-3], dtype=torch.float64)).flatten()
+    handles = mesh.lattice(sheet, 0.3)
+    vector = torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64)
+    moved = mesh.rows(handles.displaced(sheet, vector.expand(1, len(handles), 3))[0] - sheet)
+    assert float((moved - vector).abs().max()) < 0.05 * float(vector.norm())
+    one = handles.matrix[:, int(handles.matrix.amax(0).argmax())]
+    below = torch.cdist(mesh.sphere, mesh.sphere * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)).argmin(1)
+    assert float((one - one[below]).abs().max()) < 0.01 * float(one.max())
+    assert float(one[(mesh.sphere[:, :2] - mesh.sphere[int(one.argmax()), :2]).norm(dim=1) > 1.3].max()) == 0.0
+
+
 def test_a_handle_sums_all_pixels_that_it_changes_and_few_others() -> None:
     mesh, x = TASK.mesh, TASK.start(0)
     whole = TASK.output.image(x[None])

@@ -14,14 +14,13 @@ sigma is the sigma of the task. Sigma and the learning rate of the encoder go do
 evaluations, as for the source's methods.
 """
 
-from collections import deque
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from experiments.methods.learned_gradients import Function, fit, lax, network, slope
-from experiments.methods.paper_networks import ANNEALED
+from experiments.methods.network_training import step_count, train
 from experiments.runs.network_trial import NetworkTrial
 
 SIDE = 8
@@ -145,9 +144,7 @@ def _train(
     rate: tuple[float, float],
     gradient: Callable[[Tensor, Tensor, float], tuple[Tensor, float]],
 ) -> None:
-    """Take all steps that the evaluations allow.
-
-    The image error of a row is the mean loss of the samples of the last twentieth of the run, for no renders.
+    """Take all steps of Adam that the evaluations allow.
 
     Args:
         trial: the run.
@@ -157,19 +154,16 @@ def _train(
         gradient: predictions [B, n] without a graph, their images and sigma -> the gradient [B, n] of the loss of each,
             and the mean loss of the samples.
     """
-    steps = max(1, trial.task.evaluations // (batch * renders))
     optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=rate[0])
-    losses = deque[float](maxlen=max(1, steps // 20))
     first, last = trial.task.sigma
-    for step in range(steps):
-        share = min(step / (ANNEALED * steps), 1.0)
+
+    def step(images: Tensor, share: float) -> tuple[float, float]:
         sigma = first + share * (last - first)
-        optimizer.param_groups[0]["lr"] = rate[0] + share * (rate[1] - rate[0])
-        chosen = trial.batch(step, batch)
-        y = trial.encoder(chosen)
-        direction, loss = gradient(y.detach(), chosen, sigma)
+        y = trial.encoder(images)
+        direction, loss = gradient(y.detach(), images, sigma)
         optimizer.zero_grad()
         y.backward(direction / batch)
         optimizer.step()
-        losses.append(loss)
-        trial.report(sigma=sigma, loss=loss, image_error=sum(losses) / len(losses))
+        return sigma, loss
+
+    train(trial, optimizer, ("lr", rate), batch, step_count(trial, batch, renders), step)

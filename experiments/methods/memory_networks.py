@@ -25,7 +25,8 @@ from torch import Tensor, nn
 import torch_zerohess as zh
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
-from experiments.methods.paper_networks import ANNEALED, MOST
+from experiments.methods.network_training import ANNEALED
+from experiments.methods.paper_networks import MOST
 from experiments.problems.network_task import NetworkTask
 from experiments.runs.network_trial import NetworkTrial
 

@@ -15,7 +15,6 @@ trust radius) go down linearly over nine tenths of the evaluations. Step sizes a
 102, which no table reports, with renders looked up in a table of angles.
 """
 
-from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Literal
@@ -24,11 +23,10 @@ import torch
 from torch import Tensor, nn
 
 import torch_zerohess as zh
+from experiments.methods.network_training import ANNEALED, step_count, train
 from experiments.problems.network_task import NetworkTask
 from experiments.runs.network_trial import NetworkTrial
 
-ANNEALED = 0.9
-"""Part of the steps in which sigma and the step size go down."""
 MOST = 10
 """Parameters up to which a pair of samples per image says something of the curvature."""
 
@@ -113,8 +111,6 @@ def _train(
 ) -> None:
     """Take all steps that the evaluations allow.
 
-    The image error of a row is the mean loss over the batches of the last twentieth of the run, for no renders.
-
     Args:
         trial: the run.
         layer: the black box, whose sigma goes down.
@@ -124,16 +120,16 @@ def _train(
         renders: of a step per image.
         step: takes one with a batch of images, and returns the mean loss before it.
     """
-    steps = max(1, trial.task.evaluations // (batch * renders))
-    name, (first, last) = size
+    steps = step_count(trial, batch, renders)
     sigma = zh.LinearSigma(layer, *trial.task.sigma, steps=max(1, int(ANNEALED * steps)))
-    losses = deque[float](maxlen=max(1, steps // 20))
-    for iteration in range(steps):
-        optimizer.param_groups[0][name] = first + min(iteration / (ANNEALED * steps), 1.0) * (last - first)
-        current = layer.smoothing.sigma
-        losses.append(step(trial.batch(iteration, batch)))
+
+    def annealed_step(images: Tensor, share: float) -> tuple[float, float]:
+        current = sigma.sigma
+        loss = step(images)
         sigma.step()
-        trial.report(sigma=float(current), loss=losses[-1], image_error=sum(losses) / len(losses))
+        return current, loss
+
+    train(trial, optimizer, size, batch, steps, annealed_step)
 
 
 def _model(layer: zh.BlackBox, encoder: nn.Module, images: Tensor, *, differences: bool) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import BFGS
 from torch import Tensor
 
-from experiments.methods.sampled import Annealing, SampledGradient
+from experiments.methods.annealing import Annealing
+from experiments.methods.sampled import SampledGradient
 from experiments.runs.trial import Trial
 
 Array = NDArray[np.float64]

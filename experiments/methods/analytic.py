@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.methods.annealing import Annealing
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
-from experiments.methods.sampled import Annealing
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor, nn
 
 from experiments.methods import learned_networks
+from experiments.methods.annealing import Annealing
 from experiments.methods.keywords import with_settings
 from experiments.methods.learned_gradients import fit, lax, network, slope
 from experiments.methods.method import Method
-from experiments.methods.sampled import Annealing
 from experiments.runs.trial import Trial
 
 

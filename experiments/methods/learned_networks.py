@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from experiments.methods.annealing import linear
 from experiments.methods.learned_gradients import Function, fit, lax, network, slope
 from experiments.methods.network_training import step_count, train
 from experiments.runs.network_trial import NetworkTrial
@@ -155,10 +156,9 @@ def _train(
             and the mean loss of the samples.
     """
     optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=rate[0])
-    first, last = trial.task.sigma
 
     def step(images: Tensor, share: float) -> tuple[float, float]:
-        sigma = first + share * (last - first)
+        sigma = linear(trial.task.sigma, share)
         y = trial.encoder(images)
         direction, loss = gradient(y.detach(), images, sigma)
         optimizer.zero_grad()

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 import torch_zerohess as zh
+from experiments.methods.annealing import geometric
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.network_training import ANNEALED
@@ -110,7 +111,7 @@ def through_memory(
     }[steps]()
     for step in range(total):
         share = min(step / (ANNEALED * total), 1.0)
-        sigma = annealed(task.sigma, share)
+        sigma = geometric(task.sigma, share)
         layer.smoothing = layer.smoothing.replace(sigma=sigma)
         loss = update(trial.batch(step, batch), share, sigma)
         every, last = max(1, total // ROWS), step == total - 1
@@ -138,7 +139,7 @@ def _newton(
             return layer(y, images).mean(), y, zh.optim.SampleJacobian(network, images)
 
         group = optimizer.param_groups[0]
-        group["radius"], group["output_radius"] = annealed(radius, share), output_radius * sigma
+        group["radius"], group["output_radius"] = geometric(radius, share), output_radius * sigma
         return optimizer.step(closure)
 
     return update
@@ -165,7 +166,7 @@ def _many_targets(
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         y = network(images)
         ends = newton(lambda at: layer(at, images), y)
-        descend(optimizer, annealed(rate, share) * min(share / warm_up, 1.0), (y - ends).square().mean())
+        descend(optimizer, geometric(rate, share) * min(share / warm_up, 1.0), (y - ends).square().mean())
         assert newton.losses is not None
         return newton.losses.mean()
 
@@ -177,7 +178,7 @@ def _adam(network: nn.Module, layer: zh.BlackBox, rate: tuple[float, float]) -> 
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         loss = layer(network(images), images).mean()
-        descend(optimizer, annealed(rate, share), loss)
+        descend(optimizer, geometric(rate, share), loss)
         return loss.detach()
 
     return update
@@ -189,12 +190,6 @@ def descend(optimizer: torch.optim.Optimizer, rate: float, objective: Tensor) ->
     optimizer.zero_grad()
     objective.backward()
     optimizer.step()
-
-
-def annealed(ends: tuple[float, float], share: float) -> float:
-    """Return a number that falls from the first to the last one, by equal ratios."""
-    start, end = ends
-    return start * (end / start) ** share
 
 
 def few_outputs(task: NetworkTask) -> str | None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from experiments.methods.annealing import linear
 from experiments.runs.network_trial import NetworkTrial
 
 ANNEALED = 0.9
@@ -38,11 +39,11 @@ def train(
         step: takes one with a batch of images, and returns its sigma and the mean loss before it. It also gets the
             share of the way from first to last.
     """
-    name, (first, last) = size
+    name, ends = size
     losses = deque[float](maxlen=max(1, steps // 20))
     for iteration in range(steps):
         share = min(iteration / (ANNEALED * steps), 1.0)
-        optimizer.param_groups[0][name] = first + share * (last - first)
+        optimizer.param_groups[0][name] = linear(ends, share)
         sigma, loss = step(trial.batch(iteration, batch), share)
         losses.append(loss)
         trial.report(sigma=sigma, loss=loss, image_error=sum(losses) / len(losses))

@@ -19,11 +19,12 @@ from scipy.optimize import BFGS, OptimizeResult, line_search, minimize
 from torch import Tensor
 
 from experiments.methods.adaptive_differences import bfgs_adaptive_fd
+from experiments.methods.annealing import Annealing
 from experiments.methods.derivative_free import scipy_bounds
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.restarts import starts
-from experiments.methods.sampled import Annealing, SampledGradient
+from experiments.methods.sampled import SampledGradient
 from experiments.runs.trial import Trial
 
 Array = NDArray[np.float64]

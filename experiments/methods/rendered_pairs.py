@@ -30,8 +30,9 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.methods.annealing import geometric
 from experiments.methods.keywords import with_settings
-from experiments.methods.memory_networks import ROWS, annealed, descend, few_outputs, through_memory
+from experiments.methods.memory_networks import ROWS, descend, few_outputs, through_memory
 from experiments.methods.method import Method
 from experiments.problems.network_task import Encoder, NetworkTask
 from experiments.runs.network_trial import NetworkTrial
@@ -69,7 +70,7 @@ def fit_to_pairs(
         k = torch.randint(len(points), (batch,))
         error = trial.encoder(images[k]) - points[k]
         loss = (torch.einsum("bi,bij,bj->b", error, metric[k], error) + softness).sqrt().mean()
-        descend(optimizer, annealed(rate, step / fits) * min((step + 1) / warm_up, 1.0), loss)
+        descend(optimizer, geometric(rate, step / fits) * min((step + 1) / warm_up, 1.0), loss)
         every, last = max(1, fits // ROWS), step == fits - 1
         if step % every == 0 or last:
             trial.report(loss=loss.detach(), measured=last or step % (10 * every) == 0)

@@ -1,24 +1,10 @@
-"""Sampled derivatives for first-order methods: value and gradient of the smoothed black box, and how sigma anneals."""
-
-from dataclasses import dataclass
+"""Sampled derivatives for first-order methods: value and gradient of the smoothed black box."""
 
 import torch
 from torch import Tensor
 
 import torch_zerohess as zh
 from experiments.runs.trial import Trial
-
-
-@dataclass(frozen=True)
-class Annealing:
-    """Sigma falls linearly from `start` to `end` in `steps` iterations, and stays there."""
-
-    start: float
-    end: float
-    steps: int
-
-    def __call__(self, iteration: int) -> float:
-        return self.start + min(iteration / self.steps, 1.0) * (self.end - self.start)
 
 
 class SampledGradient:

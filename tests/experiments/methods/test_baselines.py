@@ -9,7 +9,8 @@ import torch
 
 from experiments.methods import METHODS
 from experiments.methods.adaptive_differences import adapt
-from experiments.methods.sampled import Annealing, SampledGradient
+from experiments.methods.annealing import Annealing
+from experiments.methods.sampled import SampledGradient
 from experiments.methods.settings import SPACES
 from experiments.methods.settings.rivals import TUNED
 from experiments.problems import catalogue

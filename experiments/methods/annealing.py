@@ -1,0 +1,30 @@
+"""How sigma and the size of a step go from their first to their last value in the course of a run.
+
+`zh.LinearSigma` rounds in another way. A method keeps the one that its stored results are from.
+"""
+
+from dataclasses import dataclass
+
+
+def linear(ends: tuple[float, float], share: float) -> float:
+    """Return a number that goes from the first to the last one, by equal differences."""
+    start, end = ends
+    return start + share * (end - start)
+
+
+def geometric(ends: tuple[float, float], share: float) -> float:
+    """Return a number that goes from the first to the last one, by equal ratios."""
+    start, end = ends
+    return start * (end / start) ** share
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """Sigma falls linearly from `start` to `end` in `steps` iterations, and stays there."""
+
+    start: float
+    end: float
+    steps: int
+
+    def __call__(self, iteration: int) -> float:
+        return linear((self.start, self.end), min(iteration / self.steps, 1.0))

@@ -21,7 +21,7 @@ from experiments.problems.task import Preset, Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
 from torch_zerohess.evaluators import Factory, ProcessPool
-from torch_zerohess.evaluators.lifetime import end_with_parent, one_thread
+from torch_zerohess.evaluators.lifetime import end_with_parent, ending, one_thread
 
 _PROGRESS = 0.2
 """Seconds between two messages about a running job."""
@@ -139,10 +139,9 @@ class _Process:
 def _death(job: Job, code: int) -> Outcome | Trouble:
     """Return what the death of a process means for its job: a crash is the method's, a kill is not."""
     if -code in _OUTSIDE:
-        return Trouble(f"its process was killed by {signal.Signals(-code).name}; the same command goes on with it")
-    cause = signal.Signals(-code).name if code < 0 else f"code {code}"
+        return Trouble(f"its process was killed by {ending(code)}; the same command goes on with it")
     names = job.task_name, job.method_name, job.run
-    outcome = Outcome(*names, "failed", f"its process ended with {cause}", 0.0, 0.0, 0, 0, [], job.settings)
+    outcome = Outcome(*names, "failed", f"its process ended with {ending(code)}", 0.0, 0.0, 0, 0, [], job.settings)
     write_outcome(outcome, job.files)
     return outcome
 

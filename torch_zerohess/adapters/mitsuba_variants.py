@@ -10,7 +10,6 @@ import ctypes.util
 import importlib.util
 import os
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,6 +18,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+
+from torch_zerohess.evaluators.lifetime import ending
 
 MINIMUM_LLVM = 16
 CANDIDATES = ("scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
@@ -213,8 +214,4 @@ def _reason(returncode: int, stderr: str) -> str:
     line = telling[0] if telling else "no message"
     if returncode >= 0:
         return line
-    try:
-        name = signal.Signals(-returncode).name
-    except ValueError:
-        name = f"signal {-returncode}"
-    return f"killed by {name}: {line}"
+    return f"killed by {ending(returncode)}: {line}"

@@ -2,7 +2,6 @@
 
 import multiprocessing
 import select
-import signal
 import threading
 import time
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from typing import Any
 from torch_zerohess.evaluators import transfer, worker
 from torch_zerohess.evaluators.ahead import Job
 from torch_zerohess.evaluators.batch import Chunk
-from torch_zerohess.evaluators.lifetime import end_group, one_thread
+from torch_zerohess.evaluators.lifetime import end_group, ending, one_thread
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
 
 _starting = threading.Lock()
@@ -126,13 +125,3 @@ def ready(handles: Sequence[Any], seconds: float) -> set[Any]:
     for number in numbers:
         poll.register(number, select.POLLIN)
     return {numbers[number] for number, _ in poll.poll(1000 * seconds)}
-
-
-def ending(code: int) -> str:
-    """Return an exit code in words."""
-    if code >= 0:
-        return f"exit code {code}"
-    try:
-        return signal.Signals(-code).name
-    except ValueError:
-        return f"signal {-code}"

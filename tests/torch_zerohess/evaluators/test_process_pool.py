@@ -23,6 +23,7 @@ import torch_zerohess as zh
 from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
 from torch_zerohess.evaluators.batch import MOST, Batch, cut
 from torch_zerohess.evaluators.finished import finished_values
+from torch_zerohess.evaluators.lifetime import ending
 from torch_zerohess.evaluators.process_pool import cores
 from truths import Exponential, PlaneWave, deviation, vector
 
@@ -417,3 +418,8 @@ def test_a_pool_that_is_closed_while_a_worker_makes_its_black_box_prints_nothing
     assert call.cancelled()
     captured = capfd.readouterr()
     assert captured.out + captured.err == ""
+
+
+def test_how_a_process_ended_is_said_in_words():
+    assert [ending(code) for code in (0, 3, -signal.SIGSEGV)] == ["exit code 0", "exit code 3", "SIGSEGV"]
+    assert ending(-1000) == "signal 1000"

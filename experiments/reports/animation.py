@@ -14,6 +14,7 @@ from torch import Tensor
 
 from experiments.problems.rendered import Reference, RenderedTask
 from experiments.problems.task import Task
+from experiments.reports.digits import significant
 from experiments.runs.records import Outcome, Record
 
 _GRID = 61
@@ -48,19 +49,19 @@ class Trace:
 
     def caption(self, row: int) -> str:
         """Return evaluations and image error of a row."""
-        return f"{self.records[row].evaluations} evaluations, error {percent(self.error[row])}"
+        return f"{self.records[row].evaluations} evaluations, error {error_percent(self.error[row])}"
 
 
-def percent(error: float) -> str:
-    """Return a share as text.
+def error_percent(error: float) -> str:
+    """Return an error, as a share of the error at the start, as text to two digits.
 
     Example:
-        >>> percent(1.0), percent(0.0123), percent(2e-7), percent(0.0), percent(math.nan)
+        >>> error_percent(1.0), error_percent(0.0123), error_percent(2e-7), error_percent(0.0), error_percent(math.nan)
         ('100 %', '1.2 %', '< 0.001 %', '0 %', 'not finite')
     """
     if math.isnan(error):
         return "not finite"
-    return "< 0.001 %" if 0 < error < 1e-5 else f"{float(f'{100 * error:.2g}'):g} %"
+    return "< 0.001 %" if 0 < error < 1e-5 else f"{significant(100 * error, 2)} %"
 
 
 @dataclass(frozen=True)

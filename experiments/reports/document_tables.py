@@ -7,6 +7,7 @@ from typing import Any
 import pandas as pd
 
 from experiments.reports import result_files, source_table
+from experiments.reports.digits import significant
 from experiments.reports.speed_ups import HEADERS, speed_ups, with_ratios
 
 SPEED_UP = "speed_up"
@@ -98,12 +99,12 @@ def number(value: object) -> str:
     if value is None or (isinstance(value, float) and value != value):
         return ""
     if isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool)):
-        return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1000 else f"{float(f'{value:.3g}'):g}"
+        return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1000 else significant(value, 3)
     return str(value)
 
 
-def percent(share: float) -> str:
-    """Return a share as text: `95 %`."""
+def whole_percent(share: float) -> str:
+    """Return a share as text, without decimals: `95 %`."""
     return f"{100 * share:.0f} %"
 
 
@@ -170,9 +171,9 @@ def _cell(row: dict[Any, Any], show: str, interval: bool, quartiles: bool) -> st
     """A dash where fewer than half of the starts get there."""
     share = ""
     if row["reached"] < row["runs"]:
-        share = percent(row["share"])
+        share = whole_percent(row["share"])
         if interval:
-            share += f", {100 * row['share_low']:.0f} to {percent(row['share_high'])}"
+            share += f", {100 * row['share_low']:.0f} to {whole_percent(row['share_high'])}"
         share = f" ({share})"
     if row["evaluations"] != row["evaluations"]:
         return "-" + share
@@ -210,7 +211,7 @@ def _trained(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]
     for row in table.to_dict("records"):
         start = [row["task"].upper(), f"`{row['method']}`"]
         rest = [row[name] for name in columns[2:]]
-        rows.append([*start, *rest, f"{row['reached']} of {row['runs']} ({percent(row['share'])})"])
+        rows.append([*start, *rest, f"{row['reached']} of {row['runs']} ({whole_percent(row['share'])})"])
     headers = [*(_HEADER[name] for name in columns), "runs that succeed"]
     note = "Medians over runs. Errors are mean squares of held-out images. A run succeeds if it divides the parameter "
     return markdown(headers, rows), table, note + "error by 100."

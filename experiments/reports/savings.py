@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from experiments.reports.digits import significant
 from experiments.runs.records import write
 
 _NAME = "saving.json"
@@ -25,8 +26,8 @@ class Saving:
 
     def __str__(self) -> str:
         return (
-            f"time saved: {_number(self.ratio)}x ({_time(self.seconds)} against {_time(self.full_seconds)} per "
-            f"evaluation), loss differs by {_number(100 * self.difference)} % of its peak"
+            f"time saved: {significant(self.ratio, 2)}x ({_time(self.seconds)} against {_time(self.full_seconds)} per "
+            f"evaluation), loss differs by {significant(100 * self.difference, 2)} % of its peak"
         )
 
     def keep(self, folder: Path) -> None:
@@ -43,10 +44,5 @@ def kept_saving(folder: Path) -> Saving | None:
 def _time(seconds: float) -> str:
     for unit, scale in (("s", 1.0), ("ms", 1e-3)):
         if seconds >= scale:
-            return f"{_number(seconds / scale)} {unit}"
-    return f"{_number(1e6 * seconds)} us"
-
-
-def _number(value: float) -> str:
-    """Return a number to two digits, without an exponent where none is needed."""
-    return f"{float(f'{value:.2g}'):g}"
+            return f"{significant(seconds / scale, 2)} {unit}"
+    return f"{significant(1e6 * seconds, 2)} us"

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 
 from tqdm import tqdm
 
+from experiments.reports.digits import significant
+
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Return rows under headers: numbers to three digits and to the right, `None` as a dash, text to the left.
@@ -58,5 +60,5 @@ def cell_text(value: object) -> str:
     if value is None:
         return "-"
     if isinstance(value, float):
-        return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+        return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else significant(value, 3)
     return str(value)

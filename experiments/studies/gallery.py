@@ -26,7 +26,7 @@ from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, chosen
 from experiments.problems.task import Preset, Task
 from experiments.reports import supplement_figures
-from experiments.reports.animation import Look, Trace, finer, frames, look, percent, save, shown_rows, together
+from experiments.reports.animation import Look, Trace, error_percent, finer, frames, look, save, shown_rows, together
 from experiments.reports.html_page import html_page, html_table, html_text
 from experiments.reports.overview_networks import network_column
 from experiments.reports.progress import REFRESH, progress
@@ -223,7 +223,7 @@ def runs_of(shown: Sequence[Shown]) -> tuple[list[str], list[list[object]]]:
         rows.append(
             [
                 *(found.task.name, found.task.n, found.method, last.evaluations, last.seconds),
-                *(percent(found.error[-1]), parameter, _alike(found, seen), found.outcome.reason),
+                *(error_percent(found.error[-1]), parameter, _alike(found, seen), found.outcome.reason),
             ]
         )
     return headers, rows

@@ -50,7 +50,7 @@ def doctor() -> Report:
         'cpu'
     """
     versions = {"python": platform.python_version()}
-    versions |= {name: version for name in (_NAME, "torch", *_OPTIONAL) if (version := _version(name))}
+    versions |= {name: version for name in (_NAME, "torch", *_OPTIONAL) if (version := installed_version(name))}
     devices = ["cpu"] + [f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in range(torch.cuda.device_count())]
     probes = mitsuba_variants.variants()
     variants = {name: "works" if one.works else one.reason for name, one in probes.items()}
@@ -61,11 +61,19 @@ def doctor() -> Report:
     return Report(extension.available, extension.status, devices, variants, versions, advice)
 
 
+def installed_version(package: str) -> str | None:
+    """Return the version of an installed package, by its name on PyPI; None if it is not installed."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
 def _missing() -> Iterator[tuple[str, list[str]]]:
     """Yield the extras that name a package that is not installed, with these packages: each under its first extra."""
     seen: set[str] = set()
     for extra, packages in _extras().items():
-        names = [one for one in packages if one not in seen and not _version(one)]
+        names = [one for one in packages if one not in seen and not installed_version(one)]
         seen.update(packages)
         if names:
             yield extra, names
@@ -84,10 +92,3 @@ def _extras() -> dict[str, list[str]]:
         if name and extra and extra[1] != _DEVELOPERS and name[0].replace("-", "_") != _NAME:
             found.setdefault(extra[1], []).append(name[0])
     return found
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

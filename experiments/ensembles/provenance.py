@@ -1,7 +1,6 @@
 """`command.json` of a folder of results: the commands that made it, with which code and settings, on which machine."""
 
 import hashlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -15,6 +14,7 @@ from typing import Any
 
 from experiments.problems.task import Preset
 from experiments.runs.records import write
+from torch_zerohess.doctor import installed_version
 
 _ROOT = Path(__file__).parents[2]
 _CODE = ("experiments", "torch_zerohess", "csrc", "setup.py", "pyproject.toml", ":(exclude)experiments/results")
@@ -117,15 +117,8 @@ def machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        **{name: version for name in _PACKAGES if (version := _version(name))},
+        **{name: version for name in _PACKAGES if (version := installed_version(name))},
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _processor() -> str:

@@ -11,6 +11,7 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.network_trial import NetworkTrial
 from experiments.runs.trial import Trial
+from torch_zerohess.doctor import installed_version
 
 
 def everywhere(task: object) -> str | None:
@@ -65,7 +66,7 @@ class Method:
 
     def missing(self) -> list[str]:
         """Packages that are not installed."""
-        return [name for name in self.packages if not _installed(name)]
+        return [name for name in self.packages if installed_version(name) is None]
 
     def load(self) -> None:
         """Import the packages, so that the first run does not pay for it."""
@@ -77,11 +78,3 @@ class Method:
             # folder "sphinx", which SciPy takes for Sphinx.
             if spec is not None and spec.origin is not None:
                 importlib.import_module(module)
-
-
-def _installed(package: str) -> bool:
-    try:
-        importlib.metadata.distribution(package)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True

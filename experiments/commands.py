@@ -143,4 +143,5 @@ def _needs(name: str, error: ImportError) -> str:
     """Say what to install; tasks and adapters say so themselves."""
     if "pip install" in str(error) or error.name is None:
         return str(error)
-    return f"{name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments,rivals]'"
+    package = error.name.partition(".")[0]
+    return f"{name} needs {package}, which is not installed: pip install 'torch_zerohess[experiments,rivals]'"

@@ -3,13 +3,10 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments.reports.error_curves import plain_ticks, styles
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 _SPAN = 300
 """From the first to the last evaluation that is drawn, as a ratio."""
@@ -28,9 +25,8 @@ def draw(profiles: Mapping[str, Mapping[str, Profile]], of: str, unit: str, most
         path: of the PNG file.
     """
     chosen = styles(name for methods in profiles.values() for name in methods)
-    figure, axes = plt.subplots(
-        1, len(profiles), figsize=(4 * len(profiles) + 2, 3.8), sharey=True, squeeze=False, layout="constrained"
-    )
+    figure = Figure(figsize=(4 * len(profiles) + 2, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(profiles), sharey=True, squeeze=False)
     for axis, (title, methods) in zip(axes[0], profiles.items(), strict=True):
         for name, (reached, pairs) in methods.items():
             at = np.sort(np.asarray(reached, dtype=np.float64))
@@ -44,4 +40,3 @@ def draw(profiles: Mapping[str, Mapping[str, Profile]], of: str, unit: str, most
     legend = {label: handle for handles, labels in found for handle, label in zip(handles, labels, strict=True)}
     figure.legend(legend.values(), legend.keys(), loc="outside right upper", frameon=False)
     figure.savefig(path, dpi=110)
-    plt.close(figure)

@@ -5,17 +5,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
-import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 import tyro
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.reports.results import METRICS, Results, Run, load
 from experiments.runs.trial import LEVELS
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 _POINTS = 1000
 """Most corners that a curve is drawn with."""
@@ -63,7 +60,8 @@ def curves(
 ) -> None:
     """Plot the median of the errors, relative to those at the start, and the band between the quartiles."""
     chosen = styles(methods) if chosen is None else chosen
-    figure, axes = plt.subplots(2, 2, figsize=(11, 7), layout="constrained", sharex="col", sharey=True)
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    axes = figure.subplots(2, 2, sharex="col", sharey=True)
     for row, metric in zip(axes, METRICS, strict=True):
         for axis, against in zip(row, AXES, strict=True):
             axis.set(xscale="log", yscale="log")
@@ -78,7 +76,6 @@ def curves(
     figure.legend(handles, labels, loc="outside right upper", frameon=False, title="method (runs)")
     figure.suptitle(f"{task}: median and quartiles")
     figure.savefig(path, dpi=110, format="png")
-    plt.close(figure)
 
 
 def quartiles(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:

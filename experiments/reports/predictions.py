@@ -3,14 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import torch
+from matplotlib.figure import Figure
 
 from experiments.problems.network_task import NetworkTask
 from experiments.reports.trained_network import Result
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 
 def draw(task: NetworkTask, results: Sequence[Result], path: Path, count: int = 4) -> None:
@@ -26,9 +23,8 @@ def draw(task: NetworkTask, results: Sequence[Result], path: Path, count: int = 
             columns.append((f"{result.method}\n{result.seconds:.0f} s", task.image(after), after))
     pictures = [task.pictures(renders, x) for _, renders, x in columns]
     rows, wide = len(images), pictures[0].shape[2] / pictures[0].shape[1]
-    figure, axes = plt.subplots(
-        rows, len(columns), figsize=(1.7 * wide * len(columns), 1.85 * rows + 0.5), layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(1.7 * wide * len(columns), 1.85 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, len(columns), squeeze=False)
     for column, (title, _, x) in enumerate(columns):
         for row in range(rows):
             axis = axes[row][column]
@@ -37,4 +33,3 @@ def draw(task: NetworkTask, results: Sequence[Result], path: Path, count: int = 
             axis.set_xlabel(task.caption(x[row]), fontsize=9)
         axes[0][column].set_title(title, fontsize=10)
     figure.savefig(path, dpi=130)
-    plt.close(figure)

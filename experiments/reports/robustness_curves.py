@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from experiments.reports import error_curves
 from experiments.reports.results import Run
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 _LINES = ("-", "--", ":", "-.")
 
@@ -29,9 +28,8 @@ def draw(
     methods = list(dict.fromkeys(cell[0] for cell in cells))
     sweeps = [sweep for sweep in titles if any(cell[1] == sweep for cell in cells)]
     size = (3.3 * len(sweeps) + 0.4, 2.9 * len(methods) + 0.5)
-    figure, axes = plt.subplots(
-        len(methods), len(sweeps), figsize=size, layout="constrained", sharey=True, sharex="row", squeeze=False
-    )
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(methods), len(sweeps), sharey=True, sharex="row", squeeze=False)
     for line, method in zip(axes, methods, strict=True):
         for axis, sweep in zip(line, sweeps, strict=True):
             values = [(value, runs) for name, one, value, runs in cells if (name, one) == (method, sweep)]
@@ -42,10 +40,9 @@ def draw(
         axis.set_xlabel(error_curves.AXES[against])
     figure.suptitle(f"{task}: median and quartiles")
     figure.savefig(path, dpi=90)
-    plt.close(figure)
 
 
-def _axis(axis: mpl.axes.Axes, values: Sequence[tuple[str, list[Run]]], against: str) -> None:
+def _axis(axis: Axes, values: Sequence[tuple[str, list[Run]]], against: str) -> None:
     colors = mpl.colormaps["viridis"]
     axis.set(xscale="log", yscale="log")
     for k, (value, runs) in enumerate(values):

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from experiments.problems.scenes.bunny import IN_MIRRORS, in_mirrors
@@ -22,9 +22,6 @@ from experiments.reports.animation import Look, Trace, pixels
 from experiments.reports.error_curves import AXES, band, levels, plain_ticks
 from experiments.reports.results import Run
 from torch_zerohess.adapters.mitsuba import MitsubaScene
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 _COLORS = 256
 """Of a sheet: enough for its pictures, for a third of the size."""
@@ -58,7 +55,7 @@ def overview(shown: Sequence[Column], path: Path) -> None:
     """Draw figure 9: a column per task, with its start, the end of the run, and the target."""
     bands = -(-len(shown) // _ACROSS)
     across = -(-len(shown) // bands)
-    figure = plt.figure(figsize=(1.35 * across + 0.4, 4.3 * bands), layout="constrained")
+    figure = Figure(figsize=(1.35 * across + 0.4, 4.3 * bands), layout="constrained")
     methods = {one.method for one in shown}
     method = methods.pop() if len(methods) == 1 else None
     for k, part in enumerate(figure.subfigures(bands, 1, squeeze=False)[:, 0]):
@@ -88,7 +85,7 @@ def descents(groups: Mapping[str, Sequence[Trace]], path: Path) -> None:
     """
     task = next(iter(groups.values()))[0].task
     planes = list(groups) if task.n == 2 else []
-    figure = plt.figure(figsize=(3.1 * len(planes) + 9, 3.6), layout="constrained")
+    figure = Figure(figsize=(3.1 * len(planes) + 9, 3.6), layout="constrained")
     axes: Any = figure.subplots(1, len(planes) + 2, width_ratios=[1.0] * len(planes) + [1.4, 1.4], squeeze=False)[0]
     colors = {name: f"C{k}" for k, name in enumerate(groups)}
     for axis, name in zip(axes, planes, strict=False):
@@ -126,7 +123,7 @@ def caustic(found: Trace, seen: Look, other: Trace | None, path: Path) -> None:
     runs = [found, *([other] if other else [])]
     columns = [("start", found.points[0], found.caption(0))]
     columns += [(one.method, one.points[-1], one.caption(-1)) for one in runs]
-    figure = plt.figure(figsize=(2.2 * (len(columns) + 1) + 3.6, 4.9), layout="constrained")
+    figure = Figure(figsize=(2.2 * (len(columns) + 1) + 3.6, 4.9), layout="constrained")
     parts: Any = figure.subfigures(1, 2, width_ratios=[2.2 * (len(columns) + 1), 3.6])
     left, right = parts
     axes = left.subplots(2, len(columns) + 1)
@@ -154,7 +151,8 @@ def mirrors(found: Trace, seen: Look, experiment: Tensor, path: Path) -> None:
         ("target", seen.target, ""),
     ]
     widths = [1.5, 1, 1, 1, 1.5]
-    figure, axes = plt.subplots(1, 5, figsize=(12.4, 2.9), layout="constrained", width_ratios=widths)
+    figure = Figure(figsize=(12.4, 2.9), layout="constrained")
+    axes = figure.subplots(1, 5, width_ratios=widths)
     for axis, (name, picture, text) in zip(axes, panels, strict=False):
         _picture(axis, picture)
         axis.set_title(name, fontsize=10)
@@ -194,7 +192,6 @@ def save_small(figure: Any, path: Path) -> None:
 
     file = io.BytesIO()
     figure.savefig(file, dpi=100, format="png")
-    plt.close(figure)
     with Image.open(file) as image:
         image.convert("RGB").quantize(_COLORS, kmeans=1, dither=Image.Dither.NONE).save(path, optimize=True)
 

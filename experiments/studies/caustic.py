@@ -140,15 +140,12 @@ def _error(image: Tensor, target: Tensor) -> float:
 
 
 def _draw(images: dict[str, Tensor], path: Path) -> None:
-    import matplotlib as mpl
+    from matplotlib.figure import Figure
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, len(images), figsize=(3.2 * len(images), 3.4), layout="constrained")
+    figure = Figure(figsize=(3.2 * len(images), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(images))
     for axis, (name, image) in zip(axes, images.items(), strict=True):
         axis.imshow(image.numpy(), cmap="gray", vmin=0, vmax=float(next(iter(images.values())).max()))
         axis.set_title(name)
         axis.axis("off")
     figure.savefig(path, dpi=130)
-    plt.close(figure)

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from experiments.studies.estimator_problems import QUANTITIES, Problem
 from experiments.studies.estimators import ALONE, ESTIMATORS, FIRST_ORDER, OURS, Estimator
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.ticker import NullFormatter
 
 AXES = {"evaluations": "evaluations", "samples": "samples per element", "seconds": "seconds"}
 """What errors are drawn against, by the fields of a `Measurement`."""
@@ -86,7 +83,8 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
     """Draw a row per problem and a column per quantity; against: one of `AXES`."""
     budgets = sorted({m.budget for m in measurements})
     titles = {"value": "value", "gradient": "gradient", "hessian": "Hessian", "hvp": "Hessian-vector product"}
-    figure, axes = plt.subplots(len(problems), 4, figsize=(22, 6.2 * len(problems)), squeeze=False)
+    figure = Figure(figsize=(22, 6.2 * len(problems)))
+    axes = figure.subplots(len(problems), 4, squeeze=False)
     for row, problem in zip(axes, problems, strict=True):
         for axis, quantity in zip(row, QUANTITIES, strict=True):
             for method in (*ESTIMATORS, *ALONE):
@@ -117,7 +115,6 @@ def draw(measurements: Sequence[Measurement], problems: Sequence[Problem], again
     height = len(problems)  # fixed margins: leaving room for the legends automatically takes ten times as long
     figure.subplots_adjust(0.03, 0.32 / height, 0.99, 1 - 0.13 / height, wspace=0.14, hspace=0.55)
     figure.savefig(path, dpi=100)
-    plt.close(figure)
 
 
 OPERATORS = {"gradient": "gradient", "hessian": "Hessian", "hvp": "Hessian-vector product"}
@@ -131,7 +128,8 @@ def draw_operators(measurements: Sequence[Measurement], problem: str, path: Path
     Above against samples per element, as in the source; below against evaluations. Solid lines subtract f(x) from the
     values, dotted ones nothing. Gradients are of methods that estimate nothing else.
     """
-    figure, axes = plt.subplots(2, len(OPERATORS), figsize=(12, 7), layout="constrained", sharey="col", squeeze=False)
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    axes = figure.subplots(2, len(OPERATORS), sharey="col", squeeze=False)
     for row, against in zip(axes, ("samples", "evaluations"), strict=True):
         for axis, (quantity, title) in zip(row, OPERATORS.items(), strict=True):
             for method, (kind, baseline) in _operators(measurements, quantity).items():
@@ -146,7 +144,6 @@ def draw_operators(measurements: Sequence[Measurement], problem: str, path: Path
     axes[1, 0].set_ylabel("relative variance")
     axes[0, 0].legend(fontsize=7, frameon=False)
     figure.savefig(path, dpi=100)
-    plt.close(figure)
 
 
 def orders(measurements: Sequence[Measurement], problem: str) -> list[list[object]]:

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib as mpl
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 import torch_zerohess as zh
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 REACH = 5.0
 """Half width of the axes."""
@@ -159,7 +156,8 @@ def draw(path: Path, count: int, seed: int) -> dict[str, float]:
     lines = [lobe for lobe in LOBES if lobe.cdf]
     planes = [lobe for lobe in LOBES if not lobe.cdf]
     width = max(len(lines), len(planes))
-    figure, axes = plt.subplots(3, width, figsize=(3.1 * width, 9), layout="constrained")
+    figure = Figure(figsize=(3.1 * width, 9), layout="constrained")
+    axes = figure.subplots(3, width)
     drawn = {lobe.name: lobe.draw(count, seed) for lobe in LOBES}
     for k, lobe in enumerate(lines):
         _line(axes[0, k], axes[1, k], lobe, drawn[lobe.name])
@@ -169,7 +167,6 @@ def draw(path: Path, count: int, seed: int) -> dict[str, float]:
         axis.axis("off")
     figure.suptitle(f"densities of u, and {count} draws of each")
     figure.savefig(path, dpi=100)
-    plt.close(figure)
     return {lobe.name: distance(lobe, drawn[lobe.name]) for lobe in LOBES}
 
 

@@ -86,16 +86,12 @@ def write_csv(biases: Sequence[Bias], path: Path) -> None:
 
 def draw(biases: Sequence[Bias], path: Path) -> None:
     """Draw the objectives of every task and sigma, each in units of its value at the start."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from matplotlib.figure import Figure
 
     names = list(FACTORIES)
     cells = list(dict.fromkeys((bias.task, bias.sigma) for bias in biases))
-    figure, axes = plt.subplots(
-        len(cells), len(names), figsize=(11, 2.6 * len(cells)), layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(11, 2.6 * len(cells)), layout="constrained")
+    axes = figure.subplots(len(cells), len(names), squeeze=False)
     for bias in biases:
         axis = axes[cells.index((bias.task, bias.sigma)), names.index(bias.loss)]
         start = bias.values[POSITIONS.index(1.0)]
@@ -108,4 +104,3 @@ def draw(biases: Sequence[Bias], path: Path) -> None:
         axis.set_xlabel("position: 0 solution, 1 start")
     axes[0, 0].legend(frameon=False, fontsize=9)
     figure.savefig(path, dpi=110)
-    plt.close(figure)

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-import matplotlib as mpl
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 import torch_zerohess as zh
@@ -23,9 +23,6 @@ from experiments.problems import catalogue
 from experiments.problems.task import Task
 from experiments.reports import result_files
 from experiments.reports.tables import table
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 PENALTIES = (0.3, 0.1, 0.03, 0.01)
 """Of LASSO, in units of the smallest one that leaves no entry."""
@@ -157,7 +154,8 @@ def _lasso(u: Tensor, changes: Tensor) -> Tensor:
 
 def _draw_curves(rows: list[Recovery], path: Path) -> Path:
     """Draw the share of entries found against pairs over s ln n: curves of all n fall together."""
-    figure, axes = plt.subplots(figsize=(6, 4))
+    figure = Figure(figsize=(6, 4))
+    axes = figure.subplots()
     styles = {"ours": "-", "LASSO": "--", "least norm": ":"}
     sizes = list(dict.fromkeys(row.n for row in rows))
     for (name, style), (k, size) in ((a, b) for a in styles.items() for b in enumerate(sizes)):
@@ -171,7 +169,6 @@ def _draw_curves(rows: list[Recovery], path: Path) -> Path:
     axes.set(xlabel="pairs / (s ln n)", ylabel="share of entries found", ylim=(0, 1.05))
     axes.legend(fontsize=7)
     figure.savefig(path, dpi=120, bbox_inches="tight")
-    plt.close(figure)
     return path
 
 
@@ -190,7 +187,8 @@ def draw_jacobian(task: Task, path: Path, *, samples: int = 128, seed: int = 0) 
     sampled = found.dense().view_as(exact)
     height = found.shape[0]
     pixel, parameter = (height // 2) * found.shape[1] + found.shape[1] // 2, (side // 2) * side + side // 2
-    figure, axes = plt.subplots(2, 2, figsize=(6, 6), layout="constrained")
+    figure = Figure(figsize=(6, 6), layout="constrained")
+    axes = figure.subplots(2, 2)
     for column, jacobian in enumerate((exact, sampled)):
         for row, part, whole in ((0, jacobian[pixel], exact[pixel]), (1, jacobian[:, parameter], exact[:, parameter])):
             most, shape = float(whole.abs().max()), (side, side) if row == 0 else tuple(found.shape)
@@ -202,5 +200,4 @@ def draw_jacobian(task: Task, path: Path, *, samples: int = 128, seed: int = 0) 
     cosine = float((exact * sampled).sum() / (exact.norm() * sampled.norm()))
     figure.suptitle(f"Jacobian of {task.name.upper()}, cosine {cosine:.2f}")
     figure.savefig(path, dpi=120)
-    plt.close(figure)
     return path

@@ -72,7 +72,8 @@ def test_an_unknown_command_is_named_with_those_that_are_near() -> None:
 
 def test_a_missing_package_is_named(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.delitem(sys.modules, "experiments.reports.error_curves", raising=False)
+    for loaded in ("matplotlib.figure", "experiments.reports.error_curves"):
+        monkeypatch.delitem(sys.modules, loaded, raising=False)
     with pytest.raises(SystemExit, match="plot needs matplotlib, which is not installed: pip install 'torch_zerohess"):
         main(["plot", "results"])
 

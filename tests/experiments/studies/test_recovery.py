@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import small
 import torch
+from matplotlib.axes import Axes
 
 from experiments.problems.task import Output
 from experiments.reports.tables import table
@@ -50,8 +51,8 @@ def test_a_picture_of_a_row_and_a_column(tmp_path, monkeypatch):
     def image(x):
         return torch.nn.functional.avg_pool2d(x.view(-1, 1, 8, 8), 2, 1)[:, 0]
 
-    real = recovery.plt.Axes.imshow
-    monkeypatch.setattr(recovery.plt.Axes, "imshow", lambda self, x, **more: shown.append(x) or real(self, x, **more))
+    real = Axes.imshow
+    monkeypatch.setattr(Axes, "imshow", lambda self, x, **more: shown.append(x) or real(self, x, **more))
     start = torch.zeros(64, dtype=torch.float64)
     task = replace(small.TASK, n=64, start=lambda run: start, output=Output(image, torch.sum))
     draw_jacobian(task, tmp_path / "jacobian.png", samples=60)

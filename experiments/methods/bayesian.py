@@ -25,7 +25,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.methods.derivative_free import Best, is_bounded
+from experiments.methods.best import Best
+from experiments.methods.bounds import is_bounded
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.problems.task import Task

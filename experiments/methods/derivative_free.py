@@ -11,35 +11,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.optimize import Bounds, minimize
+from scipy.optimize import minimize
 
+from experiments.methods.best import Array, Best
+from experiments.methods.bounds import is_bounded, scipy_bounds
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.restarts import starts
 from experiments.problems.task import Task
 from experiments.runs.trial import Trial
 
-Array = NDArray[np.float64]
 MOST = 100
 """Parameters beyond which COBYQA, made for small problems, takes minutes between two evaluations."""
 MOST_RESIDUALS = 2000
 """Parameters beyond which DFO-LS, which keeps the residuals of n points, takes gigabytes."""
-
-
-class Best:
-    """The best point evaluated so far, which is what gets reported."""
-
-    def __init__(self, trial: Trial) -> None:
-        self._trial = trial
-        self.x, self.value = trial.start, math.inf
-
-    def __call__(self, points: Array, values: Array, *, sigma: float | None = None) -> None:
-        """Report after points [K, n] with values [K]."""
-        k = int(np.argmin(np.where(np.isnan(values), np.inf, values)))
-        if values[k] < self.value:
-            self.x, self.value = torch.tensor(points[k], dtype=torch.float64), float(values[k])
-        self._trial.report(self.x, sigma=sigma, loss=self.value)
 
 
 def cma_es(trial: Trial, *, scale: float = 1.0, bounded: bool = False) -> None:
@@ -151,16 +136,6 @@ def _one_by_one(trial: Trial) -> Callable[[Array], float]:
         return float(value[0])
 
     return evaluate
-
-
-def scipy_bounds(task: Task) -> Bounds | None:
-    """Return the bounds of a task as SciPy takes them."""
-    return None if task.bounds is None else Bounds(*(one.numpy() for one in task.bounds))
-
-
-def is_bounded(task: Task) -> str | None:
-    """Say so where a task has no bounds."""
-    return "the task has no bounds" if task.bounds is None else None
 
 
 def _is_small(task: Task) -> str | None:

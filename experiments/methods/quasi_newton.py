@@ -20,7 +20,7 @@ from torch import Tensor
 
 from experiments.methods.adaptive_differences import bfgs_adaptive_fd
 from experiments.methods.annealing import Annealing
-from experiments.methods.derivative_free import scipy_bounds
+from experiments.methods.bounds import scipy_bounds
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.restarts import starts

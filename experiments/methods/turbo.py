@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from experiments.methods.bayesian import Cube
-from experiments.methods.derivative_free import Best, is_bounded
+from experiments.methods.best import Best
+from experiments.methods.bounds import is_bounded
 from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.runs.trial import Trial

@@ -71,9 +71,9 @@ def zerograds(
     *,
     batch: int = 4,
     pairs: int = 1,
-    rate: tuple[float, float] = (5e-4, 1e-4),
+    lr: tuple[float, float] = (5e-4, 1e-4),
     inner: float = 0.1,
-    fit_rate: float = 1e-3,
+    fit_lr: float = 1e-3,
     fits: int = 10,
     hidden: Sequence[int] = (64, 64, 64),
 ) -> None:
@@ -83,14 +83,14 @@ def zerograds(
         trial: the run.
         batch: images of a step.
         pairs: antithetic pairs per image.
-        rate: first and last learning rate of the encoder.
+        lr: first and last learning rate of the encoder.
         inner: sigma of the kernel that smooths the loss / sigma of the samples.
-        fit_rate: learning rate of the surrogate.
+        fit_lr: learning rate of the surrogate.
         fits: its steps for every step of the encoder.
         hidden: widths of its layers, with leaky ReLU.
     """
     surrogate = Surrogate(trial, hidden, nn.LeakyReLU)
-    fitted = torch.optim.Adam(surrogate.network.parameters(), lr=fit_rate)
+    fitted = torch.optim.Adam(surrogate.network.parameters(), lr=fit_lr)
 
     def gradient(y: Tensor, images: Tensor, sigma: float) -> tuple[Tensor, float]:
         centres, seen = y.repeat(2 * pairs, 1), _repeated(images, 2 * pairs)
@@ -100,7 +100,7 @@ def zerograds(
         fit(surrogate.of(seen), fitted, z, f, fits)
         return slope(surrogate.of(images), y), mean
 
-    _train(trial, batch, 2 * pairs, rate, gradient)
+    _train(trial, batch, 2 * pairs, lr, gradient)
 
 
 def relax(
@@ -108,8 +108,8 @@ def relax(
     *,
     batch: int = 4,
     samples: int = 2,
-    rate: tuple[float, float] = (5e-4, 1e-4),
-    fit_rate: float = 0.01,
+    lr: tuple[float, float] = (5e-4, 1e-4),
+    fit_lr: float = 0.01,
     hidden: Sequence[int] = (10,),
 ) -> None:
     """RELAX for continuous variables (LAX): Adam along the score function with a learned control variate.
@@ -118,12 +118,12 @@ def relax(
         trial: the run.
         batch: images of a step.
         samples: per image.
-        rate: first and last learning rate of the encoder.
-        fit_rate: learning rate of the control variate.
+        lr: first and last learning rate of the encoder.
+        fit_lr: learning rate of the control variate.
         hidden: widths of its layers, with tanh.
     """
     surrogate = Surrogate(trial, hidden, nn.Tanh)
-    tuned = torch.optim.Adam(surrogate.network.parameters(), lr=fit_rate)
+    tuned = torch.optim.Adam(surrogate.network.parameters(), lr=fit_lr)
 
     def gradient(y: Tensor, images: Tensor, sigma: float) -> tuple[Tensor, float]:
         centres, seen = y.repeat(samples, 1), _repeated(images, samples)
@@ -135,14 +135,14 @@ def relax(
         tuned.step()
         return gradients.detach().view(samples, *y.shape).mean(0), mean
 
-    _train(trial, batch, samples, rate, gradient)
+    _train(trial, batch, samples, lr, gradient)
 
 
 def _train(
     trial: NetworkTrial,
     batch: int,
     renders: int,
-    rate: tuple[float, float],
+    lr: tuple[float, float],
     gradient: Callable[[Tensor, Tensor, float], tuple[Tensor, float]],
 ) -> None:
     """Take all steps of Adam that the evaluations allow.
@@ -151,11 +151,11 @@ def _train(
         trial: the run.
         batch: images of a step.
         renders: of a step per image.
-        rate: first and last learning rate of the encoder.
+        lr: first and last learning rate of the encoder.
         gradient: predictions [B, n] without a graph, their images and sigma -> the gradient [B, n] of the loss of each,
             and the mean loss of the samples.
     """
-    optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=rate[0])
+    optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=lr[0])
 
     def step(images: Tensor, share: float) -> tuple[float, float]:
         sigma = linear(trial.task.sigma, share)
@@ -166,4 +166,4 @@ def _train(
         optimizer.step()
         return sigma, loss
 
-    train(trial, optimizer, ("lr", rate), batch, step_count(trial, batch, renders), step)
+    train(trial, optimizer, ("lr", lr), batch, step_count(trial, batch, renders), step)

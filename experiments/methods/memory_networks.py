@@ -51,12 +51,12 @@ def through_memory(
     radius: tuple[float, float] = (0.07, 0.003),
     output_radius: float = 0.5,
     damping: float = 3e-4,
-    rate: tuple[float, float] = (3e-3, 3e-4),
+    lr: tuple[float, float] = (3e-3, 3e-4),
     target_damping: float = 1e-2,
     target_radius: float = 0.5,
     fit_damping: float = 0.3,
     many_damping: float = 3e-4,
-    many_rate: tuple[float, float] = (1e-2, 3e-4),
+    many_lr: tuple[float, float] = (1e-2, 3e-4),
     warm_up: float = 0.05,
     temperature: float = 0.15,
 ) -> zh.Memory:
@@ -73,12 +73,12 @@ def through_memory(
         radius: first and last trust radius of "newton", in the weights.
         output_radius: longest move of the outputs in a step of "newton", over sigma.
         damping: of "newton".
-        rate: first and last learning rate of "adam".
+        lr: first and last learning rate of "adam".
         target_damping: of the Newton steps on up to 10 outputs.
         target_radius: longest Newton step on up to 10 outputs, over sigma.
         fit_damping: of the steps on the weights that follow them.
         many_damping: of the Newton steps on more outputs.
-        many_rate: first and last learning rate of Adam, which follows them.
+        many_lr: first and last learning rate of Adam, which follows them.
         warm_up: share of the training in which the learning rate grows to its first value. Without it, some networks
             do not train.
         temperature: of the local entropy over the mean loss, with up to 10 parameters.
@@ -106,8 +106,8 @@ def through_memory(
         "newton": partial(_newton, network, layer, radius, output_radius, damping),
         "targets": partial(_targets, network, layer, target_damping, target_radius, fit_damping)
         if task.n <= MOST
-        else partial(_many_targets, network, layer, many_damping, many_rate, warm_up),
-        "adam": partial(_adam, network, layer, rate),
+        else partial(_many_targets, network, layer, many_damping, many_lr, warm_up),
+        "adam": partial(_adam, network, layer, lr),
     }[steps]()
     for step in range(total):
         share = min(step / (ANNEALED * total), 1.0)
@@ -159,34 +159,34 @@ def _targets(network: nn.Module, layer: zh.BlackBox, damping: float, radius: flo
 
 
 def _many_targets(
-    network: nn.Module, layer: zh.BlackBox, damping: float, rate: tuple[float, float], warm_up: float
+    network: nn.Module, layer: zh.BlackBox, damping: float, lr: tuple[float, float], warm_up: float
 ) -> Update:
     optimizer, newton = torch.optim.Adam(network.parameters()), zh.optim.NewtonTargets(damping=damping)
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         y = network(images)
         ends = newton(lambda at: layer(at, images), y)
-        descend(optimizer, geometric(rate, share) * min(share / warm_up, 1.0), (y - ends).square().mean())
+        descend(optimizer, geometric(lr, share) * min(share / warm_up, 1.0), (y - ends).square().mean())
         assert newton.losses is not None
         return newton.losses.mean()
 
     return update
 
 
-def _adam(network: nn.Module, layer: zh.BlackBox, rate: tuple[float, float]) -> Update:
+def _adam(network: nn.Module, layer: zh.BlackBox, lr: tuple[float, float]) -> Update:
     optimizer = torch.optim.Adam(network.parameters())
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         loss = layer(network(images), images).mean()
-        descend(optimizer, geometric(rate, share), loss)
+        descend(optimizer, geometric(lr, share), loss)
         return loss.detach()
 
     return update
 
 
-def descend(optimizer: torch.optim.Optimizer, rate: float, objective: Tensor) -> None:
+def descend(optimizer: torch.optim.Optimizer, lr: float, objective: Tensor) -> None:
     """Take a step along the gradient of an objective."""
-    optimizer.param_groups[0]["lr"] = rate
+    optimizer.param_groups[0]["lr"] = lr
     optimizer.zero_grad()
     objective.backward()
     optimizer.step()

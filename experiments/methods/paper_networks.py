@@ -36,7 +36,7 @@ def first_order(
     *,
     proposal: Literal["fr22", "aggregate"],
     batch: int = 2,
-    rate: tuple[float, float] = (5e-4, 1e-4),
+    lr: tuple[float, float] = (5e-4, 1e-4),
 ) -> None:
     """Adam on the weights.
 
@@ -44,11 +44,11 @@ def first_order(
         trial: the run.
         proposal: how the gradient is sampled, with one antithetic pair and f(x) per image.
         batch: images of a step.
-        rate: first and last learning rate.
+        lr: first and last learning rate.
     """
     smoothing = zh.Smoothing(sigma=trial.task.sigma[0], samples=1, proposal=proposal, order=1)
     layer = zh.BlackBox(trial.loss, smoothing)
-    optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=rate[0])
+    optimizer = torch.optim.Adam(trial.encoder.parameters(), lr=lr[0])
 
     def step(images: Tensor) -> float:
         optimizer.zero_grad()
@@ -57,7 +57,7 @@ def first_order(
         optimizer.step()
         return float(loss.detach())
 
-    _train(trial, layer, optimizer, ("lr", rate), batch, smoothing.evaluations(trial.task.n), step)
+    _train(trial, layer, optimizer, ("lr", lr), batch, smoothing.evaluations(trial.task.n), step)
 
 
 def second_order(

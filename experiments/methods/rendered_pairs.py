@@ -47,7 +47,7 @@ def fit_to_pairs(
     *,
     fits: int = 8000,
     batch: int = 16,
-    rate: tuple[float, float] = (4e-3, 3e-5),
+    lr: tuple[float, float] = (4e-3, 3e-5),
     warm_up: int = 100,
     softness: float = 0.01,
 ) -> None:
@@ -58,7 +58,7 @@ def fit_to_pairs(
         memory: of renders.
         fits: steps.
         batch: examples of a step.
-        rate: first and last learning rate.
+        lr: first and last learning rate.
         warm_up: steps in which the learning rate grows to its first value.
         softness: added to the squared errors.
     """
@@ -70,7 +70,7 @@ def fit_to_pairs(
         k = torch.randint(len(points), (batch,))
         error = trial.encoder(images[k]) - points[k]
         loss = (torch.einsum("bi,bij,bj->b", error, metric[k], error) + softness).sqrt().mean()
-        descend(optimizer, geometric(rate, step / fits) * min((step + 1) / warm_up, 1.0), loss)
+        descend(optimizer, geometric(lr, step / fits) * min((step + 1) / warm_up, 1.0), loss)
         every, last = max(1, fits // ROWS), step == fits - 1
         if step % every == 0 or last:
             trial.report(loss=loss.detach(), measured=last or step % (10 * every) == 0)

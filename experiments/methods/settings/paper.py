@@ -84,11 +84,11 @@ RETUNED: dict[str, dict[str, Settings]] = {
             "steps": 50,
         },
     },
-    # By hand on runs 100 to 102 with 1 000 simulations: eight combinations of rate and batch of our_g, whose best one
+    # By hand on runs 100 to 102 with 1 000 simulations: eight combinations of lr and batch of our_g, whose best one
     # fr22 has too; six ranges of the radius of our_hvpa.
     "cnn_throw": {
-        "fr22": {"rate": (2e-3, 2e-4)},
-        "our_g": {"rate": (2e-3, 2e-4)},
+        "fr22": {"lr": (2e-3, 2e-4)},
+        "our_g": {"lr": (2e-3, 2e-4)},
         "our_hvpa": {"radius": (0.3, 0.01)},
     },
     # The rendered tasks: eight to twenty-four settings of each method on three starts. Table 3 gives up the plateau of

@@ -52,7 +52,7 @@ def test_sigma_and_the_step_go_down():
             weights.append(torch.cat([p.detach().flatten().clone() for p in encoder.parameters()]))
             return super().parameter_error(encoder)
 
-    _, trial = trained("our_g", Noted(size), batch=1, rate=(1e-3, 1e-5))
+    _, trial = trained("our_g", Noted(size), batch=1, lr=(1e-3, 1e-5))
     sigmas = [row.sigma for row in trial.rows[1:]]
     assert sigmas[0] == Bump.sigma[0]
     assert sigmas[90:] == pytest.approx([Bump.sigma[1]] * 10)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.levenberg_marquardt import levenberg_steps
+
 _INVARIANT = 1e-10
 """Length of a new direction, relative to the largest curvature, from which on the space is complete."""
 _SHIFTS = (1e-10, 1e8)
@@ -44,9 +46,5 @@ def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: T
     )
     curvature, slope = values.clamp_min(0.0), length * vectors[0]
     size = float(curvature.max()) or length
-    low, high = (slope.new_full((len(radii), 1), factor * size) for factor in _SHIFTS)
-    for _ in range(_BISECTIONS):
-        shift = (low * high).sqrt()
-        long = (slope / (curvature + shift)).norm(dim=1, keepdim=True) > radii[:, None]
-        low, high = torch.where(long, shift, low), torch.where(long, high, shift)
-    return -(slope / (curvature + high)) @ vectors.mT @ known
+    low, high = _SHIFTS
+    return levenberg_steps(slope, curvature, radii, (low * size, high * size), _BISECTIONS) @ vectors.mT @ known

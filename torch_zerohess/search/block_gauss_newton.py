@@ -22,6 +22,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.levenberg_marquardt import damped_steps
 from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, check_share
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
@@ -29,9 +30,6 @@ from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 
-_SHIFTS = (1e-8, 1e8)
-"""Range of the shift that shortens a step, in units of the largest curvature."""
-_BISECTIONS = 50
 _RIDGE = 1e-6
 """Added to D D^T, in units of its mean diagonal: bounds can make the steps of a block dependent."""
 
@@ -200,24 +198,6 @@ def renewed(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
     square = d @ d.mT
     square.diagonal().add_(_RIDGE * float(square.diagonal().mean()) or 1.0)
     return torch.addmm(jacobian, d.mT, torch.cholesky_solve(c - d @ jacobian, torch.linalg.cholesky(square)))
-
-
-def damped_steps(gradient: Tensor, hessian: Tensor, radii: Tensor) -> Tensor:
-    """Return steps s [k, n] that minimise gradient.s + s.hessian s/2 within each of the radii [k], all float64.
-
-    s = -(hessian + shift)^-1 gradient (Levenberg-Marquardt), with the shift found by bisection of its logarithm.
-    Negative curvature counts as none. Eigenvectors are as exact as the Jacobian is: float32.
-    """
-    size = _largest(hessian)
-    values, basis = torch.linalg.eigh((hessian / size).float())
-    curvature, vectors = size * values.double().clamp_min(0.0), basis.double()
-    slope = vectors.mT @ gradient
-    low, high = (slope.new_full((len(radii), 1), factor * size) for factor in _SHIFTS)
-    for _ in range(_BISECTIONS):
-        shift = (low * high).sqrt()
-        long = (slope / (curvature + shift)).norm(dim=1, keepdim=True) > radii[:, None]
-        low, high = torch.where(long, shift, low), torch.where(long, high, shift)
-    return -(slope / (curvature + high)) @ vectors.mT
 
 
 def _largest(values: Tensor) -> float:

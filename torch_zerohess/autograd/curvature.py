@@ -19,6 +19,7 @@ from torch.autograd.graph import Node
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.autograd.transforms import made_by
+from torch_zerohess.linalg.flat import flattened, split_like
 
 _DENSE = 10_000
 """Parameters beyond which `to_dense` refuses: the matrix would take 800 MB in float64."""
@@ -64,19 +65,19 @@ class CurvatureOperator:
         self._inputs = _listed(inputs)
         if not self._inputs or not all(one.requires_grad for one in self._inputs):
             raise ValueError("inputs must be tensors that require grad")
-        self._sizes = [one.numel() for one in self._inputs]
         self.mode = mode
-        self.shape = (sum(self._sizes), sum(self._sizes))
+        N = sum(one.numel() for one in self._inputs)
+        self.shape = (N, N)
         self.dtype, self.device = self._inputs[0].dtype, self._inputs[0].device
         if mode == "exact":
             self._through = self._inputs
             self._slopes = _grad([outputs], self._inputs, None, create_graph=True)
-            self.gradient = self._flat([one.detach() for one in self._slopes])
+            self.gradient = flattened([one.detach() for one in self._slopes])
         else:
             self._through = black_box_inputs(outputs) if through is None else _listed(through)
             self._check_path(outputs)
             self._slopes = _grad([outputs], self._through, None, create_graph=True)
-            self.gradient = self._flat(_grad([outputs], self._inputs, None))
+            self.gradient = flattened(_grad([outputs], self._inputs, None))
 
     gradient: Tensor
     """Gradient of the loss, [N]."""
@@ -100,7 +101,7 @@ class CurvatureOperator:
             return torch.stack([self @ column for column in v.unbind(1)], 1) if v.shape[1] else v.clone()
         t = self._split(v)
         if self.mode == "exact":
-            return self._flat(_grad(self._slopes, self._inputs, t))
+            return flattened(_grad(self._slopes, self._inputs, t))
         return self.pull(self.output_curvature(self.output_step(v)))
 
     @property
@@ -135,7 +136,7 @@ class CurvatureOperator:
 
     def pull(self, d: Sequence[Tensor]) -> Tensor:
         """Return J^T d, [N], for vectors d in the shapes of the inputs of the black boxes ("gauss_newton" only)."""
-        return self._flat(_grad(self._through, self._inputs, d))
+        return flattened(_grad(self._through, self._inputs, d))
 
     def to_dense(self) -> Tensor:
         """Return the matrix [N, N], one product per column; ValueError beyond 10 000 parameters."""
@@ -144,11 +145,7 @@ class CurvatureOperator:
         return self @ torch.eye(self.shape[0], dtype=self.dtype, device=self.device)
 
     def _split(self, v: Tensor) -> list[Tensor]:
-        v = v.detach().to(self.dtype)
-        return [part.view_as(one) for part, one in zip(v.split(self._sizes), self._inputs, strict=True)]
-
-    def _flat(self, parts: Sequence[Tensor]) -> Tensor:
-        return torch.cat([part.reshape(-1) for part in parts])
+        return split_like(v.detach().to(self.dtype), self._inputs)
 
 
 def hvp(
@@ -176,9 +173,7 @@ def hvp(
             f"got {[list(one.shape) for one in vectors]}"
         )
     operator = CurvatureOperator(outputs, parts, mode=mode, through=through)
-    product = operator @ torch.cat([one.reshape(-1) for one in vectors])
-    pieces = product.split([one.numel() for one in parts])
-    result = [piece.view_as(one) for piece, one in zip(pieces, parts, strict=True)]
+    result = split_like(operator @ flattened(vectors), parts)
     return result[0] if isinstance(inputs, Tensor) else result
 
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.overrides import TorchFunctionMode
 
+from torch_zerohess.linalg.flat import flattened
 from torch_zerohess.linalg.jacobians import Blocks, Jacobian, OuterProducts, Rows
 
 _OF_TRAINING = (
@@ -108,8 +109,8 @@ class SampleJacobian:
             with torch.enable_grad():
                 outputs = _checked(self._network(sample[None]))[0]
             for one in outputs:
-                parts = torch.autograd.grad(one, parameters, retain_graph=True, materialize_grads=True)
-                rows.append(torch.cat([part.reshape(-1) for part in parts]))
+                gradients = torch.autograd.grad(one, parameters, retain_graph=True, materialize_grads=True)
+                rows.append(flattened(gradients))
         return torch.stack(rows)
 
     def _places(self) -> dict[int, Places]:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from torch_zerohess.arguments import check_tensors
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
+from torch_zerohess.linalg.flat import split_like
 from torch_zerohess.optim.second_order import check_positive
 
 
@@ -66,7 +67,6 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
 
 
 def _add(weights: Sequence[Tensor], step: Tensor) -> None:
-    parts = step.split([one.numel() for one in weights])
     with torch.no_grad():
-        for one, part in zip(weights, parts, strict=True):
-            one.add_(part.view_as(one).to(one.dtype))
+        for one, part in zip(weights, split_like(step, weights), strict=True):
+            one.add_(part.to(one.dtype))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
+from torch_zerohess.linalg.flat import flattened
 from torch_zerohess.optim.second_order import (
     TRIALS,
     Closure,
@@ -177,7 +178,7 @@ class NonlinearCG(SecondOrder):
         parts = [self.state[one].get(name) for one in self._parameters]
         if any(part is None for part in parts):
             return None
-        return torch.cat([part.double().reshape(-1) for part in parts])
+        return flattened(parts).double()
 
     def _set(self, name: str, vector: Tensor) -> None:
         for one, part in zip(self._parameters, self._split(vector), strict=True):

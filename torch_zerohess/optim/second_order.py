@@ -15,6 +15,7 @@ from torch_zerohess.autograd.blocks import magnitudes, output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.dual import dual_step
+from torch_zerohess.linalg.flat import flattened, split_like
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.steihaug import Step
 
@@ -88,8 +89,7 @@ class Model:
     def dual_step(self, radius: float, damping: float) -> Step | None:
         """Return the step of `linalg.dual.dual_step` for the mean of the losses; None where A is indefinite."""
         A = torch.stack([torch.block_diag(*self._dense(index)) for index in range(len(self._operators))]).mean(0)
-        slopes = [[one.reshape(-1) for one in operator.output_gradient] for operator in self._operators]
-        g = torch.stack([torch.cat(one) for one in slopes]).double().mean(0)
+        g = torch.stack([flattened(operator.output_gradient) for operator in self._operators]).double().mean(0)
         J = self._white_box
         if float((self.gradient - J.rmatvec(g).double()).norm()) > _OUTSIDE * float(self.gradient.norm()):
             raise ValueError(
@@ -117,9 +117,7 @@ class Model:
         if self._jacobian is None:
             moved = operator.output_step(s)
         else:
-            sizes = [one.numel() for one in operator.through]
-            flat = self._white_box.matvec(s).split(sizes)
-            moved = [one.view_as(y) for one, y in zip(flat, operator.through, strict=True)]
+            moved = split_like(self._white_box.matvec(s), operator.through)
         return max(float(one.norm(dim=-1).max()) for one in moved)
 
     def _dense(self, index: int) -> list[Tensor]:
@@ -194,8 +192,8 @@ class SecondOrder(Optimizer):
 
     def _split(self, vector: Tensor) -> list[Tensor]:
         """Return the parts of a vector [N] in the shapes and types of the parameters."""
-        parts = vector.split([one.numel() for one in self._parameters])
-        return [part.view_as(one).to(one.dtype) for part, one in zip(parts, self._parameters, strict=True)]
+        parts = split_like(vector, self._parameters)
+        return [part.to(one.dtype) for part, one in zip(parts, self._parameters, strict=True)]
 
     def _copy(self) -> list[Tensor]:
         """Return a copy of the parameters, to `_restore`."""

@@ -1,0 +1,17 @@
+"""Several tensors as one vector: parameters, gradients, outputs."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def flattened(tensors: Sequence[Tensor]) -> Tensor:
+    """Return the numbers of tensors, N in all, one after the other: [N]."""
+    return torch.cat([one.reshape(-1) for one in tensors])
+
+
+def split_like(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Return the parts of a vector [N] in the shapes of tensors, N numbers in all."""
+    parts = vector.split([one.numel() for one in tensors])
+    return [part.view_as(one) for part, one in zip(parts, tensors, strict=True)]

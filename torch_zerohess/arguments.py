@@ -57,15 +57,6 @@ def checked_seed(value: Any) -> int:
     return seed
 
 
-def checked_timeout(value: Any) -> float | None:
-    """Return seconds, or None for no limit. TypeError if it is no number, ValueError if it is not positive."""
-    if value is None:
-        return None
-    if not checked_number("timeout", value) > 0:
-        raise ValueError(f"timeout must be seconds > 0 or None, got {value!r}")
-    return float(value)
-
-
 def checked_integer(name: str, value: Any, least: int | None = None) -> int:
     """Return an integer as one of Python. TypeError if it is none, ValueError if it is below `least`."""
     try:
@@ -79,18 +70,44 @@ def checked_integer(name: str, value: Any, least: int | None = None) -> int:
     return number
 
 
-def checked_number(name: str, value: Any, least: float = -math.inf) -> float:
-    """Return a number. TypeError if it is none, ValueError if it is NaN or below `least`."""
+def checked_number(
+    name: str,
+    value: Any,
+    least: float = -math.inf,
+    *,
+    above: float | None = None,
+    most: float = math.inf,
+    below: float | None = None,
+) -> float:
+    """Return a number. TypeError if it is none, ValueError if it is NaN or out of its range.
+
+    least, most: ends that belong to the range.
+    above, below: ends that do not. A number below infinity is finite.
+    """
     try:
         number = None if isinstance(value, (str, bytes, bool)) else float(value)
     except (TypeError, ValueError, RuntimeError):
         number = None
     if number is None:
         raise TypeError(f"{name} must be a number, got {value!r}")
-    if not number >= least:
-        wanted = "a number" if least == -math.inf else f"at least {least:g}"
-        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    outside = (above is not None and number <= above) or (below is not None and number >= below)
+    if outside or not least <= number <= most:
+        raise ValueError(f"{name} must be {_range(least, above, most, below)}, got {value!r}")
     return number
+
+
+def _range(least: float, above: float | None, most: float, below: float | None) -> str:
+    """Return a range of numbers as text."""
+    ends = []
+    if above is not None:
+        ends.append("positive" if above == 0.0 else f"above {above:g}")
+    if least > -math.inf:
+        ends.append(f"at least {least:g}")
+    if most < math.inf:
+        ends.append(f"at most {most:g}")
+    elif below is not None:
+        ends.append("finite" if below == math.inf else f"below {below:g}")
+    return " and ".join(ends) or "a number"
 
 
 def checked_file(name: str, value: Any) -> Path:

@@ -7,6 +7,7 @@ of this form is a head. A render then serves every reference, because the black 
     loss = layer(network(images), images).mean()
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -68,8 +69,7 @@ class LocalEntropy:
     def __post_init__(self) -> None:
         if not callable(self.head):
             raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {self.head!r}")
-        if not 0.0 < checked_number("temperature", self.temperature) < float("inf"):
-            raise ValueError(f"temperature must be positive and finite, got {self.temperature}")
+        checked_number("temperature", self.temperature, above=0.0, below=math.inf)
 
     def __call__(self, outputs: Tensor, *aux: Tensor) -> Tensor:
         """Return the losses [K] themselves; the layer takes the local entropy over its samples."""

@@ -9,6 +9,7 @@ image, and has derivatives of every order in it:
     fit = zh.minimize(lambda x: loss(render(x)), x0, sigma=0.1)                 # E L(image): the loss inside of it
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import checked_integer, checked_number
 
 __all__ = ["ImageLoss", "mse", "multiscale_mse", "ssim"]
 
@@ -100,8 +101,7 @@ def ssim(target: Any, *, window_size: int = 11, data_range: float = 1.0) -> Imag
     target = _checked(target)
     if window_size < 3 or window_size % 2 == 0:
         raise ValueError(f"window_size must be odd and at least 3, got {window_size}")
-    if not 0.0 < data_range < float("inf"):
-        raise ValueError(f"data_range must be positive and finite, got {data_range}")
+    data_range = checked_number("data_range", data_range, above=0.0, below=math.inf)
     _large_enough(target, window_size, f"a window of {window_size}")
     try:
         import kornia.metrics  # noqa: F401 - that it is missing should be known before the first evaluation
@@ -109,7 +109,7 @@ def ssim(target: Any, *, window_size: int = 11, data_range: float = 1.0) -> Imag
         raise ImportError(
             f"losses.ssim needs kornia ({error}): pip install 'torch_zerohess[losses]'", name=error.name
         ) from error
-    return ImageLoss("ssim", target, partial(_dissimilarity, window_size=window_size, data_range=float(data_range)))
+    return ImageLoss("ssim", target, partial(_dissimilarity, window_size=window_size, data_range=data_range))
 
 
 def _mean_square(images: Tensor, target: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.adapters.server import Server, ended, late, shown
-from torch_zerohess.arguments import check_tensors, checked_timeout
+from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
@@ -89,7 +89,8 @@ class Program(Closing):
             raise ValueError("server=True needs a command that is a list, and format 'json' or 'npy'")
         if on_failure not in ("raise", "nan"):
             raise ValueError(f"on_failure must be 'raise' or 'nan', got {on_failure!r}")
-        self.command, self.server, self.format, self.timeout = command, server, format, checked_timeout(timeout)
+        self.command, self.server, self.format = command, server, format
+        self.timeout = None if timeout is None else checked_number("timeout", timeout, above=0.0)
         self.on_failure, self._shape = on_failure, torch.Size()
         self.last_failure: str | None = None
         """Message of the last run that failed, with what it wrote to the standard error; in worker processes theirs."""

@@ -81,7 +81,6 @@ def check_limits(tolerance: float | None, of: Derivative, max_evaluations: int |
                 f"max_evaluations is the limit of a tolerance: give tolerance too, got {max_evaluations} alone"
             )
         return
-    if not 0 < checked_number("tolerance", tolerance) < math.inf:
-        raise ValueError(f"tolerance must be positive and finite, a relative error such as 0.1, got {tolerance}")
+    checked_number("tolerance", tolerance, above=0.0, below=math.inf)
     if max_evaluations is not None:
         checked_integer("max_evaluations", max_evaluations)

@@ -65,8 +65,7 @@ def finite_difference_hvp(
     n = x.shape[-1]
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):
         raise ValueError(f"v must be a tensor of shape [{n}] or of the shape of x, got {getattr(v, 'shape', v)}")
-    if not 0 < checked_number("step", step) < math.inf:
-        raise ValueError(f"step must be positive and finite, in units of sigma, got {step}")
+    checked_number("step", step, above=0.0, below=math.inf)
     sigma = smoothing.sigma_vector(n, x.device)
     t = v.detach().double() / sigma
     size = t.abs().amax(-1, keepdim=True)  # the square of a large number is infinite

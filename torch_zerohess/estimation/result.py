@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from numbers import Real
 from typing import NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.evaluation import ValueMode
 from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.inputs import all_finite, short
@@ -150,10 +150,7 @@ class Estimate:
         Raises:
             ValueError: as `standard_error`, or a level out of its range.
         """
-        if isinstance(level, bool) or not isinstance(level, Real):
-            raise TypeError(f"level must be a number, got {level!r}")
-        if not 0 < level <= _MOST_LEVEL:
-            raise ValueError(f"level must be between 0 and {_MOST_LEVEL}, got {level}")
+        level = checked_number("level", level, above=0.0, most=_MOST_LEVEL)
         t = self._checked(quantity, v)
         error, degrees = self._spread(quantity, t)
         half = error * student_factor(level, degrees)

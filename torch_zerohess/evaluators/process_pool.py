@@ -20,7 +20,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer, checked_timeout
+from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.payload import dumped, loaded_error
@@ -96,7 +96,7 @@ class ProcessPool(Ahead):
             raise ValueError(f"memory_limit must be bytes > 0 or None, got {memory_limit!r}")
         if memory_limit is not None and sys.platform != "linux":
             raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
-        self.timeout = checked_timeout(timeout)
+        self.timeout = None if timeout is None else checked_number("timeout", timeout, above=0.0)
         self.retries, self.recycle, self.memory_limit = retries, recycle, memory_limit
         super().__init__()
         self._forget()

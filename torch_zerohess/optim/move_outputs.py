@@ -6,10 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.arguments import check_tensors
+from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.flat import split_like
-from torch_zerohess.optim.second_order import check_positive
 
 
 def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping: float = 0.3) -> None:
@@ -40,7 +39,7 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
         >>> torch.allclose(network(x) - before, torch.ones(2, 2), atol=1e-4)
         True
     """
-    check_positive(damping=damping)
+    checked_number("damping", damping, above=0.0)
     if not isinstance(network, nn.Module):
         raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
     check_tensors(samples=samples, change=change)

@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool
+from torch_zerohess.arguments import check_bool, checked_number
 from torch_zerohess.linalg.steihaug import Step
 from torch_zerohess.linalg.subproblem import diagonal_step
 from torch_zerohess.optim.newton_step import NewtonStep
-from torch_zerohess.optim.second_order import Model, check_positive, check_radius
+from torch_zerohess.optim.second_order import Model
 
 MOST = 10_000
 """Parameters beyond which the Hessian is not formed."""
@@ -64,8 +64,8 @@ class Newton(NewtonStep):
         max_radius: float = math.inf,
         lr: float = 1.0,
     ) -> None:
-        check_radius(radius)
-        check_positive(max_radius=max_radius)
+        checked_number("radius", radius, above=0.0, below=math.inf)
+        checked_number("max_radius", max_radius, above=0.0)
         check_bool(adapt=adapt)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'shift' or 'abs', got {modification!r}")

@@ -6,10 +6,10 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool, checked_integer
+from torch_zerohess.arguments import check_bool, checked_integer, checked_number
 from torch_zerohess.linalg.steihaug import Step, clipped, steihaug
 from torch_zerohess.optim.newton_step import NewtonStep
-from torch_zerohess.optim.second_order import Model, check_not_negative, check_positive, check_radius
+from torch_zerohess.optim.second_order import Model
 
 SOLVERS = ("steihaug", "clip", "dual")
 _FAR = 1e6
@@ -92,16 +92,18 @@ class NewtonCG(NewtonStep):
         output_radius: float | None = None,
         lr: float = 1.0,
     ) -> None:
-        check_radius(radius)
-        check_positive(tolerance=tolerance, max_radius=max_radius)
+        checked_number("radius", radius, above=0.0, below=math.inf)
+        for name, value in (("tolerance", tolerance), ("max_radius", max_radius)):
+            checked_number(name, value, above=0.0)
+        for name, value in (("damping", damping), ("noise", noise)):
+            checked_number(name, value, 0.0, below=math.inf)
         check_bool(adapt=adapt)
-        check_not_negative(damping=damping, noise=noise)
         if solver not in SOLVERS:
             raise ValueError(f"solver must be one of {', '.join(map(repr, SOLVERS))}, got {solver!r}")
         if modification not in (None, "abs"):
             raise ValueError(f"modification must be None or 'abs', got {modification!r}")
         if output_radius is not None:
-            check_positive(output_radius=output_radius)
+            checked_number("output_radius", output_radius, above=0.0)
         if (modification or solver == "dual" or output_radius) and curvature != "gauss_newton":
             what = "modification 'abs'" if modification else "solver 'dual'" if solver == "dual" else "output_radius"
             raise ValueError(f"{what} needs curvature 'gauss_newton', got {curvature!r}")

@@ -6,9 +6,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_tensors, checked_integer
+from torch_zerohess.arguments import check_tensors, checked_integer, checked_number
 from torch_zerohess.autograd.blocks import magnitudes
-from torch_zerohess.optim.second_order import check_positive
 
 _DENSE = 16
 """Outputs up to which the Hessian of every element is formed and solved."""
@@ -49,7 +48,8 @@ class NewtonTargets:
     """
 
     def __init__(self, *, damping: float = 1e-3, iterations: int = 16, radius: float = math.inf) -> None:
-        check_positive(damping=damping, radius=radius)
+        for name, value in (("damping", damping), ("radius", radius)):
+            checked_number(name, value, above=0.0)
         self.damping, self.radius = damping, radius
         self.iterations = checked_integer("iterations", iterations, 1)
         self.losses: Tensor | None = None

@@ -7,16 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.linalg.flat import flattened
-from torch_zerohess.optim.second_order import (
-    TRIALS,
-    Closure,
-    Model,
-    SecondOrder,
-    check_not_negative,
-    check_radius,
-)
+from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder
 
 MODIFICATIONS = ("abs", "radius")
 Product = Callable[[Tensor], Tensor]
@@ -76,8 +69,8 @@ class NonlinearCG(SecondOrder):
         modification: str = "abs",
         lr: float = 1.0,
     ) -> None:
-        check_radius(radius)
-        check_not_negative(line_search_tolerance=line_search_tolerance)
+        checked_number("radius", radius, above=0.0, below=math.inf)
+        checked_number("line_search_tolerance", line_search_tolerance, 0.0, below=math.inf)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'abs' or 'radius', got {modification!r}")
         defaults = {

@@ -42,8 +42,7 @@ class LinearSigma:
                     "parameters of the black box instead"
                 )
         for name, value in (("start", start), ("end", end)):
-            if not 0 < checked_number(name, value) < math.inf:
-                raise ValueError(f"{name} must be a positive sigma, got {value!r}")
+            checked_number(name, value, above=0.0, below=math.inf)
         self.start, self.end, self.count = float(start), float(end), 0
         self.steps, self.hold = checked_integer("steps", steps, 1), checked_integer("hold", hold, 0)
         self._apply()

@@ -1,6 +1,5 @@
 """Shared by the second-order optimizers: one group of parameters as a vector, and the quadratic model of a loss."""
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any
@@ -135,8 +134,7 @@ class SecondOrder(Optimizer):
     """An optimizer with one Hessian, hence one group of parameters."""
 
     def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any]) -> None:
-        if not 0.0 <= checked_number("lr", defaults["lr"]) <= 1.0:
-            raise ValueError(f"lr must be a factor from 0 to 1, got {defaults['lr']}")
+        checked_number("lr", defaults["lr"], 0.0, most=1.0)
         if defaults["curvature"] not in CURVATURES:
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
         super().__init__(params, defaults)
@@ -214,23 +212,3 @@ def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, Sa
     if jacobian is not None and not isinstance(jacobian, SampleJacobian):
         raise TypeError(f"closure must return a SampleJacobian after the loss and y, got {type(jacobian).__name__}")
     return loss, through, jacobian
-
-
-def check_positive(**settings: float) -> None:
-    """Raise TypeError for a setting that is no number, ValueError for one that is not positive."""
-    for name, value in settings.items():
-        if not checked_number(name, value) > 0.0:
-            raise ValueError(f"{name} must be positive, got {value}")
-
-
-def check_radius(radius: float) -> None:
-    """Raise TypeError for a radius that is no number, ValueError for one that is not positive or not finite."""
-    if not 0.0 < checked_number("radius", radius) < math.inf:
-        raise ValueError(f"radius must be positive and finite, got {radius}")
-
-
-def check_not_negative(**settings: float) -> None:
-    """Raise TypeError for a setting that is no number, ValueError for one that is negative or not finite."""
-    for name, value in settings.items():
-        if not 0.0 <= checked_number(name, value) < math.inf:
-            raise ValueError(f"{name} must be finite and not negative, got {value}")

@@ -13,6 +13,7 @@ from typing import Literal, TypeVar
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_number
 from torch_zerohess.search.method import Method
 from torch_zerohess.search.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -177,6 +178,5 @@ class GaussNewton(Method[Q]):
 
 
 def check_share(name: str, value: float, most: float) -> None:
-    """Raise ValueError for a value that is not above 0, finite and at most `most`."""
-    if not 0.0 < value <= most or value == math.inf:
-        raise ValueError(f"{name} must be above 0 and at most {most}, got {value}")
+    """Raise TypeError or ValueError for a value that is no positive, finite number of at most `most`."""
+    checked_number(name, value, above=0.0, most=most, below=math.inf)

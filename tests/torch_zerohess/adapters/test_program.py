@@ -199,7 +199,7 @@ def test_arguments_are_checked():
         Program(["true"], format="xml")
     with pytest.raises(ValueError, match="server=True needs a command that is a list"):
         Program(list, server=True)
-    with pytest.raises(ValueError, match="timeout must be seconds > 0 or None, got 0"):
+    with pytest.raises(ValueError, match="timeout must be positive, got 0"):
         Program(["true"], timeout=0)
     with pytest.raises(ValueError, match="on_failure must be 'raise' or 'nan', got 'drop'"):
         Program(["true"], on_failure="drop")

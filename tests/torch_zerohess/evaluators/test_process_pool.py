@@ -378,7 +378,7 @@ def test_no_worker_outlives_its_parent(end, tmp_path):
 def test_arguments_are_checked():
     for wrong, message in [
         ({"workers": 0}, "workers must be at least 1, got 0"),
-        ({"timeout": 0}, "timeout must be seconds > 0 or None, got 0"),
+        ({"timeout": 0}, "timeout must be positive, got 0"),
         ({"retries": -1}, "retries must be at least 0, got -1"),
         ({"recycle": 0}, "recycle must be at least 1, got 0"),
         ({"memory_limit": 0}, "memory_limit must be bytes > 0 or None, got 0"),

@@ -256,7 +256,7 @@ def test_errors():
         ({"damping": -1.0}, "damping"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"curvature": "newton"}, "curvature"),
-        ({"noise": -1.0}, "noise must be finite and not negative, got -1.0"),
+        ({"noise": -1.0}, "noise must be at least 0 and finite, got -1.0"),
     ):
         with pytest.raises(ValueError, match=message):
             zh.optim.NewtonCG([x], **settings)

@@ -252,7 +252,7 @@ def test_errors():
     for settings, message in (
         ({"radius": 0.0}, "radius must be positive and finite, got 0.0"),
         ({"line_search_iterations": 0}, "line_search_iterations must be at least 1, got 0"),
-        ({"line_search_tolerance": -1.0}, "line_search_tolerance must be finite and not negative, got -1.0"),
+        ({"line_search_tolerance": -1.0}, "line_search_tolerance must be at least 0 and finite, got -1.0"),
         ({"recompute": 0}, "recompute must be at least 1, got 0"),
         ({"curvature": "hessian"}, "curvature must be"),
         ({"modification": "cube"}, "modification must be 'abs' or 'radius', got 'cube'"),

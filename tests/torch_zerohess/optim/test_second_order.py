@@ -99,7 +99,7 @@ def test_schedulers_of_torch_scale_the_step(kind: type, settings: dict, schedule
 @pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
 @pytest.mark.parametrize("lr", [-0.1, 1.5, float("nan")])
 def test_lr_is_a_factor_from_0_to_1(kind: type, lr: float) -> None:
-    with pytest.raises(ValueError, match=r"lr must be a (factor from 0 to 1|number), got"):
+    with pytest.raises(ValueError, match=r"lr must be (at least 0 and at most 1|a number), got"):
         kind([torch.ones(1, requires_grad=True)], lr=lr)
 
 

@@ -255,7 +255,7 @@ def test_the_model_at_the_best_point_is_gauss_newton():
 def test_what_cannot_be_searched_is_refused():
     start = torch.zeros(3).double()
     for name, value in (("radius", 0.0), ("share", 2.0), ("block", -0.1), ("radius", math.inf)):
-        with pytest.raises(ValueError, match=f"{name} must be above 0"):
+        with pytest.raises(ValueError, match=f"{name} must be positive"):
             zh.optim.BlockGaussNewton(start, sigma=1.0, loss=torch.sum, **{name: value})
     with pytest.raises(ValueError, match="loss must be a function of one output, got None"):
         zh.optim.BlockGaussNewton(start, sigma=1.0, loss=None)

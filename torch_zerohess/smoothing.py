@@ -229,6 +229,12 @@ class Smoothing:
         return self.sigma.to(device=device, dtype=torch.float64)
 
 
+def check_smoothing(value: Any) -> None:
+    """Raise TypeError for what is no `Smoothing`."""
+    if not isinstance(value, Smoothing):
+        raise TypeError(f"smoothing must be a Smoothing, got {type(value).__name__}")
+
+
 def _sampling(proposal: str, sampler: str, antithetic: Signs, baseline: str, **_: Any) -> str:
     return f"{proposal}, {sampler}, {'pairs' if antithetic else 'single'}, {baseline}"
 

@@ -23,7 +23,7 @@ from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 
@@ -97,8 +97,7 @@ class BlackBox(nn.Module):
         on_nonfinite: str | float = "raise",
     ) -> None:
         super().__init__()
-        if not isinstance(smoothing, Smoothing):
-            raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
+        check_smoothing(smoothing)
         self.smoothing = smoothing
         check_memory(memory)
         self.call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)

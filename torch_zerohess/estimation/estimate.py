@@ -18,7 +18,7 @@ from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 _ONE_SIGMA = 0.6826894921370859  # probability within one standard deviation of a normal distribution
@@ -84,8 +84,7 @@ def estimate(
         >>> bool((e.gradient - torch.tensor([2.0, 4.0])).abs().max() < 0.5), e.evaluations
         (True, 1025)
     """
-    if not isinstance(smoothing, Smoothing):
-        raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
+    check_smoothing(smoothing)
     call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head, joint)
     check_limits(tolerance, tolerance_of, max_evaluations)
     _check_memory(call, aux, memory, tolerance)

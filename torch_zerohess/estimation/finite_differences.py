@@ -11,7 +11,7 @@ from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.estimate import estimate
 from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.smoothing import Smoothing, check_smoothing
 
 
 def finite_difference_hvp(
@@ -59,8 +59,7 @@ def finite_difference_hvp(
         >>> bool((product - torch.tensor([12.0, 0.0])).abs().max() < 1.0)
         True
     """
-    if not isinstance(smoothing, Smoothing):
-        raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
+    check_smoothing(smoothing)
     dtype, x = checked_input(x).dtype, working(x)
     n = x.shape[-1]
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.evaluation import BlackBoxCall
-from torch_zerohess.estimation.inputs import checked_input
+from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values
 from torch_zerohess.estimation.perturbations import perturb
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
@@ -72,8 +72,7 @@ def sparse_jacobian(
         >>> J.evaluations, J.explained > 0.9, bool((seen - 1 / 9).abs().max() < 0.01)
         (200, True, True)
     """
-    if not isinstance(smoothing, Smoothing):
-        raise TypeError(f"smoothing must be a Smoothing, got {type(smoothing).__name__}")
+    check_smoothing(smoothing)
     x = checked_input(x).detach()
     if x.ndim != 1:
         raise ValueError(f"x must be one point [n], got {list(x.shape)}")
@@ -86,7 +85,7 @@ def sparse_jacobian(
     settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True)
     check_samples(smoothing.samples, settings.keep)
     call = BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite)
-    work = x if x.dtype == torch.float64 else x.float()
+    work = working(x)
     u, changes, weights, shape, evaluations = _sampled(call, work, smoothing)
     check_samples(len(u), settings.keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)

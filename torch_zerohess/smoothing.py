@@ -218,7 +218,7 @@ class Smoothing:
         """
         if self.seed is None:
             return int(torch.randint(2**63 - 1, (), device="cpu"))
-        return (self.seed + _STRIDE * taken) % 2**63
+        return following_seed(self.seed, taken)
 
     def sigma_vector(self, n: int, device: torch.device) -> Tensor:
         """Return sigma as float64 [n]; ValueError for a tensor that has not n elements."""
@@ -233,6 +233,11 @@ def check_smoothing(value: Any) -> None:
     """Raise TypeError for what is no `Smoothing`."""
     if not isinstance(value, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(value).__name__}")
+
+
+def following_seed(seed: int, number: int) -> int:
+    """Return one of the seeds that follow from a seed, by its number; number 0 is the seed itself."""
+    return (seed + _STRIDE * number) % 2**63
 
 
 def _sampling(proposal: str, sampler: str, antithetic: Signs, baseline: str, **_: Any) -> str:

@@ -6,14 +6,13 @@ from typing import Literal
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.estimation.sums import Sums
-from torch_zerohess.smoothing import Smoothing
+from torch_zerohess.smoothing import Smoothing, following_seed
 
 Derivative = Literal["gradient", "hessian_diagonal", "hessian"]
 """Derivatives whose error may end the drawing."""
 MOST = 100_000
 """Evaluations that a tolerance may take where no other number is given."""
 _NAMES = {"gradient": "gradient", "hessian_diagonal": "diagonal of the Hessian", "hessian": "Hessian"}
-_STEP = 0x9E3779B97F4A7C15  # from the seed of a batch to the seed of the next
 
 
 def draw_until(
@@ -52,7 +51,7 @@ def draw_until(
             following = following // 2
         if not following:
             break
-        own = smoothing.replace(samples=following * smoothing.samples, seed=(seed + len(batches) * _STEP) % 2**63)
+        own = smoothing.replace(samples=following * smoothing.samples, seed=following_seed(seed, len(batches)))
         batches.append(draw(own))
         used, multiple = used + cost(own), multiple + following
         found, flat = error(batches)

@@ -22,6 +22,7 @@ from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 _ONE_SIGMA = 0.6826894921370859  # probability within one standard deviation of a normal distribution
+_ALONE = "one batch: no tolerance was given"
 
 
 def estimate(
@@ -105,18 +106,8 @@ def estimate(
         return Sums(evaluate(call, flat, aux_rows, own, stored(own, B, n), control), own)
 
     def made(batches: list[Sums], reason: str) -> Estimate:
-        first, *more = batches
-        return Estimate(
-            *(first.evaluations, batch, x, first.smoothing),
-            more=more,
-            reason=reason,
-            value=value,
-            term=term,
-            chosen=chosen,
-            joint=joint,
-        )
+        return Estimate(batches, batch, x, reason=reason, value=value, term=term, chosen=chosen, joint=joint)
 
-    alone = "one batch: no tolerance was given"
     if memory is not None:
         memory.check_parameters(x.shape[-1])
         with memory.lock:
@@ -126,9 +117,9 @@ def estimate(
                 seed = smoothing.drawn_seed(control.taken)
                 term = SurrogateTerm.fixed(control, flat, aux_rows, sigma, seed, smoothing.order)
                 aux_rows = [*aux_rows, *term.encoded]
-            return made([draw(smoothing)], alone)
+            return made([draw(smoothing)], _ALONE)
     if tolerance is None:
-        return made([draw(smoothing)], alone)
+        return made([draw(smoothing)], _ALONE)
     center = value == "center" or smoothing.baseline == "center"
     batches, reason = draw_until(
         draw,

@@ -9,13 +9,11 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.evaluation import ValueMode
-from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.inputs import all_finite, short
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
-from torch_zerohess.smoothing import Smoothing
 
 _MOST_LEVEL = 0.9999  # up to which the factor of Student's t is right to four digits
 
@@ -42,23 +40,20 @@ class Estimate:
 
     def __init__(
         self,
-        evaluations: Evaluations,
+        batches: Sequence[Sums],
         batch: torch.Size,
         x: Tensor,
-        smoothing: Smoothing,
         *,
-        more: Sequence[Sums] = (),
-        reason: str = "one batch: no tolerance was given",
+        reason: str,
         value: ValueMode = "center",
         term: SurrogateTerm | None = None,
         chosen: str = "",
         joint: bool = False,
     ) -> None:
-        self._batches = [Sums(evaluations, smoothing), *more]
-        self._batch, self._x, self._smoothing, self.reason = batch, x, smoothing, reason
+        self._batches, self._batch, self._x, self.reason = batches, batch, x, reason
         self._value_mode, self._term, self._chosen, self._joint = value, term, chosen, joint
-        self._sigma = evaluations.expansion.sigma
-        self._out = evaluations.expansion.base.shape[1:]
+        expansion = batches[0].evaluations.expansion
+        self._sigma, self._out = expansion.sigma, expansion.base.shape[1:]
 
     @property
     def value(self) -> Tensor:
@@ -216,7 +211,7 @@ class Estimate:
         if quantity == "value":
             return sums
         if quantity == "hessian":
-            one = self._smoothing.sigma
+            one = self._batches[0].smoothing.sigma
             if isinstance(one, float):  # in place: a Hessian is large, and the sums are of no other use
                 return sums.div_(one).div_(one)
             i, j = self._sigma[:, None], self._sigma  # the larger sigma first, for symmetry to the last bit

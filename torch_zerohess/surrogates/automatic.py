@@ -14,7 +14,7 @@ from torch_zerohess.surrogates.low_rank import LowRank
 from torch_zerohess.surrogates.process import ProcessSurrogate
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
 from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
-from torch_zerohess.surrogates.surrogate import Surrogate, checked
+from torch_zerohess.surrogates.surrogate import Surrogate, checked, fitted
 
 _PROCESS = 32
 """Parameters up to which a Gaussian process is tried; in more, distances say little."""
@@ -91,9 +91,7 @@ class AutomaticSurrogate:
 
     def coordinates(self, z: Tensor) -> Tensor:
         """Coordinates [K, r] of the expected outputs at z [K, n], where `space` is not None."""
-        if self.model is None:
-            raise RuntimeError("fit the surrogate to evaluations before it is used")
-        return self.model(z)
+        return fitted(self.model)(z)
 
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""

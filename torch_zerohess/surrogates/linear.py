@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.surrogate import checked
+from torch_zerohess.surrogates.surrogate import checked, fitted
 
 _RIDGE = 1e-9
 """Added to the squares of the points, in units of their mean: enough to be solvable."""
@@ -29,8 +29,9 @@ class LinearSurrogate:
     def __init__(self, *, capacity: int = 4000) -> None:
         capacity = checked_integer("capacity", capacity, 2)
         self.capacity = capacity
-        self._middle = self._mean = self._slope = torch.empty(0, device="cpu")
-        self._squares = torch.empty(0, device="cpu")  # of the slope, summed over the elements of the output [n]
+        self._middle = self._mean = torch.empty(0, device="cpu")
+        self._slope: Tensor | None = None
+        self._squares: Tensor | None = None  # of the slope, summed over the elements of the output [n]
         self._shape = torch.Size()
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
@@ -48,12 +49,14 @@ class LinearSurrogate:
 
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
-        predicted = self._mean + (z.double() - self._middle) @ self._slope
+        slope = fitted(self._slope)
+        predicted = self._mean + (z.double() - self._middle) @ slope
         return predicted.reshape(len(z), *self._shape).to(z.dtype)
 
     def variance(self, sigma: Tensor) -> Tensor:
         """Return the variances of the elements of an output under N(z, sigma^2), summed, for sigma [n]."""
-        return self._squares @ sigma.to(self._squares).square()
+        squares = fitted(self._squares)
+        return squares @ sigma.to(squares).square()
 
 
 def _solve(square: Tensor, right: Tensor, ridge: float) -> Tensor:

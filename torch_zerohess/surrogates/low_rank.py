@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.surrogate import Surrogate, checked, scaled
+from torch_zerohess.surrogates.surrogate import Surrogate, checked, fitted, scaled
 
 _FLAT = 1e-7
 """Variance along a direction, relative to the largest one, below which the direction is left out."""
@@ -82,9 +82,7 @@ class LowRankSurrogate:
     @property
     def space(self) -> LowRank:
         """The coordinates of the latest fit."""
-        if self._space is None:
-            raise RuntimeError("fit the surrogate to evaluations before it is used")
-        return self._space
+        return fitted(self._space)
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.inducing import InducedProcess
 from torch_zerohess.surrogates.lengths import most_likely
-from torch_zerohess.surrogates.surrogate import checked
+from torch_zerohess.surrogates.surrogate import checked, fitted
 
 _MOST = 10
 """Parameters up to which each one gets a length of its own."""
@@ -42,9 +42,7 @@ class ProcessSurrogate:
     @property
     def process(self) -> InducedProcess:
         """The posterior, over z / lengths."""
-        if self._process is None:
-            raise RuntimeError("fit the surrogate to evaluations before it is used")
-        return self._process
+        return fitted(self._process)
 
     @property
     def lengths(self) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.surrogate import checked, scaled
+from torch_zerohess.surrogates.surrogate import checked, fitted, scaled
 
 
 class SparseSurrogate:
@@ -41,7 +41,7 @@ class SparseSurrogate:
         self.jacobian: SparseJacobian | None = None
         """Of the latest fit. `explained` is the share of the change of held-out outputs that it predicts."""
         self._middle = self._mean = torch.empty(0, device="cpu")
-        self._squares = torch.empty(0, device="cpu")  # squared lengths of the columns of the Jacobian [n]
+        self._squares: Tensor | None = None  # squared lengths of the columns of the Jacobian [n]
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
@@ -63,14 +63,9 @@ class SparseSurrogate:
 
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
-        jacobian = self._fitted()
+        jacobian = fitted(self.jacobian)
         return self._mean.to(z).view(jacobian.shape) + jacobian.matvec(z - self._middle.to(z))
 
     def variance(self, sigma: Tensor) -> Tensor:
         """Return the variances of the elements of an output under N(z, sigma^2), summed, for sigma [n]."""
-        return self._squares.to(sigma) @ sigma.square()
-
-    def _fitted(self) -> SparseJacobian:
-        if self.jacobian is None:
-            raise RuntimeError("fit the surrogate to evaluations before it is used")
-        return self.jacobian
+        return fitted(self._squares).to(sigma) @ sigma.square()

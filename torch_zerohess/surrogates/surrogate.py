@@ -3,11 +3,12 @@
 import contextlib
 import math
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
+T = TypeVar("T")
 _MIDDLING = 2.0**30
 """Numbers up to this, and down to its inverse, have squares that float32 can add up."""
 
@@ -34,6 +35,13 @@ def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
     if outputs.ndim < 1 or len(outputs) != len(points):
         raise ValueError(f"outputs must be [{len(points)}, *out], one per point, got {list(outputs.shape)}")
     return points.detach(), outputs.detach()
+
+
+def fitted(model: T | None) -> T:
+    """Return what a fit made; RuntimeError if there was no fit."""
+    if model is None:
+        raise RuntimeError("fit the surrogate to evaluations before it is used")
+    return model
 
 
 def outside_inference() -> AbstractContextManager[None]:

@@ -130,5 +130,3 @@ def test_very_few_points_give_their_mean():
 def test_wrong_settings_are_named(settings, message):
     with pytest.raises(ValueError, match=message):
         SparseSurrogate(**settings).fit(normal(P, n), image(normal(P, n)))
-    with pytest.raises(RuntimeError, match="fit the surrogate"):
-        SparseSurrogate()(normal(2, n))

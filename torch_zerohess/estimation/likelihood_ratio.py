@@ -36,7 +36,7 @@ class LikelihoodRatio(Divisible):
             )
             made = cls(u if keep else Redrawn(rows, x, sigma, smoothing.paired, single), weight)
         else:
-            _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
+            drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
             points, u, weight = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.paired, single, density)
             points, made = completed(points, x, center), cls(u, weight)
         if density == proposals.UNIFORM and bool((weight == 0).all(1).any()):

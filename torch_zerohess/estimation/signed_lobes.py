@@ -30,7 +30,7 @@ class SignedLobes(Divisible):
     ) -> tuple[Tensor, "SignedLobes"]:
         B, n = x.shape
         density, single = proposals.SIGNED_LOBES, x.dtype == torch.float32
-        _, drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
+        drawn = samplers.SAMPLERS[smoothing.sampler](seed, B, n, smoothing, density, x.device)
         points, u, _ = kernels.place(drawn, x.double().contiguous(), sigma, smoothing.paired, single, density)
         return completed(points, x, center), cls(u.sign() * math.sqrt(2 / math.pi))
 

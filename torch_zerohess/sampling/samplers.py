@@ -32,10 +32,8 @@ def draw_size(smoothing: Smoothing, n: int) -> int:
     return min(n, max(1, samples // 3) if smoothing.baseline == "mean" else (samples + 1) // 2)
 
 
-def sobol(
-    seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Scrambled Sobol points: rows [R, 5] and u [R, n].
+def sobol(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:
+    """Scrambled Sobol points: u [R, n].
 
     Each independent scramble is a linear matrix scramble (Matousek 1998), shared by the batch, and a digital shift,
     one per batch element. The sequence has thirty bits; the bits below them are random. Raises ValueError if n is over
@@ -58,13 +56,11 @@ def sobol(
     p = (bits.reshape(jitter.shape) + jitter) * 2.0**-_SOBOL_BITS
     p = p.clamp(_HALF_ULP, 1.0 - _HALF_ULP)
     rows = mixture_rows(torch.full_like(index, seed), index, p[:, n:], n, proposal)
-    return rows, shape(rows, p[:, :n])
+    return shape(rows, p[:, :n])
 
 
-def orthogonal(
-    seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Blocks of orthogonal directions with independent chi-distributed lengths (Yu et al. 2016): rows and u [R, n].
+def orthogonal(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:
+    """Blocks of orthogonal directions with independent chi-distributed lengths (Yu et al. 2016): u [R, n].
 
     The orthonormal factor of a Gaussian matrix is independent of the lengths of its rows. So each direction is scaled
     by the length of its own row, and every row is N(0, I).
@@ -79,7 +75,7 @@ def orthogonal(
     if whole < smoothing.samples:
         blocks.append(_orthogonalized(gaussian[:, whole:]))
     p = uniforms(rows[:, 0], rows[:, 1], 0, 2, EXTRA)
-    return rows, with_lobes(rows, torch.cat(blocks, 1).flatten(0, 1), p[:, 0], p[:, 1])
+    return with_lobes(rows, torch.cat(blocks, 1).flatten(0, 1), p[:, 0], p[:, 1])
 
 
 def _orthogonalized(block: Tensor) -> Tensor:
@@ -94,12 +90,9 @@ def _orthogonalized(block: Tensor) -> Tensor:
     return basis * torch.linalg.vector_norm(block, dim=2, keepdim=True)
 
 
-def random(
-    seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device
-) -> tuple[Tensor, Tensor]:
-    """Independent rows [R, 5] and their u [R, n]."""
-    rows = kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device)
-    return rows, kernels.draw(rows, n)
+def random(seed: int, batch: int, n: int, smoothing: Smoothing, proposal: int, device: torch.device) -> Tensor:
+    """Independent u [R, n]."""
+    return kernels.draw(kernels.pick_rows(seed, 0, batch * smoothing.samples, n, proposal, device), n)
 
 
 SAMPLERS = {"random": random, "sobol": sobol, "orthogonal": orthogonal}

@@ -14,7 +14,7 @@ CPU = torch.device("cpu")
 def drawn(sampler: str, batch: int, n: int, samples: int, seed: int = 5) -> Tensor:
     """Perturbations [batch, samples, n] of a Gaussian."""
     smoothing = Smoothing(sigma=1.0, samples=samples, proposal="gaussian", sampler=sampler)
-    u = samplers.SAMPLERS[sampler](seed, batch, n, smoothing, proposals.GAUSSIAN, CPU)[1]
+    u = samplers.SAMPLERS[sampler](seed, batch, n, smoothing, proposals.GAUSSIAN, CPU)
     return u.view(batch, samples, n)
 
 

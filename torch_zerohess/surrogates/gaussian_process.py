@@ -94,21 +94,6 @@ class GaussianProcess:
         weights = torch.cholesky_inverse(factor) @ change  # of many elements: faster than to solve for each
         return cls(points, kernel, length, mean, weights, variance, noise, factor)
 
-    @classmethod
-    def condition(
-        cls, points: Tensor, outputs: Tensor, kernel: Kernel, length: float, noise: float
-    ) -> "GaussianProcess":
-        """Condition on outputs [P, m] at points [P, n] with a kernel, length and noise that are known.
-
-        The variance is the most likely one.
-        """
-        mean = outputs.mean(0)
-        change = outputs - mean
-        factor = _factor(_distance(points, points), kernel, length, noise)
-        weights = torch.cholesky_solve(change, factor)
-        variance = float((change * weights).sum()) / outputs.numel() or 1.0
-        return cls(points, kernel, length, mean, weights, variance, noise, factor)
-
     def pending(self, x: Tensor) -> "GaussianProcess":
         """Return the process as if its prediction at x [n] had been evaluated.
 

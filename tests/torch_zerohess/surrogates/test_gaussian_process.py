@@ -7,7 +7,7 @@ import torch
 from searches import bar, waves
 from torch.distributions import MultivariateNormal
 
-from torch_zerohess.surrogates import lengths
+from torch_zerohess.surrogates import gaussian_process, lengths
 from torch_zerohess.surrogates.gaussian_process import (
     HIGH_NOISES,
     KERNELS,
@@ -42,16 +42,11 @@ def test_kernels_are_their_textbook_formulas():
     assert torch.allclose(gaussian(d), vector(*[math.exp(-(x**2) / 2) for x in d.tolist()]), rtol=1e-14)
 
 
-@pytest.mark.parametrize("how", ["chosen", "given"])
 @pytest.mark.parametrize("n", [1, 3])
-def test_the_posterior_is_the_conditional_of_the_joint_normal_distribution(n, how):
+def test_the_posterior_is_the_conditional_of_the_joint_normal_distribution(n):
     points, x = 2 * normal(12, n), 2 * normal(7, n, seed=1)
     outputs = waves(points)
-    if how == "chosen":
-        process = GaussianProcess.fit(points, outputs)
-    else:
-        process = GaussianProcess.condition(points, outputs, matern, 1.7, 0.01)
-        assert (process.kernel, process.length, process.noise) == (matern, 1.7, 0.01)
+    process = GaussianProcess.fit(points, outputs)
     scaled, at = points / process.length, x / process.length
     K = by_hand(process.kernel, scaled, scaled) + process.noise * torch.eye(12, dtype=torch.float64)
     inverse = torch.linalg.inv(K)
@@ -172,10 +167,12 @@ def test_more_is_predicted_of_a_smooth_output_than_of_its_loss():
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_derivatives_are_those_of_the_formula(kernel):
+def test_derivatives_are_those_of_the_formula(kernel, monkeypatch):
     """The kernels' derivatives written out: d/dd matern = -3 d exp(-sqrt(3) d), d/dd gaussian = -d exp(-d^2/2)."""
     points = 2 * normal(8, 3)
-    process = GaussianProcess.condition(points, waves(points), kernel, 1.3, 1e-3)
+    monkeypatch.setattr(gaussian_process, "KERNELS", (kernel,))
+    monkeypatch.setattr(gaussian_process, "LENGTHS", (1.3,))
+    process = GaussianProcess.fit(points, waves(points), (1e-3,))
     x = torch.cat([normal(4, 3, seed=5), points[:2]])
     step = (x[:, None] - points) / 1.3
     d = step.norm(dim=2)
@@ -196,8 +193,8 @@ def test_derivatives_are_those_of_the_formula(kernel):
 
 def test_distances_far_from_the_origin_are_exact():
     points = normal(10, 2)
-    far = GaussianProcess.condition(points + 1e7, waves(points), matern, 1.0, 1e-3)
-    near = GaussianProcess.condition(points, waves(points), matern, 1.0, 1e-3)
+    far = GaussianProcess.fit(points + 1e7, waves(points), (1e-3,))
+    near = GaussianProcess.fit(points, waves(points), (1e-3,))
     x = normal(5, 2, seed=1)
     torch.testing.assert_close(far(x + 1e7), near(x), atol=1e-5, rtol=0)
 

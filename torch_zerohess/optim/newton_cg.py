@@ -132,7 +132,7 @@ class NewtonCG(NewtonStep):
 
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
         step = self._solved(model, radius, group)
-        most = group.get("output_radius")  # absent from the states of older versions
+        most = group["output_radius"]
         return step if most is None else clipped(step, model.gradient, most, model.longest_move(step.s))
 
     @staticmethod

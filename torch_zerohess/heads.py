@@ -10,7 +10,6 @@ of this form is a head. A render then serves every reference, because the black 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -63,7 +62,7 @@ class LocalEntropy:
         temperature: T over the mean loss.
     """
 
-    head: Callable[..., Tensor] | Any
+    head: Callable[..., Tensor]
     temperature: float = 0.1
 
     def __post_init__(self) -> None:

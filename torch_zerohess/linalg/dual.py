@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.jacobians import Jacobian
-from torch_zerohess.linalg.steihaug import Step
+from torch_zerohess.linalg.step import Step
 
 
 def dual_step(J: Jacobian, A: Tensor, g: Tensor, radius: float, damping: float) -> Step:

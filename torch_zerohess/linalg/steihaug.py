@@ -2,18 +2,11 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-
-class Step(NamedTuple):
-    """A step s [N], the decrease -(g.s + s.Hs/2) that the quadratic model promises, and why the search for it ended."""
-
-    s: Tensor
-    decrease: float
-    exit: str
+from torch_zerohess.linalg.step import Step
 
 
 def steihaug(
@@ -102,16 +95,3 @@ def _to_boundary(s: Tensor, direction: Tensor, radius: float) -> Tensor:
     a, b, c = direction.dot(direction), s.dot(direction), s.dot(s) - radius**2
     root = (b * b - a * c).clamp_min(0.0).sqrt()
     return -c / (b + root) if float(b) >= 0.0 else (root - b) / a
-
-
-def clipped(step: Step, gradient: Tensor, radius: float, length: float | None = None) -> Step:
-    """Return a step of a quadratic model with this gradient [N], shortened to the radius.
-
-    length: of the step, in the units of the radius; its Euclidean norm if None.
-    """
-    length = float(step.s.norm()) if length is None else length
-    if length <= radius:
-        return step
-    slope, scale = float(gradient.dot(step.s.to(gradient))), radius / length
-    bend = -2.0 * (step.decrease + slope)  # s.Hs
-    return Step(scale * step.s, -scale * (slope + 0.5 * scale * bend), "boundary")

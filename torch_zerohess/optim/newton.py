@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, checked_number
-from torch_zerohess.linalg.steihaug import Step
+from torch_zerohess.linalg.step import Step
 from torch_zerohess.linalg.subproblem import diagonal_step
 from torch_zerohess.optim.newton_step import NewtonStep
 from torch_zerohess.optim.second_order import Model

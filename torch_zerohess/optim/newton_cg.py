@@ -7,7 +7,8 @@ from typing import Any
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, checked_integer, checked_number
-from torch_zerohess.linalg.steihaug import Step, clipped, steihaug
+from torch_zerohess.linalg.steihaug import steihaug
+from torch_zerohess.linalg.step import Step, clipped
 from torch_zerohess.optim.newton_step import NewtonStep
 from torch_zerohess.optim.second_order import Model
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.steihaug import Step
+from torch_zerohess.linalg.step import Step
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, parts_of
 
 _ROUNDING = 10.0

@@ -16,7 +16,7 @@ from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.dual import dual_step
 from torch_zerohess.linalg.flat import flattened, split_like
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
-from torch_zerohess.linalg.steihaug import Step
+from torch_zerohess.linalg.step import Step
 
 Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], SampleJacobian]
 """What a closure returns: loss, (loss, y), or (loss, y, jacobian), with the inputs y of the black boxes."""

@@ -10,7 +10,7 @@ from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.dual import dual_step
 from torch_zerohess.linalg.jacobians import Rows
-from torch_zerohess.linalg.steihaug import Step, clipped
+from torch_zerohess.linalg.step import Step, clipped
 
 
 def network() -> nn.Module:

@@ -1,9 +1,7 @@
-"""The curvature of a batch of black boxes as one small matrix per element, and its modification.
+"""The curvature of a batch of black boxes as one small matrix per element.
 
 Behind a network, H = J^T A J with A = d2l/dy2 over the outputs y [*batch, n] of the network. Where the loss is a sum
 over the batch, A is block-diagonal: one matrix [n, n] per element, which n products give for all elements at once.
-Sampled matrices are often indefinite. "abs" replaces the eigenvalues of each by their magnitudes, so that J^T A J is
-positive (saddle-free Newton: Dauphin et al. 2014).
 """
 
 import torch
@@ -49,12 +47,6 @@ def _check(operator: CurvatureOperator, blocks: list[Tensor]) -> None:
             "modification and solver 'dual' need a loss that is a sum or mean over the batch of black boxes, but the "
             "loss couples its elements: use modification=None and solver 'steihaug' or 'clip'"
         )
-
-
-def magnitudes(blocks: Tensor) -> Tensor:
-    """Return the blocks [..., n, n] with the magnitudes of their eigenvalues."""
-    values, vectors = torch.linalg.eigh(blocks)
-    return (vectors * values.abs()[..., None, :]) @ vectors.mT
 
 
 def jacobian(operator: CurvatureOperator) -> Tensor:

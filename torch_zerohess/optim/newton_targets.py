@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_tensors, checked_integer, checked_number
-from torch_zerohess.autograd.blocks import magnitudes
+from torch_zerohess.linalg.magnitudes import magnitudes
 
 _DENSE = 16
 """Outputs up to which the Hessian of every element is formed and solved."""

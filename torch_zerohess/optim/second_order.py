@@ -10,12 +10,13 @@ from torch.optim import Optimizer
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.autograd.blocks import jacobian as white_box_jacobian
-from torch_zerohess.autograd.blocks import magnitudes, output_blocks
+from torch_zerohess.autograd.blocks import output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.dual import dual_step
 from torch_zerohess.linalg.flat import flattened, split_like
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
+from torch_zerohess.linalg.magnitudes import magnitudes
 from torch_zerohess.linalg.step import Step
 
 Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], SampleJacobian]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation.control import Control, Prediction
-from torch_zerohess.estimation.surrogate_term import STEIN, nodes, prefers_pathwise, smoothed
+from torch_zerohess.estimation.surrogate_term import MOST_STEIN, nodes, prefers_pathwise, smoothed
 
 Part = Callable[[Tensor], Tensor]
 """x [B, n] -> [B, *out], differentiable."""
@@ -64,7 +64,7 @@ def around(
             u = nodes(seed, memory.draws, center.shape[1], B).to(center.device)
         if memory.pathwise is None and not (transforms.watched(center) or transforms.forward_mode_active()):
             memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
-        pathwise = len(sigma) > STEIN if memory.pathwise is None else memory.pathwise
+        pathwise = len(sigma) > MOST_STEIN if memory.pathwise is None else memory.pathwise
     else:  # the mean over all points is known from the center
         u, pathwise = sigma.new_zeros(1, len(sigma)), True
     with torch.no_grad():

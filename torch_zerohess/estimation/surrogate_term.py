@@ -28,7 +28,7 @@ from torch_zerohess.estimation.stein import Quantity
 
 _SOBOL = 64
 """Parameters up to which points are quasi-random; beyond them a sequence of few points is not even."""
-STEIN = 8
+MOST_STEIN = 8
 """Parameters up to which Stein's sums are tried."""
 _POINTS = 1024
 """Points of a call with few parameters, shared by the elements of its batch."""
@@ -231,7 +231,7 @@ def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: 
     surrogate = control.memory.surrogate
     if _jumps(surrogate, (x[0] + sigma * u).to(x.dtype)):
         return False
-    if len(sigma) > STEIN:
+    if len(sigma) > MOST_STEIN:
         return True
     few = SurrogateTerm(surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
     quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"

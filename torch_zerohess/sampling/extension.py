@@ -4,7 +4,7 @@ import importlib
 import os
 import warnings
 
-from torch_zerohess.sampling import shapes
+from torch_zerohess.sampling import fake_kernels
 
 HINT = "install a C++20 compiler (Debian: apt-get install g++) and reinstall: pip install --force-reinstall --no-deps ."
 
@@ -22,7 +22,7 @@ def _load() -> tuple[bool, str]:
             stacklevel=2,
         )
         return False, reason
-    shapes.register()
+    fake_kernels.register()
     return True, "built"
 
 

@@ -42,10 +42,11 @@ struct Counter {
 constexpr uint32_t kMultiplier0 = 0xD2511F53u, kMultiplier1 = 0xCD9E8D57u;
 constexpr uint32_t kWeyl0 = 0x9E3779B9u, kWeyl1 = 0xBB67AE85u;
 
-// `blocks` blocks of four words: two uniforms of type double, or the four words themselves.
+// Numbers that a block of four words gives: two uniforms of type double, or the four words themselves.
 template <class Out>
 constexpr int64_t kPerBlock = sizeof(Out) == sizeof(double) ? 2 : 4;
 
+// The numbers of `blocks` blocks, from the block of the counter on.
 template <class Out>
 ZH_INLINE void noise_generic(const Counter& at, int64_t blocks, Out* out) {
   for (int64_t i = 0; i < blocks; ++i) {

@@ -87,7 +87,8 @@ inline void project_drawn_rows(const DrawnRows& rows, int64_t begin, int64_t end
     for (int64_t m = 0; m < M; ++m) out[m * K + rows.samples + k] = -out[m * K + k];
 }
 
-// out[m, d] += sum_k a[m, k] U[k, d] (or U[k, d]^2) over rows u + k * stride, 0 <= k < count_k; a has stride K.
+// sums[m, d] += sign sum_k a[m, k] U[k, d] over rows u + k * stride, 0 <= k < rows, of `count` columns; a has stride K.
+// With `squares` U[k, d]^2 in place of U[k, d], which has no sign. sign is -1 for the mirror images of drawn rows.
 inline void accumulate_rows(const double* u, int64_t stride, int64_t rows, int64_t count, int64_t K, int64_t M,
                             bool squares, double sign, const double* a, double* sums) {
   for (int64_t k = 0; k < rows; ++k) {

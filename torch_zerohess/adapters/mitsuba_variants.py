@@ -1,9 +1,9 @@
 """Which Mitsuba variant is safe here: an LLVM that is too old aborts the whole process, so every try runs in a child.
 
-``llvm_ad_rgb`` is several times faster than ``scalar_rgb``, but Dr.Jit hands LLVM code that LLVM 14 and 15 do not
-compile ("Cannot select: fminimum", then ``abort()``). :func:`select_variant` therefore takes ``llvm_ad_rgb`` only with
+`llvm_ad_rgb` is several times faster than `scalar_rgb`, but Dr.Jit hands LLVM code that LLVM 14 and 15 do not
+compile ("Cannot select: fminimum", then `abort()`). `select_variant` therefore takes `llvm_ad_rgb` only with
 a library of a version known to be new enough that also passes a tiny render in a child process, and the embedded
-``scalar_rgb``, which needs nothing, in all other cases.
+`scalar_rgb`, which needs nothing, in all other cases.
 """
 
 import ctypes.util
@@ -63,16 +63,16 @@ if not float(mi.TensorXf(mi.render(scene, spp=1)).array[0]) > 0.0:
 
 @dataclass(frozen=True)
 class Probe:
-    """Outcome of a try of one variant: whether it ``works``, and if not the ``reason`` (empty when it works)."""
+    """Outcome of a try of one variant: whether it `works`, and if not the `reason` (empty when it works)."""
 
     works: bool
     reason: str
 
 
 def find_llvm() -> Path | None:
-    """Newest libLLVM shared library with a known major version of at least ``MINIMUM_LLVM``.
+    """Newest libLLVM shared library with a known major version of at least `MINIMUM_LLVM`.
 
-    The library that ``DRJIT_LIBLLVM_PATH`` names is preferred when it qualifies; then come the usual folders of Linux
+    The library that `DRJIT_LIBLLVM_PATH` names is preferred when it qualifies; then come the usual folders of Linux
     and of Homebrew. The version is read from the file name or from the name of what a symbolic link points to; a
     library of unknown version is never a candidate.
 
@@ -93,11 +93,11 @@ def probe(variant: str, llvm: Path | None = None, timeout: float = 60.0) -> Prob
     """Try a variant on a 2x2 image in a child process, so that an abort there never reaches the caller.
 
     Args:
-        variant: name of a Mitsuba variant, such as ``"llvm_ad_rgb"``.
-        llvm: library for the child's ``DRJIT_LIBLLVM_PATH``; None leaves the choice to Dr.Jit.
+        variant: name of a Mitsuba variant, such as `"llvm_ad_rgb"`.
+        llvm: library for the child's `DRJIT_LIBLLVM_PATH`; None leaves the choice to Dr.Jit.
         timeout: seconds after which the child is killed and the variant counts as not working.
 
-    Returns: the :class:`Probe`; remembered per arguments, since a try costs one to two seconds.
+    Returns: the `Probe`; remembered per arguments, since a try costs one to two seconds.
 
     """
     if importlib.util.find_spec("mitsuba") is None:
@@ -124,25 +124,25 @@ def probe(variant: str, llvm: Path | None = None, timeout: float = 60.0) -> Prob
 
 
 def variants() -> dict[str, Probe]:
-    """Probe of each of ``CANDIDATES``, all tried at the same time; never aborts, never raises.
+    """Probe of each of `CANDIDATES`, all tried at the same time; never aborts, never raises.
 
-    Returns: name -> :class:`Probe`; what ``select_variant("auto")`` would not take for lack of LLVM does not work.
+    Returns: name -> `Probe`; what `select_variant("auto")` would not take for lack of LLVM does not work.
     """
     with ThreadPoolExecutor(len(CANDIDATES)) as pool:
         return dict(zip(CANDIDATES, pool.map(_safe, CANDIDATES), strict=True))
 
 
 def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleType:
-    """Set a variant that is known to work in this process, and return the ``mitsuba`` module.
+    """Set a variant that is known to work in this process, and return the `mitsuba` module.
 
     Args:
-        variant: ``"auto"`` (``llvm_ad_rgb`` where that is safe, else ``scalar_rgb``) or the name of a variant.
+        variant: `"auto"` (`llvm_ad_rgb` where that is safe, else `scalar_rgb`) or the name of a variant.
         threads: render threads of this process, at least 1; None keeps Dr.Jit's own choice (all cores). One thread in
             each of several processes uses the cores best.
 
     Raises:
         ModuleNotFoundError: Mitsuba is not installed.
-        ValueError: ``threads`` below 1.
+        ValueError: `threads` below 1.
         RuntimeError: the variant asked for does not work here; the message has the reason and what to do.
 
     """
@@ -199,7 +199,7 @@ def _libraries() -> Iterator[Path]:
 
 
 def _major(path: Path) -> int:
-    """Major version in the name of ``path`` or of the file it links to; 0 when neither says."""
+    """Major version in the name of `path` or of the file it links to; 0 when neither says."""
     for name in (path.resolve().name, path.name):
         match = _NAME.match(name)
         if match:

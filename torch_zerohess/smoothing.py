@@ -49,7 +49,8 @@ class Smoothing:
             perturbations: every call uses the same ones, whatever the number of threads. With a `Memory` they also
             depend on the number of evaluations that it has taken.
         scrambles: independent scrambles of sampler "sobol", a divisor of samples. Fewer ones have a smaller error, and
-            a standard error with fewer degrees of freedom. None takes 8 of at least 8 points, else 4, 2 or 1.
+            a standard error with fewer degrees of freedom. None: the largest of 1, 2, 4 and 8 that divides samples; 4
+            and 8 only with at least 8 points in each scramble, 8 only if no setting is "auto".
         order: highest derivative that is wanted; 1 leaves out the lobes made for the second. Second derivatives stay
             available from "aggregate", with more variance, and not from "optimal".
 

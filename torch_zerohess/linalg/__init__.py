@@ -1,1 +1,1 @@
-"""Steps inside a ball, a box and a Krylov space."""
+"""Steps inside a ball, a box, a metric and a Krylov space; Jacobians of many parameters; tensors as one vector."""

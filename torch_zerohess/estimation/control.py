@@ -23,6 +23,9 @@ from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
 _WITH_COORDINATES = (AutomaticSurrogate, LowRankSurrogate)
 """Exact types: a subclass may predict anything, and a surrogate of the caller's may have a `space` of its own."""
 
+_ROUNDING, _DEVIATION = 16.0, 0.01
+"""Errors of values that are negligible: in units of their rounding, and of their deviation."""
+
 
 @dataclass(frozen=True)
 class Control:
@@ -91,8 +94,9 @@ class Control:
             if self.active and not bool(torch.isfinite(predicted).all()):
                 raise ValueError("the surrogate of the memory predicted a value that is not finite")
         if self.learning and predicted is not None:
-            derivatives = list(zip(added(values), added(predicted), strict=True))
-            self.memory.observe(values, predicted, derivatives, kept)
+            least = [float(one.square().mean()) for one in added(_negligible(values, outputs.dtype))]
+            derivatives = list(zip(added(values), added(predicted), least, strict=True))
+            self.memory.regression.observe(values, predicted, derivatives, kept)
         return predicted if self.active else None
 
 
@@ -156,6 +160,16 @@ class Prediction:
             return None
         whole = model.variance(sigma)
         return whole if self.encoded else whole / max(1, self._aux[0][0].numel())
+
+
+def _negligible(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return errors [B, E] of random signs: rounding of values [B, E, *out], and a hundredth of their deviation."""
+    generator = torch.Generator().manual_seed(0)
+    signs = torch.randint(2, values.shape[:2], generator=generator, device="cpu").to(values.device) * 2.0 - 1.0
+    every = values.reshape(*signs.shape, -1).double()
+    deviation = (every - every.mean(1, keepdim=True)).square().mean((1, 2)).sqrt()
+    size = _ROUNDING * torch.finfo(dtype).eps * every.abs().amax((1, 2)) + _DEVIATION * deviation
+    return signs * size[:, None]
 
 
 def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:

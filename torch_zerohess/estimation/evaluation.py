@@ -103,7 +103,10 @@ class BlackBoxCall:
             self._lost(flat)
             return values, values
         outputs = self(flat, []).unflatten(0, (B, E))
+        before = _version(outputs)
         values, lost = apply_head(self.head, outputs, aux), self._lost(flat)
+        if _version(outputs) != before:
+            raise ValueError("head must not change the outputs of the black box, which are kept: use a copy of them")
         if lost:  # a head may make a number of NaN
             values = values.clone()
             values[[k // E for k in lost], [k % E for k in lost]] = torch.nan
@@ -214,6 +217,11 @@ def evaluate(
     expansion = Expansion(base, coefficients, sigma, outer.kept(scales, values, K), stein)
     kept_points = None if again is not None else perturbations.points
     return Evaluations(x, K, kept_points, values, kept, remaining, baseline, smoothing, expansion)
+
+
+def _version(outputs: Tensor) -> int:
+    """Return how often outputs were changed in place; tensors of inference mode do not tell."""
+    return 0 if outputs.is_inference() else outputs._version
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:

@@ -41,6 +41,8 @@ _PAIRS = 2
 quadratic in an affine map are exact from one pair, and two pairs tell an error."""
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
+_LOOKED = 512
+"""Points around the batch, and kept points, at which a surrogate is looked at for jumps, at most."""
 _EDGE = 1e-9
 """Probability at which the normal quantile is cut off."""
 
@@ -124,7 +126,7 @@ class SurrogateTerm:
         if memory.pathwise is None:
             memory.pathwise = prefers_pathwise(control, x, aux, sigma, u, order)
         copies = [one.clone() for one in aux]
-        return cls(copy.deepcopy(memory.surrogate), control, x, copies, sigma, u, memory.pathwise)
+        return cls(copy.deepcopy(memory.surrogate), control, x, copies, sigma, u, bool(memory.pathwise))
 
     @property
     def encoded(self) -> list[Tensor]:
@@ -221,31 +223,41 @@ def _derivative(fn: Callable[[Tensor], Tensor], x: Tensor, v: Tensor) -> Tensor:
     return result
 
 
-def prefers_pathwise(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int) -> bool:
+def prefers_pathwise(
+    control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int
+) -> bool | None:
     """Whether pathwise derivatives of the surrogate at x [B, n] vary less than Stein's sums.
 
     Both are computed for a few elements of the batch, and the variances of the derivative of this order compared. The
-    answer depends on the surrogate and not on evaluations of the present call. The pathwise
-    derivatives of a table, a tree or a model outside of autograd are 0, without variance, and wrong: the answer is no.
+    answer depends on the surrogate and not on evaluations of the present call. The pathwise derivatives of a table, a
+    tree or a model outside of autograd are 0, without variance, and wrong: the answer is no. It is None where the
+    surrogate is constant wherever it was looked at: both derivatives are 0 there, and another call decides.
     """
-    surrogate = control.memory.surrogate
-    if _jumps(surrogate, (x[0] + sigma * u).to(x.dtype)):
-        return False
+    memory, step = control.memory, -(-len(x) * len(u) // _LOOKED)
+    looked_at = [(x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype)]
+    if len(memory):
+        looked_at.append(memory.points[-_LOOKED:].to(x))
+    jumps = _jumps(memory.surrogate, torch.cat(looked_at))
+    if jumps is not False:
+        return None if jumps is None else False
     if len(sigma) > MOST_STEIN:
         return True
-    few = SurrogateTerm(surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
+    few = SurrogateTerm(memory.surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
     quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
     return float(few.variance(quantity).sum()) < float(replace(few, pathwise=False).variance(quantity).sum())
 
 
-def _jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool:
-    """Whether outputs at points z [Q, n] differ where their derivative says that they are constant."""
+def _jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
+    """Whether outputs at points z [Q, n] differ where their derivative says that they are constant; None if they do not
+    differ.
+    """
     with torch.inference_mode(False), torch.enable_grad():
         at = z.clone().requires_grad_()
         outputs = surrogate(at).reshape(len(z), -1)
-        differ = not bool((outputs == outputs[:1]).all())
-        if not differ or not outputs.requires_grad:
-            return differ
+        if bool((outputs == outputs[:1]).all()):
+            return None
+        if not outputs.requires_grad:
+            return True
         weights = torch.arange(
             1, 1 + outputs.shape[1], dtype=outputs.dtype, device=outputs.device
         )  # their plain sum may be constant

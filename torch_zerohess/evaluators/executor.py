@@ -1,6 +1,8 @@
 """Evaluation by an executor of somebody else: the standard pools, loky, dask, mpi4py."""
 
 import concurrent.futures
+import hashlib
+import pickle
 import threading
 import uuid
 from collections.abc import Callable, Sequence
@@ -32,6 +34,9 @@ class Executor(Closing):
     `ProcessPoolExecutor` (use one with `mp_context` "spawn"), almost anything for loky, dask and threads. It is sent
     with every task; pass `Factory(make, *args)` for one that is large or slow to make, which each process makes once.
 
+    Processes use the black box as it was when the call began. Where `pickle` tells that it has changed since the last
+    call they take the new one. Do not change one that only loky or dask can pickle.
+
     Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception
     of the first point is raised. An executor whose workers ended raises its own error (`BrokenExecutor`): it has no
     limit of time and no second try, which `ProcessPool` and `Ray` have.
@@ -53,6 +58,8 @@ class Executor(Closing):
             raise TypeError(f"executor must have a method submit, as concurrent.futures.Executor has, got {executor!r}")
         self.executor = executor
         self._fn: Callable[..., Any] | None = None
+        self._pickled = b""
+        """A digest of the state of that black box."""
         self._name = ""
         self._closed = False
 
@@ -93,9 +100,11 @@ class Executor(Closing):
 
     def _tasks(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> tuple[Batch, Tasks]:
         """Submit the chunks of points."""
+        threads = isinstance(self.executor, concurrent.futures.ThreadPoolExecutor)  # they use the black box itself
+        state = b"" if threads else _state(fn)
         with _lock:
-            if not same(self._fn, fn):
-                self._fn, self._name = fn, uuid.uuid4().hex
+            if not same(self._fn, fn) or state != self._pickled:
+                self._fn, self._pickled, self._name = fn, state, uuid.uuid4().hex
             name = self._name
         batch, tasks = Batch(points, 0), Tasks()
         try:
@@ -113,6 +122,14 @@ class Executor(Closing):
         """Take no further points; the executor stays as it is."""
         self._closed = True
         self._fn = None
+
+
+def _state(fn: Callable[..., Any]) -> bytes:
+    """Return a digest of what the workers get for a black box; the same for all that are not picklable."""
+    try:
+        return hashlib.sha256(pickle.dumps(fn)).digest()
+    except Exception:  # what pickle raises is up to the object
+        return b""
 
 
 def _joined(batch: Batch, tasks: Tasks) -> Tensor:

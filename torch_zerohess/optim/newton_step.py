@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.step import Step
-from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, parts_of
+from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr, parts_of
 
 _ROUNDING = 10.0
 """Smallest predicted decrease that can be tested, in units of rounding of the loss."""
@@ -45,7 +45,7 @@ class NewtonStep(SecondOrder):
         s, decrease, self.exit = self._minimise(model, radius, group)
         if not math.isfinite(decrease) or not bool(torch.isfinite(s).all()):
             raise ValueError("the curvature of the loss is not finite; no step was taken")
-        lr = float(group["lr"])
+        lr = checked_lr(group)
         if not group["adapt"]:
             self._add(lr * s)
             return model.loss

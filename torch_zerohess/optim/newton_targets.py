@@ -178,7 +178,7 @@ class NewtonTargets:
                 return s, True
             z = precondition(r)
             before, rz = rz, (r * z).sum(1, keepdim=True)
-            p = z + rz / before * p
+            p = z + torch.where(before == 0, 0.0, rz / before) * p  # an element that has ended may have nothing left
         return s, False
 
 

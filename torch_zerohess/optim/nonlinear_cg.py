@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.linalg.flat import flattened
-from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder
+from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr
 
 MODIFICATIONS = ("abs", "radius")
 Product = Callable[[Tensor], Tensor]
@@ -157,7 +157,7 @@ class NonlinearCG(SecondOrder):
             bend = -bend if group["modification"] == "abs" else 0.0
         radius = group["radius"]
         length = radius if abs(slope) >= radius * bend else abs(slope) / bend
-        return math.copysign(float(group["lr"]) * length, -slope) * d
+        return math.copysign(checked_lr(group) * length, -slope) * d
 
     def _given(self, hvp: Product, d: Tensor) -> Tensor:
         result = hvp(d.to(self._parameters[0].dtype))

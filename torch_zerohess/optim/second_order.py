@@ -131,11 +131,16 @@ class Model:
         return 0.5 * (dense + dense.mT)
 
 
+def checked_lr(group: dict[str, Any]) -> float:
+    """Return the learning rate of a group, which a scheduler may have set; ValueError if it is not in [0, 1]."""
+    return checked_number("lr", group["lr"], 0.0, most=1.0)
+
+
 class SecondOrder(Optimizer):
     """An optimizer with one Hessian, hence one group of parameters."""
 
     def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any]) -> None:
-        checked_number("lr", defaults["lr"], 0.0, most=1.0)
+        checked_lr(defaults)
         if defaults["curvature"] not in CURVATURES:
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
         super().__init__(params, defaults)

@@ -39,8 +39,11 @@ def evaluated(values: Tensor, points: Tensor, loss: Callable[[Tensor], Tensor] |
         return Evaluated(points, values)
     if shape and values.shape[1:] != shape:
         raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
+    before = values._version
     with torch.no_grad():
         losses = [loss(one) for one in values]
+    if values._version != before:
+        raise ValueError("loss must not change the output that it is given, which is kept: use a copy of it")
     if not all(isinstance(one, Tensor) for one in losses):
         raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")
     if any(one.numel() != 1 for one in losses):

@@ -1,8 +1,6 @@
 """Evaluations that are kept, and the surrogate fitted to them: a control variate for later estimates."""
 
-import math
 import threading
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,6 +9,7 @@ from torch import Tensor, nn
 from torch_zerohess.arguments import check_state, checked_integer
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.coefficient import Coefficient
 from torch_zerohess.surrogates.surrogate import Surrogate, outside_inference
 
 _GROWTH = 1.3
@@ -21,8 +20,6 @@ _EXCESS = 1.05
 """Evaluations over the capacity at which they are thinned."""
 _BLOCK = 1024
 """Points whose distances to others are held at once."""
-_KEPT = 0.9
-"""Weight of what the coefficient knows, at every new call."""
 
 
 class Memory:
@@ -104,9 +101,8 @@ class Memory:
         """How many of the evaluations that are kept the last fit knew: they come first."""
         self._known = 0
         """How many evaluations the last fit knew."""
-        self._moments: list[list[float]] = []
-        """Covariance of h(f) and h(g), and variance of h(g), over the sum of both variances in a call, averaged over
-        calls that g had not seen: of the values, then of what they add to first and second derivatives."""
+        self.regression = Coefficient()
+        """What earlier calls tell about the surrogate."""
 
     def __len__(self) -> int:
         """Evaluations that are kept."""
@@ -191,57 +187,15 @@ class Memory:
 
     @property
     def coefficient(self) -> float:
-        """Coefficient c in [0, 1]: the regression of h(f) on h(g) over evaluations that g had not seen; 0 before.
-
-        There is one regression for values and one for each order of derivatives, on the contributions of the
-        evaluations. They differ: a surrogate may explain values and no curvature. c is the smallest coefficient, so
-        that no derivative becomes noisier.
-
-        Each call has the weight 1 / (var h(f) + var h(g)). Losses at the edge of a plateau are a thousand times as
-        large as elsewhere: without the weights one call there would decide alone.
-        """
-        if self.fresh == 0:
-            return 1.0
-        ratios = [covariance / variance if variance > 0.0 else 0.0 for covariance, variance in self._moments]
-        return min(max(min(ratios, default=0.0), 0.0), 1.0)
-
-    def observe(
-        self,
-        losses: Tensor,
-        predicted: Tensor,
-        derivatives: Sequence[tuple[Tensor, Tensor]] = (),
-        kept: Tensor | None = None,
-    ) -> None:
-        """Tell the coefficient the values of a call, and what the surrogate predicted for them.
-
-        Args:
-            losses: values [B, K, *out].
-            predicted: the same by the surrogate.
-            derivatives: for each order the contributions of the values, and of the predicted ones: [B, *] each.
-            kept: which values count [B, K]; all of them if None.
-        """
-        a, b = (one.double().reshape(*one.shape[:2], -1) for one in (losses, predicted))
-        dim = 1 if a.shape[1] > 1 else 0  # the differences within an element make its derivatives
-        weight = torch.ones_like(a[..., :1]) if kept is None else kept[..., None].double()
-        count = weight.sum(dim, keepdim=True).clamp_min(1.0)
-        a, b = ((one - (weight * one).sum(dim, keepdim=True) / count) * weight for one in (a, b))
-        pairs = [(a, b), *derivatives]
-        new = [_moments_of(one, other) for one, other in pairs]
-        if not all(math.isfinite(one) for moments in new for one in moments):  # the surrogate predicts nonsense
-            self._moments = []
-            return
-        if len(self._moments) != len(new):
-            self._moments = [[0.0, 0.0] for _ in new]
-        self._moments = [
-            [_KEPT * old + (1.0 - _KEPT) * one for old, one in zip(kept, moments, strict=True)]
-            for kept, moments in zip(self._moments, new, strict=True)
-        ]
+        """Coefficient c in [0, 1] of the surrogate's values in the next call; see `Coefficient`."""
+        return 1.0 if self.fresh == 0 else self.regression.value
 
     def _thin(self) -> None:
         """Drop points whose nearest neighbour among later ones is closest, until the capacity is kept."""
         first = max(self._size - 2 * self.capacity, 0)  # older ones go first, so that distances are few
         points = self.points[first:]
-        scaled = points / points.std(0).clamp_min(torch.finfo(points.dtype).tiny)
+        deviation = points.std(0)
+        scaled = (points - points.mean(0)) / torch.where(deviation > 0, deviation, 1.0)
         nearest = torch.cat([_to_later(scaled, row) for row in range(0, len(scaled), _BLOCK)])
         kept = first + nearest.argsort()[len(points) - self.capacity :].sort().values
         with outside_inference():
@@ -259,7 +213,7 @@ class Memory:
             "rows": self._rows,
             "known": self._known,
             "pathwise": self.pathwise,
-            "moments": [list(one) for one in self._moments],
+            "moments": [list(one) for one in self.regression.moments],
             "surrogate": model,
         }
 
@@ -272,7 +226,7 @@ class Memory:
         points, outputs = state["points"], state["outputs"]
         self._points, self._outputs = ([points], [outputs]) if len(points) else ([], [])
         self._size, self.evaluations = len(points), state["evaluations"]
-        self._moments = [list(one) for one in state["moments"]]
+        self.regression.moments = [list(one) for one in state["moments"]]
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
         self._known = state["known"]
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
@@ -291,12 +245,6 @@ class Memory:
     def __repr__(self) -> str:
         kept = f"{self._size} of {self.evaluations} evaluations, fresh={self.fresh}"
         return f"Memory({type(self.surrogate).__name__}, {kept}, coefficient={self.coefficient:.2f})"
-
-
-def _moments_of(a: Tensor, b: Tensor) -> list[float]:
-    """Return the covariance of two samples without a mean and the variance of b, over the sum of both variances."""
-    size = float(a.square().sum() + b.square().sum())
-    return [float((a * b).sum()) / size, float(b.square().sum()) / size] if size != 0.0 else [0.0, 0.0]
 
 
 def _joined(parts: list[Tensor]) -> list[Tensor]:

@@ -34,7 +34,7 @@ def test_value_and_derivatives_of_a_square(memory: bool) -> None:
         z = torch.linspace(-4, 6, 200, dtype=torch.float64)[:, None]
         kept.add(z, identity(z))
         kept.fit()
-        kept._moments = [[1.0, 1.0]]
+        kept.regression.moments = [[1.0, 1.0]]
     box = zh.BlackBox(
         identity,
         zh.Smoothing(sigma=sigma, samples=16384, seed=0, baseline="mean"),

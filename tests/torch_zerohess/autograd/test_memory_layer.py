@@ -71,7 +71,7 @@ def remembering(surrogate: Any, coefficient: float = 1.0, **settings: Any) -> zh
     memory = zh.Memory(surrogate, **settings)
     memory.add(torch.zeros(2, 2, dtype=torch.float64), render(torch.zeros(2, 2)))
     memory.fit()
-    memory._moments = [[coefficient, 1.0]]
+    memory.regression.moments = [[coefficient, 1.0]]
     return memory
 
 
@@ -132,6 +132,47 @@ def test_a_surrogate_without_derivatives_is_smoothed_by_stein(function: Callable
     each = torch.stack(gradients)
     z = (each.mean(0) - g) / (each.std(0) / math.sqrt(len(each)))
     assert float(z.abs().max()) < 5, "of 8 numbers; false alarms: 1 in 5 000"
+
+
+@pytest.mark.parametrize("n", [2, 10])
+@pytest.mark.parametrize("numpy", [True, False])
+def test_a_table_is_told_wherever_it_jumps(n: int, numpy: bool) -> None:
+    """A step at 0 under sigma .5: the slope of the smoothed step is .798, also where the first element is far away."""
+
+    def step(z: Tensor) -> Tensor:
+        return (z[:, 0] > 0.0).to(z)
+
+    def table(z: Tensor) -> Tensor:
+        return torch.from_numpy(step(z.detach()).numpy()) if numpy else step(z)
+
+    torch.manual_seed(0)
+    memory = zh.Memory(Fixed(table))
+    box = zh.BlackBox(step, zh.Smoothing(sigma=0.5, samples=8), memory=memory)
+    slopes = []
+    for _ in range(40):
+        x = torch.zeros(8, n, dtype=torch.float64)
+        x[0, 0] = 50.0
+        x.requires_grad_()
+        slopes.append(torch.autograd.grad(box(x).sum(), x)[0][1:, 0].mean())
+    assert memory.pathwise is False
+    late = torch.stack(slopes[10:])
+    error = float(late.std()) / math.sqrt(len(late))
+    assert abs(float(late.mean()) - 2.0 / math.sqrt(2.0 * math.pi)) < 5.0 * error < 0.05
+
+
+def test_a_surrogate_that_is_constant_so_far_is_looked_at_again() -> None:
+    torch.manual_seed(0)
+    memory = zh.Memory(Fixed(lambda z: z[:, 0].clamp(min=0.0).square()))
+    box = zh.BlackBox(lambda z: z[:, 0].clamp(min=0.0).square(), zh.Smoothing(sigma=0.1, samples=8), memory=memory)
+    chosen = []
+    for center in (-5.0, -5.0, -5.0, 5.0):
+        x = torch.full((4, 2), center, dtype=torch.float64, requires_grad=True)
+        box(x).sum().backward()
+        chosen.append(memory.pathwise)
+    assert chosen[:3] == [None, None, None]
+    x = torch.full((4, 2), 5.0, dtype=torch.float64, requires_grad=True)
+    box(x).sum().backward()
+    assert memory.pathwise is not None
 
 
 class Sine(torch.autograd.Function):

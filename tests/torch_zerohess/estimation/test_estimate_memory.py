@@ -298,3 +298,49 @@ def test_points_that_are_dropped_leave_the_coefficient() -> None:
     for seed in SEEDS[:4]:
         estimate(half, X, SMOOTHING.replace(samples=64, seed=seed), memory=memory, on_nonfinite="drop")
     assert memory.coefficient == pytest.approx(1.0, abs=1e-9)
+
+
+def parabolas(z: Tensor) -> Tensor:
+    return (z - 0.2).square()
+
+
+@pytest.mark.parametrize("at", [0.2, 0.25])
+def test_pairs_that_cancel_say_nothing_about_the_surrogate(at: float) -> None:
+    """At the minimum of an even loss the values of a pair are the same: they contribute nothing to the gradient."""
+    torch.manual_seed(0)
+    memory, x = Memory(), torch.full((4, 3), at)
+    smoothing = Smoothing(sigma=0.3, samples=8)
+    errors = []
+    for _ in range(8):
+        found = estimate(parabolas, x, smoothing, torch.zeros(4, 3), head=total, memory=memory)
+        errors.append(float((found.hessian_diagonal() - 2.0).abs().mean()))
+    assert memory.coefficient > 0.9
+    assert sum(errors[4:]) < 0.1 * sum(errors[:2])
+
+
+def total(outputs: Tensor, references: Tensor) -> Tensor:
+    return (outputs - references).sum(1)
+
+
+def test_rounding_says_nothing_about_the_surrogate() -> None:
+    """Of an affine function in float32 the second derivatives are rounding."""
+    torch.manual_seed(0)
+    memory, matrix = Memory(), torch.randn(5, 3)
+    for _ in range(5):
+        found = estimate(lambda z: 100.0 + z @ matrix, torch.full((4, 5), 0.2), Smoothing(sigma=0.3), memory=memory)
+    assert memory.coefficient > 0.99
+    assert float((found.gradient - matrix.mT).abs().max()) < 1e-3
+
+
+def test_a_head_that_changes_the_outputs_is_refused() -> None:
+    memory = Memory()
+    with pytest.raises(ValueError, match="head must not change the outputs of the black box"):
+        estimate(
+            parabolas,
+            torch.zeros(2, 3),
+            Smoothing(sigma=0.3),
+            torch.ones(2, 3),
+            head=lambda y, r: y.sub_(r).square().mean(1),
+            memory=memory,
+        )
+    assert len(memory) == 0

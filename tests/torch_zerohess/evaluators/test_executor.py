@@ -116,3 +116,11 @@ def test_threads_that_share_it_get_the_values_of_their_own_black_box():
 def test_what_is_no_executor_is_refused():
     with pytest.raises(TypeError, match="executor must have a method submit"):
         Executor(3)
+
+
+def test_a_black_box_that_has_changed_is_sent_again():
+    with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        evaluator, fn = Executor(pool), black_boxes.Scaled()
+        assert torch.equal(evaluator(fn, Z), Z.sum(1))
+        fn.factor = 10.0
+        assert torch.equal(evaluator(fn, Z), 10.0 * Z.sum(1))

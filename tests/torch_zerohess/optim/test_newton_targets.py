@@ -138,3 +138,14 @@ def test_wrong_outputs_say_so_and_none_have_no_targets() -> None:
     for shape in ((0, 17), (0, 2), (2, 0)):
         assert targets(lambda y: y.square().sum(1), torch.zeros(shape)).shape == shape
         assert targets.losses.shape == shape[:1]
+
+
+def test_an_element_on_a_plateau_stays_while_others_move() -> None:
+    """Twenty outputs, so that the solve is iterative: one gradient is zero, and the others take several iterations."""
+    losses = quadratics(20)[2]
+    with_plateau = torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64)
+    y = torch.zeros(3, 20, dtype=torch.float64)
+    targets = NewtonTargets(damping=1e-6, radius=1e3)(lambda y: with_plateau[: len(y)] * losses(y), y)
+    assert float(targets[0].abs().max()) == 0.0
+    assert bool(torch.isfinite(targets).all())
+    assert float(losses(targets)[1:].max()) < 0.1 * float(losses(y)[1:].min())

@@ -96,6 +96,16 @@ def test_schedulers_of_torch_scale_the_step(kind: type, settings: dict, schedule
     assert optimizer.param_groups[0]["radius"] == 100.0
 
 
+@pytest.mark.parametrize(("kind", "settings"), SCHEDULED.values(), ids=SCHEDULED.keys())
+def test_a_schedule_out_of_range_is_refused(kind: type, settings: dict) -> None:
+    x = vector(3.0, -2.0).requires_grad_()
+    optimizer = kind([x], radius=100.0, **settings)
+    lr_scheduler.LambdaLR(optimizer, lambda _: 3.0)
+    with pytest.raises(ValueError, match="lr must be at least 0 and at most 1, got 3"):
+        optimizer.step(lambda: 0.5 * x.square().sum())
+    assert torch.equal(x.detach(), vector(3.0, -2.0))
+
+
 @pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
 @pytest.mark.parametrize("lr", [-0.1, 1.5, float("nan")])
 def test_lr_is_a_factor_from_0_to_1(kind: type, lr: float) -> None:

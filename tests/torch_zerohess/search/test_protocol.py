@@ -428,6 +428,12 @@ def test_an_output_that_is_not_finite_at_the_start(name):
         search.tell(values)
 
 
+def test_a_loss_that_changes_the_output_is_refused():
+    search = Descent(zeros(3), sigma=1.0, loss=lambda y: y.sub_(1.0).square().sum(), seed=0)
+    with pytest.raises(ValueError, match="loss must not change the output that it is given"):
+        search.tell(search.ask())
+
+
 def test_a_start_that_is_not_finite_can_be_told_again():
     search = Descent(zeros(2), sigma=1.0, seed=0)
     values = bowl(search.ask())

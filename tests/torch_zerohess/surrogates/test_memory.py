@@ -80,24 +80,11 @@ def test_refresh_fits_only_after_growth() -> None:
     assert fits == [0, 1, 1, 2]
 
 
-def test_the_coefficient_follows_the_surrogate() -> None:
-    memory, truth = Memory(), normal(1, 2000)
-    assert memory.coefficient == 0.0
-    memory.observe(truth, truth + 0.01 * normal(1, 2000, seed=1))
-    assert memory.coefficient == pytest.approx(1.0, abs=0.01)
-    unrelated = Memory()
-    unrelated.observe(truth, normal(1, 2000, seed=2))
-    assert unrelated.coefficient < 0.1
-    opposite = Memory()
-    opposite.observe(truth, -truth)
-    assert opposite.coefficient == 0.0
-
-
 def test_a_state_gives_the_same_predictions() -> None:
     memory, z = Memory(), normal(30, 2)
     memory.add(z, z.sin())
     memory.fit()
-    memory.observe(z[None], z[None])
+    memory.regression.observe(z[None], z[None])
     other = Memory()
     other.load_state_dict(memory.state_dict())
     new = normal(5, 2, seed=1)
@@ -186,39 +173,6 @@ def test_a_fit_of_nothing_raises() -> None:
         Memory().fit()
 
 
-def test_the_coefficient_is_the_smallest_over_values_and_derivatives() -> None:
-    memory, truth = Memory(), normal(1, 2000)
-    slope, bend = normal(1, 500, seed=1), normal(1, 500, seed=2)
-    memory.observe(truth, truth, [(slope, slope), (0.25 * bend, bend)])
-    assert memory.coefficient == pytest.approx(0.25)
-    memory.observe(truth, truth, [(slope, slope), (-bend, bend)])
-    assert memory.coefficient < 0.25
-
-
-def test_values_that_were_left_out_do_not_count() -> None:
-    memory, truth = Memory(), normal(1, 2000) + 5.0
-    kept = torch.rand(1, 2000, generator=torch.Generator().manual_seed(1)) < 0.5
-    memory.observe(torch.where(kept, truth, 0.0), truth, kept=kept)
-    assert memory.coefficient == pytest.approx(1.0)
-
-
-def test_older_calls_count_less() -> None:
-    """The regression of 1, then of 1/4, with the weights 0.9 and 1, over the sums of squares 2 and 17/16."""
-    memory, truth = Memory(), normal(1, 2000)
-    memory.observe(truth, truth)
-    memory.observe(0.25 * truth, truth)
-    assert memory.coefficient == pytest.approx((0.9 / 2 + 0.25 * 16 / 17) / (0.9 / 2 + 16 / 17))
-
-
-def test_one_call_with_large_values_does_not_decide() -> None:
-    """The surrogate is right in twenty calls and opposite in one, whose values are a thousand times as large."""
-    memory, truth = Memory(), normal(1, 2000)
-    for _ in range(20):
-        memory.observe(truth, truth, [(truth, truth)])
-    memory.observe(1000.0 * truth, -1000.0 * truth, [(1e6 * truth, -1e6 * truth)])
-    assert memory.coefficient > 0.7
-
-
 def test_states_of_something_else_are_named() -> None:
     with pytest.raises(KeyError, match="state must be a state_dict of a memory, this one lacks points, outputs"):
         Memory().load_state_dict({})
@@ -226,3 +180,14 @@ def test_states_of_something_else_are_named() -> None:
         Memory().load_state_dict(None)
     with pytest.raises(TypeError, match="order must be an integer, got True"):
         Memory(order=True)
+
+
+def test_a_parameter_that_is_constant_does_not_decide_what_is_kept() -> None:
+    """Of 300 points the latest 100 are denser than the others only by chance: about a third of them are kept."""
+    memory = Memory(capacity=100)
+    for part in torch.rand(300, 1, generator=torch.Generator().manual_seed(0)).split(150):
+        memory.add(torch.cat([part, torch.full_like(part, 5.0)], 1), part[:, 0])
+    assert len(memory) == 100
+    generator = torch.Generator().manual_seed(0)
+    latest = torch.rand(300, 1, generator=generator)[200:, 0]
+    assert 0.3 < float(torch.isin(memory.outputs, latest).double().mean()) < 0.9

@@ -146,12 +146,12 @@ def _newton(
 
 
 def _targets(network: nn.Module, layer: zh.BlackBox, damping: float, radius: float, fit: float) -> Update:
-    newton = zh.optim.NewtonTargets(damping=damping)
+    newton = zh.optim.NewtonTargets(relative_damping=damping)
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         y = network(images).detach()
-        newton.radius = radius * sigma
-        zh.optim.move_outputs(network, images, newton(lambda at: layer(at, images), y) - y, damping=fit)
+        newton.output_radius = radius * sigma
+        zh.optim.move_outputs(network, images, newton(lambda at: layer(at, images), y) - y, relative_damping=fit)
         assert newton.losses is not None
         return newton.losses.mean()
 
@@ -161,7 +161,7 @@ def _targets(network: nn.Module, layer: zh.BlackBox, damping: float, radius: flo
 def _many_targets(
     network: nn.Module, layer: zh.BlackBox, damping: float, lr: tuple[float, float], warm_up: float
 ) -> Update:
-    optimizer, newton = torch.optim.Adam(network.parameters()), zh.optim.NewtonTargets(damping=damping)
+    optimizer, newton = torch.optim.Adam(network.parameters()), zh.optim.NewtonTargets(relative_damping=damping)
 
     def update(images: Tensor, share: float, sigma: float) -> Tensor:
         y = network(images)

@@ -31,8 +31,8 @@ class SampleJacobian:
     mixes the samples, and dropout changes the network from call to call.
 
     Args:
-        network: a module, samples [B, ...] -> [B, n].
-        samples: the batch that the closure evaluates, [B, ...].
+        network: a module, inputs [B, ...] -> [B, n], each of its own input.
+        inputs: the batch that the closure evaluates, [B, ...].
 
     Example:
         >>> network, x = torch.nn.Linear(3, 2), torch.ones(4, 3)
@@ -40,10 +40,10 @@ class SampleJacobian:
         torch.Size([8, 8])
     """
 
-    def __init__(self, network: nn.Module, samples: Tensor) -> None:
+    def __init__(self, network: nn.Module, inputs: Tensor) -> None:
         if not isinstance(network, nn.Module):
             raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
-        self._network, self._samples = network, samples
+        self._network, self._inputs = network, inputs
 
     def __call__(self, parameters: Sequence[Tensor]) -> Tensor:
         """Return J [B n, N] by parameters of the network, N numbers in all.
@@ -89,7 +89,7 @@ class SampleJacobian:
             torch.func.jacrev(output, argnums=(0, 1), has_aux=True), in_dims=(None, None, 0)
         )
         try:
-            (by_rows, by_slopes), inputs = differentiated(rows, slopes, self._samples)
+            (by_rows, by_slopes), inputs = differentiated(rows, slopes, self._inputs)
         except RuntimeError as error:  # torch's vmap does not know the operations of GRU and PReLU, among others
             if "random" in str(error):
                 raise
@@ -105,7 +105,7 @@ class SampleJacobian:
     def _one_by_one(self, parameters: Sequence[Tensor]) -> Tensor:
         """Return the rows by a backward pass for every output of every sample."""
         rows = []
-        for sample in self._samples:
+        for sample in self._inputs:
             with torch.enable_grad():
                 outputs = _checked(self._network(sample[None]))[0]
             for one in outputs:
@@ -130,7 +130,7 @@ class SampleJacobian:
     def _outer(self, chosen: Mapping[Places, Tensor]) -> set[Places]:
         """Return the weights [p, q] whose only use, for one sample, is one product with a vector."""
         with torch.enable_grad(), _Uses(chosen.values()) as uses:
-            self._called(chosen, self._samples[:1])
+            self._called(chosen, self._inputs[:1])
         return {at for at, one in chosen.items() if uses.count[id(one)] == 1 and id(one) in uses.products}
 
 

@@ -11,46 +11,46 @@ from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.flat import split_like
 
 
-def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping: float = 0.3) -> None:
-    """Change the weights so that the outputs of some samples move, by damped least squares (Levenberg).
+def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative_damping: float = 0.3) -> None:
+    """Change the weights so that the outputs of some inputs move, by damped least squares (Levenberg).
 
     With the Jacobian J of the outputs by the N weights that require grad,
 
-        step = argmin |J step - change|^2 + damping * h |step|^2,    h = mean of the diagonal of J J^T
+        step = argmin |J step - change|^2 + relative_damping * h |step|^2,    h = mean of the diagonal of J J^T
 
     `NewtonTargets(...)(losses, y) - y` is such a change. Its length is in units of the outputs, so the scale of the
     weights does not matter, as it does for a trust radius on the weights. The system that is solved has as many
     equations as the batch has outputs.
 
     Args:
-        network: samples [B, ...] -> outputs [B, n], each of its own sample.
-        samples: [B, ...]
+        network: inputs [B, ...] -> outputs [B, n], each of its own input.
+        inputs: [B, ...]
         change: of the outputs [B, n].
-        damping: relative to h; positive. With more damping one noisy change moves the outputs less.
+        relative_damping: in units of h; positive. With more of it one noisy change moves the outputs less.
 
     Raises:
-        ValueError: a change of a wrong shape or that is not finite, a damping that is not positive, no samples, or a
+        ValueError: a change of a wrong shape or that is not finite, a damping that is not positive, no inputs, or a
             network whose outputs do not change with its weights or whose Jacobian is not finite.
 
     Example:
         >>> network, x = torch.nn.Linear(3, 2), torch.eye(3)[:2]
         >>> before = network(x)
-        >>> move_outputs(network, x, torch.ones(2, 2), damping=1e-6)
+        >>> move_outputs(network, x, torch.ones(2, 2), relative_damping=1e-6)
         >>> torch.allclose(network(x) - before, torch.ones(2, 2), atol=1e-4)
         True
     """
-    checked_number("damping", damping, above=0.0)
+    checked_number("relative_damping", relative_damping, above=0.0)
     if not isinstance(network, nn.Module):
         raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
-    check_tensors(samples=samples, change=change)
+    check_tensors(inputs=inputs, change=change)
     weights = [one for one in network.parameters() if one.requires_grad]
     if not weights:
         raise ValueError("network must have weights that require grad, got none")
-    if not len(samples):
-        raise ValueError("samples must be at least one, got none")
-    J = SampleJacobian(network, samples).products(weights)
+    if not len(inputs):
+        raise ValueError("inputs must be at least one, got none")
+    J = SampleJacobian(network, inputs).products(weights)
     gram = J.gram().double()
-    shape = [len(samples), len(gram) // len(samples)]
+    shape = [len(inputs), len(gram) // len(inputs)]
     if list(change.shape) != shape:
         raise ValueError(f"change must be {shape}, one for each output, got {list(change.shape)}")
     if not bool(torch.isfinite(change).all()):
@@ -60,7 +60,7 @@ def move_outputs(network: nn.Module, samples: Tensor, change: Tensor, *, damping
         raise ValueError("the Jacobian of the network is not finite")
     if h == 0.0:
         raise ValueError("the outputs of the network do not change with its weights: all are saturated")
-    gram.diagonal().add_(damping * h)
+    gram.diagonal().add_(relative_damping * h)
     step = J.rmatvec(torch.linalg.solve(gram, change.detach().reshape(-1).double()))
     _add(weights, step)
 

@@ -22,7 +22,7 @@ class NewtonTargets:
 
     For losses l of outputs y [B, n] with gradient g and Hessian H of every element,
 
-        t = y - (H + damping * h I)^-1 g,    h = mean of |diagonal of H|
+        t = y - (H + relative_damping * h I)^-1 g,    h = mean of |diagonal of H|
 
     `0.5 * (network(images) - t).square().sum(1)` has the gradient of l where H is the identity. Any first-order
     optimizer of the weights then trains as if the loss were well-conditioned in y. Convergence no longer depends on the
@@ -34,23 +34,25 @@ class NewtonTargets:
     solution takes too many iterations. An affine black box with a quadratic loss takes one.
 
     Args:
-        damping: relative to h; positive.
+        relative_damping: of the Hessian, in units of h; positive.
         iterations: of conjugate gradients at most.
-        radius: longest step |t - y| of an element, in units of y.
+        output_radius: longest step |t - y| of an element, in units of y.
 
     Example:
         >>> scale = torch.tensor([1.0, 100.0])
-        >>> targets = NewtonTargets(damping=1e-9)
+        >>> targets = NewtonTargets(relative_damping=1e-9)
         >>> targets(lambda y: (scale * (y - 3.0)).square().sum(1), torch.zeros(1, 2))
         tensor([[3.0000, 3.0000]])
 
     Source: Petersen, Sutter, Borgelt, Huh, Kuehne, Sun, Deussen: Newton Losses, NeurIPS 2024, equation 2.
     """
 
-    def __init__(self, *, damping: float = 1e-3, iterations: int = 16, radius: float = math.inf) -> None:
-        for name, value in (("damping", damping), ("radius", radius)):
+    def __init__(
+        self, *, relative_damping: float = 1e-3, iterations: int = 16, output_radius: float = math.inf
+    ) -> None:
+        for name, value in (("relative_damping", relative_damping), ("output_radius", output_radius)):
             checked_number(name, value, above=0.0)
-        self.damping, self.radius = damping, radius
+        self.relative_damping, self.output_radius = relative_damping, output_radius
         self.iterations = checked_integer("iterations", iterations, 1)
         self.losses: Tensor | None = None
         """[B], of the last call."""
@@ -58,7 +60,8 @@ class NewtonTargets:
         self._age = 0
 
     def __repr__(self) -> str:
-        return f"NewtonTargets(damping={self.damping}, iterations={self.iterations}, radius={self.radius})"
+        names = ("relative_damping", "iterations", "output_radius")
+        return f"NewtonTargets({', '.join(f'{name}={getattr(self, name)}' for name in names)})"
 
     def __call__(self, losses: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
         """Return the targets [B, n], without a graph.
@@ -106,7 +109,9 @@ class NewtonTargets:
         step = self._dense(product, gradient) if y.shape[1] <= _DENSE else self._iterate(product, gradient)
         _check(step)
         length = step.norm(dim=1, keepdim=True)
-        return y.detach() - step * (self.radius / length.clamp_min(self.radius) if self.radius < math.inf else 1.0)
+        return y.detach() - step * (
+            self.output_radius / length.clamp_min(self.output_radius) if self.output_radius < math.inf else 1.0
+        )
 
     def _dense(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
         n = gradient.shape[1]
@@ -119,7 +124,7 @@ class NewtonTargets:
 
     def _shift(self, size: Tensor) -> Tensor:
         """Return the damping for h; 1 for a Hessian of zeros."""
-        return torch.where(size > 0, self.damping * size, 1.0)
+        return torch.where(size > 0, self.relative_damping * size, 1.0)
 
     def _iterate(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
         n = gradient.shape[1]
@@ -151,9 +156,9 @@ class NewtonTargets:
         self._age = 0
 
     def _solve(self, product: Callable[[Tensor], Tensor], gradient: Tensor, size: Tensor) -> tuple[Tensor, bool]:
-        """Solve (H + damping h I) s = g for all elements; an element ends at its tolerance or at negative curvature.
+        """Solve (H + relative_damping h I) s = g for all elements.
 
-        size: h, [B, 1].
+        An element ends at its tolerance or at negative curvature. size: h, [B, 1].
         """
         factor, shift, unit = self._factor, self._shift(size), torch.where(size > 0, size, 1.0)
         assert factor is not None

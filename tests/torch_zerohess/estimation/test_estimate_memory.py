@@ -322,14 +322,15 @@ def total(outputs: Tensor, references: Tensor) -> Tensor:
     return (outputs - references).sum(1)
 
 
-def test_rounding_says_nothing_about_the_surrogate() -> None:
-    """Of an affine function in float32 the second derivatives are rounding."""
+@pytest.mark.parametrize("offset", [100.0, 3e5])
+def test_rounding_says_nothing_about_the_surrogate(offset: float) -> None:
+    """Of an affine function in float32 the second derivatives are rounding, which an offset makes larger."""
     torch.manual_seed(0)
     memory, matrix = Memory(), torch.randn(5, 3)
     for _ in range(5):
-        found = estimate(lambda z: 100.0 + z @ matrix, torch.full((4, 5), 0.2), Smoothing(sigma=0.3), memory=memory)
-    assert memory.coefficient > 0.99
-    assert float((found.gradient - matrix.mT).abs().max()) < 1e-3
+        found = estimate(lambda z: offset + z @ matrix, torch.full((4, 5), 0.2), Smoothing(sigma=0.3), memory=memory)
+    assert memory.coefficient > 0.9
+    assert float((found.gradient - matrix.mT).abs().max()) < 1e-5 * offset
 
 
 def test_a_head_that_changes_the_outputs_is_refused() -> None:

@@ -29,7 +29,7 @@ def test_the_step_is_the_least_squares_solution(damping: float) -> None:
     # The normal equations of all weights, where the library solves those of all outputs.
     expected = torch.linalg.solve(J.T @ J + damping * h * torch.eye(J.shape[1]).double(), J.T @ change.flatten())
     before = weights(network)
-    zh.optim.move_outputs(network, x, change, damping=damping)
+    zh.optim.move_outputs(network, x, change, relative_damping=damping)
     torch.testing.assert_close(weights(network) - before, expected, rtol=1e-8, atol=1e-10)
 
 
@@ -64,12 +64,12 @@ def test_what_cannot_be_moved_is_said() -> None:
         zh.optim.move_outputs(network, x, change.mT)
     with pytest.raises(ValueError, match="change must be finite"):
         zh.optim.move_outputs(network, x, change / 0.0)
-    with pytest.raises(ValueError, match="samples must be at least one, got none"):
+    with pytest.raises(ValueError, match="inputs must be at least one, got none"):
         zh.optim.move_outputs(network, x[:0], change[:0])
     with pytest.raises(ValueError, match="the Jacobian of the network is not finite"):
         zh.optim.move_outputs(network, x * torch.nan, change)
     with pytest.raises(ValueError, match="damping must be positive, got 0"):
-        zh.optim.move_outputs(network, x, change, damping=0.0)
+        zh.optim.move_outputs(network, x, change, relative_damping=0.0)
     with pytest.raises(ValueError, match="outputs of the network do not change with its weights"):
         zh.optim.move_outputs(nn.Sequential(nn.Linear(4, 2), nn.Hardtanh()), 1e9 * torch.ones(1, 4), torch.ones(1, 2))
     assert torch.equal(weights(network), before)

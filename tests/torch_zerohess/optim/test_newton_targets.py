@@ -25,21 +25,21 @@ def quadratics(n, seed=0):
 @pytest.mark.parametrize("n", [1, 5, 16])
 def test_few_outputs_reach_the_minima_of_quadratics(n):
     _, minima, losses = quadratics(n)
-    found = NewtonTargets(damping=1e-12)(losses, torch.zeros(3, n, dtype=torch.float64))
+    found = NewtonTargets(relative_damping=1e-12)(losses, torch.zeros(3, n, dtype=torch.float64))
     torch.testing.assert_close(found, minima, rtol=1e-5, atol=1e-5)
 
 
 def test_many_outputs_of_one_curvature_take_one_iteration():
     matrices, minima, _ = quadratics(40)
     losses = lambda y: 0.5 * torch.einsum("bi,ij,bj->b", y - minima, matrices[0], y - minima)  # noqa: E731
-    targets = NewtonTargets(damping=1e-12, iterations=1)
+    targets = NewtonTargets(relative_damping=1e-12, iterations=1)
     torch.testing.assert_close(targets(losses, torch.zeros(3, 40, dtype=torch.float64)), minima, rtol=1e-4, atol=1e-4)
 
 
 def test_many_outputs_of_different_curvature_are_those_of_the_dense_solve():
     _, _, losses = quadratics(24)
     y = torch.ones(3, 24, dtype=torch.float64)
-    targets = NewtonTargets(damping=0.1, iterations=400)
+    targets = NewtonTargets(relative_damping=0.1, iterations=400)
     found = targets(losses, y)
     matrices = quadratics(24)[0]
     shift = 0.1 * matrices.mean(0).diagonal().abs().mean()
@@ -51,7 +51,7 @@ def test_many_outputs_of_different_curvature_are_those_of_the_dense_solve():
 def test_negative_curvature_is_descended():
     losses = lambda y: (y[:, 0] ** 2 - 3 * y[:, 1] ** 2) / 2 + y[:, 1] ** 4  # noqa: E731
     y = torch.tensor([[0.5, 0.1], [-0.5, -0.1]], dtype=torch.float64)
-    found = NewtonTargets(damping=1e-9)(losses, y)
+    found = NewtonTargets(relative_damping=1e-9)(losses, y)
     h, g = vmap(hessian(lambda p: losses(p[None])[0]))(y), vmap(grad(lambda p: losses(p[None])[0]))(y)
     torch.testing.assert_close(found, y - g / h.diagonal(dim1=1, dim2=2).abs())
     many = lambda y: (y[:, ::2] ** 2).sum(1) - 0.5 * (y[:, 1::2] ** 2).sum(1)  # noqa: E731
@@ -61,7 +61,7 @@ def test_negative_curvature_is_descended():
 
 def test_steps_are_at_most_the_radius():
     _, minima, losses = quadratics(5)
-    found = NewtonTargets(damping=1e-12, radius=0.25)(losses, torch.zeros(3, 5, dtype=torch.float64))
+    found = NewtonTargets(relative_damping=1e-12, output_radius=0.25)(losses, torch.zeros(3, 5, dtype=torch.float64))
     torch.testing.assert_close(found, 0.25 * minima / minima.norm(dim=1, keepdim=True), rtol=1e-4, atol=1e-4)
 
 
@@ -72,7 +72,7 @@ def test_a_network_learns_through_an_ill_conditioned_layer():
     errors = []
     for newton in (False, True):
         torch.manual_seed(0)
-        network, targets = torch.nn.Linear(3, 2), NewtonTargets(damping=1e-8)
+        network, targets = torch.nn.Linear(3, 2), NewtonTargets(relative_damping=1e-8)
         layer = zh.BlackBox(lambda z: scale * z, zh.Smoothing(sigma=0.1, samples=16, order=2))
         optimizer = torch.optim.SGD(network.parameters(), lr=0.3)
         for _ in range(60):
@@ -89,8 +89,8 @@ def test_a_network_learns_through_an_ill_conditioned_layer():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"damping": 0.0}, "damping must be positive, got 0.0"),
-        ({"radius": -1.0}, "radius must be positive, got -1.0"),
+        ({"relative_damping": 0.0}, "relative_damping must be positive, got 0.0"),
+        ({"output_radius": -1.0}, "output_radius must be positive, got -1.0"),
         ({"iterations": 0}, "iterations must be at least 1, got 0"),
     ],
 )
@@ -113,7 +113,7 @@ def test_losses_and_outputs_are_checked():
 
 def test_many_outputs_are_damped_by_the_size_of_their_own_hessian() -> None:
     """Quadratics a |y - 3|^2 with h = 2 a, one object for all calls: t = 3 (1 - damping / (1 + damping))."""
-    targets, y = NewtonTargets(damping=0.1), torch.zeros(4, 20)
+    targets, y = NewtonTargets(relative_damping=0.1), torch.zeros(4, 20)
     for size in (100.0, 1.0, 0.01):
         a = size * torch.tensor([1e-2, 1.0, 1e2, 10.0])
         found = targets(lambda y, a=a: a * (y - 3.0).square().sum(1), y)
@@ -145,7 +145,7 @@ def test_an_element_on_a_plateau_stays_while_others_move() -> None:
     losses = quadratics(20)[2]
     with_plateau = torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64)
     y = torch.zeros(3, 20, dtype=torch.float64)
-    targets = NewtonTargets(damping=1e-6, radius=1e3)(lambda y: with_plateau[: len(y)] * losses(y), y)
+    targets = NewtonTargets(relative_damping=1e-6, output_radius=1e3)(lambda y: with_plateau[: len(y)] * losses(y), y)
     assert float(targets[0].abs().max()) == 0.0
     assert bool(torch.isfinite(targets).all())
     assert float(losses(targets)[1:].max()) < 0.1 * float(losses(y)[1:].min())

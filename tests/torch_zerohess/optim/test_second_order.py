@@ -119,7 +119,7 @@ def test_lr_is_a_factor_from_0_to_1(kind: type, lr: float) -> None:
         (zh.optim.NewtonCG, ("lr", "radius", "tolerance", "max_radius", "damping", "noise")),
         (zh.optim.Newton, ("lr", "radius", "max_radius")),
         (zh.optim.NonlinearCG, ("lr", "radius", "line_search_tolerance")),
-        (lambda _, **settings: zh.optim.NewtonTargets(**settings), ("radius", "damping")),
+        (lambda _, **settings: zh.optim.NewtonTargets(**settings), ("output_radius", "relative_damping")),
     ],
 )
 def test_truth_values_and_texts_are_no_numbers(make, names: tuple[str, ...]) -> None:

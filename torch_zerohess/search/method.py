@@ -46,7 +46,8 @@ class Settings:
 class Method(ABC, Generic[P]):
     """A search as settings and a pure step.
 
-    A method changes neither itself nor a `Progress` that it was given. All randomness is drawn from the generator.
+    A method changes no `Progress` that it was given, and of itself at most a cache. All randomness is drawn from the
+    generator.
     Both `first` and `next` return points [K, n] within the bounds, at least one unless the search is done.
     """
 

@@ -89,11 +89,11 @@ class RegionDescent(Method[R]):
         return self._started(self._begun(Best(self.settings.start)), generator)
 
     def next(self, known: R, evaluated: Evaluated, generator: torch.Generator) -> tuple[R, Tensor]:
-        before, missed = known.lowest.loss, float(evaluated.losses[0]) - known.expected
+        before, told = known.lowest.loss, float(evaluated.losses[0])
         known = known.remembered(evaluated, self._capacity)
         evaluated = evaluated.needed
-        risen = known.expected + missed - before
-        known = replace(known, confirmed=known.phase == "geometry" and abs(missed) <= _CONFIRMED * abs(risen))
+        confirmed = known.phase == "geometry" and abs(told - known.expected) <= _CONFIRMED * abs(told - before)
+        known = replace(known, confirmed=confirmed)
         if known.lost >= LOST:
             reason = f"{LOST} batches in a row had values that are not finite"
             return self._arrived(known, reason, generator, last=known.rounds == 0)
@@ -102,7 +102,7 @@ class RegionDescent(Method[R]):
         if known.phase == "start":
             return self._after_start(known, evaluated, generator)
         if known.phase == "trial":
-            loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
+            loss = told if bool(evaluated.finite[0]) else math.inf
             known = replace(known, iterations=known.iterations + 1, tied=known.tied + 1 if loss == before else 0)
             if known.tied >= _TIES:
                 if float((evaluated.points[0] - known.lowest.point).norm()) < self.settings.tolerance:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from torch import Tensor
 
@@ -20,7 +20,7 @@ _MOST = 4
 """Parameters up to which random candidates cover a box."""
 
 Engine = Literal["auto", "gaussian_process", "descent", "local"]
-ENGINES = ("auto", "gaussian_process", "descent", "local")
+ENGINES: tuple[str, ...] = get_args(Engine)
 
 
 class TrustRegion(AskTell[Any]):
@@ -126,4 +126,4 @@ def _chosen(settings: Settings) -> tuple[str, str]:
         return "descent", "not every parameter has finite bounds"
     if n > _MOST:
         return "descent", f"a Gaussian process covers a box of up to {_MOST} parameters, and there are {n}"
-    return "gaussian_process", f"a Gaussian process covers a finite box of {n} parameter{'s'[: n > 1]}"
+    return "gaussian_process", f"a Gaussian process covers a finite box of {n} parameter{'s' if n > 1 else ''}"

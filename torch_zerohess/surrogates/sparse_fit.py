@@ -258,10 +258,18 @@ def _predicted(index: Tensor, values: Tensor, u: Tensor) -> Tensor:
 
 
 def _least_norm(u: Tensor, d: Tensor, v: Tensor) -> Tensor:
-    """Return the changes along v [H, n] that the Jacobian of least norm with the changes d along u predicts."""
-    gram = u @ u.mT
-    gram.diagonal().add_(_DENSE_RIDGE * float(gram.diagonal().mean()) or 1.0)
-    return (v @ u.mT) @ torch.linalg.solve(gram, d)
+    """Return the changes along v [H, n] that the Jacobian of least norm with the changes d along u predicts.
+
+    The normal equations are K x K or n x n, whichever is smaller. In float32 their rounding can exceed the ridge.
+    """
+    fewer, dtype = u.shape[1] < len(u), d.dtype
+    u, d, v = (one.double() for one in (u, d, v))
+    gram = u.mT @ u if fewer else u @ u.mT
+    gram.diagonal().add_(_DENSE_RIDGE * float(u.square().sum()) / len(u) or 1.0)
+    factor = torch.linalg.cholesky(gram)
+    if fewer:
+        return (v @ torch.cholesky_solve(u.mT @ d, factor)).to(dtype)
+    return ((v @ u.mT) @ torch.cholesky_solve(d, factor)).to(dtype)
 
 
 def _subset(grids: Grids, changes: Tensor) -> tuple[Tensor, Grids]:

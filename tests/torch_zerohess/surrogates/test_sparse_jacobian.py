@@ -151,6 +151,32 @@ def test_a_dense_map_is_not_explained():
     assert J.explained_dense == pytest.approx(24 / 300, abs=0.06)
 
 
+def explained_by_least_norm(u, d):
+    """Share of the change of each fourth of the samples that the others predict, by singular values."""
+    rest, fold = torch.zeros(2).double(), torch.arange(len(u)) % 4
+    for number in range(4):
+        kept, held = fold != number, fold == number
+        v, e = u[held] - u[kept].mean(0), d[held] - d[kept].mean(0)
+        U, s, V = torch.linalg.svd(u[kept] - u[kept].mean(0), full_matrices=False)
+        inverse = s / (s.square() + 1e-6 * s.square().sum() / int(kept.sum()))
+        slopes = V.mT @ (inverse[:, None] * (U.mT @ (d[kept] - d[kept].mean(0))))
+        rest += torch.stack([(e - v @ slopes).square().sum(), e.square().sum()])
+    return 1.0 - float(rest[0] / rest[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("K", "n"), [(42, 40), (64, 40), (200, 40), (1000, 40), (64, 300)])
+def test_a_dense_map_is_explained_as_singular_values_explain_it(dtype, K, n):
+    """Fewer samples than parameters, more, and many more. In the last case each sample nearly repeats another one."""
+    A, B, u = normal(n, 70) / n**0.5, normal(n, 70, seed=1) / n**0.5, normal(K, n, seed=2)
+    if n > K:
+        u[K // 2 :] = u[: K // 2] + 1e-3 * u[K // 2 :]
+    u = u.float().double()
+    d = (u @ A + 0.05 * u.square() @ B).float().double()
+    J = fit_sparse(u.to(dtype), d.to(dtype), torch.Size([70]), SparseSettings(16))
+    assert J.explained_dense == pytest.approx(explained_by_least_norm(u, d), abs=1e-4)
+
+
 def test_held_out_samples_are_not_used():
     """The predicted share is measured on samples that the fit has not seen."""
     A, u, v = sparse_map(200, 300, 3), normal(80, 300, seed=1), normal(200, 300, seed=2)

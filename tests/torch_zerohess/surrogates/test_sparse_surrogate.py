@@ -112,6 +112,20 @@ def test_a_dense_map_and_few_points_keep_the_map_of_least_norm():
     torch.testing.assert_close(automatic(z[:5]), image(z[:5]), rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("points", [300, 1200])
+def test_a_memory_keeps_the_map_of_least_norm_of_a_curved_dense_function(points):
+    """40 parameters and 70 outputs, of whose change an affine map predicts 99.5 %."""
+    memory, z = zh.Memory(), normal(points, 40)
+    slopes, curvatures = normal(40, 70, seed=1) / 40**0.5, normal(40, 70, seed=2) / 40**0.5
+    memory.add(z, z @ slopes + 0.05 * z.square() @ curvatures)
+    memory.fit()
+    assert isinstance(memory.surrogate.model, LinearSurrogate)
+    other = normal(2, 40, seed=3)
+    change = memory.surrogate(other)[0] - memory.surrogate(other)[1]
+    true = (other[0] - other[1]) @ slopes
+    assert float((change - true).norm() / true.norm()) < 0.05
+
+
 def test_very_few_points_give_their_mean():
     surrogate = SparseSurrogate()
     surrogate.fit(normal(5, n), image(normal(5, n)))

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+from torch_zerohess.surrogates.sparse_regression import predicted, significant, slopes
 from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, spaced, thresholds
 from torch_zerohess.surrogates.surrogate import scaled
 
@@ -36,8 +37,6 @@ _RIDGES = ((1e-4, 1e-4), (0.03, 0.03), (0.3, 0.1), (0.3, 0.3), (1.0, 0.3))
 """Squares of the ridge of old and of new entries, in units of the samples."""
 _FEWEST, _BAND, _BANDS = 1024, 4, 4
 """Elements for the held-out test, at least about, in bands of so many rows of the image, and bands at least."""
-_BLOCK = 1 << 22
-"""Elements of A held at a time."""
 _DENSE_RIDGE = 1e-6
 """Of the fit of least norm, in units of the mean square of the directions."""
 
@@ -134,8 +133,8 @@ def _validated(
             v, e = v * root, e * root
         index, used = _support(*train, inner, settings, before)
         for k, ridges in enumerate(choices):
-            values, _ = _slopes(*train, index, used, before, ridges)
-            rests[k] += float((e - _predicted(index, values, v)).square().sum())
+            values, _ = slopes(*train, index, used, before, ridges)
+            rests[k] += float((e - predicted(index, values, v)).square().sum())
         total += float(e.square().sum())
         if first:
             dense += float((e - _least_norm(*train, v)).square().sum())
@@ -154,28 +153,13 @@ def _fitted(
     ridges: tuple[float, float],
 ) -> SparseJacobian:
     index, used = _support(u, d, grids, settings, previous)
-    values, errors = _slopes(u, d, index, used, previous, ridges)
+    values, errors = slopes(u, d, index, used, previous, ridges)
     if settings.prune:
-        used = used & _significant(values, errors, used, len(u), settings.rate)
+        used = used & significant(values, errors, used, len(u), settings.rate)
         order = torch.argsort(used.byte(), dim=1, descending=True, stable=True)  # the used ones come first
         index, used = index.gather(1, order), used.gather(1, order)
-        values, errors = _slopes(u, d, index, used, previous, ridges)
+        values, errors = slopes(u, d, index, used, previous, ridges)
     return replace(previous, index=index, values=values, standard_error=errors)
-
-
-def _significant(values: Tensor, errors: Tensor, used: Tensor, K: int, rate: float) -> Tensor:
-    """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries.
-
-    Student's t with K - 1 - s degrees of freedom, s entries of the row, becomes a normal number (Wallace 1959). The
-    threshold for its probability is by Benjamini and Hochberg (1995).
-    """
-    nu = (K - 1 - used.sum(1, keepdim=True)).clamp_min(1).double()
-    t = values.double() / errors.double().clamp_min(torch.finfo(torch.float64).tiny)
-    z = (8 * nu + 1) / (8 * nu + 3) * (nu * torch.log1p(t.square() / nu)).sqrt()
-    chance = torch.erfc(z * math.sqrt(0.5))
-    ordered = chance[used].sort().values
-    fine = (ordered <= rate * torch.arange(1, len(ordered) + 1, device=z.device) / max(len(ordered), 1)).nonzero()
-    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
 
 
 def _support(
@@ -190,7 +174,7 @@ def _support(
     used = values != 0
     rounds = 1 if bool(used.any()) else _ROUNDS
     for number in range(rounds):
-        rest = d - _predicted(index, values, u)
+        rest = d - predicted(index, values, u)
         least = thresholds(u, rest, grids, settings.rate)
         if number and least.own > 1.0 and least.joint > 1.0:
             break
@@ -200,61 +184,8 @@ def _support(
         row, column, size = (torch.cat([one[k] for one in parts]) for k in range(3))
         index, used = largest(row, column, size, m, settings.keep)
         if number + 1 < rounds:
-            values, _ = _slopes(u, d, index, used, previous, _RIDGES[1])
+            values, _ = slopes(u, d, index, used, previous, _RIDGES[1])
     return index, used
-
-
-def _slopes(
-    u: Tensor, d: Tensor, index: Tensor, used: Tensor, previous: SparseJacobian, ridges: tuple[float, float]
-) -> tuple[Tensor, Tensor]:
-    """Return slopes [m, keep] on a support and their standard errors, with the previous slopes as the prior."""
-    K, m = len(u), len(index)
-    rows, values = u.mT.contiguous(), torch.zeros_like(index, dtype=u.dtype)
-    errors = torch.zeros_like(values)
-    # Rows with few used entries have small systems: the used ones come first.
-    width = max(1, int(used.sum(1).max()))
-    size = max(1, _BLOCK // (K * width))
-    for first in range(0, m, size):
-        some = slice(first, first + size)
-        own, live = index[some, :width], used[some, :width]
-        same = (own[:, :, None] == previous.index[some][:, None]) & (previous.values[some] != 0)[:, None]
-        old = (same * previous.values[some][:, None]).sum(2) * live
-        A = rows[own] * live[:, :, None]  # [b, width, K]
-        prior = torch.where(old != 0, u.new_tensor(ridges[0]), u.new_tensor(ridges[1])) * K * _scale(u, own)
-        gram = A @ A.mT
-        gram.diagonal(dim1=1, dim2=2).add_(prior)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
-        target = d[:, some].mT - (A * old[:, :, None]).sum(1)
-        change = (inverse @ (A @ target[:, :, None]))[..., 0]
-        values[some, :width] = (old + change) * live
-        left = target - (A * change[:, :, None]).sum(1)
-        own_part = inverse.diagonal(dim1=1, dim2=2)
-        spent = ((1.0 - own_part * prior) * live).sum(1).clamp_min(0.0)
-        variance = left.square().sum(1) / (K - 1 - spent).clamp_min(1.0)
-        shortened = (inverse @ (prior * change)[:, :, None])[..., 0]  # by the ridge
-        square = variance[:, None] * own_part.clamp_min(0.0) + shortened.square()
-        errors[some, :width] = square.sqrt() * live
-    return values, errors
-
-
-def _scale(u: Tensor, own: Tensor) -> Tensor:
-    """Mean squares of the directions along parameters."""
-    return u.square().mean(0).clamp_min(torch.finfo(u.dtype).tiny)[own]
-
-
-def _predicted(index: Tensor, values: Tensor, u: Tensor) -> Tensor:
-    """Return the changes [K, m] along u [K, n] that slopes predict."""
-    K, m, rows = len(u), len(index), u.mT.contiguous()
-    live = values != 0
-    if not bool(live.any()):
-        return u.new_zeros(K, m)
-    width = int(live.any(0).nonzero()[-1]) + 1
-    size = max(1, _BLOCK // (K * width))
-    parts = [
-        (rows[index[first : first + size, :width]] * values[first : first + size, :width, None]).sum(1)
-        for first in range(0, m, size)
-    ]
-    return torch.cat(parts).mT.contiguous()
 
 
 def _least_norm(u: Tensor, d: Tensor, v: Tensor) -> Tensor:

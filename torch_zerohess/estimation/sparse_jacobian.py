@@ -62,7 +62,11 @@ def sparse_jacobian(
     Raises ValueError or TypeError for an argument out of range, an output of one number, and fewer samples than the
     kept entries need.
 
-    Source: screening by correlation (Fan and Lv 2008), false discoveries by decoys (Barber and Candes 2015).
+    `standard_error` of the result holds for curved and for noisy fn, whose residuals have a variance that depends on
+    the perturbation. With sampler "sobol" it is too large, because these samples fill space more evenly.
+
+    Source: screening by correlation (Fan and Lv 2008), false discoveries by decoys (Barber and Candes 2015), standard
+    errors of samples of different variance (HC3, MacKinnon and White 1985).
 
     Example:
         >>> x = torch.zeros(900).double()

@@ -83,7 +83,8 @@ class LocalSettings:
                 f"loss must be a function of one output for the engine 'local', got {settings.loss!r}: without one use "
                 "engine='descent'"
             )
-        result = cls(SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid), **own)
+        sparse = SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid)
+        result = cls(replace(sparse, robust=False), **own)  # no step needs standard errors
         for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
             check_share(name, getattr(result, name), most)
         check_samples(result.samples, result.sparse.keep)

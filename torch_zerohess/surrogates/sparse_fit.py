@@ -8,8 +8,9 @@ the slopes J minimise
     |d - A J|^2 + K |ridge (J - J')|^2 ,     A [K, keep] the columns of u,
 
 where J' are the previous slopes, or 0 for an entry that is new. Where an old entry is outside of the support it is 0.
-The ridges are chosen for the best prediction of held-out samples. The support is found anew without each held-out part,
-so that the predicted share of its change is unbiased by the selection.
+The slopes and their standard errors are in `sparse_regression`. The ridges are chosen for the best prediction of
+held-out samples. The support is found anew without each held-out part, so that the predicted share of its change is
+unbiased by the selection.
 """
 
 import math
@@ -53,6 +54,8 @@ class SparseSettings:
     """Rows, columns and channels of the parameters; None: they lie in no order."""
     prune: bool = False
     """Whether entries that are not significant beside the others of their row are left out in the end."""
+    robust: bool = True
+    """Whether standard errors hold if samples differ in variance, which takes 1 to 5 % longer."""
 
     @classmethod
     def checked(cls, n: int, *, keep: int | None, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
@@ -100,7 +103,8 @@ def fit_sparse(
     before = SparseJacobian.empty(u.shape[1], shape, settings.keep, u) if previous is None else previous.times(1 / size)
     ridges, explained, dense = _validated(u, changes, weights, grids, settings, before, previous is None)
     u, d = _centered(u, changes, weights)
-    found = _fitted(u, d, grids, settings, before, ridges)
+    constant = u.new_full((len(u),), 1 / len(u)) if weights is None else weights / weights.sum()
+    found = _fitted(u, d, grids, settings, before, ridges, constant)
     return replace(found, explained=explained, explained_dense=dense).times(size)
 
 
@@ -151,14 +155,16 @@ def _fitted(
     settings: SparseSettings,
     previous: SparseJacobian,
     ridges: tuple[float, float],
+    constant: Tensor,
 ) -> SparseJacobian:
     index, used = _support(u, d, grids, settings, previous)
-    values, errors = slopes(u, d, index, used, previous, ridges)
     if settings.prune:
+        # The variance of an output does not depend on a parameter that the output does not depend on.
+        values, errors = slopes(u, d, index, used, previous, ridges)
         used = used & significant(values, errors, used, len(u), settings.rate)
         order = torch.argsort(used.byte(), dim=1, descending=True, stable=True)  # the used ones come first
         index, used = index.gather(1, order), used.gather(1, order)
-        values, errors = slopes(u, d, index, used, previous, ridges)
+    values, errors = slopes(u, d, index, used, previous, ridges, constant if settings.robust else None)
     return replace(previous, index=index, values=values, standard_error=errors)
 
 

@@ -30,7 +30,8 @@ class SparseJacobian:
     values: Tensor
     """Slopes [m, keep]."""
     standard_error: Tensor
-    """Of the slopes [m, keep]. The support is taken as given: an entry that was not found has no error here."""
+    """Of the slopes [m, keep], also where the variance of a sample depends on its perturbation. The support is taken
+    as given: an entry that was not found has no error here."""
     n: int
     """Parameters."""
     shape: torch.Size

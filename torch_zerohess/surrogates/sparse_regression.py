@@ -1,4 +1,14 @@
-"""Slopes on a known support, their standard errors, and which of them are significant."""
+"""Slopes on a known support, their standard errors, and which of them are significant.
+
+With A [K, s] of the columns of u on the support of a row, P the diagonal matrix of K ridge^2, and what the fit leaves
+e = d - A J, the slopes are J = M (A^T d + P J') with M = (A^T A + P)^-1. The variance of e_k usually depends on u_k: it
+grows with |u_k| if the black box is curved. So the variances of the slopes are
+
+    sum_k (M a_k)^2 e_k^2 / (1 - h_k)^2 ,     h_k = a_k^T M a_k + the leverage of the constant,
+
+in which e_k / (1 - h_k) is what the fit without sample k leaves of it (HC3: MacKinnon and White 1985). The error of the
+prior is added: (M P (J - J'))^2, and the diagonal of s^2 M P M, where s^2 is the mean of e^2.
+"""
 
 import math
 
@@ -12,9 +22,18 @@ _BLOCK = 1 << 22
 
 
 def slopes(
-    u: Tensor, d: Tensor, index: Tensor, used: Tensor, previous: SparseJacobian, ridges: tuple[float, float]
+    u: Tensor,
+    d: Tensor,
+    index: Tensor,
+    used: Tensor,
+    previous: SparseJacobian,
+    ridges: tuple[float, float],
+    constant: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return slopes [m, keep] on a support and their standard errors, with the previous slopes as the prior."""
+    """Return slopes [m, keep] on a support and their standard errors, with the previous slopes as the prior.
+
+    constant: leverage of the constant on each sample [K]. If it is None, all samples have the same variance.
+    """
     K, m = len(u), len(index)
     rows, values = u.mT.contiguous(), torch.zeros_like(index, dtype=u.dtype)
     errors = torch.zeros_like(values)
@@ -39,9 +58,21 @@ def slopes(
         spent = ((1.0 - own_part * prior) * live).sum(1).clamp_min(0.0)
         variance = left.square().sum(1) / (K - 1 - spent).clamp_min(1.0)
         shortened = (inverse @ (prior * change)[:, :, None])[..., 0]  # by the ridge
-        square = variance[:, None] * own_part.clamp_min(0.0) + shortened.square()
-        errors[some, :width] = square.sqrt() * live
+        if constant is None:
+            square = variance[:, None] * own_part.clamp_min(0.0)
+        else:
+            square = _of_samples(A, inverse, left, constant)
+            square += variance[:, None] * (inverse.square() * prior[:, None]).sum(2)  # of the prior
+        errors[some, :width] = (square + shortened.square()).sqrt() * live
     return values, errors
+
+
+def _of_samples(A: Tensor, inverse: Tensor, left: Tensor, constant: Tensor) -> Tensor:
+    """Return the variances [b, width] of slopes by HC3, for what the fit leaves of the samples [b, K]."""
+    influence = inverse @ A
+    rest = 1.0 - constant - (A * influence).sum(1)
+    left_out = left / rest.clamp_min(torch.finfo(left.dtype).eps ** 0.5)
+    return influence.mul_(left_out[:, None]).square_().sum(2)
 
 
 def _scale(u: Tensor, own: Tensor) -> Tensor:
@@ -64,7 +95,7 @@ def predicted(index: Tensor, values: Tensor, u: Tensor) -> Tensor:
     return torch.cat(parts).mT.contiguous()
 
 
-def significant(values: Tensor, errors: Tensor, used: Tensor, K: int, rate: float) -> Tensor:
+def significant(values: Tensor, errors: Tensor, used: Tensor, K: float, rate: float) -> Tensor:
     """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries.
 
     Student's t with K - 1 - s degrees of freedom, s entries of the row, becomes a normal number (Wallace 1959). The

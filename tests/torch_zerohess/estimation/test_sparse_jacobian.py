@@ -49,6 +49,39 @@ def test_a_step_has_the_slope_of_its_convolution():
     assert float(slopes.std()) == pytest.approx(float(errors.max()), rel=0.5)
 
 
+def sines(z):
+    return torch.sin(2 * z)
+
+
+def noisy(z, spread=0.0):
+    """Each output is its parameter and noise, whose standard deviation may grow with the perturbation."""
+    return z + (0.2 + spread * z.square()) * normal(*z.shape, seed=int(1e6 * z[0, 0].abs()))
+
+
+@pytest.mark.parametrize(
+    ("fn", "slope", "samples"),
+    [
+        (sines, 2 * math.exp(-0.5), 100),
+        (sines, 2 * math.exp(-0.5), 400),
+        (noisy, 1.0, 100),
+        (noisy, 1.0, 400),
+        (lambda z: noisy(z, 1.0), 1.0, 400),
+    ],
+)
+@pytest.mark.parametrize("antithetic", [False, True])
+def test_intervals_cover_the_slope(fn, slope, samples, antithetic):
+    """400 slopes: the standard errors of the shares are 2.3 % and 1.1 %, and the limits 3 and 3.6 of them."""
+    scores = []
+    for seed in range(20):
+        settings = zh.Smoothing(sigma=0.5, samples=samples, antithetic=antithetic, seed=seed)
+        J = zh.sparse_jacobian(fn, torch.zeros(20).double(), settings, keep=1)
+        assert J.index[:, 0].tolist() == list(range(20))
+        scores.append((J.values - slope) / J.standard_error)
+    within = lambda limit: float((torch.cat(scores).abs() < limit).double().mean())  # noqa: E731
+    assert within(1.0) == pytest.approx(0.683, abs=0.07)
+    assert within(1.96) == pytest.approx(0.95, abs=0.04)
+
+
 def test_an_earlier_jacobian_helps_and_is_in_the_same_units():
     before = zh.sparse_jacobian(scaled, torch.zeros(N).double(), smoothing(60))
     f = lambda z: 1.05 * scaled(z) + 0.3 * normal(len(z), SIDE, SIDE, seed=len(z)) * 0.1  # noqa: E731

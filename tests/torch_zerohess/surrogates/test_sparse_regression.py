@@ -1,0 +1,64 @@
+"""Standard errors of slopes on a known support, against fits without one sample at a time."""
+
+import pytest
+import torch
+
+from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+from torch_zerohess.surrogates.sparse_regression import slopes
+from truths import normal
+
+K, M, N = 30, 5, 3
+
+
+def fitted(u, d, weights, penalty, prior):
+    """Slopes [M, N] by weighted least squares with a constant, and a penalty [N] on what differs from the prior."""
+    design = torch.cat([u, torch.ones(len(u), 1).double()], 1)
+    gram = design.mT @ (weights[:, None] * design) + torch.diag(torch.cat([penalty, torch.zeros(1).double()]))
+    right = design.mT @ (weights[:, None] * d)
+    right[:N] += penalty[:, None] * prior.mT
+    return torch.linalg.solve(gram, right)[:N].mT
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("old", [False, True])
+def test_variances_are_those_of_fits_without_one_sample(weighted, old):
+    """The sum of the squared changes of a slope when one sample is left out, and the error of the prior."""
+    u, d = normal(K, N), normal(K, M, seed=1) * (1 + normal(K, 1, seed=2).square())
+    weights = normal(K, seed=3).square() + 0.1 if weighted else torch.ones(K).double()
+    weights *= K / weights.sum()
+    prior = normal(M, N, seed=4) if old else torch.zeros(M, N).double()
+    root, index = weights.sqrt()[:, None], torch.arange(N).expand(M, N)
+    before = SparseJacobian(index, prior, torch.zeros(M, N), N, torch.Size([M]))
+    v, e = (root * (one - weights @ one / K) for one in (u, d))
+    ridge = 0.3 if old else 0.1
+    values, errors = slopes(v, e, index, torch.ones(M, N).bool(), before, (0.3, 0.1), weights / K)
+    penalty = ridge * v.square().sum(0)
+    whole = fitted(u, d, weights, penalty, prior)
+    torch.testing.assert_close(values, whole)
+    expected = torch.zeros(M, N).double()
+    for k in range(K):
+        some = torch.arange(K) != k
+        expected += (fitted(u[some], d[some], weights[some], penalty, prior) - whole).square()
+    gram = v.mT @ v
+    inverse = torch.linalg.inv(gram + torch.diag(penalty))
+    left, spent = (e - v @ whole.mT).square().sum(0), (inverse @ gram).trace()
+    expected += (left / (K - 1 - spent))[:, None] * (inverse @ torch.diag(penalty) @ inverse).diagonal()
+    expected += ((whole - prior) @ torch.diag(penalty) @ inverse).square()
+    torch.testing.assert_close(errors.square(), expected)
+
+
+def test_a_fit_with_as_many_samples_as_it_takes_has_finite_errors():
+    """10 samples, 8 entries and a constant: a fit without one sample is of more unknowns than samples."""
+    u = normal(10, 8)
+    J = fit_sparse(u.float(), (u @ normal(8, 40, seed=1)).float(), torch.Size([40]), SparseSettings(8, rate=0.9))
+    assert bool(torch.isfinite(J.standard_error).all())
+
+
+def test_a_search_may_do_without_robust_errors():
+    """Slopes are the same; errors are those of samples of equal variance."""
+    u = normal(200, 20)
+    d = u * (1 + u.square())  # the variance of the residual grows with the perturbation
+    found = [fit_sparse(u, d, torch.Size([20]), SparseSettings(1, robust=robust)) for robust in (True, False)]
+    assert torch.equal(found[0].dense(), found[1].dense())
+    assert bool((found[0].standard_error > 1.5 * found[1].standard_error).all())

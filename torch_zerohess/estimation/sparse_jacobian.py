@@ -14,8 +14,11 @@ from torch_zerohess.estimation.nonfinite import finite_values
 from torch_zerohess.estimation.perturbations import perturb
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing
-from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples, fit_sparse
+from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples, fewest_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+
+_COUNTING = 0.5
+"""Share of the samples that counts in any fit: weights of "aggregate" leave more than this."""
 
 
 def sparse_jacobian(
@@ -60,7 +63,8 @@ def sparse_jacobian(
         on_nonfinite: "raise", "drop", or a number that replaces NaN and infinities.
 
     Raises ValueError or TypeError for an argument out of range, an output of one number, and fewer samples than the
-    kept entries need.
+    kept entries need. ValueError too if the weights of "uniform" leave too few samples that count, as they do in more
+    than a few dimensions.
 
     `standard_error` of the result holds for curved and for noisy fn, whose residuals have a variance that depends on
     the perturbation. With sampler "sobol" it is too large, because these samples fill space more evenly.
@@ -92,6 +96,7 @@ def sparse_jacobian(
     work = working(x)
     u, changes, weights, shape, evaluations = _sampled(call, work, smoothing)
     check_samples(len(u), settings.keep)
+    _check_weights(weights, smoothing, settings.keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)
     earlier = None if previous is None else _checked(previous, len(x), shape).to(work).times(sigma)
     found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
@@ -124,6 +129,18 @@ def _sampled(call: BlackBoxCall, x: Tensor, smoothing: Smoothing) -> tuple[Tenso
         some = kept[0, : len(u)]
         flat, u, weights = flat[some], u[some], weights[some]
     return u, flat, weights, shape, len(points[0])
+
+
+def _check_weights(weights: Tensor, smoothing: Smoothing, keep: int) -> None:
+    """Raise ValueError if few of the weights [S] count, as those of "uniform" do in more than a few dimensions."""
+    shares = weights / weights.max()
+    effective = float(shares.sum().square() / shares.square().sum())
+    if not effective >= min(fewest_samples(keep), _COUNTING * len(weights)):
+        raise ValueError(
+            f"proposal {smoothing.proposal!r} leaves an effective sample size of {effective:.3g} of {len(weights)} "
+            f"samples, (sum of weights)^2 / (sum of squared weights), and {keep} parameters per output (keep) need "
+            f"{fewest_samples(keep)}: use proposal 'gaussian', whose weights are all 1"
+        )
 
 
 def _checked(previous: SparseJacobian, n: int, shape: torch.Size) -> SparseJacobian:

@@ -78,9 +78,14 @@ class SparseSettings:
         return cls(keep, rate, (rows, columns, channels[0] if channels else 1))
 
 
+def fewest_samples(keep: int) -> int:
+    """Samples that the kept entries and a constant need."""
+    return max(FEWEST_SAMPLES, keep + 2)
+
+
 def check_samples(samples: int, keep: int) -> None:
     """Raise ValueError for fewer samples than the kept entries and a constant need."""
-    least = max(FEWEST_SAMPLES, keep + 2)
+    least = fewest_samples(keep)
     if samples < least:
         raise ValueError(f"samples must be at least {least} to fit {keep} parameters per output (keep), got {samples}")
 
@@ -161,7 +166,8 @@ def _fitted(
     if settings.prune:
         # The variance of an output does not depend on a parameter that the output does not depend on.
         values, errors = slopes(u, d, index, used, previous, ridges)
-        used = used & significant(values, errors, used, len(u), settings.rate)
+        count = 1.0 / float(constant.square().sum())  # samples of equal weights with as much information
+        used = used & significant(values, errors * (len(u) / count) ** 0.5, used, count, settings.rate)
         order = torch.argsort(used.byte(), dim=1, descending=True, stable=True)  # the used ones come first
         index, used = index.gather(1, order), used.gather(1, order)
     values, errors = slopes(u, d, index, used, previous, ridges, constant if settings.robust else None)

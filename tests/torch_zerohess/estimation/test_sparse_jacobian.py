@@ -82,6 +82,39 @@ def test_intervals_cover_the_slope(fn, slope, samples, antithetic):
     assert within(1.96) == pytest.approx(0.95, abs=0.04)
 
 
+@pytest.mark.parametrize(
+    ("n", "samples", "keep", "least"), [(60, 400, 1, 8), (60, 400, 16, 18), (10, 400, 4, 8), (3, 20, 1, 8)]
+)
+def test_uniform_samples_of_which_few_count_are_refused(n, samples, keep, least):
+    x, settings = torch.zeros(n).double(), zh.Smoothing(sigma=0.5, samples=samples, proposal="uniform", seed=0)
+    with pytest.raises(
+        ValueError,
+        match=rf"proposal 'uniform' leaves an effective sample size of \d(\.\d+)? of {samples} samples, .* and {keep} "
+        rf"parameters per output \(keep\) need {least}: use proposal 'gaussian'",
+    ):
+        zh.sparse_jacobian(lambda z: torch.cat([sines(z), z], 1), x, settings, keep=keep)
+    for proposal in ("gaussian", "aggregate"):
+        zh.sparse_jacobian(lambda z: torch.cat([sines(z), z], 1), x, settings.replace(proposal=proposal), keep=keep)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_fewest_samples_are_enough_with_weights_that_differ_little(seed):
+    """Of the 8 samples of "aggregate" that one parameter needs, 6 or 7 count."""
+    J = zh.sparse_jacobian(lambda z: z.repeat(1, 40), torch.zeros(1).double(), smoothing(8, seed=seed))
+    assert J.explained > 0.99
+
+
+def test_uniform_samples_are_as_significant_as_those_that_count():
+    """In 4 dimensions 15 to 100 of 1000 samples count, and correlations by chance are those of so few."""
+    x, false = torch.zeros(4).double(), 0
+    for seed in range(20):
+        settings = zh.Smoothing(sigma=0.5, samples=1000, proposal="uniform", seed=seed)
+        slopes = zh.sparse_jacobian(lambda z: sines(z).repeat(1, 4), x, settings, keep=4).dense()
+        false += int((slopes != 0).sum()) - int((slopes.view(4, 4, 4).diagonal(dim1=1, dim2=2) != 0).sum())
+    assert false <= 10  # of 960
+    assert int((slopes != 0).sum()) >= 16
+
+
 def test_an_earlier_jacobian_helps_and_is_in_the_same_units():
     before = zh.sparse_jacobian(scaled, torch.zeros(N).double(), smoothing(60))
     f = lambda z: 1.05 * scaled(z) + 0.3 * normal(len(z), SIDE, SIDE, seed=len(z)) * 0.1  # noqa: E731

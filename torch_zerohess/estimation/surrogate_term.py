@@ -42,7 +42,7 @@ quadratic in an affine map are exact from one pair, and two pairs tell an error.
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
 _LOOKED = 512
-"""Points around the batch, and kept points, at which a surrogate is looked at for jumps, at most."""
+"""Points around the elements of a batch at which a surrogate is looked at for jumps, at most."""
 _EDGE = 1e-9
 """Probability at which the normal quantile is cut off."""
 
@@ -233,16 +233,13 @@ def prefers_pathwise(
     tree or a model outside of autograd are 0, without variance, and wrong: the answer is no. It is None where the
     surrogate is constant wherever it was looked at: both derivatives are 0 there, and another call decides.
     """
-    memory, step = control.memory, -(-len(x) * len(u) // _LOOKED)
-    looked_at = [(x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype)]
-    if len(memory):
-        looked_at.append(memory.points[-_LOOKED:].to(x))
-    jumps = _jumps(memory.surrogate, torch.cat(looked_at))
+    surrogate, step = control.memory.surrogate, -(-len(x) * len(u) // _LOOKED)
+    jumps = _jumps(surrogate, (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype))
     if jumps is not False:
         return None if jumps is None else False
     if len(sigma) > MOST_STEIN:
         return True
-    few = SurrogateTerm(memory.surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
+    few = SurrogateTerm(surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
     quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
     return float(few.variance(quantity).sum()) < float(replace(few, pathwise=False).variance(quantity).sum())
 

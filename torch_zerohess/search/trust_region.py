@@ -7,12 +7,12 @@ from typing import Any, Literal, get_args
 from torch import Tensor
 
 from torch_zerohess.search.descent_search import descent_method
-from torch_zerohess.search.evidence import FEWEST, EvidenceMethod, EvidenceProgress
 from torch_zerohess.search.gaussian_process_search import process_method
 from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalSettings
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
+from torch_zerohess.search.sparse_or_dense import FEWEST, SparseOrDense, SparseOrDenseProgress
 
 _TOLERANCE = 1e-2
 """Length, in units of the first sigma, below which a search has arrived, if the caller says nothing."""
@@ -97,13 +97,13 @@ class TrustRegion(AskTell[Any]):
     def engine(self) -> str:
         """Which search it is: "gaussian_process", "descent" or "local"; "descent" as long as it is not decided."""
         known = self._state.progress
-        return known.chosen or "descent" if isinstance(known, EvidenceProgress) else self._method.engine
+        return known.chosen or "descent" if isinstance(known, SparseOrDenseProgress) else self._method.engine
 
     @property
     def reason(self) -> str:
         """Why this engine, in a sentence."""
         known = self._state.progress
-        return known.reason if isinstance(known, EvidenceProgress) else self._reason
+        return known.reason if isinstance(known, SparseOrDenseProgress) else self._reason
 
     def _make(self, settings: Settings) -> Method[Any]:
         if self._grid is not None and self._wanted in ("descent", "gaussian_process"):
@@ -116,7 +116,7 @@ class TrustRegion(AskTell[Any]):
         tolerance = LOCAL_TOLERANCE if self._tolerance is None else settings.tolerance
         own = LocalSettings.checked(settings, grid=self._grid)
         local = LocalMethod(replace(settings, tolerance=tolerance), own)
-        return local if engine == "local" else EvidenceMethod(settings, local)
+        return local if engine == "local" else SparseOrDense(settings, local)
 
 
 def _chosen(settings: Settings) -> tuple[str, str]:

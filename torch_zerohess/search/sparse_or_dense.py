@@ -30,7 +30,7 @@ _MORE = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class EvidenceProgress(Progress):
+class SparseOrDenseProgress(Progress):
     """The evaluations before the choice; after the choice, the progress of the chosen search."""
 
     chosen: Literal["", "descent", "local"] = ""
@@ -48,22 +48,22 @@ class EvidenceProgress(Progress):
     local: LocalProgress | None = None
 
 
-class EvidenceMethod(Relay[EvidenceProgress]):
+class SparseOrDense(Relay[SparseOrDenseProgress]):
     """`OutputDescent` or `LocalMethod`, for outputs with a loss."""
 
     engine = "descent or local"
-    progress = EvidenceProgress
+    progress = SparseOrDenseProgress
 
     def __init__(self, settings: Settings, local: LocalMethod) -> None:
         super().__init__(settings)
         self.descent, self.local = OutputDescent(settings), local
 
-    def first(self, generator: torch.Generator) -> tuple[EvidenceProgress, Tensor]:
+    def first(self, generator: torch.Generator) -> tuple[SparseOrDenseProgress, Tensor]:
         """Ask for the start and the first part of the samples."""
         descent, points = self.descent.first(generator)
         count = 1 + min(_FIRST, max(FEWEST_SAMPLES, self.settings.n // 2))
         none = points.new_empty(0)
-        known = EvidenceProgress(
+        known = SparseOrDenseProgress(
             best=descent.best,
             center=descent.center,
             reason="the first samples are to tell whether outputs depend on few parameters each",
@@ -76,8 +76,8 @@ class EvidenceMethod(Relay[EvidenceProgress]):
         return known, points[:count]
 
     def next(
-        self, known: EvidenceProgress, evaluated: Evaluated, generator: torch.Generator
-    ) -> tuple[EvidenceProgress, Tensor]:
+        self, known: SparseOrDenseProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[SparseOrDenseProgress, Tensor]:
         if known.chosen == "local":
             assert known.local is not None
             local, points = self.local.next(known.local, evaluated, generator)
@@ -104,14 +104,14 @@ class EvidenceMethod(Relay[EvidenceProgress]):
         descent, points = self.descent.next(known.descent, every, generator)
         return replace(known, descent=descent).taking(descent), points
 
-    def more(self, known: EvidenceProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    def more(self, known: SparseOrDenseProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         return super().more(known, points, count, generator) if known.chosen else points[:0]
 
-    def turn(self, known: EvidenceProgress) -> tuple[Method[Any], Any]:
+    def turn(self, known: SparseOrDenseProgress) -> tuple[Method[Any], Any]:
         return (self.descent, known.descent) if known.local is None else (self.local, known.local)
 
 
-def _gathered(known: EvidenceProgress, evaluated: Evaluated) -> EvidenceProgress:
+def _gathered(known: SparseOrDenseProgress, evaluated: Evaluated) -> SparseOrDenseProgress:
     """Add what was evaluated."""
     assert evaluated.outputs is not None
     outputs = torch.cat([known.outputs, evaluated.outputs]) if len(known.outputs) else evaluated.outputs
@@ -129,6 +129,6 @@ def _gathered(known: EvidenceProgress, evaluated: Evaluated) -> EvidenceProgress
     )
 
 
-def _emptied(known: EvidenceProgress) -> EvidenceProgress:
+def _emptied(known: SparseOrDenseProgress) -> SparseOrDenseProgress:
     """Forget the batch that the search has been given."""
     return replace(known, points=known.points[:0], losses=known.losses[:0], outputs=known.outputs[:0])

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import pandas as pd
+import torch
 import tyro
 
 from experiments.ensembles.provenance import read_command
 from experiments.methods import METHODS
-from experiments.problems.catalogue import NETWORKS, chosen
+from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, chosen, fitting
+from experiments.problems.task import Preset
 from experiments.reports import result_files
 from experiments.reports.medians import medians, reached
 from experiments.reports.networks import HELD_OUT, per_method
@@ -35,6 +37,7 @@ def store(
     A fitting task has a row per method, error and level. A task that trains a network has a row per method. Rows say
     how many evaluations a run may use (`evaluation_limit`) and how many runs the limit of time ended. Refused if
     the runs are of several commits, of code with changes, of several machines, presets or limits, or not finished.
+    A task with a measure of its own, as the silhouettes of MESHFIT, has its median and least value where runs ended.
 
     Args:
         folder: written by `run` or `robustness`.
@@ -55,7 +58,8 @@ def store(
         raise SystemExit(f"{count} runs in {folder} are unfinished: the same `run` goes on with them")
     known = read_command(folder)
     whence = result_files.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
-    table = (trained(results) if networks else fitted(results, levels)).assign(**whence)
+    table = trained(results) if networks else fitted(results, levels).merge(measured(results, whence["preset"]), "left")
+    table = table.assign(**whence)
     table = table[[*(one for one in table if one not in result_files.ORIGIN), *result_files.ORIGIN]]
     print(result_files.write(_added(table, name) if add else table, name))
     if left := [task for task in there.runs if task not in wanted]:
@@ -121,6 +125,25 @@ def fitted(results: Results, levels: Sequence[float] = LEVELS) -> pd.DataFrame:
     measures = [f"{one}{end}" for one in ("evaluations", "seconds") for end in ("", "_low", "_high")]
     shares = with_intervals(found)
     return about.merge(shares, on=["task", "method"])[[*about, "metric", "level", *measures, *_SHARES]]
+
+
+def measured(results: Results, preset: Preset) -> pd.DataFrame:
+    """Return a row per task and method: the first of the task's own measures where runs ended, its median and least.
+
+    Tasks that need a renderer are left out: none of them has a measure. Without a measure there are no such columns.
+    """
+    rows = []
+    for task in (one for one in results.runs if one in FITTING and one not in RENDERED):
+        measures = fitting(task, preset).truth.measures
+        if measures is None:
+            continue
+        for method, runs in results.runs[task].items():
+            ends = [measures(torch.tensor(run.outcome.x, dtype=torch.float64)) for run in runs if run.outcome.x]
+            name = next(iter(ends[0]), "") if ends else ""
+            values = pd.Series([one[name] for one in ends])
+            found = {"measure": name, "measure_median": values.median(), "measure_least": values.min()}
+            rows.append({"task": task, "method": method} | found)
+    return pd.DataFrame(rows, columns=[*(rows[0] if rows else ("task", "method"))])
 
 
 def trained(results: Results) -> pd.DataFrame:

@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import binomtest
 
 from experiments.ensembles import provenance
+from experiments.problems import catalogue
 from experiments.reports import result_files
 from experiments.reports.document_tables import SPEED_UP, Query, number, table_of
 from experiments.reports.documents import filled, readme
@@ -34,7 +35,7 @@ def results(tmp_path, monkeypatch):
     return tmp_path / "stored"
 
 
-def write(folder, task, method, run, errors, *, each, settings=None, status="stopped"):
+def write(folder, task, method, run, errors, *, each, settings=None, status="stopped", x=(1.0, 2.0)):
     """A run with these image errors after `each` evaluations and half a second; parameter errors are their squares."""
     files = Files(folder / task / method, run)
     log = Log(files.log)
@@ -42,7 +43,7 @@ def write(folder, task, method, run, errors, *, each, settings=None, status="sto
         log(Record(task, method, run, i, 0.5 * i, i * each, None, None, one, one**2))
     log.close()
     n = len(errors) - 1
-    x = [] if task.startswith("cnn") else [1.0, 2.0]
+    x = [] if task.startswith("cnn") else list(x)
     one = {"preset": "fast", "limit": 15.0, "evaluations": 400, **(settings or {})}
     write_outcome(Outcome(task, method, run, status, "", 0.5 * n, 0.4 * n, n * each, n, x, one), files)
     provenance.register(folder, {task: {method: one}})
@@ -62,6 +63,20 @@ def folder(tmp_path):
 def rows(results, name):
     with (results / f"{name}.csv").open() as file:
         return list(csv.DictReader(file))
+
+
+def test_a_measure_of_a_task_has_its_median_and_least_value(tmp_path, results):
+    task, ends = catalogue.fitting("meshfit"), []
+    for run in range(3):
+        x = task.start(run)
+        write(tmp_path / "runs", "meshfit", "levels_local", run, [100.0, 1.0], each=9, x=x.tolist())
+        ends.append(task.truth.measures(x))
+    store(tmp_path / "runs", name="meshes")
+    (row, *_) = rows(results, "meshes")
+    values = sorted(one["least silhouette IoU"] for one in ends)
+    assert row["measure"] == "least silhouette IoU"
+    assert float(row["measure_median"]) == pytest.approx(values[1], rel=1e-5)
+    assert float(row["measure_least"]) == pytest.approx(values[0], rel=1e-5)
 
 
 def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):

@@ -9,7 +9,7 @@ smooth, so that no other prior on the mesh is needed. Each stage is one `zh.opti
 a level. Samples tell which pixels a handle changes: no camera and no footprint is given.
 
 Fine handles stretch triangles between the ears and the back into a dark web. Its two sides hide each other: the
-silhouette changes only if both move. In one stage the handles are therefore points in space, each of which moves both.
+silhouette changes only if both move. In two stages the handles are therefore points in space, each of which moves both.
 
 The output is the image after two white-box operations. A *tone curve* raises dark pixels: shading is a quarter at
 least where there is a mesh, and the background is 0. With the shading alone, a dark part that is missing is a small
@@ -48,12 +48,13 @@ class Stage(NamedTuple):
 
 STAGES = (
     Stage(1, 150, 0.2, 8),
-    Stage(2, 850, 0.3, 4),
-    Stage(3, 500, 0.3, 4, 0.6),
-    Stage(None, 450, 0.3, 4, 0.9),
+    Stage(2, 700, 0.3, 4),
+    Stage(None, 250, 0.3, 4, 0.7),
+    Stage(3, 450, 0.3, 4, 0.6),
+    Stage(None, 400, 0.3, 4, 0.9),
     Stage(3, 400, 0.25, 4, 0.9),
 )
-"""Chosen by hand on runs 1000 to 1005, as the defaults of `levels_local`."""
+"""Chosen by hand on runs 1000 to 1013, as the defaults of `levels_local`."""
 _APART = 0.2
 """Distance of handles in space, in units of the parameters."""
 

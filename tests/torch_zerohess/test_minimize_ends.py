@@ -252,6 +252,48 @@ def test_every_engine_knows_both_tolerances(engine, n, whole, name):
     assert fit.value < 1e-2
 
 
+@pytest.mark.parametrize(
+    "settings", [{"xtol": 1e-2}, {"ftol": 1e-3}, {"restarts": 0}], ids=["xtol", "ftol", "restarts"]
+)
+def test_a_plateau_beside_a_jump_is_not_solved(settings):
+    """A bar with hard edges: images do not change when a parameter changes a little."""
+    pixels = torch.linspace(0.0, 1.0, 16, dtype=torch.float64)
+
+    def bars(z):
+        return ((pixels - z[:, :1]).abs() < 0.2 + 0.1 * z[:, 1:]).double()
+
+    goal = bars(torch.tensor([[0.3, 0.5]]))[0]
+    for seed in range(5):
+        fit = zh.minimize(bars, [0.8, 0.2], sigma=0.3, loss=lambda y: (y - goal).square().mean(), seed=seed, **settings)
+        assert not fit.success or fit.value == 0.0
+        assert fit.success or "may be no minimum" in fit.message
+
+
+@pytest.mark.parametrize("settings", [{"xtol": 1e-2}, {"ftol": 1e-4}], ids=["xtol", "ftol"])
+def test_the_hessian_in_a_curved_valley_is_that_of_the_nearest_evaluations_that_tell_it(settings):
+    """Steps along the valley say nothing about its walls."""
+
+    def banana(z):
+        return 100.0 * (z[:, 1] - z[:, 0].square()).square() + (1.0 - z[:, 0]).square()
+
+    fit = zh.minimize(banana, [-1.0, -1.0], sigma=0.5, seed=0, **settings)
+    expected = torch.func.hessian(lambda x: banana(x[None])[0])(fit.x)
+    assert float((fit.hessian - expected).norm()) < 0.1 * float(expected.norm())
+
+
+def test_a_region_that_shrank_by_mistake_is_no_evidence():
+    """A valley of condition 4e4 that begins at a bound: a third of the runs shrink the region there, and grow it again.
+
+    At most four of 20 runs may call the bound a minimum; two are expected.
+    """
+
+    def valley(z):
+        return 1e4 * (z.sum(1) - 3.9).square() + (z[:, 0] - z[:, 1] - 0.5).square()
+
+    fits = [zh.minimize(valley, zeros(2) - 1.0, sigma=2.0, bounds=(-5, 5), seed=k, xtol=1e-2) for k in range(20)]
+    assert sum(fit.success and fit.value > 0.1 for fit in fits) <= 4
+
+
 @pytest.mark.parametrize("kind", [zh.optim.LocalGaussNewton, zh.optim.BlockGaussNewton])
 def test_gauss_newton_says_that_it_has_arrived(kind):
     goal = torch.linspace(-0.7, 0.7, 64, dtype=torch.float64).view(8, 8)
@@ -281,7 +323,7 @@ def test_a_model_of_few_evaluations_that_promises_nothing_does_not_end_it(seed):
 def test_a_tolerance_ends_nothing_before_it_has_begun():
     seen = []
     fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, xtol=9.0, callback=seen.append)
-    assert len(seen) == 1
+    assert 1 <= len(seen) <= 3
     assert fit.value == float(tilted(fit.x[None]))
 
 

@@ -46,13 +46,14 @@ class Minimum:
             interrupted before them, it is the prediction of a Gaussian process of all evaluations.
         value_error: standard error of `value`; 0 without noise.
         gradient: [n], of a quadratic around x of width `sigma`; None if too few evaluations lie around x.
-        hessian: [n, n], of the same quadratic; None likewise.
+        hessian: [n, n], of the same quadratic; None likewise. With `loss` it may be J^T H J, with the Jacobian J of the
+            output and the Hessian H of the loss: second derivatives of the output are left out.
         standard_errors: of these by the names "gradient" [n] and "hessian_diagonal" [n]; None likewise. They are
-            infinite where the evaluations do not determine the derivative. Without noise they bound the error due to
-            terms that are not quadratic. In noise, and up to 40 parameters, twice the error covers the derivative of a
-            quadratic in about 93 % of all runs. It covers less, some 70 %, where third derivatives change the function
-            by several times the noise within `sigma`. With fewer evaluations than a quadratic has coefficients, and
-            with more parameters, it covers about 85 %.
+            infinite where the evaluations do not determine the derivative. Without noise they are an estimate, often
+            too small: they tell neither third derivatives nor what J^T H J leaves out. In noise, and up to 40
+            parameters, twice the error covers the derivative of a quadratic in about 93 % of all runs. It covers less,
+            some 70 %, where third derivatives change the function by several times the noise within `sigma`. With fewer
+            evaluations than a quadratic has coefficients, and with more parameters, it covers about 85 %.
         sigma: [n], width of the quadratic along every parameter.
         evaluations: how many there were.
         points: [evaluations, n], where, in order.
@@ -63,8 +64,8 @@ class Minimum:
             that it may have looked for a lower one until its evaluations were used up: then the status is "budget".
         status: target: the value is at most the target. solved: the search has ended at a minimum, possibly a local
             one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and where
-            fn jumps or fails next to x. budget, time: evaluations or seconds are used up. callback, interrupted: the
-            caller has ended it. failed: the black box, the loss or the callback has raised.
+            fn jumps, fails or is constant next to x. budget, time: evaluations or seconds are used up. callback,
+            interrupted: the caller has ended it. failed: the black box, the loss or the callback has raised.
         message: why the search ended, in words.
         engine: which search it was: "gaussian_process", "descent" or "local".
     """

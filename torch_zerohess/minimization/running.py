@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.decision import Decision, decide
-from torch_zerohess.minimization.jumps import jumps
+from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
 from torch_zerohess.minimization.noise import REPEATED, deviation, differs, reserved
 from torch_zerohess.minimization.record import Call, Record
@@ -25,7 +25,7 @@ _LUCK = 2.0
 """Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
 _FITTED = 40
 """Parameters up to which a quadratic is fitted to all evaluations at the end."""
-_EXACT = 1e-3
+_RELIABLE = 0.1
 """Relative standard error of its Hessian, below which it takes the place of the model that the search has."""
 
 
@@ -111,9 +111,9 @@ class Running:
         return f"{given} allows no step after the {count} so far" if rest else f"{given} used up"
 
     @property
-    def jumps(self) -> bool:
-        """Whether the black box jumps or fails next to the best point, which is then no minimum for sure."""
-        return jumps(*self.record.told, *self._best()[:2], self.search.unit)
+    def doubt(self) -> str:
+        """Why the best point may be no minimum; empty if there is no doubt."""
+        return doubt(*self.record.told, *self._best()[:2], self.search.unit)
 
     @property
     def iterate(self) -> Iterate:
@@ -142,7 +142,7 @@ class Running:
 
     def ending(self, *, arrived: bool) -> Status:
         """Return the status when the search ends by itself: in noise or at a jump a small region is no evidence."""
-        return "solved" if arrived and not self.record.flat and not self.noise and not self.jumps else "stalled"
+        return "solved" if arrived and not self.record.flat and not self.noise and not self.doubt else "stalled"
 
     def reaches(self, target: float) -> bool:
         """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.
@@ -201,8 +201,8 @@ class Running:
             errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
         if self.record.flat and len(search.unit) < self.evaluations and status != "target":
             message += f"; all {self.evaluations} values are equal: enlarge sigma"
-        if status == "stalled" and not self.noise and self.jumps:
-            message += "; fn jumps or fails next to x, which may be no minimum"
+        elif status == "stalled" and not self.noise and self.doubt:
+            message += f"; {self.doubt}"
         success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
         if success and status in ("budget", "time"):
             message += "; the search had arrived at x, a minimum at least of its surroundings"
@@ -268,7 +268,7 @@ class Running:
             return found
         unit, (points, losses), noise = self.search.unit, self.record.told, self.noise or 0.0
         around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
-        if around is None or (found is not None and not noise and around[2] > _EXACT):
+        if around is None or (found is not None and not noise and around[2] > _RELIABLE):
             return found
         return around[:2]
 

@@ -72,8 +72,9 @@ class FinishedProcess(ProcessMethod[F]):
         return math.inf if local is None else self.local.promise(local)
 
     def width(self, known: F) -> Tensor:
+        """Return the region of the local search if it is at the best point; or infinity."""
         local = self._at_best(known)
-        return super().width(known) if local is None else self.local.width(local)
+        return torch.full_like(known.center, math.inf) if local is None else self.local.width(local)
 
     def _at_best(self, known: F) -> RegionProgress | None:
         """Return the progress of the local search if it is at the best point, and its turn has come."""

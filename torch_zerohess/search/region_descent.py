@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_zerohess.linalg.metric import region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal, reflect
-from torch_zerohess.search.region_progress import R
+from torch_zerohess.search.region_progress import R, RegionProgress
 from torch_zerohess.search.state import LOST, Best, Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
@@ -161,11 +161,12 @@ class RegionDescent(Method[R]):
         return fit_values(u, values, torch.ones_like(values)), sigma
 
     def promise(self, known: R) -> float:
-        tested = known.phase == "trial" and known.iterations > 0 and known.rejected == 0
-        return known.promised if tested and known.length < _LONG else math.inf
+        return known.promised if _is_sound(known) else math.inf
 
     def width(self, known: R) -> Tensor:
-        return known.sigma * known.root.norm(dim=0)
+        """Return the extent of the region; infinity where it may have shrunk because its model was wrong."""
+        extent = known.sigma * known.root.norm(dim=0)
+        return extent if _is_sound(known) else torch.full_like(extent, math.inf)
 
     def _begun(self, best: Best, **own: Any) -> R:
         """Return a round that begins at a point, with the fields of a subclass."""
@@ -225,3 +226,8 @@ class RegionDescent(Method[R]):
 
     def _inside(self, points: Tensor) -> Tensor:
         return reflect(points, self.settings.lower, self.settings.upper)
+
+
+def _is_sound(known: RegionProgress) -> bool:
+    """Whether the last step was good, and the next one ends at a minimum of the model within the region."""
+    return known.phase == "trial" and known.iterations > 0 and known.rejected == 0 and known.length < _LONG

@@ -1,11 +1,11 @@
-"""Which evaluations around a point are a jump: by hand, in one parameter with sigma = 2."""
+"""Which evaluations around a point are a jump or a plateau: by hand."""
 
 import math
 
 import pytest
 import torch
 
-from torch_zerohess.minimization.jumps import jumps
+from torch_zerohess.minimization.doubt import doubt, is_constant, jumps
 from truths import vector
 
 
@@ -31,3 +31,13 @@ def test_a_jump_is_large_for_its_distance(distance: float, value: float, expecte
 
 def test_without_a_finite_value_nothing_is_known() -> None:
     assert not jumps(torch.zeros(2, 1).double(), vector(math.nan, math.nan), vector(0.0), math.nan, vector(1.0))
+
+
+@pytest.mark.parametrize(("distance", "constant"), [(1e-4, False), (0.01, True), (0.2, True), (0.5, False)])
+def test_an_equal_value_near_x_is_a_plateau(distance, constant):
+    """Nearer it may be rounding, farther away another minimum. Distances are in units of sigma, here of 3."""
+    points = vector(0.0, 0.0) + torch.stack([vector(0.0, 0.0), 3.0 * distance * vector(1.0, -1.0), vector(9.0, 9.0)])
+    values, unit = vector(0.5, 0.5, 7.0), vector(3.0, 3.0)
+    assert is_constant(points, values, points[0], 0.5, unit) == constant
+    assert is_constant(points, values + vector(0.0, 1e-9, 0.0), points[0], 0.5, unit) is False
+    assert ("constant" in doubt(points, values, points[0], 0.5, unit)) == constant

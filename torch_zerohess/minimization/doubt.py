@@ -1,0 +1,46 @@
+"""Whether a black box jumps, fails or is constant next to a point: a search ends there as it does at a minimum."""
+
+import torch
+from torch import Tensor
+
+_NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
+"""Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
+
+_PLATEAU = (1e-3, 0.3)
+"""Distances in units of sigma between which an equal value is a plateau: nearer ones may differ by less than rounding,
+and farther ones may be other minima."""
+
+
+def is_constant(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:
+    """Whether an evaluation near x, but not next to it, has exactly the value at x; arguments as of `jumps`."""
+    distance = ((points - x) / unit).square().mean(1).sqrt()
+    nearest, farthest = _PLATEAU
+    return bool((losses[(distance >= nearest) & (distance <= farthest)] == value).any())
+
+
+def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:
+    """Whether an evaluation next to x has no finite value, or a value that is much larger than the value at x.
+
+    Kinks and narrow valleys are no jumps: there the difference vanishes with the distance.
+
+    Args:
+        points: evaluations [P, n].
+        losses: [P].
+        x: [n].
+        value: the loss at x.
+        unit: sigma of every parameter [n].
+    """
+    finite = losses[torch.isfinite(losses)]
+    if not len(finite):
+        return False
+    distance, range_ = ((points - x) / unit).norm(dim=1), finite.max() - finite.min()
+    return not all(bool((losses[distance <= near] - value <= part * range_).all()) for near, part in _NEXT)
+
+
+def doubt(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> str:
+    """Return why x may be no minimum, in words; empty if there is no doubt. Arguments as of `jumps`."""
+    if jumps(points, losses, x, value, unit):
+        return "fn jumps or fails next to x, which may be no minimum"
+    if is_constant(points, losses, x, value, unit):
+        return "fn is constant next to x, which may be no minimum: enlarge sigma"
+    return ""

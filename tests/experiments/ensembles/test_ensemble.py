@@ -173,12 +173,14 @@ def test_settings_of_an_ensemble_are_checked(tmp_path, changes, message):
 
 
 ENSEMBLE = """
+import signal
 import sys
 from pathlib import Path
 from small import GATED, GATED_BUMP, SEARCH
 from experiments.ensembles.ensemble import Ensemble
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
     workers = int(sys.argv[3])
     ensemble = Ensemble(Path(sys.argv[1]), range(workers), jobs=workers)
     plan = {"search": ([GATED], [SEARCH]), "our_g": ([GATED_BUMP], ["our_g"])}

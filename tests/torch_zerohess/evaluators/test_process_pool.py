@@ -342,11 +342,12 @@ def test_a_worker_that_takes_too_much_memory_is_replaced_and_one_that_is_old_too
 
 
 ORPHAN = """
-import os, sys, time
+import os, signal, sys, time
 import torch
 import black_boxes
 from torch_zerohess.evaluators import ProcessPool
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
     pool = ProcessPool(1)
     print(int(pool(black_boxes.process, torch.zeros(1, 1, dtype=torch.float64))), flush=True)
     if sys.argv[1] == "sleep":

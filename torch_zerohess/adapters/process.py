@@ -14,11 +14,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.adapters.server import Server, ended, late, shown
+from torch_zerohess.adapters.server import GRACE, Server, end_program, ended, late, shown
 from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
+from torch_zerohess.evaluators.lifetime import ends_by_its_group
 from torch_zerohess.evaluators.values import as_tensor
 
 
@@ -52,7 +53,7 @@ class Program(Closing):
         command: program and arguments, or a function that returns them for a point.
         server: whether the program answers many requests.
         format: see above.
-        timeout: seconds per point; None for no limit.
+        timeout: seconds per point; None for no limit. Then the program ends, with the programs that it started.
         folder: where the program runs; here if None.
         environment: variables added to the environment of this process.
         on_failure: "raise", or "nan" to go on without the values of a run that fails.
@@ -185,7 +186,9 @@ class Program(Closing):
     def _start(self, command: Sequence[str]) -> "subprocess.Popen[bytes]":
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         variables = None if self.environment is None else os.environ | self.environment
-        return subprocess.Popen(list(command), cwd=self.folder, env=variables, **pipes)
+        # A group of its own, to end it with the programs that it starts. In a worker it ends with the group of that.
+        own = not ends_by_its_group()
+        return subprocess.Popen(list(command), cwd=self.folder, env=variables, start_new_session=own, **pipes)
 
     def _run(self, command: Sequence[str], request: bytes, points: int) -> Tensor:
         limit = self._limit(points)
@@ -193,10 +196,15 @@ class Program(Closing):
             try:
                 output, errors = process.communicate(request, limit)
             except subprocess.TimeoutExpired:
-                process.kill()
-                raise TimeoutError(late(command, limit, process.communicate()[1])) from None
-            except BaseException:
-                process.kill()
+                end_program(process)
+                try:
+                    errors = process.communicate(timeout=GRACE)[1]
+                except subprocess.TimeoutExpired as error:  # a program that left the group holds the pipe
+                    errors = error.stderr or b""
+                raise TimeoutError(late(command, limit, errors)) from None
+            except BaseException:  # also Ctrl-C, which a group of its own does not get
+                end_program(process)
+                process.wait()
                 raise
         if process.returncode:
             raise RuntimeError(ended(command, process.returncode, errors))

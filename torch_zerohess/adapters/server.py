@@ -8,6 +8,11 @@ from collections import deque
 from collections.abc import Sequence
 from typing import IO, Any
 
+from torch_zerohess.evaluators.lifetime import end_group, end_tree, ends_by_its_group
+
+GRACE = 1.0
+"""Seconds that a program has to end, and that pipes have to close after it."""
+
 _KEPT = 50
 """Lines of the standard error that are shown in an error."""
 
@@ -18,6 +23,7 @@ class Server:
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
         self.process = process
         self.errors: deque[bytes] = deque(maxlen=_KEPT)
+        self._exchange: threading.Thread | None = None
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
@@ -38,41 +44,59 @@ class Server:
                 answer.append(_read_npy(self.process.stdout) if npy else self.process.stdout.readline())
 
         thread = threading.Thread(target=exchange, daemon=True)
+        self._exchange = thread
         thread.start()
-        thread.join(limit)
+        try:
+            thread.join(limit)
+        except BaseException:  # Ctrl-C, which a group of its own does not get
+            end_program(self.process)
+            raise
         command: Any = self.process.args
         if thread.is_alive():
-            self.process.kill()
-            thread.join()
-            self._listener.join(1.0)
+            end_program(self.process)
+            thread.join(GRACE)
+            self._listener.join(GRACE)
             raise TimeoutError(late(command, limit, b"".join(self.errors)))
         if not answer or not answer[0]:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(2.0)
-            self.process.kill()
-            self._listener.join(1.0)
+            end_program(self.process)
+            self._listener.join(GRACE)
             raise RuntimeError(ended(command, self.process.wait(), b"".join(self.errors)))
         return answer[0]
 
     def end(self) -> None:
-        """Close the input of the program, and kill it if it does not end."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(OSError):
-            self.process.stdin.close()
-        try:
-            self.process.wait(1.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        self._listener.join(1.0)
-        for pipe in (self.process.stdout, self.process.stderr):
-            assert pipe is not None
-            pipe.close()
+        """Close the input of the program, and kill it if it does not end. The programs that it started end with it."""
+        self._close(self.process.stdin, self._exchange)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(GRACE)
+        end_program(self.process)
+        self.process.wait()
+        self._close(self.process.stdout, self._exchange)
+        self._close(self.process.stderr, self._listener)
+
+    def _close(self, pipe: IO[bytes] | None, user: threading.Thread | None) -> None:
+        """Close a pipe, unless a thread still uses it: that would wait for a program that left the group."""
+        assert pipe is not None
+        if user is not None:
+            user.join(GRACE)
+        if user is None or not user.is_alive():
+            with contextlib.suppress(OSError):
+                pipe.close()
 
     def _listen(self) -> None:
         assert self.process.stderr is not None
         with contextlib.suppress(OSError, ValueError):
             self.errors.extend(self.process.stderr)
+
+
+def end_program(process: "subprocess.Popen[bytes]") -> None:
+    """Kill a program and the programs that it started."""
+    if not ends_by_its_group():
+        end_group(process.pid)
+    elif process.poll() is None:
+        end_tree(process.pid)
+    process.kill()
 
 
 def _read_npy(file: IO[bytes]) -> bytes:

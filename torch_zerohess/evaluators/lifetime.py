@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from multiprocessing.connection import wait
+from pathlib import Path
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -56,10 +57,29 @@ def _follow(sentinel: int) -> None:
 
 
 def end_group(pid: int) -> None:
-    """Kill a process that called `end_with_parent`, and the programs that it started."""
+    """Kill a process that leads a group, as one that called `end_with_parent`, and the programs that it started."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(pid, signal.SIGKILL)
+
+
+def ends_by_its_group() -> bool:
+    """Return whether this process called `end_with_parent`: programs that it starts must stay in its group."""
+    return multiprocessing.parent_process() is not None and hasattr(os, "getpgrp") and os.getpgrp() == os.getpid()
+
+
+def end_tree(pid: int) -> None:
+    """Kill a process, what it started, and what those started, where the system lists processes in /proc."""
+    parents: dict[int, int] = {}
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it ended
+            parents[int(file.parent.name)] = int(file.read_text(errors="replace").rpartition(")")[2].split()[1])
+    tree = [pid]
+    for one in tree:
+        tree += [child for child, parent in parents.items() if parent == one]
+    for one in tree:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(one, signal.SIGKILL)
 
 
 def ending(code: int) -> str:

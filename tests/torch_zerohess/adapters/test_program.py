@@ -1,10 +1,15 @@
 """External programs: what they answer, what they do wrong, and a real one."""
 
+import os
 import pickle
 import shutil
+import signal
 import subprocess
 import sys
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 
 import pytest
@@ -12,7 +17,7 @@ import torch
 
 import torch_zerohess as zh
 from torch_zerohess.adapters.process import Program
-from torch_zerohess.evaluators import Executor
+from torch_zerohess.evaluators import Executor, ProcessPool
 from torch_zerohess.evaluators.finished import finished_values
 from truths import vector
 
@@ -105,6 +110,107 @@ def test_a_program_that_ends_or_hangs_says_why(server):
             python(wrong + "sys.exit(3)", server=one)(Z)
         with pytest.raises(TimeoutError, match=r"no answer within timeout: 1 s(.|\n)*no licence"):
             python(wrong + "time.sleep(60)", server=one, timeout=0.5)(Z)
+
+
+STARTS = ["sh", "-c", 'sleep 60 & echo $! > "$NOTE"; wait']
+"""A shell that waits for a program, and writes the number of that to a file."""
+
+
+def noted(path) -> int:
+    deadline = time.monotonic() + 30.0
+    while not (path.exists() and path.read_text().strip()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return int(path.read_text())
+
+
+def runs(pid: int) -> bool:
+    state = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout.strip()
+    return bool(state) and not state.startswith("Z")
+
+
+def has_ended(pid: int) -> bool:
+    """Whether a process ends within 10 seconds."""
+    deadline = time.monotonic() + 10.0
+    while runs(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not runs(pid)
+
+
+@pytest.mark.parametrize(
+    ("command", "settings"),
+    [(STARTS, {}), (STARTS, {"server": True}), (lambda point: STARTS, {"format": float})],
+    ids=["once", "server", "function"],
+)
+def test_programs_that_the_program_started_end_with_it(tmp_path, command, settings):
+    """They hold the pipes of the program: a call must not wait for them."""
+    note = tmp_path / "note"
+    program = Program(command, timeout=1.0, environment={"NOTE": str(note)}, on_failure="nan", **settings)
+    assert program(Z[:1]).isnan().all()
+    assert "gave no answer within timeout: 1 s" in program.last_failure
+    assert has_ended(noted(note))
+    program.close()
+
+
+def test_in_a_worker_too(tmp_path):
+    note = tmp_path / "note"
+    program = Program(STARTS, timeout=1.0, environment={"NOTE": str(note)}, on_failure="nan")
+    with ProcessPool(1) as pool:
+        assert pool(program, Z[:1]).isnan().all()
+        assert has_ended(noted(note))
+        program.timeout = 60.0
+        note.unlink()
+        with pytest.raises(KeyboardInterrupt), interrupted(note):
+            pool(program, Z[:1])
+    assert has_ended(noted(note))
+
+
+@contextmanager
+def interrupted(note):
+    """Press Ctrl-C as soon as the program has written its note."""
+
+    def press() -> None:
+        noted(note)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    thread = threading.Thread(target=press)
+    thread.start()
+    try:
+        yield
+    finally:
+        thread.join()
+
+
+@pytest.mark.parametrize("server", [False, True])
+def test_ctrl_c_ends_the_program_and_what_it_started(tmp_path, server):
+    note = tmp_path / "note"
+    with (
+        Program(STARTS, server=server, environment={"NOTE": str(note)}) as program,
+        pytest.raises(KeyboardInterrupt),
+        interrupted(note),
+    ):
+        program(Z)
+    assert has_ended(noted(note))
+
+
+def test_a_program_that_left_the_group_is_not_waited_for(tmp_path):
+    """It may hold the pipes for ever."""
+    note = tmp_path / "note"
+    program = Program([sys.executable, "-S", "-c", LEAVES], timeout=1.0, environment={"NOTE": str(note)})
+    with pytest.raises(TimeoutError, match=r"timeout: 2 s(.|\n)*started"):
+        program(Z)
+    other = noted(note)
+    assert runs(other)
+    os.kill(other, signal.SIGKILL)
+
+
+LEAVES = (
+    "import os, subprocess, sys, time\n"
+    "print('started', file=sys.stderr, flush=True)\n"
+    "child = subprocess.Popen(['sleep', '60'], start_new_session=True)\n"
+    "open(os.environ['NOTE'], 'w').write(str(child.pid))\n"
+    "time.sleep(60)\n"
+)
 
 
 SQUARE = "a = json.load(sys.stdin)['x']; print('seen', file=sys.stderr); x = a[0][0]; "

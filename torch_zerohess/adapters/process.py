@@ -39,8 +39,9 @@ class Program(Closing):
     - "npy": a request is the array x, then each aux, as `numpy.save` writes them. The answer is one array.
     - a function of bytes: turns the output of the program into the value. Requests are written as for "json".
 
-    A server flushes its output after each answer, and writes messages to the standard error alone. It ends when its
-    standard input does. A server that ended or took too long is started again by the next call.
+    A server writes one answer per request and flushes it, and writes messages to the standard error alone. More answers
+    are an error of the next call, if they are there when it begins. A server ends when its standard input
+    does. A server that ended or took too long is started again by the next call.
 
     A run fails if it ends with a code other than 0, takes too long, or writes no number. With on_failure="nan" all
     points of the run have NaN as their values, in the shape of earlier outputs. Before the first output the shape is

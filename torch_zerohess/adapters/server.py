@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import subprocess
 import threading
 from collections import deque
@@ -32,7 +33,15 @@ class Server:
         return self.process.poll() is None
 
     def ask(self, request: bytes, npy: bool, limit: float | None) -> bytes:
-        """Return the answer to a request."""
+        """Return the answer to a request. ValueError if the program wrote something since the last one."""
+        command: Any = self.process.args
+        assert self.process.stdout is not None
+        if more := _pending(self.process.stdout):
+            raise ValueError(
+                f"the program {command[0]!r} wrote more than one answer to a request, or other text beside it: "
+                f"{more[:200].decode(errors='replace')!r} was there before the next request; let it write one answer "
+                f"and flush, and print messages to its standard error{shown(b''.join(self.errors))}"
+            )
         answer: list[bytes] = []
 
         def exchange() -> None:
@@ -51,7 +60,6 @@ class Server:
         except BaseException:  # Ctrl-C, which a group of its own does not get
             end_program(self.process)
             raise
-        command: Any = self.process.args
         if thread.is_alive():
             end_program(self.process)
             thread.join(GRACE)
@@ -97,6 +105,17 @@ def end_program(process: "subprocess.Popen[bytes]") -> None:
     elif process.poll() is None:
         end_tree(process.pid)
     process.kill()
+
+
+def _pending(file: Any) -> bytes:
+    """Return what can be read from a pipe at once, and leave it there."""
+    if not hasattr(os, "set_blocking"):
+        return b""
+    os.set_blocking(file.fileno(), False)
+    try:
+        return bytes(file.peek(1))
+    finally:
+        os.set_blocking(file.fileno(), True)
 
 
 def _read_npy(file: IO[bytes]) -> bytes:

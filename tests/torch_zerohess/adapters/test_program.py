@@ -112,6 +112,21 @@ def test_a_program_that_ends_or_hangs_says_why(server):
             python(wrong + "time.sleep(60)", server=one, timeout=0.5)(Z)
 
 
+TWICE = ANSWER.replace("print(json", "print(2 * (json").replace("), flush", ") + chr(10)), end='', flush")
+
+
+@pytest.mark.parametrize("answers", [TWICE, ANSWER + "    time.sleep(0.1)\n    " + ANSWER])
+def test_an_answer_too_many_is_not_taken_for_the_next(answers):
+    """The second line is read with the first, or waits in the pipe."""
+    code = SERVE + answers
+    with python(code, server=True) as program:
+        assert torch.equal(program(Z), Z.sum(1))
+        time.sleep(1.0)  # the answer too many arrives
+        with pytest.raises(ValueError, match=r"wrote more than one answer to a request(.|\n)*before the next request"):
+            program(2 * Z)
+        assert torch.equal(program(2 * Z), 2 * Z.sum(1))  # it was started again
+
+
 STARTS = ["sh", "-c", 'sleep 60 & echo $! > "$NOTE"; wait']
 """A shell that waits for a program, and writes the number of that to a file."""
 

@@ -14,9 +14,17 @@ from torch_zerohess.linalg.jacobians import Blocks, Jacobian, OuterProducts, Row
 
 _OF_TRAINING = (
     *(nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm),
-    *(nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout),
+    *(nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout, nn.RReLU),
 )
 """Modules that in training mode mix samples or draw random numbers."""
+
+_WITH_DROPOUT = (nn.RNNBase, nn.MultiheadAttention)
+"""Modules that draw random numbers in training mode if their `dropout` is positive."""
+
+_DRAWS = (
+    "network draws random numbers, and has no Jacobian per sample: call network.eval() first, or take what draws them "
+    "out of its forward function"
+)
 
 
 Places = tuple[str, ...]
@@ -28,7 +36,8 @@ class SampleJacobian:
 
     Made in a closure of `NewtonCG` with solver "dual", which otherwise takes one backward pass for every output of
     every sample. Batch normalisation and dropout must be in evaluation mode: in training mode, batch normalisation
-    mixes the samples, and dropout changes the network from call to call.
+    mixes the samples, and dropout changes the network from call to call. So does the dropout of recurrent layers and
+    of attention, and RReLU.
 
     Args:
         network: a module, inputs [B, ...] -> [B, n], each of its own input.
@@ -49,7 +58,8 @@ class SampleJacobian:
         """Return J [B n, N] by parameters of the network, N numbers in all.
 
         Raises ValueError for a parameter that the network does not have, for outputs that are not [B, n], for batch
-        normalisation and dropout in training mode, and for batch normalisation without running statistics.
+        normalisation and dropout in training mode, for batch normalisation without running statistics, and for a
+        network that draws random numbers.
         """
         return self.products(parameters).dense()
 
@@ -65,9 +75,11 @@ class SampleJacobian:
                     f"network has a {type(one).__name__} without running statistics ({name!r}), which mixes samples in "
                     "evaluation mode, too: it has no Jacobian per sample"
                 )
-            if one.training and isinstance(one, _OF_TRAINING):
+            dropout = isinstance(one, _WITH_DROPOUT) and float(one.dropout) > 0.0
+            if one.training and (dropout or isinstance(one, _OF_TRAINING)):
+                kind = type(one).__name__ + " with dropout" * dropout
                 raise ValueError(
-                    f"network has a {type(one).__name__} in training mode ({name!r}), and no Jacobian per sample: call "
+                    f"network has a {kind} in training mode ({name!r}), and no Jacobian per sample: call "
                     "network.eval() first"
                 )
         places = self._places()
@@ -92,7 +104,7 @@ class SampleJacobian:
             (by_rows, by_slopes), inputs = differentiated(rows, slopes, self._inputs)
         except RuntimeError as error:  # torch's vmap does not know the operations of GRU and PReLU, among others
             if "random" in str(error):
-                raise
+                raise ValueError(_DRAWS) from error
             return Rows(self._one_by_one(parameters))
 
         def part(at: Places) -> Jacobian:
@@ -106,8 +118,11 @@ class SampleJacobian:
         """Return the rows by a backward pass for every output of every sample."""
         rows = []
         for sample in self._inputs:
+            before = _generators(self._inputs)
             with torch.enable_grad():
                 outputs = _checked(self._network(sample[None]))[0]
+            if not all(map(torch.equal, before, _generators(self._inputs))):
+                raise ValueError(_DRAWS)
             for one in outputs:
                 gradients = torch.autograd.grad(one, parameters, retain_graph=True, materialize_grads=True)
                 rows.append(flattened(gradients))
@@ -132,6 +147,12 @@ class SampleJacobian:
         with torch.enable_grad(), _Uses(chosen.values()) as uses:
             self._called(chosen, self._inputs[:1])
         return {at for at, one in chosen.items() if uses.count[id(one)] == 1 and id(one) in uses.products}
+
+
+def _generators(inputs: Tensor) -> list[Tensor]:
+    """Return the states of torch's own random number generators that a network of these inputs may use."""
+    on_device = [torch.cuda.get_rng_state(inputs.device)] if inputs.is_cuda else []
+    return [torch.get_rng_state(), *on_device]
 
 
 def _checked(outputs: object) -> Tensor:

@@ -23,14 +23,15 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
     equations as the batch has outputs.
 
     Args:
-        network: inputs [B, ...] -> outputs [B, n], each of its own input.
+        network: inputs [B, ...] -> outputs [B, n], each of its own input. It may not draw random numbers.
         inputs: [B, ...]
         change: of the outputs [B, n].
         relative_damping: in units of h; positive. With more of it one noisy change moves the outputs less.
 
     Raises:
         ValueError: a change of a wrong shape or that is not finite, a damping that is not positive, no inputs, or a
-            network whose outputs do not change with its weights or whose Jacobian is not finite.
+            network whose outputs do not change with its weights, are random or mix samples, or whose Jacobian is not
+            finite.
 
     Example:
         >>> network, x = torch.nn.Linear(3, 2), torch.eye(3)[:2]

@@ -9,6 +9,7 @@ from torch.nn.utils.parametrize import register_parametrization
 
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.jacobians import Blocks, OuterProducts, Rows
+from torch_zerohess.optim import move_outputs
 
 SAMPLES = torch.randn(5, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
@@ -232,7 +233,46 @@ def test_networks_that_vmap_does_not_know_have_a_jacobian(make: Callable[[], nn.
     torch.testing.assert_close(SampleJacobian(net, SAMPLES)(parameters), backward(net, parameters))
 
 
-def test_a_network_that_draws_random_numbers_is_refused() -> None:
-    net = Net(lambda net, x: nn.functional.dropout(net.a(x), training=True), a=linear()).double()
-    with pytest.raises(RuntimeError, match="random"):
+class Drawing(nn.Module):
+    """A layer over two vectors per sample, in training mode; then dropout as a function."""
+
+    def __init__(self, inner: nn.Module, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.inner, self._dropout = inner, dropout
+
+    def forward(self, x: Tensor) -> Tensor:
+        rows = in_rows(x)
+        attention = isinstance(self.inner, nn.MultiheadAttention)
+        result = self.inner(rows, rows, rows)[0] if attention else self.inner(rows)
+        result = (result[0] if isinstance(result, tuple) else result).flatten(1)
+        return nn.functional.dropout(result, self._dropout) if self._dropout else result
+
+
+RECURRENT = {"num_layers": 2, "dropout": 0.5, "batch_first": True}
+
+
+@pytest.mark.parametrize(
+    ("inner", "kind"),
+    [
+        (nn.GRU(2, 3, **RECURRENT), "GRU with dropout"),
+        (nn.LSTM(2, 3, **RECURRENT), "LSTM with dropout"),
+        (nn.RNN(2, 3, **RECURRENT), "RNN with dropout"),
+        (nn.MultiheadAttention(2, 1, dropout=0.5, batch_first=True), "MultiheadAttention with dropout"),
+        (nn.Sequential(nn.Linear(2, 3), nn.RReLU()), "RReLU"),
+    ],
+)
+def test_layers_with_dropout_of_their_own_are_refused_in_training_mode(inner: nn.Module, kind: str) -> None:
+    net = Drawing(inner).double()
+    jacobian = SampleJacobian(net, SAMPLES)
+    for refused in (jacobian, lambda some: move_outputs(net, SAMPLES, torch.zeros(5, 6))):
+        with pytest.raises(ValueError, match=rf"network has a {kind} in training mode \('inner.*call network.eval\(\)"):
+            refused(list(net.parameters()))
+    net.eval()
+    torch.testing.assert_close(jacobian(list(net.parameters())), backward(net, list(net.parameters())))
+
+
+@pytest.mark.parametrize("inner", [nn.Linear(2, 3), nn.GRU(2, 3, batch_first=True)], ids=["vmap", "one by one"])
+def test_a_network_that_draws_random_numbers_is_refused(inner: nn.Module) -> None:
+    net = Drawing(inner, dropout=0.5).double()
+    with pytest.raises(ValueError, match="network draws random numbers, and has no Jacobian per sample"):
         SampleJacobian(net, SAMPLES).products(list(net.parameters()))

@@ -100,7 +100,8 @@ class OnnxFunction:
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...].
 
-        Raises ValueError if x has another number of columns, or if there are not as many auxiliary inputs as names.
+        Raises ValueError if x has another number of columns, if points that differ are all equal in the type of the
+        model, or if there are not as many auxiliary inputs as names.
         """
         check_tensors(x=x, aux=aux)
         if x.ndim != 2 or x.shape[1] != self.n:
@@ -108,10 +109,29 @@ class OnnxFunction:
             raise ValueError(f"x must have shape [K, {self.n}] for {parts}, got {list(x.shape)}")
         if len(aux) != len(self.aux):
             raise ValueError(f"aux must be {len(self.aux)} tensors for {list(self.aux)}, got {len(aux)}")
+        self._check_rounding(x)
         if self._batched and len(x):
             return self._run(x, aux).to(x.device)
         rows = [self._one(x[k : k + 1], tuple(one[k : k + 1] for one in aux)) for k in range(len(x))]
         return torch.stack(rows).to(x.device) if rows else x.new_empty(0)
+
+    def _check_rounding(self, x: Tensor) -> None:
+        """Raise ValueError for points that differ, but not one of them after the conversion."""
+        kinds = {self._type(name) for name in self.parameters}
+        exact = not x.is_floating_point() or all(torch.finfo(one).eps <= torch.finfo(x.dtype).eps for one in kinds)
+        if exact or bool((x == x[:1]).all()):
+            return
+        first = self._given(x[:1])
+        if all(all(map(torch.equal, self._given(x[k : k + 1]), first)) for k in range(1, len(x))):
+            raise ValueError(
+                f"sigma is below the rounding of the model: the {len(x)} points differ in {x.dtype}, and all are equal "
+                f"in {', '.join(sorted(map(str, kinds)))}, which the model takes; use a larger sigma or other units"
+            )
+
+    def _given(self, x: Tensor) -> list[Tensor]:
+        """Return x [K, n] as the parameters get it, each [K, elements] of its type."""
+        parts = x.detach().split([math.prod(one) for one in self.shapes.values()], 1)
+        return [part.to(self._type(name)) for name, part in zip(self.parameters, parts, strict=True)]
 
     def _one(self, x: Tensor, aux: tuple[Tensor, ...]) -> Tensor:
         values = self._run(x, aux)
@@ -119,9 +139,7 @@ class OnnxFunction:
 
     def _run(self, x: Tensor, aux: tuple[Tensor, ...]) -> Tensor:
         K, feeds = len(x), {}
-        for name, part in zip(
-            self.parameters, x.split([math.prod(one) for one in self.shapes.values()], 1), strict=True
-        ):
+        for name, part in zip(self.parameters, self._given(x), strict=True):
             feeds[name] = part.reshape(self._full(name, self.shapes[name], K))
         for name, one in zip(self.aux, aux, strict=True):
             wanted = self._inputs[name].shape

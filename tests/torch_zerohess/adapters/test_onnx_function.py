@@ -123,6 +123,22 @@ def test_wrong_inputs():
         OnnxFunction("no.onnx")
 
 
+@pytest.mark.parametrize("batch", ["K", 1])
+@pytest.mark.parametrize(("kind", "sigma"), [(TensorProto.FLOAT, 1e-8), (TensorProto.FLOAT16, 1e-4)])
+def test_points_that_round_to_one_are_refused(batch, kind, sigma):
+    """Their values are equal: the gradient would be 0, without a standard error."""
+    f = OnnxFunction(model(batch, kind), constants={"c": C[:1]}, output="y")
+    x, dtype = vector(1.0, 2.0), "float16" if kind == TensorProto.FLOAT16 else "float32"
+    smoothing = zh.Smoothing(sigma=sigma, samples=8, seed=0)
+    with pytest.raises(ValueError, match=rf"sigma is below the rounding of the model.* all are equal in torch.{dtype}"):
+        zh.estimate(lambda z: f(z).sum(1), x, smoothing)
+    assert bool((zh.estimate(lambda z: f(z).sum(1), x, smoothing.replace(sigma=0.1)).gradient != 0).all())
+    assert torch.equal(f(x.expand(3, 2)), f(x[None]).expand(3, 3))  # equal before it
+    apart = torch.stack([x, x + sigma, x + 0.1])
+    assert torch.equal(f(apart)[0], f(apart)[1])
+    assert torch.equal(f(torch.tensor([[1, 2], [2, 1]]))[0], f(x[None])[0])  # integers
+
+
 def test_what_is_no_model_is_named() -> None:
     with pytest.raises(
         TypeError, match="model must be a path, the bytes of a model or an InferenceSession, got NoneType"

@@ -48,8 +48,8 @@ class OnnxFunction:
     Raises:
         ModuleNotFoundError: onnxruntime or NumPy is not installed.
         FileNotFoundError: there is no such model file.
-        ValueError: a name is unknown, an input is given twice or not at all, a parameter is of an integer type, or has
-            free dimensions beside the first.
+        ValueError: a name is unknown, an input is given twice or not at all, a parameter is of an integer type or has
+            free dimensions beside the first, or a constant has a value that an input of integers cannot hold.
     """
 
     def __init__(
@@ -85,7 +85,8 @@ class OnnxFunction:
         """Number of parameters."""
         self._batched = all(_free(self._inputs[name].shape[:1]) for name in (*self.parameters, *self.aux))
         self._constants = {
-            name: torch.as_tensor(one, device="cpu").to(self._type(name), copy=True) for name, one in fixed.items()
+            name: self._converted("constants", name, torch.as_tensor(one, device="cpu")).clone()
+            for name, one in fixed.items()
         }
 
     def __repr__(self) -> str:
@@ -101,7 +102,7 @@ class OnnxFunction:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...].
 
         Raises ValueError if x has another number of columns, if points that differ are all equal in the type of the
-        model, or if there are not as many auxiliary inputs as names.
+        model, if there are not as many auxiliary inputs as names, or if an input of integers cannot hold one of them.
         """
         check_tensors(x=x, aux=aux)
         if x.ndim != 2 or x.shape[1] != self.n:
@@ -143,6 +144,7 @@ class OnnxFunction:
             feeds[name] = part.reshape(self._full(name, self.shapes[name], K))
         for name, one in zip(self.aux, aux, strict=True):
             wanted = self._inputs[name].shape
+            one = self._converted("aux", name, one)
             feeds[name] = one if self._batched or one.ndim == len(wanted) else one[0]
         for name, one in self._constants.items():
             wanted = self._inputs[name].shape
@@ -170,6 +172,18 @@ class OnnxFunction:
         if kind not in _TYPES:
             raise ValueError(f"input {name!r} is of type {kind}, possible are {', '.join(_TYPES)}")
         return _TYPES[kind]
+
+    def _converted(self, argument: str, name: str, one: Tensor) -> Tensor:
+        """Return a tensor in the type of an input. ValueError if that is of integers and changes a value."""
+        kind, one = self._type(name), one.detach()
+        result = one.to(kind)
+        if not kind.is_floating_point and one.dtype != kind:
+            changed = one[result.to(one.dtype) != one]
+            if len(changed):
+                raise ValueError(
+                    f"{argument}: input {name!r} is {self._inputs[name].type}, which cannot hold {changed[0].item()}"
+                )
+        return result
 
     def _check_names(self, constants: Mapping[str, Any]) -> None:
         given = (*self.parameters, *self.aux, *constants)

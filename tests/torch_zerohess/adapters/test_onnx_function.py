@@ -1,5 +1,6 @@
 """ONNX models: the same numbers as the torch module that they come from, and what they cannot be asked for."""
 
+import math
 import pickle
 
 import onnx
@@ -137,6 +138,28 @@ def test_points_that_round_to_one_are_refused(batch, kind, sigma):
     apart = torch.stack([x, x + sigma, x + 0.1])
     assert torch.equal(f(apart)[0], f(apart)[1])
     assert torch.equal(f(torch.tensor([[1, 2], [2, 1]]))[0], f(x[None])[0])  # integers
+
+
+@pytest.mark.parametrize(
+    ("kind", "named", "value"),
+    [
+        (TensorProto.UINT8, "uint8", 300),
+        (TensorProto.UINT8, "uint8", -1),
+        (TensorProto.INT64, "int64", 1.5),
+        (TensorProto.INT64, "int64", math.nan),
+        (TensorProto.INT8, "int8", 128.0),
+        (TensorProto.BOOL, "bool", 2),
+    ],
+)
+def test_integers_that_an_input_cannot_hold_are_refused(kind, named, value):
+    some = torch.tensor([1, value])
+    with pytest.raises(ValueError, match=rf"constants: input 'x' is tensor\({named}\), which cannot hold {value}"):
+        OnnxFunction(model(kind=kind), ["c"], constants={"x": some.numpy()}, output="y")
+    f = OnnxFunction(model(kind=kind), ["c"], aux=("x",), output="y")
+    with pytest.raises(ValueError, match=rf"aux: input 'x' is tensor\({named}\), which cannot hold {value}"):
+        f(C, some.expand(5, 2))
+    for fits in (torch.tensor([1.0, 0.0]), torch.tensor([1, 0]), torch.tensor([True, False])):
+        torch.testing.assert_close(f(C, fits.expand(5, 2)), truth(fits, C))
 
 
 def test_what_is_no_model_is_named() -> None:

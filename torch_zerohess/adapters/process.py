@@ -51,7 +51,8 @@ class Program(Closing):
     A `Program` can be pickled; a copy starts a program of its own.
 
     Args:
-        command: program and arguments, or a function that returns them for a point.
+        command: program and arguments, or a function that returns them for a point. A path of the program is relative
+            to `folder`.
         server: whether the program answers many requests.
         format: see above.
         timeout: seconds per point; None for no limit. Then the program ends, with the programs that it started.
@@ -100,7 +101,7 @@ class Program(Closing):
         if folder is not None and not os.path.isdir(folder):
             raise FileNotFoundError(f"folder must be a folder that exists, got {folder!r}")
         if not callable(command):
-            _found(command)
+            _found(command, folder)
         self._server: Server | None = None
         self._end: weakref.finalize[Any, Any] | None = None
         """Ends the server: called by `close`, when nobody refers to this object any more, or when Python ends."""
@@ -130,10 +131,12 @@ class Program(Closing):
         if callable(self.command):
             if aux:
                 raise ValueError(f"aux must be empty for a command that is a function of x, got {len(aux)} tensors")
+            if not len(x):
+                return _missing((0, *self._shape))
             found: dict[int, Tensor | None] = {}
             try:
                 for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
-                    run = functools.partial(self._run, _found(self.command(one)), b"", 1)
+                    run = functools.partial(self._run, _found(self.command(one), self.folder), b"", 1)
                     found[k] = self._unless_failed(run, one)
             except BaseException as error:  # Ctrl-C, too
                 keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
@@ -263,13 +266,21 @@ def _checked_environment(environment: Any) -> dict[str, str] | None:
     return dict(environment)
 
 
-def _found(command: Sequence[str]) -> Sequence[str]:
-    """Return a command whose program exists; TypeError if it is text, which a function may return by mistake."""
+def _found(command: Sequence[str], folder: str | None) -> Sequence[str]:
+    """Return a command whose program exists; TypeError if it is text, which a function may return by mistake.
+
+    A path of the program is relative to the folder where it runs, a name alone is looked for in PATH.
+    """
     if isinstance(command, str) or not isinstance(command, Sequence) or not command:
         raise TypeError(f"command must return a list, the program and its arguments, got {command!r}")
     wrong = [one for one in command if not isinstance(one, (str, bytes, os.PathLike))]
     if wrong:
         raise TypeError(f"command must be a list of texts and paths, got {wrong[0]!r} in it: write str({wrong[0]!r})")
-    if shutil.which(str(command[0])) is None:
-        raise FileNotFoundError(f"command: there is no program {str(command[0])!r} that could be run, see PATH")
+    name = os.fsdecode(command[0])
+    place = os.path.join(folder or "", name) if os.path.dirname(name) else name
+    if shutil.which(place) is None:
+        raise FileNotFoundError(
+            f"command: there is no program {name!r} that could be run, see "
+            + ("PATH" if place == name else f"folder {os.fspath(folder or '')!r}")
+        )
     return command

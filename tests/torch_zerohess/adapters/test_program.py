@@ -309,6 +309,24 @@ def test_a_server_that_failed_is_started_again():
     assert "ended with code 3" in program.last_failure
 
 
+def test_a_program_in_the_folder_where_it_runs(tmp_path):
+    script = tmp_path / "sim.sh"
+    script.write_text("#!/bin/sh\necho 3.5\n")
+    script.chmod(0o755)
+    for command in (["./sim.sh"], [script], lambda point: ["./sim.sh"]):
+        program = Program(command, folder=str(tmp_path), format=lambda out: [float(out)])
+        assert program(Z[:1]).flatten().tolist() == [3.5]
+    with pytest.raises(FileNotFoundError, match=r"there is no program './other\.sh' that could be run, see folder"):
+        Program(["./other.sh"], folder=str(tmp_path))
+
+
+def test_no_points_have_no_values():
+    program = Program(lambda point: ["echo", "[1, 2]"])
+    assert program(Z[:0]).shape == (0,)
+    program(Z)
+    assert program(Z[:0]).shape == (0, 2)  # as values before it
+
+
 def test_arguments_are_checked():
     with pytest.raises(FileNotFoundError, match="there is no program 'no-such-program'"):
         Program(["no-such-program", "-x"])

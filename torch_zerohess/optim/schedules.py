@@ -1,7 +1,7 @@
 """Sigma annealing with the interface of a learning-rate schedule."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from torch import nn
@@ -41,11 +41,7 @@ class LinearSigma:
                     f"module_or_modules must have one sigma for all parameters, got {one.smoothing.sigma}: scale the "
                     "parameters of the black box instead"
                 )
-        for name, value in (("start", start), ("end", end)):
-            checked_number(name, value, above=0.0, below=math.inf)
-        self.start, self.end, self.count = float(start), float(end), 0
-        self.steps, self.hold = checked_integer("steps", steps, 1), checked_integer("hold", hold, 0)
-        self._apply()
+        self._take({"start": start, "end": end, "steps": steps, "hold": hold, "count": 0})
 
     @property
     def sigma(self) -> float:
@@ -63,10 +59,15 @@ class LinearSigma:
         return {name: getattr(self, name) for name in ("start", "end", "steps", "hold", "count")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume and set the sigma of the layers."""
+        """Resume and set the sigma of the layers. Raises as `LinearSigma` for numbers out of their range."""
         check_state(state, self.state_dict(), "a schedule")
-        for name in ("start", "end", "steps", "hold", "count"):
-            setattr(self, name, state[name])
+        self._take(state)
+
+    def _take(self, state: Mapping[str, Any]) -> None:
+        start, end = (checked_number(name, state[name], above=0.0, below=math.inf) for name in ("start", "end"))
+        steps = checked_integer("steps", state["steps"], 1)
+        hold, count = (checked_integer(name, state[name], 0) for name in ("hold", "count"))
+        self.start, self.end, self.steps, self.hold, self.count = start, end, steps, hold, count
         self._apply()
 
     def _apply(self) -> None:

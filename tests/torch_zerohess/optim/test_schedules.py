@@ -40,6 +40,19 @@ def test_linear_sigma():
             zh.LinearSigma(nothing, 1.0, 0.5, steps=2)
 
 
+def test_a_state_with_wrong_numbers_changes_nothing():
+    layer = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0))
+    schedule = zh.LinearSigma(layer, 1.0, 0.5, steps=2)
+    state = schedule.state_dict()
+    for wrong in ({"steps": 0}, {"hold": -1}, {"count": -1}, {"start": 0.0}, {"end": float("nan")}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            schedule.load_state_dict(state | {"start": 3.0} | wrong)
+        assert schedule.state_dict() == state
+    with pytest.raises(TypeError, match=r"steps must be an integer, got 2\.0"):
+        schedule.load_state_dict(state | {"steps": 2.0})
+    assert layer.smoothing.sigma == 1.0
+
+
 def test_numbers_of_every_kind():
     layer = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0))
     schedule = zh.LinearSigma(layer, torch.tensor(2.0), np.float32(1.0), steps=np.int64(2), hold=torch.tensor(1))

@@ -99,6 +99,7 @@ def ssim(target: Any, *, window_size: int = 11, data_range: float = 1.0) -> Imag
     Raises ImportError if kornia is not installed (`pip install 'torch_zerohess[losses]'`).
     """
     target = _checked(target)
+    window_size = checked_integer("window_size", window_size)
     if window_size < 3 or window_size % 2 == 0:
         raise ValueError(f"window_size must be odd and at least 3, got {window_size}")
     data_range = checked_number("data_range", data_range, above=0.0, below=math.inf)

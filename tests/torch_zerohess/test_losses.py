@@ -207,6 +207,11 @@ def test_wrong_settings_are_named(make, message) -> None:
         make()
 
 
+def test_a_window_has_a_whole_number_of_pixels() -> None:
+    with pytest.raises(TypeError, match=r"window_size must be an integer, got 11\.0"):
+        zh.losses.ssim(images(20, 20), window_size=11.0)
+
+
 def test_without_kornia_the_package_to_install_is_named(monkeypatch) -> None:
     for module in ("kornia", "kornia.metrics"):
         monkeypatch.setitem(sys.modules, module, None)

@@ -46,7 +46,9 @@ class MitsubaScene:
 
     Args:
         description: what `mitsuba.load_dict` takes, a function that returns it for the `mitsuba` module (for what needs
-            the variant, such as transforms and meshes), or the path of an XML file.
+            the variant, such as transforms and meshes), or the path of an XML file. Scenes share an object that was
+            loaded before and is in the mappings of both: what one changes in it, the other renders too. A function
+            that loads the object anew gives each scene its own.
         parameters: what the columns of x change, in this order.
         film: width and height in pixels; None keeps the film of the scene.
         spp: samples per pixel, at least 1; None keeps the number of the scene.

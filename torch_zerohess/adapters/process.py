@@ -175,8 +175,13 @@ class Program(Closing):
             if self._server is not None and not self._server.alive:
                 self.close()
             if self._server is None:
-                self._server = Server(self._start(self.command))
-                self._end = weakref.finalize(self, self._server.end)
+                process = self._start(self.command)
+                try:
+                    self._server = Server(process)
+                    self._end = weakref.finalize(self, self._server.end)
+                except BaseException:  # Ctrl-C
+                    end_program(process)
+                    raise
             try:
                 answer = self._server.ask(request, self.format == "npy", self._limit(points))
                 return self._values(answer, b"".join(self._server.errors))

@@ -127,8 +127,8 @@ def test_an_answer_too_many_is_not_taken_for_the_next(answers):
         assert torch.equal(program(2 * Z), 2 * Z.sum(1))  # it was started again
 
 
-STARTS = ["sh", "-c", 'sleep 60 & echo $! > "$NOTE"; wait']
-"""A shell that waits for a program, and writes the number of that to a file."""
+STARTS = ["sh", "-c", 'read line; sleep 60 & echo $! > "$NOTE"; wait']
+"""A shell that, at a request, waits for a program, and writes the number of that to a file."""
 
 
 def noted(path) -> int:

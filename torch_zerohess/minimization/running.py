@@ -25,8 +25,8 @@ _LUCK = 2.0
 """Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
 _FITTED = 40
 """Parameters up to which a quadratic is fitted to all evaluations at the end."""
-_RELIABLE = 0.1
-"""Relative standard error of its Hessian, below which it takes the place of the model that the search has."""
+_RELIABLE, _MORE_RELIABLE = 0.1, 1e-3
+"""Relative standard error of its Hessian up to which it takes the place of a model of the loss, and of the output."""
 
 
 class Running:
@@ -193,8 +193,7 @@ class Running:
         found = self._model(x)
         gradient, hessian, errors, unit = None, None, None, search.unit
         if found is not None:
-            model, sigma = found
-            unit = unit * sigma
+            model, unit = found[0], unit * found[1]
             gradient = (model.full_gradient() / unit).to(x)
             hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
             slope, bend = model.full_errors()
@@ -268,7 +267,8 @@ class Running:
             return found
         unit, (points, losses), noise = self.search.unit, self.record.told, self.noise or 0.0
         around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
-        if around is None or (found is not None and not noise and around[2] > _RELIABLE):
+        least = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
+        if around is None or (found is not None and not noise and around[2] > least):
             return found
         return around[:2]
 

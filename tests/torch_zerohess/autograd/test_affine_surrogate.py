@@ -68,7 +68,7 @@ def test_new_evaluations_correct_it():
     points = normal(200, n, seed=0)
     memory.add(points, image(points))
     memory.fit()
-    memory.observe(normal(2, 9, seed=3), normal(2, 9, seed=3))
+    memory.regression.observe(normal(2, 9, seed=3), normal(2, 9, seed=3))
     assert memory.coefficient > 0.0
     smoothing = zh.Smoothing(sigma=0.3, samples=2000, seed=0, proposal="gaussian")
     layer = zh.BlackBox(
@@ -85,7 +85,7 @@ def test_references_are_split_once_per_call(head, monkeypatch):
     points = normal(200, n, seed=0)
     memory.add(points, image(points))
     memory.fit()
-    memory.observe(normal(2, 9, seed=3), normal(2, 9, seed=3))
+    memory.regression.observe(normal(2, 9, seed=3), normal(2, 9, seed=3))
     layer = zh.BlackBox(image, zh.Smoothing(sigma=0.3, samples=2, seed=0), head=head, memory=memory, value="smoothed")
     calls, split = [], LowRank.split
     monkeypatch.setattr(LowRank, "split", lambda space, outputs: calls.append(len(outputs)) or split(space, outputs))

@@ -82,7 +82,7 @@ def checked_number(
     """Return a number. TypeError if it is none, ValueError if it is NaN or out of its range.
 
     least, most: ends that belong to the range.
-    above, below: ends that do not. A number below infinity is finite.
+    above, below: ends that do not. With `below` infinity the number must be finite.
     """
     try:
         number = None if isinstance(value, (str, bytes, bool)) else float(value)
@@ -90,7 +90,7 @@ def checked_number(
         number = None
     if number is None:
         raise TypeError(f"{name} must be a number, got {value!r}")
-    outside = (above is not None and number <= above) or (below is not None and number >= below)
+    outside = (above is not None and number <= above) or (below is not None and not -math.inf < number < below)
     if outside or not least <= number <= most:
         raise ValueError(f"{name} must be {_range(least, above, most, below)}, got {value!r}")
     return number

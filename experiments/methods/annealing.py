@@ -1,6 +1,7 @@
 """How sigma and the size of a step go from their first to their last value in the course of a run.
 
-`zh.LinearSigma` rounds in another way. A method keeps the one that its stored results are from.
+Results differ from those with `zh.LinearSigma` by rounding: each method keeps the function that its stored results were
+made with.
 """
 
 from dataclasses import dataclass

@@ -33,7 +33,7 @@ def train(
     Args:
         trial: the run.
         optimizer: of the weights.
-        size: of the steps: its name in the optimizer, first and last.
+        size: name of the step size in the optimizer, and its first and last value.
         batch: images of a step.
         steps: their number.
         step: takes one with a batch of images, and returns its sigma and the mean loss before it. It also gets the

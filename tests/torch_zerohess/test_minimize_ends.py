@@ -327,6 +327,17 @@ def test_a_tolerance_ends_nothing_before_it_has_begun():
     assert fit.value == float(tilted(fit.x[None]))
 
 
+@pytest.mark.parametrize(("engine", "n"), [("local", 64), ("auto", 64), ("descent", 50), ("descent", 3)])
+def test_a_wide_tolerance_ends_nothing_before_a_step(engine, n):
+    goal = torch.linspace(-0.5, 0.5, n, dtype=torch.float64)
+    start = float(goal.square().mean())
+    fit = zh.minimize(
+        torch.tanh, zeros(n), sigma=1.0, loss=lambda y: (y - goal).square().mean(), engine=engine, xtol=1.0, seed=0
+    )
+    assert fit.status == "solved"
+    assert fit.value < 0.5 * start
+
+
 def test_a_time_limit_ends_it():
     seen = []
     fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, time_limit=0.0, callback=seen.append)

@@ -55,7 +55,8 @@ class Program(Closing):
             to `folder`.
         server: whether the program answers many requests.
         format: see above.
-        timeout: seconds per point; None for no limit. Then the program ends, with the programs that it started.
+        timeout: seconds per point, after which the program ends, with the programs that it started; None for no
+            limit.
         folder: where the program runs; here if None.
         environment: variables added to the environment of this process.
         on_failure: "raise", or "nan" to go on without the values of a run that fails.

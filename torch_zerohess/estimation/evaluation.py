@@ -15,7 +15,7 @@ from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head, apply_head, checked_head
-from torch_zerohess.estimation.inputs import all_finite, check_finite
+from torch_zerohess.estimation.inputs import all_finite, check_finite, times_changed
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
 from torch_zerohess.estimation.outer import Outer, outer_of
@@ -103,9 +103,9 @@ class BlackBoxCall:
             self._lost(flat)
             return values, values
         outputs = self(flat, []).unflatten(0, (B, E))
-        before = _version(outputs)
+        before = times_changed(outputs)
         values, lost = apply_head(self.head, outputs, aux), self._lost(flat)
-        if _version(outputs) != before:
+        if times_changed(outputs) != before:
             raise ValueError("head must not change the outputs of the black box, which are kept: use a copy of them")
         if lost:  # a head may make a number of NaN
             values = values.clone()
@@ -217,11 +217,6 @@ def evaluate(
     expansion = Expansion(base, coefficients, sigma, outer.kept(scales, values, K), stein)
     kept_points = None if again is not None else perturbations.points
     return Evaluations(x, K, kept_points, values, kept, remaining, baseline, smoothing, expansion)
-
-
-def _version(outputs: Tensor) -> int:
-    """Return how often outputs were changed in place; tensors of inference mode do not tell."""
-    return 0 if outputs.is_inference() else outputs._version
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:

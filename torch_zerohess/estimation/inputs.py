@@ -69,6 +69,11 @@ def check_finite(x: Tensor) -> None:
         raise ValueError(f"x must be finite, got {float(x[b, d])} for parameter {d}")
 
 
+def times_changed(tensor: Tensor) -> int:
+    """Return how often a tensor was changed in place; 0 for tensors of inference mode, which do not tell."""
+    return 0 if tensor.is_inference() else tensor._version
+
+
 def short(tensor: Tensor) -> str:
     """Return the numbers of a small tensor in four digits, the shape of a large one."""
     return str(_rounded(tensor.tolist())).replace("'", "") if tensor.numel() <= _SHOWN else f"{list(tensor.shape)}"

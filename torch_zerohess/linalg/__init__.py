@@ -1,1 +1,1 @@
-"""Steps inside a ball, a box, a metric and a Krylov space; Jacobians of many parameters; tensors as one vector."""
+"""Steps inside a ball, a box, the region of a metric, and a Krylov space; Jacobians of many parameters; flat vectors."""

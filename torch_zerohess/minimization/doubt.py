@@ -7,8 +7,8 @@ _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 """Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
 
 _PLATEAU = (1e-3, 0.3)
-"""Distances in units of sigma between which an equal value is a plateau: nearer ones may differ by less than rounding,
-and farther ones may be other minima."""
+"""Distances, root mean square over the parameters in units of sigma, between which an equal value is a plateau: nearer
+ones may differ by less than rounding, and farther ones may be other minima."""
 
 
 def is_constant(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:

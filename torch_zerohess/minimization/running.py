@@ -26,7 +26,7 @@ _LUCK = 2.0
 _FITTED = 40
 """Parameters up to which a quadratic is fitted to all evaluations at the end."""
 _RELIABLE, _MORE_RELIABLE = 0.1, 1e-3
-"""Relative standard error of its Hessian up to which it takes the place of a model of the loss, and of the output."""
+"""Largest relative standard error of its Hessian with which it replaces a model of the loss, and one of the output."""
 
 
 class Running:
@@ -141,7 +141,7 @@ class Running:
         self._noted(points, search.told)
 
     def ending(self, *, arrived: bool) -> Status:
-        """Return the status when the search ends by itself: in noise or at a jump a small region is no evidence."""
+        """Return the status when the search ends by itself: a small region is no evidence in noise and in doubt."""
         return "solved" if arrived and not self.record.flat and not self.noise and not self.doubt else "stalled"
 
     def reaches(self, target: float) -> bool:
@@ -267,8 +267,8 @@ class Running:
             return found
         unit, (points, losses), noise = self.search.unit, self.record.told, self.noise or 0.0
         around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
-        least = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
-        if around is None or (found is not None and not noise and around[2] > least):
+        most = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
+        if around is None or (found is not None and not noise and around[2] > most):
             return found
         return around[:2]
 

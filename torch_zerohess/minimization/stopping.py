@@ -1,4 +1,4 @@
-"""What ends a search before its evaluations are used up, and what it is called."""
+"""When a search ends, with which status, and why."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,12 @@ from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.running import Running
 
 _AGREED = 3
-"""Rounds from random points that arrive at one point, after which it is the solution, if there is no other limit."""
+"""Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
 
 
 @dataclass(frozen=True)
 class Stopping:
-    """Limits of `minimize`, None where there is none."""
+    """Limits of `minimize`, None where one is not given, and whether agreement ends the search."""
 
     target: float | None
     xtol: float | None

@@ -114,6 +114,10 @@ class LocalQuadratics(Method[DescentProgress]):
             sigma *= _WIDENING
         return None
 
+    def width(self, known: DescentProgress) -> Tensor:
+        """Return sigma for every parameter, and infinity before a step."""
+        return super().width(known) if known.iterations else torch.full_like(known.center, math.inf)
+
     def _begun(self, best: Best) -> DescentProgress:
         start, pool = best.point, Pool.empty(self._n, best.point.device)
         return DescentProgress(best=best, lowest=best, center=start, first=start, step=start, pool=pool)

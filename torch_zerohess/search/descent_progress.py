@@ -13,7 +13,8 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 BATCH = 64
 """Points asked for at a time, at most."""
 WIDEST = 1.6
-"""Largest sigma to which plateaus and faithful models of the output widen it. Other good steps may widen it further."""
+"""Sigma, in units of the first one, up to which plateaus and faithful models of the output widen it. Other good steps
+may widen it further."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -148,7 +148,10 @@ class GaussNewton(Method[Q]):
         return known if known.done else replace(known, radius=self.radius, phase="sample")
 
     def promise(self, known: Q) -> float:
-        """Return what the longest step that would be tried promises, if the model has its minimum there."""
+        """Return what the step to the minimum of the model promises.
+
+        It is infinite if the minimum is farther than the longest step, or if no step is next.
+        """
         longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
         if known.phase != "trial":
             return math.inf
@@ -157,8 +160,9 @@ class GaussNewton(Method[Q]):
         return -0.5 * float(self.gradient(known) @ step) if float(step.norm()) < _INNER * longest else math.inf
 
     def width(self, known: Q) -> Tensor:
-        """Return the radius, for every parameter."""
-        return torch.full_like(known.center, known.radius)
+        """Return the radius for every parameter; infinity before a step, and where the minimum is farther away."""
+        sound = known.iterations > 0 and self.promise(known) < math.inf
+        return torch.full_like(known.center, known.radius if sound else math.inf)
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
         """The model of the latest Jacobian, moved from the center to the best point, without standard errors.

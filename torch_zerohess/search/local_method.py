@@ -268,11 +268,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
         return min(1.0, max(self.own.share * radius, self.own.least_sigma))
 
     def promise(self, known: LocalProgress) -> float:
-        """Return the promise of a step at the best point, infinite after a hop from it."""
-        return super().promise(known) if known.predicts and known.home is None else math.inf
-
-    def width(self, known: LocalProgress) -> Tensor:
-        return super().width(known) if known.home is None else torch.full_like(known.center, math.inf)
+        """Return the promise of a step; it is infinite while a hop has led to nothing better."""
+        return super().promise(known) if known.predicts and not known.failed else math.inf
 
     def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
         home = known.home

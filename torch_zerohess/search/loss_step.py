@@ -12,7 +12,7 @@ _SLACK = 2.0
 _LONG, _GOOD, _GROWTH = 0.9, 0.5, 1.2
 """A step of this length, in units of the radius, that achieves this part of its promise widens sigma by this factor."""
 _SHORT, _SHRINKING = 0.4, 0.75
-"""A shorter step narrows sigma by this factor, and so does a step that is refused."""
+"""A shorter step narrows sigma by this factor, and so does a step that is rejected."""
 _TRUSTED = 0.7
 """Part of its promise that a step achieves when only the directions unknown to the model are worth samples."""
 _PLATEAU, _PATIENCE = 1.3, 2

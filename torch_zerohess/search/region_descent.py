@@ -197,8 +197,9 @@ class RegionDescent(Method[R]):
         """Change sigma by the part of its promise that a step achieved; or return where the model knows least [n]."""
         if ratio >= BAD:
             grows = ratio > _GOOD and known.length > _LONG
-            return replace(known, rejected=0, sigma=_GROWTH * known.sigma if grows else known.sigma), None
-        known = replace(known, rejected=known.rejected + 1)
+            sigma = _GROWTH * known.sigma if grows else known.sigma
+            return replace(known, good=True, rejected=0, sigma=sigma), None
+        known = replace(known, good=False, rejected=known.rejected + 1)
         u = known.scaled
         distance = u.norm(dim=1)
         if int((distance <= _CLOSE).sum()) > self._n or known.rejected % 2 == 0:
@@ -230,4 +231,4 @@ class RegionDescent(Method[R]):
 
 def _is_sound(known: RegionProgress) -> bool:
     """Whether the last step was good, and the next one ends at a minimum of the model within the region."""
-    return known.phase == "trial" and known.iterations > 0 and known.rejected == 0 and known.length < _LONG
+    return known.phase == "trial" and known.good and known.length < _LONG

@@ -42,6 +42,8 @@ class RegionProgress(Progress):
     """Loss that the model predicts at a point for the model."""
     confirmed: bool = False
     """Whether the last such point was as predicted."""
+    good: bool = False
+    """Whether the last step of this search was not rejected."""
     rejected: int = 0
     """Steps in a row that were rejected."""
     tied: int = 0

@@ -12,7 +12,7 @@ T = TypeVar("T")
 _SCALAR = torch.Size()
 
 LOST = 10
-"""Batches in a row with values that are not finite, after which a round ends."""
+"""Batches in a row that are lost, after which a round or the search ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,8 @@ class Progress:
     place: Tensor | None = None
     """Where the first of them arrived [n]."""
     lost: int = 0
-    """Batches in a row with values that were not finite at points that the search needed."""
+    """Batches in a row that were lost: with values that are not finite at points that the search needed; in noise, and
+    for Gauss-Newton, without any finite value."""
     done: bool = False
     message: str = ""
     """Why the search is done."""

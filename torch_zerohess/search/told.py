@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
+from torch_zerohess.estimation.inputs import times_changed
 from torch_zerohess.search.state import Evaluated
 
 
@@ -39,10 +40,10 @@ def evaluated(values: Tensor, points: Tensor, loss: Callable[[Tensor], Tensor] |
         return Evaluated(points, values)
     if shape and values.shape[1:] != shape:
         raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
-    before = values._version
+    before = times_changed(values)
     with torch.no_grad():
         losses = [loss(one) for one in values]
-    if values._version != before:
+    if times_changed(values) != before:
         raise ValueError("loss must not change the output that it is given, which is kept: use a copy of it")
     if not all(isinstance(one, Tensor) for one in losses):
         raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")

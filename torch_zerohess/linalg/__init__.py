@@ -1,1 +1,1 @@
-"""Steps inside a ball, a box, the region of a metric, and a Krylov space; Jacobians of many parameters; flat vectors."""
+"""Steps inside a ball, a box, the region of a metric, or a Krylov space; Jacobians of many parameters; flat vectors."""

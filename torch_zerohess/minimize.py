@@ -93,7 +93,7 @@ def minimize(
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this.
         xtol: the search ends when the region in which it looks is at most this wide on either side of the best point,
-            in every parameter, and its model has a minimum there.
+            in every parameter, and a step has been tried.
         ftol: the search ends when its quadratic model promises a decrease of at most this. Without `loss` the latest
             2 (n + 1) evaluations must have lowered the loss by no more, too: such a model may be wrong.
         time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but a

@@ -29,7 +29,7 @@ class Coefficient:
 
     @property
     def value(self) -> float:
-        """Of what was observed so far."""
+        """The coefficient after what was observed so far."""
         ratios = [covariance / variance for covariance, variance in self.moments if variance > 0.0]
         return min(max(min(ratios, default=0.0), 0.0), 1.0)
 

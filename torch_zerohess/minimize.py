@@ -102,7 +102,7 @@ def minimize(
             from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
             file, or of another x0, sigma, bounds or engine.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
-            up or three rounds in a row have arrived at the same point.
+            up, or three rounds in a row have arrived at the same point, or at points with the same loss.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
             evaluations, and six more if the two differ. Give it if fn is noisy elsewhere but not at x0, as on a
             plateau. The noise is taken to be the same everywhere. In noise, an eighth of `max_evaluations` (4 to 48) is

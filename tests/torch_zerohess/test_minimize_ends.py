@@ -166,6 +166,55 @@ def test_every_search_ends_when_three_rounds_agree(fn, dtype, settings, most):
     assert float((fit.x.double() - CENTER).norm()) < 1e-3
 
 
+def sum_of_one(z):
+    """Zero on a plane."""
+    return (z.sum(1) - 1.0).square()
+
+
+def ring(z):
+    """Zero on a sphere."""
+    return (z.square().sum(1) - 1.0).square()
+
+
+def first_two(z):
+    """Only two parameters change anything."""
+    return (z[:, :2] - CENTER).square().sum(1)
+
+
+@pytest.mark.parametrize(
+    ("fn", "n", "settings"),
+    [
+        (sum_of_one, 2, {}),
+        (sum_of_one, 6, {}),
+        (sum_of_one, 2, {"bounds": (-3.0, 3.0)}),
+        (ring, 3, {}),
+        (first_two, 10, {}),
+        (lambda z: z[:, :2] - CENTER, 4, {"loss": lambda output: output.square().sum()}),
+    ],
+    ids=["plane", "plane of six", "plane in a box", "sphere", "unused", "unused of the output"],
+)
+def test_a_minimum_that_is_not_unique_is_found_once_and_said(fn, n, settings):
+    """Rounds from random points arrive at many points of a valley, all with the same loss."""
+    start = torch.full((n,), 1.5, dtype=torch.float64)
+    fit = zh.minimize(fn, start, sigma=1.0, seed=0, max_evaluations=2000, **settings)
+    assert (fit.status, fit.success) == ("solved", True)
+    assert "the minimum is not unique" in fit.message
+    assert fit.evaluations < 1200
+    assert fit.value < 1e-16
+
+
+@pytest.mark.parametrize("n", [2, 6])
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+def test_a_floor_is_no_agreement(n, bounds):
+    """All points of a ball have the lowest loss, exactly: a plateau may lie beside something lower."""
+    start = torch.full((n,), -1.5, dtype=torch.float64)
+    found = []
+    for wide in (ring, lambda z: (z.square().sum(1) - 1.0).clamp(min=0.0)):
+        found.append(zh.minimize(wide, start, sigma=1.0, seed=0, bounds=bounds, max_evaluations=1200))
+    assert [fit.status for fit in found] == ["solved", "budget"]
+    assert not found[1].success
+
+
 def test_arrivals_at_a_worse_minimum_do_not_end_a_search_in_a_box():
     for seed in range(2):
         fit = zh.minimize(waved, -zeros(1) - 2.0, sigma=0.5, seed=seed, bounds=(-4.0, 4.0), max_evaluations=90)

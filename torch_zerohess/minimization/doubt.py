@@ -3,19 +3,22 @@
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.plateau import is_plateau
+
 _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 """Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
 
 _PLATEAU = (1e-3, 0.3)
-"""Distances, root mean square over the parameters in units of sigma, between which an equal value is a plateau: nearer
+"""Distances, root mean square over the parameters in units of sigma, between which equal values are a plateau: nearer
 ones may differ by less than rounding, and farther ones may be other minima."""
 
 
 def is_constant(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:
-    """Whether an evaluation near x, but not next to it, has exactly the value at x; arguments as of `jumps`."""
+    """Whether evaluations near x, but not next to it, have exactly the value at x; arguments as of `jumps`."""
     distance = ((points - x) / unit).square().mean(1).sqrt()
     nearest, farthest = _PLATEAU
-    return bool((losses[(distance >= nearest) & (distance <= farthest)] == value).any())
+    near = distance <= farthest
+    return is_plateau(distance[near], losses[near], value, beyond=nearest)
 
 
 def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:

@@ -6,7 +6,7 @@ from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.running import Running
 
 _AGREED = 3
-"""Rounds from random points that arrive at one point, after which it is the solution, if `restarts` is not given."""
+"""Rounds from random points that arrive at one point, or at one loss, after which it is the solution, if `restarts` is not given."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Stopping:
     ftol: float | None
     time_limit: float | None
     agrees: bool
-    """Whether rounds that arrive at one point end the search."""
+    """Whether rounds that arrive at one point, or at one loss, end the search."""
 
     def reason(self, running: Running) -> tuple[Status, str] | None:
         """Return the status of a search that has come to its end, and why it has; None if it goes on."""
@@ -36,7 +36,7 @@ class Stopping:
         if search.solved and (self.xtol, self.ftol) != (None, None):
             return running.ending(arrived=True), "the search has arrived at x"
         if self.agrees and not running.noise and search.agreed >= _AGREED:
-            return "solved", f"{search.agreed} rounds in a row have arrived at x"
+            return "solved", f"{search.agreed} rounds in a row have arrived at {search.where}"
         if running.spent:
             return "budget", running.budget
         if self.time_limit is not None and running.seconds > self.time_limit:

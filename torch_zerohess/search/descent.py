@@ -191,7 +191,7 @@ class LocalQuadratics(Method[DescentProgress]):
         end, tolerance = known.lowest, self.settings.tolerance
         if known.pool.ties(end.point, end.loss, tolerance):
             return replace(known, agreed=0)
-        counted = agreeing(known, end.point, tolerance)
+        counted = agreeing(known, end, tolerance, known.pool.values)
         random = known.rounds == 0 or known.rounds % 2 == 1
         return counted if random else replace(counted, agreed=min(counted.agreed, known.agreed))
 

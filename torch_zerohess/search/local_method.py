@@ -53,7 +53,7 @@ _ITERATIONS = 100
 _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
-_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "lost")
+_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost")
 """What a search that returns from a hop keeps."""
 
 
@@ -224,8 +224,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
             return self._returned(known)
         if not known.predicts:
             return super().arrived(known)
-        known = arriving(known, Best(known.center, known.loss, known.sigma))
-        known = super().arrived(agreeing(known, known.center, self.settings.tolerance))
+        end = Best(known.center, known.loss, known.sigma)
+        known = super().arrived(agreeing(arriving(known, end), end, self.settings.tolerance))
         return known if known.done else self._hopping(replace(known, finished=True))
 
     def _stalled(self, known: LocalProgress) -> LocalProgress:
@@ -260,7 +260,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
         known = replace(home.taking(known, *_SHARED), phase="sample", patient=True)
         if not home.finished:
             return known
-        known = agreeing(known, known.center, self.settings.tolerance) if same else replace(known, agreed=0)
+        end = Best(known.center, known.loss, known.sigma)
+        known = agreeing(known, end, self.settings.tolerance) if same else replace(known, agreed=0)
         known = super().arrived(known)
         return known if known.done else self._hopping(known)
 

@@ -118,7 +118,9 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = replace(known, finishing=False, waited=0)
         if plateau or (best is not now.best and not converged):  # they have found no minimum
             return replace(known, settled=0, exploring=ROUND * self.settings.n), points
-        known = self.arrived(known, "quadratics have arrived or found nothing better for a while")
-        if known.beside or float((now.best.point - best.point).norm()) > APART:
+        elsewhere = float((now.best.point - best.point).norm()) > APART
+        end = now.best if elsewhere and converged else None
+        known = self.arrived(known, "quadratics have arrived or found nothing better for a while", end)
+        if known.beside or (elsewhere and not converged):
             return replace(known, agreed=0), points
         return known, points

@@ -23,6 +23,7 @@ from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.least_change import least_change
+from torch_zerohess.surrogates.plateau import is_plateau
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
@@ -43,7 +44,7 @@ _LATEST = 2
 _ROUNDED = 1e15
 """A Hessian of values that were larger than those of now by this factor is made of their roundings."""
 
-_SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place")
+_SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place", "apart")
 """What further rounds, and isotropic quadratics on a plateau, go on with."""
 
 
@@ -78,9 +79,13 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[MetricProgress, Tensor]:
-        if known.wide is not None:
-            return self._widely(known, *self._wide.next(known.wide, evaluated, generator))
-        return super().next(known, evaluated, generator)
+        if known.wide is None:
+            return super().next(known, evaluated, generator)
+        first = known.phase == "start" and len(known.wide.pool) == len(known.values)
+        wide, points = self._wide.next(known.wide, evaluated, generator)
+        if first and not wide.done and bool((known.values[:, None] != evaluated.losses).all()):
+            return self._narrowly(known, wide, generator)
+        return self._widely(known, wide, points)
 
     def more(self, known: MetricProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         if known.wide is not None:
@@ -126,8 +131,11 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """End, or start another round at a random point."""
         settings = self.settings
         if known.lost < LOST:
-            known = agreeing(known, known.lowest.point, settings.tolerance)
-            known = arriving(known, known.lowest)
+            end = known.lowest
+            distance = (known.points - end.point).square().mean(1).sqrt()
+            plateau = is_plateau(distance, known.values, end.loss, beyond=settings.tolerance)
+            known = agreeing(known, end, settings.tolerance, None if plateau else known.values)
+            known = arriving(known, end)
         known = known.ended_round(reason, 0 if last else settings.restarts)
         if known.done:
             return known, known.points[:0]
@@ -139,7 +147,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _on_plateau(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let isotropic quadratics go on from the best point."""
         pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
-        wide = self._wide.go_on(pool, known.lowest, 1.0).taking(known, "first", *_SHARED)
+        wide = self._wide.go_on(pool, known.lowest, 1.0).taking(known, "first", "iterations", *_SHARED)
         wide = wide.sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
@@ -147,6 +155,13 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Return the progress of isotropic quadratics, and their points."""
         known = replace(known, wide=wide)
         return known.taking(wide, *_SHARED, "center", "sigma", "iterations", "done", "message"), points
+
+    def _narrowly(
+        self, known: MetricProgress, wide: DescentProgress, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        """Return from isotropic quadratics: parameters along whose axes nothing changes are no plateau."""
+        begun = self.go_on(wide.pool.points, wide.pool.values, wide.lowest, 1.0)
+        return self.plan(begun.taking(wide, "first", "iterations", *_SHARED), generator)
 
     # Models.
 

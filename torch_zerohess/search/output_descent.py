@@ -96,7 +96,7 @@ class OutputDescent(Relay[OutputDescentProgress]):
         """Return the progress of Gauss-Newton and its points, or of the descent where Gauss-Newton is at its end."""
         if not (smooth.done or smooth.failed):
             now = replace(known, smooth=smooth).taking(smooth)
-            return now.taking(known, "rounds", "arrived", "agreed", "place"), points
+            return now.taking(known, "rounds", "arrived", "agreed", "place", "apart"), points
         descent = self._told(known.descent, smooth)
         if smooth.done:
             descent = replace(descent, sigma=min(smooth.sigma, 0.5 * self.settings.tolerance))

@@ -15,7 +15,7 @@ from torch_zerohess.search.finished_process import PATIENCE, FinishedProcess, Fi
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
 from torch_zerohess.search.process_method import ROUND
-from torch_zerohess.search.state import Evaluated
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -63,7 +63,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             known = replace(known, best=replace(best, sigma=self.settings.tolerance))
         return super().model_at_best(known)
 
-    def arrived(self, known: OutputProcessProgress, reason: str) -> OutputProcessProgress:
+    def arrived(self, known: OutputProcessProgress, reason: str, end: Best | None = None) -> OutputProcessProgress:
         """Note it: Gauss-Newton may go on from there."""
         return replace(known, due=reason)
 

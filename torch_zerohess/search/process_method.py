@@ -174,9 +174,9 @@ class ProcessMethod(Method[Q]):
         """Note points [K, n] whose values are not finite."""
         return replace(known, holes=torch.cat([known.holes, holes])[-self.capacity :])
 
-    def arrived(self, known: Q, reason: str) -> Q:
-        """End, or explore."""
-        known = replace(known, settled=0, exploring=ROUND * self.settings.n).agreeing(self.settings.tolerance)
+    def arrived(self, known: Q, reason: str, end: Best | None = None) -> Q:
+        """End, or explore, after an arrival at the best point, or at `end`."""
+        known = replace(known, settled=0, exploring=ROUND * self.settings.n).agreeing(self.settings.tolerance, end)
         return known.ended_round(reason, self.settings.restarts)
 
     def _settled(self, known: Q) -> Q:

@@ -48,8 +48,8 @@ class ProcessProgress(Progress):
     counted: int = 0
     """Evaluations at the latest arrival that has counted as a round of those that agree."""
 
-    def agreeing(self: Q, tolerance: float) -> Q:
-        """Count an arrival at the best point.
+    def agreeing(self: Q, tolerance: float, end: Best | None = None) -> Q:
+        """Count an arrival at the best point, or at `end`.
 
         It agrees with earlier arrivals if the search has since evaluated elsewhere as often as it had evaluated until
         then: beside a minimum that was hard to find there may be a lower one that is as hard to find.
@@ -59,7 +59,7 @@ class ProcessProgress(Progress):
         if not self.is_minimum(tolerance):
             return self
         looked, least = self.evaluations - self.counted, _LOOKING * (len(self.center) + 1)
-        known = agreeing(self, self.best.point, tolerance)
+        known = agreeing(self, end or self.best, tolerance, self.pool.values)
         if known.agreed > 1 and looked < max(self.counted, least):
             return self
         return replace(known, counted=self.evaluations)

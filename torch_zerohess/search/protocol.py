@@ -148,8 +148,13 @@ class AskTell(ABC, Generic[P]):
 
     @property
     def agreed(self) -> int:
-        """Rounds in a row that have arrived at one point, the best one."""
+        """Rounds in a row that have arrived at the best point, or at other points with the same loss."""
         return self._state.progress.agreed
+
+    @property
+    def where(self) -> str:
+        """Where they have arrived, in words."""
+        return "points with the loss at x: the minimum is not unique" if self._state.progress.apart else "x"
 
     @property
     def promise(self) -> float:

@@ -11,6 +11,8 @@ from torch import Tensor
 T = TypeVar("T")
 _SCALAR = torch.Size()
 
+_EQUAL = 1e-6
+"""Difference between two losses that are the same, over the distance of the median of all losses from the lowest."""
 LOST = 10
 """Batches in a row that are lost, after which a round or the search ends."""
 
@@ -43,9 +45,11 @@ class Progress:
     arrived: Best | None = None
     """The lowest point at which it has arrived."""
     agreed: int = 0
-    """Rounds in a row that have arrived at one point, the best one."""
-    place: Tensor | None = None
-    """Where the first of them arrived [n]."""
+    """Rounds in a row that have arrived at the best point, or at other points with the same loss."""
+    place: Best | None = None
+    """Where the first of them arrived."""
+    apart: bool = False
+    """Whether they arrived at several points: there are several minima, or the floor of a valley."""
     lost: int = 0
     """Batches in a row that were lost: with values that are not finite at points that the search needed; in noise, and
     for Gauss-Newton, without any finite value."""
@@ -83,17 +87,30 @@ def are_same(one: Tensor, other: Tensor, tolerance: float) -> bool:
     return float((one - other).norm()) < tolerance * math.sqrt(len(one))
 
 
-def agreeing(known: P, end: Tensor, tolerance: float) -> P:
-    """Count a round that has arrived at a point [n] whose loss is the lowest of the round.
+def agreeing(known: P, end: Best, tolerance: float, losses: Tensor | None = None) -> P:
+    """Count a round that has arrived.
 
-    It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point.
+    It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point; or if its
+    loss, and theirs, is the best one.
+
+    Args:
+        known: the progress.
+        end: the lowest point of the round.
+        tolerance: see `are_same`.
+        losses: evaluations [P], against whose median two losses are the same; None if they are not to be compared.
     """
-    best = known.best.point
-    if not are_same(end, best, tolerance):
+    best = known.best
+    slack = -math.inf if losses is None else _EQUAL * (float(losses.median()) - best.loss)
+
+    def is_best(one: Best) -> bool:
+        return are_same(one.point, best.point, tolerance) or one.loss - best.loss <= slack
+
+    if not is_best(end):
         return replace(known, agreed=0)
-    if known.place is not None and are_same(best, known.place, tolerance):
-        return replace(known, agreed=known.agreed + 1)
-    return replace(known, agreed=1, place=best)
+    if known.place is None or known.agreed == 0 or not is_best(known.place):
+        return replace(known, agreed=1, place=best, apart=False)
+    apart = known.apart or not are_same(end.point, known.place.point, tolerance)
+    return replace(known, agreed=known.agreed + 1, apart=apart)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.plateau import is_plateau
+
 _CAP = 7.4
 """Largest weight of one evaluation."""
 _FLAT = 4
@@ -88,9 +90,8 @@ class Pool:
         return Pool(self.points[rest], self.values[rest], outputs, self.centers[groups], self.sigmas[groups], origin)
 
     def ties(self, x: Tensor, value: float, distance: float) -> bool:
-        """Whether an evaluation farther than this from x [n], root mean square, has exactly the value: a plateau."""
-        far = (self.points - x).square().mean(1).sqrt() > distance
-        return bool((self.values[far] == value).any())
+        """Whether x [n] lies on a plateau, by evaluations farther away than this, root mean square."""
+        return is_plateau((self.points - x).square().mean(1).sqrt(), self.values, value, beyond=distance)
 
     def weights(self, x: Tensor, sigma: float) -> Tensor:
         """Weights [P] for a fit around x [n], at most 7.4; 1 for an evaluation at x itself."""

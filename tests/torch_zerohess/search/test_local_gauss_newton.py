@@ -164,7 +164,7 @@ def test_a_hop_that_returns_to_a_minimum_confirms_it(above, agreed):
     search = search_for(image, normal(N))
     known = hopping(search, finished=True)
     home = replace(known.home, best=replace(known.best, point=known.home.center))
-    known = replace(known, home=home, best=home.best, place=home.center, agreed=1, loss=(1.0 + above) * home.loss)
+    known = replace(known, home=home, best=home.best, place=home.best, agreed=1, loss=(1.0 + above) * home.loss)
     after = search._method.arrived(known)
     assert after.agreed == agreed
     assert after.rounds == 1

@@ -175,3 +175,13 @@ def test_a_wall_near_the_largest_number_is_forgotten(seed):
     slopes = vector(1.0, -0.5, 2.0)
     run(search, lambda x: (x - slopes).square().sum(1) + (800 * (x[:, 1] - 1.2)).clamp(max=600).exp() * 1e-20, 200)
     assert search.value < 1e-12
+
+
+@pytest.mark.parametrize("n", [4, 10])
+def test_parameters_that_change_nothing_are_no_plateau(n):
+    """The quadratics that go on are not isotropic: those give 1e-6 where these give 1e-12."""
+    search = Descent(torch.full((n,), 1.5, dtype=torch.float64), sigma=1.0, seed=0, restarts=0)
+    run(search, lambda z: (z[:, :2] - vector(0.4, -0.3)).square().sum(1), 200)
+    assert search._state.progress.wide is None
+    assert search.value < 1e-12
+    assert search.iterations > 10

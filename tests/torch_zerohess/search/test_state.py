@@ -119,12 +119,26 @@ def test_a_state_in_noise_is_of_another_search():
 
 def test_rounds_agree_that_arrive_at_one_point_which_is_the_best_one():
     """Within 0.05 of each parameter, root mean square."""
-    first = agreeing(Progress(best=Best(vector(1.0, 0.0)), center=zeros(2)), vector(1.0, 0.0), 0.05)
-    second = agreeing(first, vector(1.07, 0.0), 0.05)
-    assert (first.agreed, second.agreed) == (1, 2)
-    assert agreeing(second, vector(1.08, 0.0), 0.05).agreed == 0
-    moved = agreeing(replace(second, best=Best(vector(3.0, 0.0))), vector(3.0, 0.0), 0.05)
-    assert (moved.agreed, moved.place.tolist()) == (1, [3.0, 0.0])
+    first = agreeing(Progress(best=Best(vector(1.0, 0.0)), center=zeros(2)), Best(vector(1.0, 0.0)), 0.05)
+    second = agreeing(first, Best(vector(1.07, 0.0)), 0.05)
+    assert (first.agreed, second.agreed, second.apart) == (1, 2, False)
+    assert agreeing(second, Best(vector(1.08, 0.0)), 0.05).agreed == 0
+    moved = agreeing(replace(second, best=Best(vector(3.0, 0.0))), Best(vector(3.0, 0.0)), 0.05)
+    assert (moved.agreed, moved.place.point.tolist()) == (1, [3.0, 0.0])
+
+
+def test_rounds_agree_that_arrive_at_one_loss():
+    """Equal within a millionth of the distance of the median, 6, from the lowest loss, 1: 5e-6."""
+    losses, tolerance = vector(1.0, 2.0, 6.0, 9.0, 1e9), 0.05
+    first = agreeing(Progress(best=Best(vector(0.0), 1.0), center=zeros(1)), Best(vector(0.0), 1.0), tolerance, losses)
+    second = agreeing(first, Best(vector(3.0), 1.0 + 4e-6), tolerance, losses)
+    assert (second.agreed, second.apart) == (2, True)
+    assert agreeing(second, Best(vector(0.0), 1.0), tolerance, losses).agreed == 3
+    assert agreeing(first, Best(vector(3.0), 1.0 + 6e-6), tolerance, losses).agreed == 0
+    assert agreeing(first, Best(vector(3.0), 1.0 + 4e-6), tolerance).agreed == 0
+    lower = replace(second, best=Best(vector(5.0), 0.0))
+    after = agreeing(lower, Best(vector(5.0), 0.0), tolerance, losses)
+    assert (after.agreed, after.apart) == (1, False)
 
 
 def test_an_output_that_is_not_finite_is_no_value_whatever_its_loss():

@@ -9,6 +9,7 @@ from searches import plateau, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import metric_descent
+from torch_zerohess.search.state import Best
 from truths import vector
 
 
@@ -185,3 +186,15 @@ def test_parameters_that_change_nothing_are_no_plateau(n):
     assert search._state.progress.wide is None
     assert search.value < 1e-12
     assert search.iterations > 10
+
+
+@pytest.mark.parametrize(("others", "agreed"), [((1.0, 2.0, 3.0, 4.0), 2), ((0.0, 2.0, 3.0, 4.0), 0)])
+def test_a_round_that_ends_on_a_floor_agrees_with_none(others, agreed):
+    """The rounds before it have arrived elsewhere, with the same loss of zero."""
+    search = Descent(zeros(1), sigma=1.0, seed=0)
+    search.tell(search.ask()[:, 0])
+    end, elsewhere = Best(vector(5.0), 0.0), Best(vector(9.0), 0.0)
+    points, values = vector(5.0, 6.0, 7.0, 8.0, 9.0)[:, None], vector(0.0, *others)
+    known = replace(search._state.progress, best=elsewhere, place=elsewhere, agreed=1, lowest=end, points=points)
+    after, _ = search._method._arrived(replace(known, values=values), "it ends", torch.Generator())
+    assert after.agreed == agreed

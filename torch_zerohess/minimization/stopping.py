@@ -6,7 +6,7 @@ from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.running import Running
 
 _AGREED = 3
-"""Rounds from random points that arrive at one point, or at one loss, after which it is the solution, if `restarts` is not given."""
+"""Rounds from random points that arrive at one point, or at one loss, after which the search ends without `restarts`."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.running import Running
 
 _AGREED = 3
-"""Rounds from random points that arrive at one point, or at one loss, after which it ends if `restarts` is not given."""
+"""Rounds from random points that arrive at one point, or at one loss, after which a search without `restarts` ends."""
 
 
 @dataclass(frozen=True)

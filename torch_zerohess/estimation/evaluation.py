@@ -84,7 +84,7 @@ class BlackBoxCall:
         values = checked_values(result, points, self.vectorized)
         object.__setattr__(self, "answered", True)
         # A copy: the black box may go on writing to what it returned.
-        return values.clone() if values.device == points.device else values.to(points.device)
+        return _copied(values) if values.device == points.device else values.to(points.device).contiguous()
 
     def values(self, points: Tensor, aux: Sequence[Tensor], *, spare: bool = False) -> tuple[Tensor, Tensor]:
         """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
@@ -95,8 +95,8 @@ class BlackBoxCall:
         """
         B, E = points.shape[:2]
         if self.joint:
-            return (self._jointly(points.transpose(0, 1).contiguous(), aux),) * 2
-        flat = points.flatten(0, 1) if spare else points.flatten(0, 1).clone()
+            return (self._jointly(_copied(points.transpose(0, 1)), aux),) * 2
+        flat = points.flatten(0, 1).contiguous() if spare else _copied(points.flatten(0, 1))
         if self.head is None:
             values = self(flat, [one.repeat_interleave(E, 0) for one in aux])
             values = values.reshape(B, E, *values.shape[1:])
@@ -128,7 +128,7 @@ class BlackBoxCall:
     def _jointly(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [B, E, *out] of points [E, B, n], of which each row is one evaluation."""
         E, B = points.shape[:2]
-        values = self(points, [one.expand(E, *one.shape).clone() for one in aux])
+        values = self(points, [_copied(one.expand(E, *one.shape)) for one in aux])
         if values.shape[1:2] != (B,):
             raise ValueError(
                 f"fn must return one value per batch element, [{E}, {B}, *out] for points {list(points.shape)}, "
@@ -225,8 +225,13 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     Raises ValueError if x is not finite.
     """
     check_finite(x)
-    values = call.values(x[:, None], [one.clone() for one in aux])[0][:, 0]
+    values = call.values(x[:, None], list(aux))[0][:, 0]
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):
         values = replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
     return values
+
+
+def _copied(tensor: Tensor) -> Tensor:
+    """Return a contiguous copy: who gets it may write to it, and read it from its pointer."""
+    return tensor.clone(memory_format=torch.contiguous_format)

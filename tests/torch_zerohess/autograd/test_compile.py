@@ -68,6 +68,15 @@ def test_compiled_inside_a_network(backend: str) -> None:
         close(p.grad, gradient)
 
 
+def test_outputs_of_any_strides_in_compiled_code() -> None:
+    """Compiled code reads the outputs by the strides of the fake kernel."""
+    layer = BlackBox(lambda z: torch.stack([z[:, 0], z.sum(1), z.prod(1)]).T, AGGREGATE)
+    model = torch.nn.Sequential(layer, torch.nn.Linear(3, 2, dtype=torch.float64))
+    x = BATCH.reshape(-1, BATCH.shape[-1])
+    with torch.no_grad():
+        close(torch.compile(model, fullgraph=True, backend="inductor")(x), model(x))
+
+
 class Between(torch.nn.Module):
     """A layer with a memory between two operations of torch."""
 

@@ -224,3 +224,37 @@ def test_the_number_in_place_of_nan_is_kept_in_float64(
     else:  # the gradient does not exist in float32
         with pytest.raises(ValueError, match=r"the gradient is not finite in torch\.float32"):
             _ = estimate(fn, x, S, on_nonfinite=number).gradient
+
+
+def strided() -> list[Tensor]:
+    """Points [*batch, 4] whose numbers are not side by side in memory."""
+    generator = torch.Generator().manual_seed(0)
+    whole = torch.randn(2, 4, 3, 8, generator=generator, dtype=torch.float64)
+    rows, columns = whole[0, :, 0].T[:4, :4].mT, whole[0, :, :, 0].T
+    return [rows, columns, whole[0, 0, :, ::2], whole.permute(0, 2, 3, 1), X[:1].expand(3, 4)]
+
+
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+@pytest.mark.parametrize("x", strided(), ids=lambda x: str([*x.shape]))
+def test_the_function_gets_contiguous_tensors(x: Tensor, value: str) -> None:
+    """A library that reads from a pointer would read other numbers, and `view` would raise."""
+    aux = torch.stack([x, -x]).movedim(0, -1)  # not contiguous either
+    calls = []
+
+    def fn(*given: Tensor) -> Tensor:
+        calls.append([one.is_contiguous() for one in given])
+        return given[0].square().sum(-1)
+
+    layer = BlackBox(fn, S, value=value)
+    for requires_grad in (False, True):
+        own = x.detach().requires_grad_(requires_grad)
+        layer(own, aux)
+        layer.freeze(own, aux)
+        torch.func.vmap(layer, in_dims=x.dim() - 2, out_dims=x.dim() - 2)(own)
+        with torch.no_grad():
+            layer(own, aux)
+    estimate(fn, x, S, aux, value=value)
+    if x.dim() == 2:
+        estimate(fn, x, S, aux, value=value, joint=True)
+    assert len(calls) > 8
+    assert all(all(one) for one in calls)

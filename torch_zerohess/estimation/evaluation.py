@@ -110,12 +110,12 @@ class BlackBoxCall:
         if lost:  # a head may make a number of NaN
             values = values.clone()
             values[[k // E for k in lost], [k % E for k in lost]] = torch.nan
-        if self.on_nonfinite == "raise" and not all_finite(values):
+        if self.on_nonfinite == "raise" and aux and E > 1 and not all_finite(values):
             self._check_head(values, outputs)
         return values, outputs
 
     def _check_head(self, values: Tensor, outputs: Tensor) -> None:
-        """Raise ValueError if no loss of an element is finite and its outputs are: its aux or the head is wrong."""
+        """Raise ValueError if no loss of an element is finite and its outputs are: its aux, or the head, is wrong."""
         sound = torch.isfinite(outputs.reshape(*outputs.shape[:2], -1)).all(2)
         wrong = (sound & ~torch.isfinite(values)).all(1)
         if bool(wrong.any()):
@@ -184,7 +184,7 @@ def evaluate(
     if control is None and outer.linear and smoothing.baseline == "center":
         _, coefficients = coefficients_of(values, None, K, smoothing, n)
     if coefficients is None or not all_finite(coefficients):  # differences to f(x) are finite only if all values are
-        values, kept = finite_values(values, points, call.on_nonfinite, K, smoothing, stein)
+        values, kept = finite_values(values, outputs, points, call.on_nonfinite, K, smoothing, stein)
         share = share_of(kept, B, K, x.device)
 
         def added(all_values: Tensor) -> list[Tensor]:
@@ -225,10 +225,10 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     Raises ValueError if x is not finite.
     """
     check_finite(x)
-    values = call.values(x[:, None], list(aux))[0][:, 0]
+    values, outputs = (one[:, 0] for one in call.values(x[:, None], list(aux)))
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):
-        values = replaced(values, bad.nonzero()[0], x, call.on_nonfinite)
+        values = replaced(values, outputs, bad.nonzero()[0], x, call.on_nonfinite)
     return values
 
 

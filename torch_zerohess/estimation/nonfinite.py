@@ -5,16 +5,24 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.inputs import all_finite
+from torch_zerohess.estimation.inputs import all_finite, short
 from torch_zerohess.estimation.stein import Stein
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.smoothing import Smoothing
 
 
 def finite_values(
-    values: Tensor, points: Callable[[], Tensor], on_nonfinite: str | float, K: int, smoothing: Smoothing, stein: Stein
+    values: Tensor,
+    outputs: Tensor,
+    points: Callable[[], Tensor],
+    on_nonfinite: str | float,
+    K: int,
+    smoothing: Smoothing,
+    stein: Stein,
 ) -> tuple[Tensor, Tensor | None]:
     """Treat values [B, E, *out] that are not finite at points [B, E, n], which are asked for where an error names one.
+
+    outputs: of fn [B, E, *outputs]; the values themselves without a head.
 
     Returns the values, and which of the K perturbed rows are kept, [B, K], or None if all are.
     """
@@ -22,24 +30,27 @@ def finite_values(
         return values, None
     bad = ~torch.isfinite(values.reshape(*values.shape[:2], -1)).all(2)
     if on_nonfinite != "drop":
-        return replaced(values, bad.nonzero()[0], points(), on_nonfinite), None
-    if bool(bad[:, K:].any()):
-        element = int(bad[:, K].nonzero()[0])
-        raise ValueError(
-            f"{_wrong(values[element, K], points()[element, K])}, which is x itself. on_nonfinite='drop' drops "
-            "perturbed points alone: choose baseline='mean' and value='smoothed', which do not need f(x), or "
-            "on_nonfinite=<a number>"
-        )
+        return replaced(values, outputs, bad.nonzero()[0], points(), on_nonfinite), None
     kept = ~bad[:, :K]
     if smoothing.antithetic:
         pair = kept[:, : K // 2] & kept[:, K // 2 :]
         kept = torch.cat([pair, pair], 1)
     fewest = 2 if smoothing.baseline == "mean" else 1
-    left = int(kept.sum(1).min()) // (2 if smoothing.antithetic else 1)
+    element = int(kept.sum(1).argmin())
+    left = int(kept[element].sum()) // (2 if smoothing.antithetic else 1)
     if left < fewest:
+        first = element, int(bad[element].nonzero()[0])
         raise ValueError(
-            f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: fn is not finite "
-            "almost everywhere around x"
+            f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: "
+            f"{int(bad[element].sum())} of {bad.shape[1]} values are not finite; "
+            f"{_wrong(values[first], outputs[first], points()[first])}"
+        )
+    if bool(bad[:, K:].any()):
+        center = int(bad[:, K].nonzero()[0]), K
+        raise ValueError(
+            f"{_wrong(values[center], outputs[center], points()[center])}, which is x itself. on_nonfinite='drop' "
+            "drops perturbed points alone: choose baseline='mean' and value='smoothed', which do not need f(x), or "
+            "on_nonfinite=<a number>"
         )
     if not stein.droppable:
         raise ValueError(
@@ -49,18 +60,26 @@ def finite_values(
     return torch.where(bad.reshape(*bad.shape, *[1] * (values.dim() - 2)), 0.0, values), kept
 
 
-def replaced(values: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
-    """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`."""
+def replaced(values: Tensor, outputs: Tensor, where: Tensor, points: Tensor, rule: str | float) -> Tensor:
+    """Put the number `rule` in place of values that are not finite, or raise for the first one, at index `where`.
+
+    The rule "drop" is for points alone that cannot be dropped.
+    """
     if isinstance(rule, str):
         index = tuple(where.tolist())
-        raise ValueError(
-            f"{_wrong(values[index], points[index])}; choose on_nonfinite='drop' or a number to go on without it"
-        )
+        wrong = _wrong(values[index], outputs[index], points[index])
+        if rule == "drop":
+            raise ValueError(f"{wrong}, which is x itself and cannot be dropped: choose on_nonfinite=<a number>")
+        raise ValueError(f"{wrong}; choose on_nonfinite='drop' or a number to go on without it")
     # float64, because the number may not exist in the dtype of fn: 1e6 is infinite in float16.
     return torch.where(torch.isfinite(values), values.double(), float(rule))
 
 
-def _wrong(value: Tensor, point: Tensor) -> str:
-    """Say what fn returned, [*out], at a point [n]."""
+def _wrong(value: Tensor, output: Tensor, point: Tensor) -> str:
+    """Say what fn, or the head after it, returned at a point [n]: the value [*out], from the output [*outputs]."""
     value = value.flatten()
-    return f"fn returned {float(value[~torch.isfinite(value)][0])} at the point [{numbers(point)}]"
+    found, where = float(value[~torch.isfinite(value)][0]), f"at the point [{numbers(point)}]"
+    if not all_finite(output):
+        return f"fn returned {found} {where}"
+    size = short(output) if output.numel() <= 1 else f"from {float(output.min()):.4g} to {float(output.max()):.4g}"
+    return f"head returned {found} {where}, where the output of fn is finite, {size}: look at head, and at aux if any"

@@ -63,6 +63,42 @@ def test_too_few_draws_left_is_an_error() -> None:
         estimate(holes(*range(8)), X, sobol, on_nonfinite="drop", value="smoothed")
 
 
+def test_where_nothing_is_finite_the_error_says_so() -> None:
+    """Also where x itself is one of the points: another baseline would not help."""
+    with pytest.raises(
+        ValueError, match=r"left 0 of 8 draws, 1 are needed: 17 of 17 values are not finite; fn returned"
+    ):
+        estimate(holes(*range(17)), X, S, on_nonfinite="drop")
+
+
+def test_x_alone_cannot_be_dropped() -> None:
+    message = r"fn returned nan at the point \[0\.1, 0\.2\], which is x itself .* choose on_nonfinite=<a number>"
+    with torch.no_grad(), pytest.raises(ValueError, match=message):
+        BlackBox(holes(0), S, on_nonfinite="drop")(X)
+
+
+def test_a_head_that_is_not_finite_is_named() -> None:
+    """Where the output of fn is finite, the head is to blame."""
+
+    def log(outputs: Tensor) -> Tensor:
+        return outputs[:, 0].log()
+
+    layer, x = BlackBox(lambda z: z - 0.2, S, head=log), X.clone().requires_grad_()
+    message = r"head returned nan at the point \[-?0?.*where the output of fn is finite, from -.* to .*: look at head"
+    for call in (lambda: layer(x), lambda: layer(X), lambda: estimate(lambda z: z - 0.2, X, S, head=log)):
+        with pytest.raises(ValueError, match=message):
+            call()
+    one = r"head returned nan at the point \[.*where the output of fn is finite, \[-.*\]: look at head"
+    with pytest.raises(ValueError, match=one):
+        estimate(lambda z: z[:, :1] - 0.2, X, S, head=log)
+    with pytest.raises(ValueError, match="fn returned nan at the point"):
+        estimate(lambda z: z / 0.0 - z / 0.0, X, S, head=log)
+    got = estimate(lambda z: z, X, S, head=log, on_nonfinite="drop")
+    assert 0 < got.dropped < 16
+    with pytest.raises(ValueError, match=r"left 0 of 8 draws.*17 of 17 values are not finite; head returned nan"):
+        estimate(lambda z: z - 9.0, X, S, head=log, on_nonfinite="drop")
+
+
 def test_the_sets_of_optimal_sampling_cannot_be_dropped_from() -> None:
     with pytest.raises(ValueError, match="cannot re-weight the element-wise sets of proposal 'optimal'"):
         estimate(holes(3), X, S.replace(proposal="optimal"), on_nonfinite="drop")

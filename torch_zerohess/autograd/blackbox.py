@@ -40,8 +40,8 @@ class BlackBox(nn.Module):
             registered: its parameters are not trained through this layer.
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
             operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
-            Parameters and other tensors in it are constants: they must not require grad. A module given as head is not
-            registered. What is trained belongs behind a layer without a head.
+            Parameters and other tensors in it are constants: they must not require grad, but under `torch.no_grad`. A
+            module given as head is not registered. What is trained belongs behind a layer without a head.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
             are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless value="smoothed". Calls of several
@@ -153,7 +153,8 @@ class BlackBox(nn.Module):
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = working(x).detach().reshape(-1, n).clone()
         check_aux(aux, self.memory, self.call.head)
-        with contextlib.nullcontext() if self.memory is None else self.memory.lock:
+        # With grad: the function may be differentiated elsewhere, and a head must be a constant there.
+        with torch.enable_grad(), contextlib.nullcontext() if self.memory is None else self.memory.lock:
             around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
 
         def frozen(z: Tensor) -> Tensor:
@@ -208,12 +209,12 @@ class BlackBox(nn.Module):
         x = opaque.noise_checked(self._handle, x, aux)
         keep = torch.compiler.is_compiling() or stored(self.smoothing, B * transforms.mapped_size([x, *aux]), n)
         K = self.smoothing.evaluations(n, center=False)
-        tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, x, aux)
+        tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, torch.is_grad_enabled(), x, aux)
         return Expansion.rebuild(tensors, x, self.smoothing if keep else self.smoothing.resolved(n), keep)
 
     def _center(self, x: Tensor, aux: list[Tensor]) -> Tensor:
         if transforms.watched(x):
-            result: Tensor = torch.ops.torch_zerohess.evaluate_center(self._handle, x, aux)
+            result: Tensor = torch.ops.torch_zerohess.evaluate_center(self._handle, torch.is_grad_enabled(), x, aux)
             return result
         return opaque.center(self, x, aux)
 

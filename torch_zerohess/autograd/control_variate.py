@@ -67,6 +67,8 @@ def around(
         pathwise = len(sigma) > MOST_STEIN if memory.pathwise is None else memory.pathwise
     else:  # the mean over all points is known from the center
         u, pathwise = sigma.new_zeros(1, len(sigma)), True
+    if not fresh:
+        predicted.check_head(center)
     with torch.no_grad():
         at_center = control.coefficient * predicted(center[:, None])[:, 0] if value == "center" else center[:, 0]
         scales = outer.scales(

@@ -35,8 +35,11 @@ class Owner(Protocol):
 
 
 def expand(owner: Owner, keep: bool, x: Tensor, aux: Sequence[Tensor]) -> Expansion:
-    """Evaluate once around x [B, n], without autograd; `keep` stores the perturbations."""
-    with torch.no_grad(), transforms.random_numbers_allowed():
+    """Evaluate once around x [B, n], which needs no graph; `keep` stores the perturbations.
+
+    Where autograd records, a head must not have a tensor of its own that requires grad.
+    """
+    with transforms.random_numbers_allowed():
         expansion = evaluate(owner.call, x, aux, owner.smoothing, keep, owner.control).expansion
     owner.output_shapes[_signature(x.shape[1], aux)] = expansion.base.shape[1:]
     return expansion
@@ -118,17 +121,22 @@ def noise_checked(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
 
 
 @torch.library.custom_op("torch_zerohess::evaluate", mutates_args=(), tags=_RANDOM)
-def _evaluate(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
-    """Return `Expansion.tensors`. K, the number of perturbations, is what the fake kernel needs of the settings."""
+def _evaluate(handle: int, K: int, keep: bool, records: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
+    """Return `Expansion.tensors`. K, the number of perturbations, is what the fake kernel needs of the settings.
+
+    records: whether autograd records where the layer is called. Compiled code runs its graph without autograd.
+    """
     owner = _owner(handle)
     if (drawn := owner.smoothing.evaluations(x.shape[1], center=False)) != K:
         raise RuntimeError(f"a graph was traced for {K} perturbations, but now the layer draws {drawn}: trace again")
-    return expand(owner, keep, x, aux).tensors()
+    with transforms.recording(records):
+        return expand(owner, keep, x, aux).tensors()
 
 
 @torch.library.custom_op("torch_zerohess::evaluate_center", mutates_args=(), tags=_RANDOM)
-def _evaluate_center(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
-    return expand_center(_owner(handle), x, aux)
+def _evaluate_center(handle: int, records: bool, x: Tensor, aux: list[Tensor]) -> Tensor:
+    with transforms.recording(records):
+        return expand_center(_owner(handle), x, aux)
 
 
 def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Layout]:
@@ -139,12 +147,12 @@ def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> li
 
 
 @_evaluate.register_fake
-def _(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
+def _(handle: int, K: int, keep: bool, records: bool, x: Tensor, aux: list[Tensor]) -> list[Tensor]:
     return [x.new_empty(one.shape, dtype=one.dtype) for one in _layout(handle, K, keep, x, aux)]
 
 
 @_evaluate_center.register_fake
-def _(handle: int, x: Tensor, aux: list[Tensor]) -> Tensor:
+def _(handle: int, records: bool, x: Tensor, aux: list[Tensor]) -> Tensor:
     return x.new_empty(len(x), *_output_shape(_owner(handle), x, aux))
 
 
@@ -183,14 +191,14 @@ def _mapped(info: Any, in_dims: Any, x: Tensor, aux: list[Tensor]) -> tuple[Tens
 
 
 @_evaluate.register_vmap
-def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> Any:
+def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, records: bool, x: Tensor, aux: list[Tensor]) -> Any:
     if info.randomness == "same" and _owner(handle).smoothing.seed is None:
         raise ValueError(
             "vmap(randomness='same') over a black box: its noise is independent for each point of a batch; use "
             "randomness='different', or give Smoothing a seed"
         )
     folded, others = _mapped(info, in_dims, x, aux)
-    results = _evaluate(handle, K, keep, folded, others)
+    results = _evaluate(handle, K, keep, records, folded, others)
     batched = [one.batched for one in _layout(handle, K, keep, folded, others)]  # after it: the shape is known by now
     unfolded = [
         one.unflatten(0, (info.batch_size, -1)) if each else one for one, each in zip(results, batched, strict=True)
@@ -199,6 +207,6 @@ def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, x: Tensor, aux: 
 
 
 @_evaluate_center.register_vmap
-def _(info: Any, in_dims: Any, handle: int, x: Tensor, aux: list[Tensor]) -> Any:
+def _(info: Any, in_dims: Any, handle: int, records: bool, x: Tensor, aux: list[Tensor]) -> Any:
     folded, others = _mapped(info, in_dims, x, aux)
-    return _evaluate_center(handle, folded, others).unflatten(0, (info.batch_size, -1)), 0
+    return _evaluate_center(handle, records, folded, others).unflatten(0, (info.batch_size, -1)), 0

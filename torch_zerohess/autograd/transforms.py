@@ -15,6 +15,8 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
+| let autograd see what a custom operator does | `torch._C._ForceDispatchKeyGuard`, `_dispatch_tls_local_include_set`,
+`_dispatch_tls_local_exclude_set`, `DispatchKey` | torch hides it, whatever `torch.enable_grad` says |
 | leave all transforms for a while | `torch._functorch.pyfunctorch.temporarily_clear_interpreter_stack` | \
 a random seed is drawn once, whatever maps over the layer |
 | real tensors in a fake kernel | `torch._subclasses.fake_tensor.unset_fake_temporarily` | none exists |
@@ -22,6 +24,7 @@ a random seed is drawn once, whatever maps over the layer |
 | which function made this node | `Function._backward_cls` | `Node.name()` is a string that other functions may share |
 """
 
+import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -126,6 +129,19 @@ def outside() -> AbstractContextManager[None]:
 
 
 _VMAP_MODE = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("VmapMode"))  # type: ignore[arg-type]
+
+
+_AUTOGRAD = torch._C.DispatchKeySet(torch._C.DispatchKey.AutogradFunctionality)
+for _key in ("AutogradOther", "AutogradNestedTensor", "ADInplaceOrView"):
+    _AUTOGRAD = _AUTOGRAD.add(getattr(torch._C.DispatchKey, _key))
+
+
+@contextlib.contextmanager
+def recording(records: bool) -> Iterator[None]:
+    """Let autograd record inside a custom operator, or not."""
+    include, exclude = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
+    with torch.set_grad_enabled(records), torch._C._ForceDispatchKeyGuard(include, exclude - _AUTOGRAD):
+        yield
 
 
 def real_tensors() -> AbstractContextManager[None]:

@@ -129,10 +129,24 @@ class Prediction:
             known, outside = self.encoded
             coordinates: Tensor = self._surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
             return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
+        outputs = self._outputs(z)
+        return outputs if self._head is None else apply_head(self._head, outputs, self._aux)
+
+    def check_head(self, x: Tensor) -> None:
+        """Raise ValueError if the head has a tensor of its own that requires grad, for outputs at x [B, n].
+
+        Where evaluations are made, they find it.
+        """
+        if self._head is not None and not self.encoded:
+            with torch.no_grad():
+                outputs = self._outputs(x[:, None])
+            apply_head(self._head, outputs, self._aux)
+
+    def _outputs(self, z: Tensor) -> Tensor:
+        """Return the predictions [B, E, *out] at points z [B, E, n]."""
         with without_autocast(z.device):
             outputs: Tensor = self._surrogate(z.flatten(0, 1))
-        outputs = self._checked(outputs, z.shape[:2].numel()).unflatten(0, z.shape[:2])
-        return outputs if self._head is None else apply_head(self._head, outputs, self._aux)
+        return self._checked(outputs, z.shape[:2].numel()).unflatten(0, z.shape[:2])
 
     def _checked(self, outputs: Tensor, count: int) -> Tensor:
         """Return predictions in the shape of the black box, [count, *out]; for one number [count, 1] is allowed, too.

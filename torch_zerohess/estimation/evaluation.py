@@ -74,7 +74,8 @@ class BlackBoxCall:
         fn = self.fn if self.vectorized else Each(self.fn)
         assert self.evaluator is not None
         try:
-            result = self.evaluator(fn, points, *aux)
+            with torch.no_grad():
+                result = self.evaluator(fn, points, *aux)
         except (IndexError, RuntimeError, TypeError, ValueError) as error:
             raised = isinstance(self.evaluator, Inline) or isinstance(error.__cause__, RemoteTraceback)
             if raised and self.vectorized and not self.answered and hasattr(error, "add_note"):  # Python 3.11

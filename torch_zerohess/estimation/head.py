@@ -5,34 +5,34 @@ inputs are never copied: the head is called once per sample with the whole batch
 expanded views, whichever takes fewer calls.
 """
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_zerohess.precision import without_autocast
 
 Head = Callable[..., Tensor]
 """(outputs [K, *out], *aux [K, ...]) -> [K], made of differentiable torch operations."""
 _ALONE = (
-    "but the layer is differentiated with respect to x alone: call requires_grad_(False) or detach() first, or put "
-    "trainable parts behind a layer without a head"
+    "but only derivatives with respect to x are made: call requires_grad_(False) or detach() first, put trainable "
+    "parts behind a layer without a head, or work under torch.no_grad()"
 )
 
 
 def checked_head(head: Any) -> Head | None:
-    """Return the head, or raise TypeError or ValueError if it cannot serve."""
+    """Return the head, or raise TypeError if it cannot be called."""
     if head is not None and not callable(head):
         raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {head!r}")
-    if isinstance(head, nn.Module) and any(one.requires_grad for one in head.parameters()):
-        raise ValueError(f"head has parameters that require grad, {_ALONE}")
     return head
 
 
 def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    """Return the losses [B, E] of outputs [B, E, *out] with auxiliary inputs [B, ...]."""
+    """Return the losses [B, E] of outputs [B, E, *out] with auxiliary inputs [B, ...].
+
+    Raises ValueError, where autograd records, for a head with a tensor of its own that requires grad.
+    """
     B, E = outputs.shape[:2]
     if E <= B:
         return torch.stack([_called(head, outputs[:, sample], aux) for sample in range(E)], 1)
@@ -45,8 +45,7 @@ def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
 
 def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
     graph = any(one.requires_grad for one in (outputs, *aux))
-    # Recording finds a tensor of the head's own that requires grad.
-    with without_autocast(outputs.device), contextlib.nullcontext() if graph else torch.enable_grad():
+    with without_autocast(outputs.device):
         losses = head(outputs, *aux)
     if not isinstance(losses, Tensor) or not losses.is_floating_point():
         raise TypeError(f"head must return a real floating-point tensor, got {getattr(losses, 'dtype', type(losses))}")

@@ -68,6 +68,23 @@ def test_compiled_inside_a_network(backend: str) -> None:
         close(p.grad, gradient)
 
 
+@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+def test_a_compiled_layer_refuses_a_trainable_head_where_gradients_are_wanted(value: str, backend: str) -> None:
+    """Compiled code runs its graph without autograd, whatever the caller wants."""
+    w = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    layer = BlackBox(SCALAR.f, AGGREGATE, head=lambda loss: w * loss, value=value)
+    compiled = torch.compile(layer, fullgraph=True, backend=backend)
+    for x in (BATCH, leaf(BATCH)):
+        with pytest.raises(ValueError, match="head depends on a tensor that requires grad"):
+            compiled(x)
+    with torch.no_grad():
+        for x in (BATCH, leaf(BATCH)):
+            close(compiled(x), layer(x))
+    with pytest.raises(ValueError, match="head depends on a tensor that requires grad"):
+        torch.func.grad(lambda x: layer(x).sum())(BATCH)
+
+
 def test_outputs_of_any_strides_in_compiled_code() -> None:
     """Compiled code reads the outputs by the strides of the fake kernel."""
     layer = BlackBox(lambda z: torch.stack([z[:, 0], z.sum(1), z.prod(1)]).T, AGGREGATE)
@@ -151,6 +168,6 @@ def test_operators_keep_the_promises_of_their_fake_kernels() -> None:
     for value in ("center", "smoothed"):
         layer = BlackBox(IMAGE.f, AGGREGATE, value=value)
         for keep in (True, False):
-            arguments = (layer._handle, 12, keep, BATCH, [])
+            arguments = (layer._handle, 12, keep, True, BATCH, [])
             torch.library.opcheck(ops.evaluate.default, arguments, test_utils=tests)
-    torch.library.opcheck(ops.evaluate_center.default, (layer._handle, BATCH, []), test_utils=tests)
+    torch.library.opcheck(ops.evaluate_center.default, (layer._handle, True, BATCH, []), test_utils=tests)

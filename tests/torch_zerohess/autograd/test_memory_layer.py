@@ -434,6 +434,55 @@ def test_first_order_leaves_the_curvature_to_the_surrogate() -> None:
     assert float((bends[2][1] - bends[3][1]).norm()) > 0.01
 
 
+class Scaled(nn.Module):
+    """A head with a trainable weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+
+    def forward(self, outputs: Tensor, references: Tensor) -> Tensor:
+        return self.weight * zh.heads.SquaredError()(outputs, references)
+
+
+REFUSED = "head depends on a tensor that requires grad"
+
+
+@pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("fresh", [None, 0, "no memory"])
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+@pytest.mark.parametrize("entropy", [False, True])
+def test_without_gradients_a_head_may_be_trainable(value: str, fresh: Any, entropy: bool, without: Any) -> None:
+    """No derivative is lost there. Where one might be, the head is refused, also if no evaluation is made."""
+    memory = None if fresh == "no memory" else remembering(SURROGATES["bad"](), fresh=fresh)
+    settings, scaled = zh.Smoothing(sigma=SIGMA, samples=4, seed=0), Scaled()
+    head = zh.heads.LocalEntropy(scaled) if entropy else scaled
+    box = zh.BlackBox(render, settings, head=head, memory=memory, value=value).eval()
+    x, r = point()
+    for own in (x, x.clone().requires_grad_()):
+        with pytest.raises(ValueError, match=REFUSED):
+            box(own, r)
+        with without():
+            got = box(own, r.clone().requires_grad_())
+        scaled.requires_grad_(False)
+        with torch.no_grad():
+            torch.testing.assert_close(got.clone(), box(own, r))
+        scaled.requires_grad_(True)
+    with torch.no_grad(), pytest.raises(ValueError, match=REFUSED):  # it may be differentiated elsewhere
+        box.freeze(x, r)
+
+
+def test_without_gradients_an_estimate_may_have_a_trainable_head() -> None:
+    x, r = point()
+    settings = zh.Smoothing(sigma=SIGMA, samples=4, seed=0)
+    with pytest.raises(ValueError, match=REFUSED):
+        zh.estimate(render, x, settings, r, head=Scaled())
+    with torch.no_grad():
+        got = zh.estimate(render, x, settings, r, head=Scaled())
+    same = zh.estimate(render, x, settings, r, head=Scaled().requires_grad_(False))
+    assert torch.equal(got.gradient, same.gradient)
+
+
 @pytest.mark.parametrize("memory", [False, True])
 @pytest.mark.parametrize("value", ["center", "smoothed"])
 @pytest.mark.parametrize("x_requires_grad", [False, True])
@@ -458,9 +507,6 @@ def test_wrong_arguments_say_so() -> None:
         zh.BlackBox(render, smoothing, memory=3)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="head must be callable"):
         zh.BlackBox(render, smoothing, head=3)  # type: ignore[arg-type]
-    for head in (nn.Linear(3, 1), zh.heads.LocalEntropy(nn.Linear(3, 1))):
-        with pytest.raises(ValueError, match="head has parameters"):
-            zh.BlackBox(render, smoothing, head=head)
     x, r = point()
     with pytest.raises(ValueError, match="aux must be empty"):
         zh.BlackBox(render, smoothing, memory=zh.Memory())(x, r)

@@ -150,10 +150,10 @@ def test_operators_of_the_extension(name: str) -> None:
 def test_operators_that_call_a_black_box(proposal: str, keep: bool) -> None:
     layer = BlackBox(lambda z: torch.stack([F(z), z[:, 0]], 1), S.replace(proposal=proposal))
     K = layer.smoothing.evaluations(N, center=False)
-    torch.library.opcheck(ops.evaluate.default, (layer._handle, K, keep, BATCH.float(), []))
-    torch.library.opcheck(ops.evaluate_center.default, (layer._handle, BATCH, []))
+    torch.library.opcheck(ops.evaluate.default, (layer._handle, K, keep, True, BATCH.float(), []))
+    torch.library.opcheck(ops.evaluate_center.default, (layer._handle, True, BATCH, []))
     with pytest.raises(RuntimeError, match=f"traced for {K + 1} perturbations, but now the layer draws {K}"):
-        ops.evaluate(layer._handle, K + 1, keep, BATCH, [])
+        ops.evaluate(layer._handle, K + 1, keep, True, BATCH, [])
 
 
 def test_compiled_code_serves_every_seed_and_sigma() -> None:

@@ -294,3 +294,11 @@ def test_the_function_gets_contiguous_tensors(x: Tensor, value: str) -> None:
         estimate(fn, x, S, aux, value=value, joint=True)
     assert len(calls) > 8
     assert all(all(one) for one in calls)
+
+
+def test_an_evaluator_of_the_caller_records_nothing() -> None:
+    """A module as black box has parameters that require grad."""
+    network = torch.nn.Linear(2, 1, dtype=torch.float64)
+    got = BlackBox(network, S, evaluator=lambda fn, points: fn(points))(X.clone().requires_grad_())
+    assert torch.equal(got.detach(), BlackBox(network, S)(X))
+    assert torch.equal(estimate(network, X, S, evaluator=lambda fn, points: fn(points)).value, got.detach())

@@ -42,7 +42,8 @@ class Smoothing:
             x^2 + sigma^2.
         antithetic: use every perturbation with both signs.
         baseline: subtracted from f. "center" is f(x); "mean" the mean of all other draws, which costs no evaluation;
-            "none" nothing. It changes the variance, by orders of magnitude, and not the expectation.
+            "none" nothing. It changes the variance, by orders of magnitude, and not the expectation. With sampler
+            "sobol" the draws are scrambles, and samples must be even for "mean".
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
@@ -108,8 +109,23 @@ class Smoothing:
             raise ValueError(
                 "proposal 'optimal' draws one small set per element: sampler must be 'random', got 'sobol'"
             )
-        if self.baseline == "mean" and self.samples < 2 and self.proposal != "optimal":
-            raise ValueError("baseline 'mean' needs the mean of other draws: samples must be at least 2, got 1")
+        if self.baseline == "mean" and self.proposal != "optimal":
+            self._check_draws()
+
+    def _check_draws(self) -> None:
+        """Raise ValueError if all samples are one independent draw: there are no other draws to take the mean of."""
+        choice = self._choice(1)  # more parameters have no more draws
+        sobol = choice["sampler"] == "sobol"
+        if (choice["scrambles"] if sobol else choice["samples"]) > 1:
+            return
+        if sobol:
+            raise ValueError(
+                "baseline 'mean' needs the mean of other draws, which are scrambles with sampler 'sobol': samples must "
+                f"be even, and scrambles None or at least 2, got samples={self.samples}, scrambles={self.scrambles}"
+            )
+        raise ValueError(
+            f"baseline 'mean' needs the mean of other draws: samples must be at least 2, got {self.samples}"
+        )
 
     def __eq__(self, other: object) -> bool:
         """Whether all settings are the same."""

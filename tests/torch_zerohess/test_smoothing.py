@@ -1,6 +1,7 @@
 """Settings as values: equal, hashable, and made of numbers that any file keeps."""
 
 import io
+import itertools
 
 import numpy as np
 import pytest
@@ -31,3 +32,36 @@ def test_integers_of_every_kind_are_those_of_python(number):
     other = zh.BlackBox(torch.sum, zh.Smoothing(sigma=3.0))
     other.load_state_dict(torch.load(file))  # with weights_only
     assert other.smoothing == settings
+
+
+@pytest.mark.parametrize("antithetic", [True, False, "auto"])
+@pytest.mark.parametrize("sampler", ["random", "sobol", "orthogonal", "auto"])
+@pytest.mark.parametrize("proposal", ["aggregate", "gaussian", "optimal", "uniform", "fr22", "auto"])
+def test_settings_serve_some_number_of_parameters_or_are_refused(proposal, sampler, antithetic):
+    """Baseline "mean" needs two independent draws. One parameter has as many as any other number of parameters."""
+    x, served = torch.tensor([0.3], dtype=torch.float64), []
+    for samples, scrambles, order in itertools.product(range(1, 8), (None, 1, 2), (1, 2)):
+        try:
+            settings = zh.Smoothing(
+                sigma=1.0,
+                samples=samples,
+                scrambles=scrambles,
+                order=order,
+                proposal=proposal,
+                sampler=sampler,
+                antithetic=antithetic,
+                baseline="mean",
+            )
+        except ValueError:
+            continue
+        zh.estimate(lambda z: z.square().sum(1), x, settings)
+        served.append(samples)
+    assert served or sampler not in ("random", "auto")
+
+
+def test_settings_that_serve_one_parameter_alone_are_made():
+    """Single Sobol points are twice as many as pairs, hence even; pairs are chosen for more than one parameter."""
+    settings = zh.Smoothing(sigma=1.0, samples=7, sampler="sobol", baseline="mean", antithetic="auto")
+    assert settings.resolved(1).scrambles == 2
+    with pytest.raises(ValueError, match=r"samples must be even, .*got samples=7"):
+        settings.resolved(2)

@@ -46,11 +46,6 @@ def mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
 
     f: [B, K, P]; share: [B, K, 1], zero for dropped rows; draws: rows [D, r] of the draws, by size.
     """
-    if sum(len(part) for part in draws) < 2:
-        raise ValueError(
-            "baseline 'mean' needs at least two independent draws to leave one out: use more samples (an even number "
-            "for sampler 'sobol'), or baseline 'center'"
-        )
     # Differences to one of the values keep the precision of a small variation on a large offset.
     origin = f[:, :1]
     shifted = (f - origin) * share

@@ -97,7 +97,7 @@ class BlackBoxCall:
         B, E = points.shape[:2]
         if self.joint:
             return (self._jointly(_copied(points.transpose(0, 1)), aux),) * 2
-        flat = points.flatten(0, 1).contiguous() if spare else _copied(points.flatten(0, 1))
+        flat = points.flatten(0, 1) if spare else _copied(points.flatten(0, 1))
         if self.head is None:
             values = self(flat, [one.repeat_interleave(E, 0) for one in aux])
             values = values.reshape(B, E, *values.shape[1:])

@@ -7,32 +7,59 @@ import torch
 from torch import Tensor
 
 
+def stacked(rows: Any) -> Any:
+    """Return a list of tensors, or of arrays of NumPy, as one of them, and anything else as it is.
+
+    Raises ValueError for rows of different shapes.
+    """
+    kind = type(leaf(rows))
+    numpy: Any = sys.modules.get("numpy")
+    arrays = numpy is not None and issubclass(kind, numpy.ndarray)
+    if not isinstance(rows, (list, tuple)) or not (arrays or issubclass(kind, Tensor)):
+        return rows
+    parts = [stacked(one) for one in rows]
+    if not all(isinstance(one, numpy.ndarray if arrays else Tensor) for one in parts):
+        return rows
+    for k, one in enumerate(parts):
+        if one.shape != parts[0].shape:
+            raise ValueError(f"rows must have one shape, got {[*one.shape]} for row {k} and {[*parts[0].shape]} before")
+    return _known(numpy.asarray(parts)) if arrays else torch.stack(parts)
+
+
+def _known(array: Any) -> Any:
+    """Return an array of NumPy that torch can share: of its own byte order, types and strides."""
+    numpy = sys.modules["numpy"]
+    long = array.dtype.kind == "f" and array.dtype.itemsize > 8
+    return numpy.require(array, dtype=float if long else array.dtype.newbyteorder("="), requirements="CW")
+
+
+def leaf(result: Any) -> Any:
+    """Return the first element of a list of lists."""
+    while isinstance(result, (list, tuple)) and len(result):
+        result = result[0]
+    return result
+
+
 def as_tensor(result: Any) -> Tensor:
     """Return what a black box returned as a tensor of real or complex numbers.
 
-    Numbers of Python are float64, alone and in lists, and so are integers and truth values of any kind: counts,
-    images of bytes, a loss that is 0 on a plateau.
+    A list of tensors or arrays of one shape is stacked. Numbers of Python are float64, alone and in lists, and so are
+    integers and truth values of any kind: counts, images of bytes, a loss that is 0 on a plateau.
     """
-    if isinstance(result, Tensor):
-        return result if result.is_floating_point() or result.is_complex() else result.double()
     try:
+        result = stacked(result)
+        if isinstance(result, Tensor):
+            return result if result.is_floating_point() or result.is_complex() else result.double()
         numpy = sys.modules.get("numpy")
-        if numpy is not None and hasattr(result, "__array_interface__"):  # of any strides, and types torch may not know
-            result = numpy.asarray(result)
-            long = result.dtype.kind == "f" and result.dtype.itemsize > 8
-            kind = float if long else result.dtype.newbyteorder("=")
-            result = numpy.require(result, dtype=kind, requirements="CW")
-        leaf = result  # whatever the default dtype of torch
-        while isinstance(leaf, (list, tuple)) and len(leaf):
-            leaf = leaf[0]
-        if numpy is not None and leaf is not result and isinstance(leaf, numpy.ndarray):  # torch takes them one by one
-            return as_tensor(numpy.asarray(result))
+        if numpy is not None and hasattr(result, "__array_interface__"):
+            result = _known(numpy.asarray(result))
+        first = leaf(result)
         # Arrays that are on no GPU go to the CPU, whatever the default device of torch.
         device = None if hasattr(result, "__cuda_array_interface__") else "cpu"
-        if isinstance(leaf, float):
+        if isinstance(first, float):  # whatever the default dtype of torch
             return torch.as_tensor(result, dtype=torch.float64, device=device)
         tensor = torch.as_tensor(result, device=device)
-        mixed = isinstance(leaf, int) and tensor.is_floating_point()  # [1, 2.5]
+        mixed = isinstance(first, int) and tensor.is_floating_point()  # [1, 2.5]
         exact = not (tensor.is_floating_point() or tensor.is_complex())
         return torch.as_tensor(result, dtype=torch.float64, device=device) if mixed or exact else tensor
     except (TypeError, ValueError, RuntimeError) as error:

@@ -10,15 +10,16 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.estimation.inputs import times_changed
+from torch_zerohess.evaluators.values import stacked
 from torch_zerohess.search.state import Evaluated
 
 
 def converted(values: Any, device: torch.device) -> Tensor:
     """Return what a caller told as float64, detached; TypeError if it is no tensor, array or list of numbers."""
     try:
-        values = torch.as_tensor(values, dtype=torch.float64, device=device)
+        values = torch.as_tensor(stacked(values), dtype=torch.float64, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}") from error
+        raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}: {error}") from error
     found: Tensor = values.detach()
     return found
 

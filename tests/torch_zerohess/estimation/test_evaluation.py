@@ -1,6 +1,9 @@
 """One call of the black box: what it is given, what becomes of values that are not finite, and the baseline."""
 
 import math
+import warnings
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -215,6 +218,34 @@ def test_lists_of_arrays_are_one_array(recwarn) -> None:
     got = estimate(lambda z: [np.sin(one) for one in z.numpy()], X, S).gradient
     assert torch.equal(got, estimate(torch.sin, X, S).gradient)
     assert not recwarn.list
+
+
+ROWS = {
+    "list": lambda z: [torch.stack([one.sum(), one[0].square()]) for one in z],
+    "tuple": lambda z: tuple(torch.stack([one.sum(), one[0].square()]) for one in z),
+    "list of lists of numbers": lambda z: [[one.sum(), one[0].square()] for one in z],
+    "list of lists of tensors": lambda z: [[one.sum()[None], one[:1].square()] for one in z],
+    "float32 before float64": lambda z: [
+        torch.stack([one.sum(), one[0].square()]).to(torch.float64 if k else torch.float32) for k, one in enumerate(z)
+    ],
+    "list of long doubles": lambda z: [np.stack([one.sum(), one[0] ** 2]) for one in z.numpy().astype(np.longdouble)],
+}
+
+
+@pytest.mark.parametrize("rows", ROWS.values(), ids=ROWS.keys())
+def test_a_list_of_rows_is_stacked(rows: Callable[[Tensor], Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        got = estimate(rows, X, S).gradient
+    same = estimate(lambda z: torch.stack([z.sum(1), z[:, 0].square()], 1), X, S).gradient
+    torch.testing.assert_close(got.reshape(same.shape), same, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [torch.ones, np.ones])
+def test_rows_of_different_shapes_are_refused(kind: Callable[[int], Any]) -> None:
+    message = r"got list: rows must have one shape, got \[3\] for row 1 and \[2\] before"
+    with pytest.raises(TypeError, match=message):
+        estimate(lambda z: [kind(2 + k % 2) for k in range(len(z))], X, S)
 
 
 @pytest.mark.parametrize("make", [lambda a: a[:, ::-1], lambda a: np.broadcast_to(a[:, :1], a.shape)])

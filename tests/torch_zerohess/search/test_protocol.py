@@ -1,6 +1,7 @@
 """Ask and tell, the same for every search: points asked for, refused values, and resumed searches."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -31,6 +32,22 @@ def test_asking_changes_nothing(name):
         assert same(search.state_dict(), before)
         search.tell(f(points))
         assert not same(search.state_dict(), before)
+
+
+@pytest.mark.parametrize("kind", [list, tuple, "NumPy", "long doubles"])
+def test_values_may_be_a_list_of_rows(kind):
+    one, other = (zh.optim.TrustRegion(zeros(2), sigma=1.0, loss=lambda y: y.square().sum(), seed=0) for _ in range(2))
+    for _ in range(5):
+        outputs = rays(one.ask())
+        one.tell(outputs)
+        other.ask()
+        rows = [row.numpy().astype(np.longdouble if kind == "long doubles" else float) for row in outputs]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            other.tell(rows if isinstance(kind, str) else kind(outputs))
+    assert same(one.state_dict(), other.state_dict())
+    with pytest.raises(TypeError, match=r"values must be .*rows must have one shape, got \[2\] for row 1"):
+        other.tell([torch.ones(3), torch.ones(2)])
 
 
 @every_search

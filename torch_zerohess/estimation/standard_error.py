@@ -69,10 +69,12 @@ def variance_of_draws(
     fewest = 2 if pooled is None else 3
     if int(D.min()) < fewest:
         raise ValueError(
-            "a standard error needs at least two independent draws: use more samples (an even number for 'sobol')"
+            f"a standard error needs at least two independent draws, got {int(D.min())}: use at least 2 samples; "
+            "sampler 'sobol' needs an even number, with scrambles None or at least 2"
             if pooled is None
-            else "a standard error with baseline 'mean' needs at least three independent draws: use more samples (a "
-            "multiple of 4 from 32 on for 'sobol'), or baseline 'center'"
+            else f"a standard error with baseline 'mean' needs at least three independent draws, got {int(D.min())}: "
+            "use baseline 'center', or at least 3 samples; sampler 'sobol' needs a multiple of 4, with scrambles=4 or, "
+            "from 32 samples on, scrambles=None"
         )
     whole = stein.sums(quantity, a, v)
     divided = _Divided(stein, quantity, share, draws, v, whole[0].numel())

@@ -137,6 +137,23 @@ def test_few_draws_with_the_mean_of_others_are_refused() -> None:
     torch.testing.assert_close(pairs.standard_error("gradient"), plain.standard_error("gradient"))
 
 
+@pytest.mark.parametrize("samples", [8, 16])
+def test_what_the_error_for_few_scrambles_advises_is_enough(samples: int) -> None:
+    few = Smoothing(sigma=0.5, samples=samples, baseline="mean", sampler="sobol", seed=3)
+    message = (
+        r"got 2: .*'center'.*'sobol' needs a multiple of 4, with scrambles=4 or, from 32 samples on, scrambles=None"
+    )
+    enough = {"scrambles": 4}, {"samples": 32}, {"samples": 36}, {"baseline": "center"}
+    for quantity in ("value", "hessian_diagonal"):
+        with pytest.raises(ValueError, match=message):
+            estimate(WAVE, X, few).standard_error(quantity)
+        for changes in enough:
+            assert bool((estimate(WAVE, X, few.replace(**changes)).standard_error(quantity) > 0).all())
+    one = few.replace(baseline="center", scrambles=1)
+    with pytest.raises(ValueError, match=r"got 1: .*'sobol' needs an even number, with scrambles None or at least 2"):
+        estimate(WAVE, X, one).standard_error("value")
+
+
 def test_dropped_draws_are_not_draws_of_the_jackknife() -> None:
     smoothing = Smoothing(sigma=0.5, samples=12, baseline="mean", antithetic=False, proposal="gaussian", seed=3)
     points = estimate(WAVE, X, smoothing).points[:12]

@@ -36,12 +36,12 @@ class BlackBox(nn.Module):
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out], scalar values (a loss) or tensors (an image). It may use NumPy,
-            Mitsuba, another program; it gets detached tensors and is not differentiated. A module given as fn is not
-            registered: its parameters are not trained through this layer.
+            Mitsuba, another program; it gets detached, contiguous tensors and is not differentiated. A module given as
+            fn is not registered: its parameters are not trained through this layer.
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
             operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
-            Parameters and other tensors in it are constants: they must not require grad, but under `torch.no_grad`. A
-            module given as head is not registered. What is trained belongs behind a layer without a head.
+            Parameters and other tensors in it are constants: they must not require grad, except under `torch.no_grad`.
+            A module given as head is not registered. What is trained belongs behind a layer without a head.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
             are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless value="smoothed". Calls of several

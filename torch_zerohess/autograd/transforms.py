@@ -16,7 +16,7 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
 | let autograd see what a custom operator does | `torch._C._ForceDispatchKeyGuard`, `_dispatch_tls_local_include_set`,
-`_dispatch_tls_local_exclude_set`, `DispatchKey` | torch hides it, whatever `torch.enable_grad` says |
+`_dispatch_tls_local_exclude_set` | torch hides it, whatever `torch.enable_grad` says |
 | leave all transforms for a while | `torch._functorch.pyfunctorch.temporarily_clear_interpreter_stack` | \
 a random seed is drawn once, whatever maps over the layer |
 | real tensors in a fake kernel | `torch._subclasses.fake_tensor.unset_fake_temporarily` | none exists |
@@ -131,9 +131,9 @@ def outside() -> AbstractContextManager[None]:
 _VMAP_MODE = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("VmapMode"))  # type: ignore[arg-type]
 
 
-_AUTOGRAD = torch._C.DispatchKeySet(torch._C.DispatchKey.AutogradFunctionality)
+_AUTOGRAD = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("AutogradFunctionality"))  # type: ignore[arg-type]
 for _key in ("AutogradOther", "AutogradNestedTensor", "ADInplaceOrView"):
-    _AUTOGRAD = _AUTOGRAD.add(getattr(torch._C.DispatchKey, _key))
+    _AUTOGRAD = _AUTOGRAD.add(torch._C._parse_dispatch_key(_key))  # type: ignore[arg-type]
 
 
 @contextlib.contextmanager

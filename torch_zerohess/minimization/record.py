@@ -94,6 +94,13 @@ class Record:
         if self.requested is not None:
             self.note(*self._interrupted)
 
+    def with_start(self, untouched: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return `told` with the loss NaN of points where untouched parameters, bools [n], are not as at the start."""
+        points, losses = self.told
+        if untouched is None:
+            return points, losses
+        return points, torch.where((points == points[:1])[:, untouched].all(1), losses, torch.nan)
+
     @property
     def flat(self) -> bool:
         """Whether all values are equal."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.decision import Decision, decide
 from torch_zerohess.minimization.doubt import doubt
-from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
+from torch_zerohess.minimization.minimum import Iterate, Minimum, Status, on_untouched
 from torch_zerohess.minimization.noise import REPEATED, deviation, differs, reserved
 from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.search.trust_region import TrustRegion
@@ -168,7 +168,8 @@ class Running:
         if allowed < 1:
             return
         self._deciding = before, allowed
-        (points, losses), search, believed = self.record.told, self.search, self._believed(before).x
+        search, believed = self.search, self._believed(before).x
+        points, losses = self.record.with_start(search.untouched)
         likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
         found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise, trusted=search.averages)
         if found is not None:
@@ -215,7 +216,7 @@ class Running:
             evaluations=self.evaluations,
             points=points,
             values=losses,
-            message=message,
+            message=message + on_untouched(search.untouched),
             engine=search.engine,
             success=success,
             status=status,
@@ -246,16 +247,15 @@ class Running:
         search = self.search
         if not self.noise and search.evaluations and self.record.requested is None:
             return Belief(search.x, search.value, 0.0)
-        points, losses = self.record.told  # with the interrupted batch, which was not told to the search
+        points, losses = self.record.with_start(search.untouched)  # with what was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):
             return self._believed(self.evaluations)
         return lowest(points, losses, search.x)
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
-        assert self.noise
-        points, losses = self.record.told
-        return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise)
+        points, losses = self.record.with_start(self.search.untouched)
+        return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
 
     def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
         """Return the search's quadratic model around x and its sigma; or the regression on all evaluations, if better.

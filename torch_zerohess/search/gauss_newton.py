@@ -110,6 +110,10 @@ class GaussNewton(Method[Q]):
             known = self.taken(known, evaluated.those(evaluated.finite))
         if known.done:
             return known, known.center[None][:0]
+        return self.asked(known, generator)
+
+    def asked(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
+        """Ask for what the phase says."""
         return self.step(known) if known.phase == "trial" else self.samples(known, generator)
 
     def sampled(self, known: Q, evaluated: Evaluated) -> Q:

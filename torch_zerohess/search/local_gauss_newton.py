@@ -8,7 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalProgress, LocalSettings
+from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalSettings
+from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
@@ -26,7 +27,10 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     Where its steps hardly lower the loss, it hops to a random point close by, at 0.3 sigma per parameter, and goes on
     from there. It stays with what it finds if the loss is lower, and returns otherwise.
 
-    A parameter that no output depends on stays where it is; `jacobian.untouched` names these parameters.
+    A parameter that no output depends on stays where it is, and `untouched` names it. Only parameters that outputs
+    change with beyond chance are moved. With a probability of at most 1 % per search another one is moved, too. A
+    parameter that changes outputs by little beside noise is named until more samples tell. Samples move all parameters.
+    So no sample is the best point once some parameters are moved and others stay.
 
     Args:
         x0: start [n], float32 or float64, within the bounds.

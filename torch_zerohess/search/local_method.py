@@ -5,7 +5,8 @@ The start and a few dozen samples of all parameters at once tell a sparse Jacobi
 
 An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths then minimise
 the model g J s + s J^T H J s / 2 by conjugate gradients, where g and H are gradient and Hessian of the loss after the
-output; see `gauss_newton`. If the output at the end of the step was predicted well, the next steps use the same J.
+output; see `gauss_newton`. Steps and hops move only the parameters that some output depends on for certain, see
+`surrogates.sparse_evidence`. If the output at the end of the step was predicted well, the next steps use the same J.
 Sigma is a share of the radius.
 
 Where steps hardly lower the loss, the search hops: it goes on from a random point close by, with the J that it has. It
@@ -22,14 +23,15 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.krylov import krylov_steps
-from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, check_share
+from torch_zerohess.search.gauss_newton import GaussNewton, check_share
+from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal, reflect
 from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.sparse_evidence import Evidence
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
-from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _TRUSTED = 0.9
 """Share of the held-out change. If the Jacobian predicts more, the first radius is at least 1, as for the samples."""
@@ -38,8 +40,6 @@ _FAITHFUL = 0.1
 _SLOW, _FAST, _MOST = 0.02, 0.1, 2
 """The next batch has twice the samples if the loss fell by less than the first share of it, and half of them if it fell
 by more than the second. It has so many times the first number of samples at most."""
-_PREDICTED = 0.5
-"""Share of the held-out change from which on the end of a round is a minimum."""
 _STALLED = 2
 """Such small gains in a row are followed by a hop."""
 _HOP = 0.3
@@ -48,12 +48,14 @@ _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
 LOCAL_TOLERANCE = 5e-4
 """Radius, in units of sigma, at which the search has arrived, if the caller says nothing."""
+_CERTAIN = 0.3
+"""Share of the entries that must be of certain parameters before steps follow, or else more samples."""
 _ITERATIONS = 100
 """Products of the Hessian for a step."""
 _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
-_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost")
+_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost", "evidence")
 """What a search that returns from a hop keeps."""
 
 
@@ -91,36 +93,6 @@ class LocalSettings:
         return result
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LocalProgress(JacobianProgress):
-    """The output at the center, the sparse Jacobian there, and the samples asked for next."""
-
-    jacobian: SparseJacobian | None = None
-    """float32: errors of sampling are far above its rounding."""
-    samples: int
-    """Of the next batch."""
-    slow: int = 0
-    """Steps in a row that hardly lowered the loss."""
-    finished: bool = False
-    """Whether the search has arrived at the center."""
-    patient: bool = False
-    """Whether slow steps go on, because a hop from here has found nothing better."""
-    home: "LocalProgress | None" = None
-    """The search before the hop that has led here."""
-    hopped: float = math.inf
-    """Loss at the start of this hop."""
-
-    @property
-    def failed(self) -> bool:
-        """Whether the search has hopped and is not below the loss before."""
-        return self.home is not None and self.loss >= self.home.loss
-
-    @property
-    def predicts(self) -> bool:
-        """Whether the Jacobian predicts so much that the end of a round is a minimum."""
-        return self.jacobian is not None and self.jacobian.explained > _PREDICTED
-
-
 class LocalMethod(GaussNewton[LocalProgress]):
     """The search of `LocalGaussNewton`, in units of its sigma."""
 
@@ -147,14 +119,14 @@ class LocalMethod(GaussNewton[LocalProgress]):
             return None
         known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated)).recorded(evaluated)
         known = self.sampled(known, evaluated)
-        return known if known.phase == "trial" else None
+        return None if known.jacobian is None else known
 
     def samples(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
         """Draw samples from N(center, sigma^2), mirrored into the bounds; after a hop, draw the center first."""
-        hops = known.home is not None and not len(known.output)
+        hops = known.hops
         if hops:
-            assert known.jacobian is not None
-            step = _HOP * ~known.jacobian.untouched * normal(generator, known.center, self.settings.n)
+            assert known.evidence is not None
+            step = _HOP * known.evidence.certain * normal(generator, known.center, self.settings.n)
             known = replace(known, center=self._inside(known.center + step))
         points = self._inside(
             known.center + known.sigma * normal(generator, known.center, known.samples, self.settings.n)
@@ -165,7 +137,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         return reflect(points, self.settings.lower, self.settings.upper)
 
     def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
-        if known.home is None or len(known.output):
+        if not known.hops:
             return super().sampled(known, evaluated)
         if not bool(evaluated.finite[0]):
             return self._returned(known)
@@ -184,10 +156,14 @@ class LocalMethod(GaussNewton[LocalProgress]):
             return known
         u = ((told.points - known.center) / known.sigma).float()
         changes = ((told.outputs - known.output) / known.sigma).float()
-        jacobian = fit_sparse(u, changes, known.shape, self.own.sparse, known.jacobian)
-        if first and jacobian.explained > _TRUSTED:
+        fitted = fit_sparse(u, changes, known.shape, self.own.sparse, known.fitted)
+        evidence = known.evidence or Evidence.none(self.settings.n, u.device)
+        known = known.fitting(fitted, evidence.with_batch(fitted, known.fitted, u, changes))
+        if known.certain_share < _CERTAIN and known.samples < _MOST * self.own.samples:
+            return replace(known, samples=_MOST * self.own.samples, phase="sample")
+        if first and fitted.explained > _TRUSTED:
             known = replace(known, radius=max(1.0, known.radius))
-        return replace(known, jacobian=jacobian, phase="trial")
+        return replace(known, phase="trial")
 
     def steps(self, known: LocalProgress, radii: Tensor) -> Tensor:
         """Solve the model by conjugate gradients, over the parameters that no bound holds."""
@@ -271,6 +247,10 @@ class LocalMethod(GaussNewton[LocalProgress]):
     def promise(self, known: LocalProgress) -> float:
         """Return the promise of a step; it is infinite while a hop has led to nothing better."""
         return super().promise(known) if known.predicts and not known.failed else math.inf
+
+    def untouched(self, known: LocalProgress) -> Tensor | None:
+        """Return the parameters on which no output is certain to depend, if some output is on others."""
+        return ~known.evidence.certain if known.some_stay and known.evidence is not None else None
 
     def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
         home = known.home

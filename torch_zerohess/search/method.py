@@ -87,3 +87,7 @@ class Method(ABC, Generic[P]):
     def width(self, known: P) -> Tensor:
         """Return half of the extent of the region along every parameter [n]."""
         return torch.full_like(known.best.point, known.sigma)
+
+    def untouched(self, known: P) -> Tensor | None:
+        """Return the parameters that no output was found to depend on, and that stay: bools [n]; None if unknown."""
+        return None

@@ -167,6 +167,11 @@ class AskTell(ABC, Generic[P]):
         return self._method.width(self._state.progress) * self._space.unit
 
     @property
+    def untouched(self) -> Tensor | None:
+        """Parameters that no output was found to depend on, and that stay: bools [n]; None if nothing is known."""
+        return self._method.untouched(self._state.progress)
+
+    @property
     def done(self) -> bool:
         """Whether there is nothing more to ask."""
         return self._state.progress.done

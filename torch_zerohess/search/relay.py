@@ -34,3 +34,7 @@ class Relay(Method[P]):
     def width(self, known: P) -> Tensor:
         method, inner = self.turn(known)
         return method.width(inner)
+
+    def untouched(self, known: P) -> Tensor | None:
+        method, inner = self.turn(known)
+        return method.untouched(inner)

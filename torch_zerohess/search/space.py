@@ -48,8 +48,9 @@ class Space:
         return x.double() / self.unit
 
     def parameters(self, z: Tensor) -> Tensor:
-        """Parameters of coordinates z, in the type of x0. Rounding does not leave the bounds."""
-        return (z * self.unit).to(self.start.dtype).clamp(self.lower, self.upper)
+        """Parameters of coordinates z, in the type of x0. Rounding does not leave the bounds, nor change the start."""
+        x = (z * self.unit).to(self.start.dtype).clamp(self.lower, self.upper)
+        return torch.where(z == self.coordinates(self.start), self.start, x)
 
     def rounded(self, z: Tensor) -> Tensor:
         """Coordinates of the parameters that are evaluated for z: those that the type of x0 has."""

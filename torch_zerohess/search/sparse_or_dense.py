@@ -12,7 +12,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LocalMethod, LocalProgress
+from torch_zerohess.search.local_method import LocalMethod
+from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
 from torch_zerohess.search.relay import Relay
@@ -94,7 +95,7 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
             sparse, dense = start.jacobian.explained, max(start.jacobian.explained_dense, 0.0)
             told = f"{max(sparse, 0.0):.0%} of the change of held-out outputs, a dense one {dense:.0%}"
             if sparse > dense + _MORE and (sparse > _MOST or not len(known.rest)):
-                local, points = self.local.step(start)
+                local, points = self.local.asked(start, generator)
                 known = replace(_emptied(known), chosen="local", reason=f"a sparse Jacobian predicts {told}")
                 return replace(known, local=local, descent=None).taking(local), points
         if len(known.rest):

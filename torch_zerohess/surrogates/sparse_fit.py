@@ -55,7 +55,8 @@ class SparseSettings:
     prune: bool = False
     """Whether entries that are not significant beside the others of their row are left out in the end."""
     robust: bool = True
-    """Whether standard errors hold if samples differ in variance, which takes 1 to 5 % longer."""
+    """Whether standard errors hold if samples differ in variance, which takes 1 to 5 % longer. Otherwise they are for
+    tests of whether slopes are 0."""
 
     @classmethod
     def checked(cls, n: int, *, keep: int | None, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
@@ -170,7 +171,8 @@ def _fitted(
         used = used & significant(values, errors * (len(u) / count) ** 0.5, used, count, settings.rate)
         order = torch.argsort(used.byte(), dim=1, descending=True, stable=True)  # the used ones come first
         index, used = index.gather(1, order), used.gather(1, order)
-    values, errors = slopes(u, d, index, used, previous, ridges, constant if settings.robust else None)
+    robust = settings.robust
+    values, errors = slopes(u, d, index, used, previous, ridges, constant if robust else None, shortened=robust)
     return replace(previous, index=index, values=values, standard_error=errors)
 
 

@@ -77,6 +77,10 @@ class SparseJacobian:
             return self
         return replace(self, values=self.values * factors, standard_error=self.standard_error * factors)
 
+    def within(self, parameters: Tensor) -> "SparseJacobian":
+        """Return the Jacobian with the entries of some parameters alone, given as bools [n]."""
+        return self if bool(parameters.all()) else self.times(parameters.to(self.values))
+
     @property
     def found(self) -> Tensor:
         """Which entries are used, [m, keep]."""

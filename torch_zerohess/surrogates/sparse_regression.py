@@ -29,10 +29,13 @@ def slopes(
     previous: SparseJacobian,
     ridges: tuple[float, float],
     constant: Tensor | None = None,
+    *,
+    shortened: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Return slopes [m, keep] on a support and their standard errors, with the previous slopes as the prior.
 
     constant: leverage of the constant on each sample [K]. If it is None, all samples have the same variance.
+    shortened: whether errors include that the ridge shortens new slopes; it shortens none that is 0.
     """
     K, m = len(u), len(index)
     rows, values = u.mT.contiguous(), torch.zeros_like(index, dtype=u.dtype)
@@ -57,13 +60,14 @@ def slopes(
         own_part = inverse.diagonal(dim1=1, dim2=2)
         spent = ((1.0 - own_part * prior) * live).sum(1).clamp_min(0.0)
         variance = left.square().sum(1) / (K - 1 - spent).clamp_min(1.0)
-        shortened = (inverse @ (prior * change)[:, :, None])[..., 0]  # by the ridge
+        by_ridge = prior * change * (1.0 if shortened else old != 0)
+        bias = (inverse @ by_ridge[:, :, None])[..., 0]
         if constant is None:
             square = variance[:, None] * own_part.clamp_min(0.0)
         else:
             square = _of_samples(A, inverse, left, constant)
             square += variance[:, None] * (inverse.square() * prior[:, None]).sum(2)  # of the prior
-        errors[some, :width] = (square + shortened.square()).sqrt() * live
+        errors[some, :width] = (square + bias.square()).sqrt() * live
     return values, errors
 
 
@@ -98,13 +102,24 @@ def predicted(index: Tensor, values: Tensor, u: Tensor) -> Tensor:
 def significant(values: Tensor, errors: Tensor, used: Tensor, K: float, rate: float) -> Tensor:
     """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries.
 
-    Student's t with K - 1 - s degrees of freedom, s entries of the row, becomes a normal number (Wallace 1959). The
-    threshold for its probability is by Benjamini and Hochberg (1995).
+    The threshold for their `chances` is by Benjamini and Hochberg (1995).
+    """
+    chance = chances(values, errors, used, K)
+    ordered = chance[used].sort().values
+    fine = (ordered <= rate * torch.arange(1, len(ordered) + 1, device=chance.device) / max(len(ordered), 1)).nonzero()
+    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
+
+
+def chances(values: Tensor, errors: Tensor, used: Tensor, K: float) -> Tensor:
+    """Return the probabilities [m, keep] of slopes as large, in K samples, where an output does not depend on them.
+
+    They are from Student's t with K - 1 - s degrees of freedom, s entries of the row.
     """
     nu = (K - 1 - used.sum(1, keepdim=True)).clamp_min(1).double()
     t = values.double() / errors.double().clamp_min(torch.finfo(torch.float64).tiny)
-    z = (8 * nu + 1) / (8 * nu + 3) * (nu * torch.log1p(t.square() / nu)).sqrt()
-    chance = torch.erfc(z * math.sqrt(0.5))
-    ordered = chance[used].sort().values
-    fine = (ordered <= rate * torch.arange(1, len(ordered) + 1, device=z.device) / max(len(ordered), 1)).nonzero()
-    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
+    return torch.erfc(normal_from_t(t, nu).abs() * math.sqrt(0.5))
+
+
+def normal_from_t(t: Tensor, nu: Tensor | float) -> Tensor:
+    """Return normal numbers with the probabilities of Student's t with nu degrees of freedom (Wallace 1959)."""
+    return t.sign() * (8 * nu + 1) / (8 * nu + 3) * (nu * torch.log1p(t.square() / nu)).sqrt()

@@ -8,6 +8,7 @@ import torch
 from searches import run
 
 import torch_zerohess as zh
+from torch_zerohess.minimization.minimum import on_untouched
 from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
 from torch_zerohess.search.gauss_newton import LENGTHS
 from torch_zerohess.search.state import Evaluated
@@ -125,9 +126,9 @@ def test_after_two_small_gains_it_hops():
 def test_a_hop_leaves_parameters_that_no_output_depends_on():
     search = LocalGaussNewton(torch.zeros(N + 10).double(), sigma=1.0, loss=square(image(normal(1, N))[0]), seed=0)
     hopped = stepped(search, slow(search, lambda x: image(x[:, :N])), 0.01)
-    left = hopped.jacobian.untouched
+    left = search.untouched
+    assert torch.equal(left.nonzero()[:, 0], torch.arange(N, N + 10))
     known, _ = search._method.samples(hopped, torch.Generator().manual_seed(0))
-    assert bool(left.any())
     assert bool((known.center == hopped.home.center)[left].all())
     assert not bool((known.center == hopped.home.center)[~left].any())
 
@@ -268,14 +269,63 @@ def test_bounds_are_kept_and_hold_parameters():
     torch.testing.assert_close(search.x, truth.clamp(-0.5, 0.5), atol=0.05, rtol=0)
 
 
-def test_parameters_that_no_pixel_depends_on_stay_and_are_named():
-    truth, start = normal(N), torch.full((N + 10,), 0.25).double()
-    search = LocalGaussNewton(start, sigma=1.0, loss=square(image(truth[None])[0]), seed=7)
-    run(search, lambda x: image(x[:, :N]), 39)
-    assert search.value < 0.05
-    assert set(search.jacobian.untouched.nonzero()[:, 0].tolist()) <= set(range(N, N + 10))
-    left = search.jacobian.untouched
-    assert bool((search.x[left] == 0.25).all())
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("engine", ["local", "auto"])
+@pytest.mark.parametrize("f", [lambda x: x[:, :60], lambda x: x[:, :60].tanh()], ids=["linear", "tanh"])
+def test_parameters_that_no_pixel_depends_on_stay_and_are_named(f, engine, seed):
+    """Through hops, and where the target is out of reach, so that samples beat the center and hops end near it.
+
+    It fails by chance for 1 % of new seeds.
+    """
+    start = torch.full((100,), 0.3).double()
+    settings = {"sigma": 0.7, "loss": square(-2.0), "seed": seed, "max_evaluations": 300}
+    fit = zh.minimize(lambda x: f(x).view(-1, 6, 10), start, engine=engine, **settings)
+    assert torch.equal(fit.x[60:], start[60:])
+    assert not torch.isclose(fit.x[:60], start[:60]).any()
+    assert fit.message.endswith(
+        "; 40 of 100 parameters (60, 61, 62, 63, 64, ...) changed no output and were left where they are"
+    )
+
+
+def test_parameters_that_no_pixel_depends_on_stay_in_noise():
+    """Also in the decision at the end, whose candidates are points with low values: samples, too."""
+    generator, start = torch.Generator().manual_seed(0), torch.full((100,), 0.3).double()
+
+    def noisy(x):
+        return x[:, :60].view(-1, 6, 10) + 0.3 * torch.randn(len(x), 6, 10, generator=generator, dtype=torch.float64)
+
+    fit = zh.minimize(noisy, start, sigma=0.5, loss=square(0.0), engine="local", seed=0, max_evaluations=200)
+    assert fit.noise > 0.0
+    assert torch.equal(fit.x[60:], start[60:])
+    assert not torch.equal(fit.x[:60], start[:60])
+
+
+def test_a_message_names_a_few_parameters():
+    untouched = torch.tensor([True, False, True, True])
+    assert on_untouched(untouched) == "; 3 of 4 parameters (0, 2, 3) changed no output and were left where they are"
+    assert on_untouched(~untouched & untouched) == on_untouched(None) == ""
+
+
+def test_a_dense_map_calls_no_parameter_untouched():
+    search = run(search_for(lambda x: x @ normal(N, N), normal(N)), lambda x: x @ normal(N, N), 80)
+    assert search.untouched is None
+
+
+def test_where_few_entries_are_certain_more_samples_follow():
+    """A perfect fit would predict a third of the change."""
+    search, generator = search_for(image, normal(N)), torch.Generator().manual_seed(0)
+    points = search.ask()
+    noise = 1.4 * torch.randn(33, SIDE, SIDE, generator=generator, dtype=torch.float64)
+    search.tell(image(points) + noise)
+    assert search.ask().shape == (64, N)
+
+
+@pytest.mark.parametrize(("gain", "failed"), [(1e-14, True), (1e-9, False)])
+def test_a_hop_that_lowers_the_loss_by_rounding_alone_has_failed(gain, failed):
+    known = hopping(search_for(image, normal(N)))
+    assert replace(known, loss=(1 - gain) * known.home.loss).failed == failed
+    low = replace(known, home=replace(known.home, loss=gain), loss=0.0, hopped=1.0)  # to where rounding is all there is
+    assert low.failed == failed
 
 
 def test_noise():

@@ -1,0 +1,90 @@
+"""What the search of `LocalGaussNewton` knows."""
+
+import math
+from dataclasses import dataclass, replace
+
+from torch_zerohess.search.gauss_newton import JacobianProgress
+from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.surrogates.sparse_evidence import Evidence
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+
+_PREDICTED = 0.5
+"""Share of the held-out change from which on the end of a round is a minimum."""
+_ROUNDING = 1e-12
+"""A hop leads to something better if it lowers the loss by more than this share of it, and of what the hop added."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalProgress(JacobianProgress):
+    """The output at the center, the sparse Jacobian there, and the samples asked for next."""
+
+    jacobian: SparseJacobian | None = None
+    """By the parameters that some output depends on for certain. float32: errors of sampling are far above its
+    rounding."""
+    fitted: SparseJacobian | None = None
+    """With the other entries that were found, some of them by chance."""
+    evidence: Evidence | None = None
+    """Which parameters are certain."""
+    samples: int
+    """Of the next batch."""
+    slow: int = 0
+    """Steps in a row that hardly lowered the loss."""
+    finished: bool = False
+    """Whether the search has arrived at the center."""
+    patient: bool = False
+    """Whether slow steps go on, because a hop from here has found nothing better."""
+    home: "LocalProgress | None" = None
+    """The search before the hop that has led here."""
+    hopped: float = math.inf
+    """Loss at the start of this hop."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether the search has hopped and is not below the loss before."""
+        return self.home is not None and not self._lower(self.loss, self.home.loss)
+
+    @property
+    def predicts(self) -> bool:
+        """Whether the Jacobian predicts so much that the end of a round is a minimum."""
+        return self.jacobian is not None and self.jacobian.explained > _PREDICTED
+
+    @property
+    def hops(self) -> bool:
+        """Whether the first of the next samples is the point that the search hops to."""
+        return self.home is not None and not len(self.output)
+
+    @property
+    def some_stay(self) -> bool:
+        """Whether some parameters stay at their start, because some output is certain to depend on others alone."""
+        certain = None if self.evidence is None else self.evidence.certain
+        return certain is not None and bool(certain.any()) and not bool(certain.all())
+
+    @property
+    def certain_share(self) -> float:
+        """Share of the entries found that are by certain parameters; 1 if none was found."""
+        certain, every = (0 if one is None else int(one.found.sum()) for one in (self.jacobian, self.fitted))
+        return certain / every if every else 1.0
+
+    def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "LocalProgress":
+        """Return the progress with a new Jacobian.
+
+        If it is the first one with some certain parameters, the best point is the center again: samples move all
+        parameters, also those that stay where they are.
+        """
+        after = replace(self, jacobian=fitted.within(evidence.certain), fitted=fitted, evidence=evidence)
+        if self.some_stay or not after.some_stay:
+            return after
+        at = self.home if self.home is not None and self.failed else self
+        return replace(after, best=Best(at.center, at.loss, at.sigma))
+
+    def recorded(self, evaluated: Evaluated) -> "LocalProgress":
+        """Return the progress with the lowest loss as the best one. Samples do not count where parameters stay."""
+        if self.some_stay and self.phase == "sample":
+            evaluated = evaluated.those(slice(int(self.hops)))
+        after = super().recorded(evaluated)
+        return after if self.home is None or self._lower(after.best.loss, self.best.loss) else self
+
+    def _lower(self, loss: float, before: float) -> bool:
+        """Whether a hop has led to a loss that is lower by more than rounding."""
+        added = self.hopped - before if self.hopped < math.inf else 0.0
+        return loss < before - _ROUNDING * max(abs(before), added)

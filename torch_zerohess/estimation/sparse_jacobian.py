@@ -52,8 +52,8 @@ def sparse_jacobian(
             which even orders of fn are gone. The baseline is not used: a constant is part of the regression.
         keep: parameters per output, at most; 16 if None, or n if that is less.
         rate: of false discoveries among the pairs of output and parameter that are found in a round; there are three.
-            A pair that is false gets a small slope. At least 1 / rate pairs must be found together, or none is: for
-            fewer, give a larger rate.
+            A pair that is false gets a small slope. Fewer than 1 / rate pairs count only if each of
+            them is significant among all pairs.
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
             evidence, which helps where outputs depend on patches of parameters.
         previous: an earlier Jacobian of the same shape, at an x nearby. Its support is tried first, and its slopes

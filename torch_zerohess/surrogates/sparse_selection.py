@@ -7,12 +7,15 @@ An r^2 counts from the threshold t on at which
 
     (1 + number of decoys with r^2 >= t) / number of pairs with r^2 >= t  <=  rate,
 
-an estimate of the share of false discoveries among them (Barber and Candes 2015, with a decoy for the knockoff).
+an estimate of the share of false discoveries among them (Barber and Candes 2015, with a decoy for the knockoff). No
+fewer than 1 / rate pairs can count by this rule. A pair counts as well if the probability that any of all pairs has as
+large an r^2 by chance is at most the rate (Bonferroni).
 
 Neighbouring pixels often depend on the same parameters, or on neighbouring ones. So the mean of r^2 over 3x3 pixels,
 and over 3x3 parameters if these lie on a grid, is a second statistic, with a decoy and a threshold of its own.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -101,6 +104,7 @@ def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds
             if grids.joint:
                 counts[2 + which] += _histogram(grids.mean(squares), _LEAST_JOINT / K)
     own, joint = (_threshold(counts[k], counts[k + 1], rate) for k in (0, 2))
+    own = min(own, _single(K, rate / (n * rest.shape[1])))
     return Thresholds(max(own, _LEAST_OWN / K), max(joint, _LEAST_JOINT / K))
 
 
@@ -213,6 +217,13 @@ def _threshold(found: Tensor, decoys: Tensor, rate: float) -> float:
     above, false = (one.flip(0).cumsum(0).flip(0) for one in (found, decoys))
     fine = (1.0 + false) <= rate * above
     return float(fine.nonzero()[0]) / _BINS if bool(fine.any()) else 2.0
+
+
+def _single(K: int, chance: float) -> float:
+    """Return the r^2 that K samples of a pair exceed by a given chance, by Wallace's normal number for Student's t."""
+    nu = max(K - 2, 1)
+    z = -float(torch.special.ndtri(torch.tensor(0.5 * chance, dtype=torch.float64, device="cpu")))
+    return -math.expm1(-((z * (8 * nu + 3) / (8 * nu + 1)) ** 2) / nu)
 
 
 def _of_three(values: Tensor, dim: int) -> Tensor:

@@ -183,3 +183,11 @@ def test_fewer_parameters_than_an_output_may_have():
     A = normal(40, 5).sign() + normal(40, 5, seed=1) / 10
     J = zh.sparse_jacobian(lambda z: z @ A.to(z).mT, torch.zeros(5).double(), smoothing(100))
     torch.testing.assert_close(J.dense(), A, atol=3e-3, rtol=0)
+
+
+@pytest.mark.parametrize("m", [2, 9])
+def test_outputs_of_few_numbers(m):
+    J = zh.sparse_jacobian(lambda z: z[:, :m], torch.zeros(150).double(), zh.Smoothing(sigma=1.0, samples=100, seed=0))
+    torch.testing.assert_close(J.dense(), torch.eye(m, 150).double(), atol=1e-3, rtol=0.0)
+    assert J.explained > 0.999
+    assert torch.equal(J.untouched, torch.arange(150) >= m)

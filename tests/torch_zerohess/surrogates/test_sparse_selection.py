@@ -75,3 +75,17 @@ def test_thresholds_of_large_images_are_those_of_all_pairs(monkeypatch):
     every = thresholds(u, centered(d), grids, 0.1)
     assert every.joint < 1.0
     assert few.joint == pytest.approx(every.joint, rel=0.15)
+
+
+def test_few_pairs_count_and_chance_alone_does_not():
+    """Of 200 outputs of pure noise at most a tenth should have any pair: 40 is more than four standard errors more."""
+    generator, none = torch.Generator().manual_seed(0), 0
+    grids = Grids.of(torch.Size([3]), None)
+    for _ in range(200):
+        u, noise = (centered(torch.randn(60, k, generator=generator)) for k in (150, 3))
+        none += bool(len(next(candidates(u, noise, grids, thresholds(u, noise, grids, 0.1)))[0]))
+    assert none < 40
+    found = list(candidates(u, u[:, :3], grids, thresholds(u, u[:, :3], grids, 0.1)))
+    assert {(0, 0), (1, 1), (2, 2)} <= {
+        pair for one in found for pair in zip(one[0].tolist(), one[1].tolist(), strict=True)
+    }

@@ -66,8 +66,9 @@ def sparse_jacobian(
     kept entries need. ValueError too if the weights of "uniform" leave too few samples that count, as they do in more
     than a few dimensions.
 
-    `standard_error` of the result holds for curved and for noisy fn, whose residuals have a variance that depends on
-    the perturbation. With sampler "sobol" it is too large, because these samples fill space more evenly.
+    `standard_error` of the result allows for residuals whose variance depends on the perturbation, as it does for
+    curved and for noisy fn. With few samples and strong curvature it is too small. With sampler "sobol" it is too
+    large, because these samples fill space more evenly.
 
     Source: screening by correlation (Fan and Lv 2008), false discoveries by decoys (Barber and Candes 2015), standard
     errors of samples of different variance (HC3, MacKinnon and White 1985).

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer
+from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_regression import predicted, significant, slopes
 from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, spaced, thresholds
@@ -67,16 +67,27 @@ class SparseSettings:
         keep = min(_KEEP, n) if keep is None else keep
         if not 1 <= checked_integer("keep", keep) <= n:
             raise ValueError(f"keep must be between 1 and the number of parameters, {n}, got {keep}")
-        if not 0.0 < rate < 1.0:
-            raise ValueError(f"rate must be between 0 and 1, got {rate}")
+        checked_rate(rate)
         if grid is None:
             return cls(keep, rate)
-        if not isinstance(grid, Sequence) or not all(isinstance(one, int) for one in grid):
-            raise TypeError(f"grid must be rows and columns (and channels), two or three integers, got {grid!r}")
+        check_grid(grid)
         if len(grid) not in (2, 3) or min(grid) < 1 or math.prod(grid) != n:
             raise ValueError(f"grid must be rows and columns (and channels) of {n} parameters, got {grid}")
         rows, columns, *channels = grid
         return cls(keep, rate, (rows, columns, channels[0] if channels else 1))
+
+
+def check_grid(grid: Sequence[int]) -> None:
+    """Raise TypeError for a grid that is no sequence of integers."""
+    if not isinstance(grid, Sequence) or not all(type(one) is int for one in grid):
+        raise TypeError(f"grid must be rows and columns (and channels), two or three integers, got {grid!r}")
+
+
+def checked_rate(rate: float) -> float:
+    """Return a rate; TypeError for no number, ValueError for one that is not between 0 and 1."""
+    if not 0.0 < checked_number("rate", rate) < 1.0:
+        raise ValueError(f"rate must be between 0 and 1, got {rate}")
+    return rate
 
 
 def fewest_samples(keep: int) -> int:
@@ -126,9 +137,8 @@ def _validated(
     """Return the ridges that predict held-out samples best, and the shares that they and a dense fit predict."""
     part, inner = _subset(grids, changes)
     d = changes[:, part]
-    before = replace(
-        previous, index=previous.index[part], values=previous.values[part], standard_error=previous.values[part]
-    )
+    rows = {name: getattr(previous, name)[part] for name in ("index", "values", "standard_error")}
+    before = replace(previous, **rows)
     fold = torch.arange(len(u), device=u.device) % _FOLDS
     choices = _RIDGES[:3] if first else _RIDGES
     rests, total, dense = [0.0] * len(choices), 0.0, 0.0

@@ -1,12 +1,13 @@
 """Sparse surrogate: an affine map of outputs that depend on few parameters each, from fewer points than parameters."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, fit_sparse
+from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_grid, checked_rate, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.surrogate import checked, fitted, scaled
 
@@ -37,6 +38,10 @@ class SparseSurrogate:
     ) -> None:
         keep = checked_integer("keep", keep, 1)
         capacity = checked_integer("capacity", capacity, 2)
+        rate = checked_rate(rate)
+        if grid is not None:
+            check_grid(grid)
+            SparseSettings.checked(math.prod(grid), keep=None, rate=rate, grid=grid)
         self.keep, self.rate, self.grid, self.capacity = keep, rate, grid, capacity
         self.jacobian: SparseJacobian | None = None
         """Of the latest fit. `explained` is the share of the change of held-out outputs that it predicts."""

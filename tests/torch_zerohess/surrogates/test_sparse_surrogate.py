@@ -144,3 +144,17 @@ def test_very_few_points_give_their_mean():
 def test_wrong_settings_are_named(settings, message):
     with pytest.raises(ValueError, match=message):
         SparseSurrogate(**settings).fit(normal(P, n), image(normal(P, n)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"rate": 0.0}, ValueError, "rate must be between 0 and 1, got 0.0"),
+        ({"rate": "a"}, TypeError, "rate must be"),
+        ({"grid": (3,)}, ValueError, "grid must be rows and columns"),
+        ({"grid": [True, True]}, TypeError, "grid must be rows and columns"),
+    ],
+)
+def test_settings_are_checked_when_they_are_given(settings, error, message):
+    with pytest.raises(error, match=message):
+        SparseSurrogate(**settings)

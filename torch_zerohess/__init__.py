@@ -13,6 +13,7 @@ Hessian-vector products of F are estimated from one batch of evaluations of f (S
 from torch_zerohess import adapters, evaluators, heads, losses, optim, surrogates
 from torch_zerohess.autograd.blackbox import BlackBox, smooth
 from torch_zerohess.autograd.curvature import CurvatureOperator, hvp
+from torch_zerohess.autograd.sparse_layer import SparseBlackBox
 from torch_zerohess.doctor import doctor
 from torch_zerohess.estimation.estimate import estimate
 from torch_zerohess.estimation.finite_differences import finite_difference_hvp
@@ -33,6 +34,7 @@ __all__ = [
     "Memory",
     "Minimum",
     "Smoothing",
+    "SparseBlackBox",
     "SparseJacobian",
     "adapters",
     "doctor",

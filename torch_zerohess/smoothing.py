@@ -1,5 +1,6 @@
 """Settings of the Gaussian smoothing: the one object that says how a black box is sampled."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -244,6 +245,18 @@ class Smoothing:
         if len(self.sigma) != n:
             raise ValueError(f"sigma has {len(self.sigma)} elements, but x has {n} parameters: give one number or {n}")
         return self.sigma.to(device=device, dtype=torch.float64)
+
+
+def settings_of(smoothing: Smoothing) -> dict[str, Any]:
+    """Return all settings by name, for a state_dict."""
+    return {one.name: getattr(smoothing, one.name) for one in fields(Smoothing)}
+
+
+def smoothing_of(settings: Mapping[str, Any]) -> Smoothing:
+    """Return the smoothing that `settings_of` described; KeyError if a name is none of a setting."""
+    if unknown := settings.keys() - {one.name for one in fields(Smoothing)}:
+        raise KeyError(f"state must be a state_dict of such a layer, this one has {', '.join(sorted(unknown))}")
+    return Smoothing(**settings)
 
 
 def check_smoothing(value: Any) -> None:

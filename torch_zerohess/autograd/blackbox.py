@@ -4,7 +4,6 @@ import contextlib
 import copy
 import functools
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 import torch
@@ -23,7 +22,7 @@ from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.smoothing import Smoothing, check_smoothing
+from torch_zerohess.smoothing import Smoothing, check_smoothing, settings_of, smoothing_of
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 
@@ -225,7 +224,7 @@ class BlackBox(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the settings, so that a state_dict resumes an annealed sigma, and what the memory keeps."""
-        settings = {one.name: getattr(self.smoothing, one.name) for one in fields(Smoothing)}
+        settings = settings_of(self.smoothing)
         return settings if self.memory is None else {**settings, "memory": self.memory.state_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -234,9 +233,7 @@ class BlackBox(nn.Module):
         memory = settings.pop("memory", None)
         if memory is not None and self.memory is None:
             raise ValueError("the state has a memory, but the layer has none: make it with memory=Memory()")
-        if unknown := settings.keys() - {one.name for one in fields(Smoothing)}:
-            raise KeyError(f"state must be a state_dict of a BlackBox, this one has {', '.join(sorted(unknown))}")
-        smoothing = Smoothing(**settings)
+        smoothing = smoothing_of(settings)
         if memory is not None and self.memory is not None:
             self.memory.load_state_dict(memory)
         self.smoothing = smoothing  # after what may fail

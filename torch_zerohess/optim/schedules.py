@@ -8,6 +8,7 @@ from torch import nn
 
 from torch_zerohess.arguments import check_state, checked_integer, checked_number
 from torch_zerohess.autograd.blackbox import BlackBox
+from torch_zerohess.autograd.sparse_layer import SparseBlackBox
 
 
 class LinearSigma:
@@ -17,7 +18,7 @@ class LinearSigma:
     value, each `step()` the next, and `state_dict` / `load_state_dict` resume it.
 
     Args:
-        module_or_modules: a `BlackBox`, a module that contains some, or several of either.
+        module_or_modules: a `BlackBox` or `SparseBlackBox`, a module that contains some, or several of either.
         start, end: sigma in units of the black box's input, positive.
         steps: number of `step()` calls from start to end, at least 1.
         hold: number of `step()` calls before that.
@@ -75,13 +76,14 @@ class LinearSigma:
             one.smoothing = one.smoothing.replace(sigma=self.sigma)
 
 
-def _layers_of(module_or_modules: nn.Module | Iterable[nn.Module]) -> list[BlackBox]:
+def _layers_of(module_or_modules: nn.Module | Iterable[nn.Module]) -> list[BlackBox | SparseBlackBox]:
     """Return the black boxes in modules, each once."""
     single = isinstance(module_or_modules, nn.Module) or not isinstance(module_or_modules, Iterable)
     modules: list[Any] = [module_or_modules] if single else [*module_or_modules]  # type: ignore[misc]
-    found: dict[BlackBox, None] = {}
+    found: dict[BlackBox | SparseBlackBox, None] = {}
     for one in modules:
-        inside = [part for part in one.modules() if isinstance(part, BlackBox)] if isinstance(one, nn.Module) else []
+        parts = one.modules() if isinstance(one, nn.Module) else []
+        inside = [part for part in parts if isinstance(part, (BlackBox, SparseBlackBox))]
         if not inside:
             raise TypeError(f"module_or_modules must be a BlackBox, or modules with a BlackBox inside, got {one!r}")
         found.update(dict.fromkeys(inside))

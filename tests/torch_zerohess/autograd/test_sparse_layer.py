@@ -1,0 +1,151 @@
+"""A layer with sparse Jacobians: against the exact Jacobian of a blurred image, and against the dense layer."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+import torch_zerohess as zh
+
+SIDE, N = 12, 144
+SMOOTHING = zh.Smoothing(sigma=0.1, samples=64, seed=0)
+
+
+def blurred(z):
+    """[K, 144] -> [K, 10, 10]: each pixel is the mean of the tanh of 3x3 texels."""
+    return nn.functional.avg_pool2d(z.tanh().view(-1, SIDE, SIDE), 3, 1)
+
+
+def drawn(*shape, seed=0):
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+X, TARGET = drawn(3, N), drawn(3, 10, 10, seed=1)
+
+
+def exact(x):
+    return torch.stack([torch.func.jacrev(lambda z: blurred(z[None])[0])(one) for one in x]).flatten(1, 2)
+
+
+def gradient_and_product(layer, v):
+    """Of half of the squared distance of the outputs from a target: J^T r, and its derivative along v."""
+    x = X.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(0.5 * (layer(x) - TARGET).square().sum(), x, create_graph=True)
+    (product,) = torch.autograd.grad((slope * v).sum(), x)
+    return slope.detach(), product
+
+
+def relative(one, other):
+    return float((one - other).norm() / other.norm())
+
+
+def test_gradient_and_gauss_newton_product():
+    """The noise of the dense layer, with as many evaluations, is a hundred times as large."""
+    v, jacobian = drawn(3, N, seed=2), exact(X)
+    slope = torch.einsum("bmn,bm->bn", jacobian, (blurred(X) - TARGET).flatten(1))
+    product = torch.einsum("bmn,bm->bn", jacobian, torch.einsum("bmn,bn->bm", jacobian, v))
+    found = gradient_and_product(zh.SparseBlackBox(blurred, SMOOTHING), v)
+    assert relative(found[0], slope) < 0.05
+    assert relative(found[1], product) < 0.05
+    dense = gradient_and_product(zh.BlackBox(blurred, SMOOTHING), v)
+    assert relative(dense[0], slope) > 0.5
+    assert relative(dense[1], product) > 5.0
+
+
+def test_the_layer_is_linear_around_the_point_of_the_call():
+    layer, v = zh.SparseBlackBox(blurred, SMOOTHING), drawn(3, N, seed=2)
+    slope, product = gradient_and_product(layer, v)
+    jacobian = torch.stack([one.dense() for one in layer.jacobians]).flatten(1, 2)
+    residual = (blurred(X) - TARGET).flatten(1)
+    torch.testing.assert_close(slope, torch.einsum("bmn,bm->bn", jacobian, residual))
+    along = torch.einsum("bmn,bn->bm", jacobian, v)
+    torch.testing.assert_close(product, torch.einsum("bmn,bm->bn", jacobian, along))
+
+
+def test_a_network_learns_through_it():
+    """Newton steps with few samples: the support is kept from call to call."""
+    torch.manual_seed(0)
+    network, inputs = nn.Linear(5, N).double(), drawn(8, 5)
+    wanted = blurred(nn.Linear(5, N).double()(inputs)).detach()
+    layer = zh.SparseBlackBox(blurred, zh.Smoothing(sigma=0.1, samples=30, seed=0), grid=(SIDE, SIDE))
+    settings = {"solver": "dual", "modification": "abs", "damping": 1e-3, "adapt": False}
+    optimizer = zh.optim.NewtonCG(network.parameters(), radius=1.0, curvature="gauss_newton", **settings)
+    losses = [float(optimizer.step(lambda: (layer(network(inputs)) - wanted).square().mean())) for _ in range(12)]
+    assert losses[-1] < 0.02 * losses[0]
+
+
+def test_evaluations_and_what_is_evaluated_without_derivatives():
+    calls = []
+
+    def counted(z):
+        calls.append(len(z))
+        return blurred(z)
+
+    layer = zh.SparseBlackBox(counted, SMOOTHING)
+    layer(X.clone().requires_grad_())
+    assert calls == [3, 128, 128, 128]
+    calls.clear()
+    with torch.no_grad():
+        layer(X.clone().requires_grad_())
+    layer(X)
+    assert calls == [3, 3]
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 1)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_shapes_and_types(batch, dtype):
+    x = drawn(*batch, N).to(dtype).requires_grad_()
+    y = zh.SparseBlackBox(blurred, SMOOTHING)(x)
+    assert y.shape == (*batch, 10, 10)
+    assert y.dtype == dtype
+    torch.testing.assert_close(y.detach(), blurred(x.detach().reshape(-1, N)).view_as(y))
+    y.sum().backward()
+    assert x.grad.shape == x.shape
+
+
+def test_one_seed_gives_the_same_bits_and_every_element_its_own_noise():
+    x = X[:1].repeat(2, 1).requires_grad_()
+    results = []
+    for _ in range(2):
+        layer = zh.SparseBlackBox(lambda z: blurred(z).round(decimals=1), SMOOTHING)
+        results.append(torch.autograd.grad(layer(x).square().sum(), x)[0])
+    assert torch.equal(*results)
+    assert not torch.equal(results[0][0], results[0][1])
+
+
+def test_what_earlier_calls_have_found_helps_later_ones():
+    jacobian = exact(X[:1])
+    layer = zh.SparseBlackBox(blurred, zh.Smoothing(sigma=0.1, samples=24, seed=0), grid=(SIDE, SIDE))
+    errors = []
+    for seed in range(4):
+        layer.smoothing = layer.smoothing.replace(seed=seed)
+        layer(X[:1].clone().requires_grad_())
+        errors.append(relative(layer.jacobians[0].dense().flatten(0, 1), jacobian[0]))
+    assert errors[-1] < 0.5 * errors[0]
+
+
+def test_sigma_is_annealed_and_saved():
+    layer, other = (zh.SparseBlackBox(blurred, SMOOTHING) for _ in range(2))
+    schedule = zh.LinearSigma(nn.Sequential(nn.Flatten(), layer), 0.4, 0.2, steps=2)
+    schedule.step()
+    assert layer.smoothing.sigma == pytest.approx(0.3)
+    other.load_state_dict(layer.state_dict())
+    assert other.smoothing == layer.smoothing
+
+
+def test_what_it_refuses():
+    x = X.clone().requires_grad_()
+    layer = zh.SparseBlackBox(blurred, SMOOTHING)
+    with pytest.raises(ValueError, match="for one number use estimate"):
+        zh.SparseBlackBox(lambda z: z.sum(1), SMOOTHING)(x)
+    with pytest.raises(RuntimeError, match="use BlackBox"):
+        torch.func.grad(lambda z: layer(z).sum())(X)
+    with pytest.raises(RuntimeError, match="use BlackBox"):
+        torch.func.vmap(layer)(X)
+    with pytest.raises(ValueError, match="grid"):
+        zh.SparseBlackBox(blurred, SMOOTHING, grid=(3, 3))(x)
+    with pytest.raises(ValueError, match="fn returned nan at the point"):
+        zh.SparseBlackBox(lambda z: blurred(z) * math.nan, SMOOTHING)(x)
+    with pytest.raises(TypeError, match="smoothing must be a Smoothing"):
+        zh.SparseBlackBox(blurred, 0.1)

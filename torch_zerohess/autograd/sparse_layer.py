@@ -1,0 +1,123 @@
+"""A layer whose derivatives are a sparse smoothed Jacobian, estimated from its own evaluations."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_zerohess.arguments import check_state
+from torch_zerohess.autograd import transforms
+from torch_zerohess.autograd.marker import Input
+from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate_center
+from torch_zerohess.estimation.inputs import checked_input, working
+from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
+from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.smoothing import Smoothing, check_smoothing, following_seed, settings_of, smoothing_of
+from torch_zerohess.surrogates.sparse_fit import SparseSettings
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+
+
+class SparseBlackBox(nn.Module):
+    """A black box whose outputs depend on few parameters each, as a layer: y = f(x), dy/dx = the smoothed Jacobian.
+
+    `BlackBox` estimates derivatives without bias and with a noise that grows with n. This layer finds which parameters
+    each output depends on, from the evaluations of the call and what earlier calls have found, see `sparse_jacobian`.
+    Its derivatives have far less noise where Jacobians are sparse. They are biased by the entries that are not found,
+    and useless where the Jacobian is dense: look at `jacobians[b].explained`, which should be near 1.
+
+    The layer is linear in x around the point of the call. So the second derivatives of a loss behind it are J^T H J,
+    the Gauss-Newton matrix, with the Hessian H of the loss in the outputs.
+
+    `backward`, double backward and `torch.autograd.functional` work, and curvature="gauss_newton" of `optim.NewtonCG`.
+    Inside of `torch.func` transforms and `torch.compile` use `BlackBox`: here they raise RuntimeError.
+
+    Args:
+        fn: [K, n] -> [K, *out], an output of at least two numbers. It gets detached tensors.
+        smoothing: how to sample around each element of the batch; its evaluations per element are 2 * samples, besides
+            f(x).
+        keep, rate, grid: see `sparse_jacobian`.
+        vectorized: False if fn takes one point [n] at a time.
+        evaluator: where evaluations run; in this process if None.
+        on_nonfinite: "raise", "drop", or a number that replaces NaN and infinities; f(x) must be finite for "drop".
+
+    Shapes: x [*batch, n] -> [*batch, *out], of the dtype and on the device of x. If no derivative can be asked for,
+    only f(x) is evaluated.
+
+    Example:
+        >>> blur = lambda z: torch.nn.functional.avg_pool2d(z.view(-1, 20, 20), 3, 1).round(decimals=1)
+        >>> layer = SparseBlackBox(blur, Smoothing(sigma=1.0, samples=100, seed=0), grid=(20, 20))
+        >>> x = torch.zeros(400, requires_grad=True)
+        >>> layer(x).sum().backward()
+        >>> round(float(x.grad.view(20, 20)[5:15, 5:15].mean()), 1), layer.jacobians[0].explained > 0.9
+        (1.0, True)
+    """
+
+    jacobians: list[SparseJacobian]
+    """Of the latest call with derivatives, one per element of the batch."""
+
+    def __init__(
+        self,
+        fn: Callable[..., Any],
+        smoothing: Smoothing,
+        *,
+        keep: int | None = None,
+        rate: float = 0.1,
+        grid: Sequence[int] | None = None,
+        vectorized: bool = True,
+        evaluator: Evaluator | None = None,
+        on_nonfinite: str | float = "raise",
+    ) -> None:
+        super().__init__()
+        check_smoothing(smoothing)
+        self.smoothing = smoothing
+        self.call = BlackBoxCall(fn, vectorized, evaluator, on_nonfinite=on_nonfinite)
+        self.settings: dict[str, Any] = {"keep": keep, "rate": rate, "grid": grid}
+        self.jacobians = []
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return values [*batch, *out] for x [*batch, n]."""
+        x = checked_input(x)
+        if transforms.watched(x) or transforms.has_tangent(x):
+            raise RuntimeError("a SparseBlackBox has no torch.func transforms and is not compiled: use BlackBox")
+        batch, n = x.shape[:-1], x.shape[-1]
+        SparseSettings.checked(n, **self.settings)
+        center = working(x).detach().reshape(-1, n).clone()
+        values = evaluate_center(self.call, center, ()).to(center.dtype)
+        if transforms.derivative_possible(x):
+            self.jacobians = self._jacobians(center)
+            change = Input.apply(working(x)).reshape(-1, n) - center
+            values = values + torch.stack([J.matvec(d) for J, d in zip(self.jacobians, change, strict=True)])
+        return values.reshape((*batch, *values.shape[1:])).to(x.dtype)
+
+    def _jacobians(self, points: Tensor) -> list[SparseJacobian]:
+        """Return the Jacobian at every point [B, n]. Each begins with what was found last."""
+        seed, call = self.smoothing.drawn_seed(), self.call
+        known = self.jacobians[-1] if self.jacobians else None
+        found: list[SparseJacobian] = []
+        for b, point in enumerate(points):
+            if known is not None and known.n != len(point):
+                known = None
+            known = sparse_jacobian(
+                call.fn,
+                point,
+                self.smoothing.replace(seed=following_seed(seed, b)),
+                previous=known,
+                vectorized=call.vectorized,
+                evaluator=call.evaluator,
+                on_nonfinite=call.on_nonfinite,
+                **self.settings,
+            )
+            found.append(known)
+        return found
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the settings of the smoothing, so that a state_dict resumes an annealed sigma."""
+        return settings_of(self.smoothing)
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        check_state(state, {}, "a SparseBlackBox")
+        self.smoothing = smoothing_of(state)
+
+    def extra_repr(self) -> str:
+        return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"

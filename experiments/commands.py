@@ -60,6 +60,9 @@ COMMANDS = {
     "noise": Command("experiments.studies.noise:noise", "our search and others on noisy functions of BBOB", long=True),
     "batches": Command("experiments.studies.batches:batches", "several points at once, in worker processes", long=True),
     "recovery": Command("experiments.studies.recovery:recovery", "sparse Jacobians from few samples", long=True),
+    "sparse_layers": Command(
+        "experiments.studies.sparse_layers:sparse_layers", "derivatives behind a network by three layers", long=True
+    ),
     "full_setting": Command(
         "experiments.studies.full_setting:full_setting", "time that tasks save over the source's setting", long=True
     ),

@@ -141,10 +141,12 @@ def _fitted(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     show = query.take("show", "both", ("both", "evaluations", "seconds"))
     interval = query.take("share", "plain", ("plain", "interval")) == "interval"
     quartiles = query.take("quartiles", "hide", ("hide", "show")) == "show"
+    worst = query.take("worst", "hide", ("hide", "show")) == "show"
     titles = query.take("titles", "show", ("show", "hide")) == "show"
     query.end()
     table = table[(table["metric"] == metric) & (table["level"] == float(level))]
-    cells = {(row["task"], row["method"]): _cell(row, show, interval, quartiles) for row in table.to_dict("records")}
+    records = table.to_dict("records")
+    cells = {(row["task"], row["method"]): _cell(row, show, interval, quartiles, worst) for row in records}
     about = table.drop_duplicates("method").set_index("method")
     sizes = table.drop_duplicates("task").set_index("task")["n"]
     known = ["title", "uses"] if titles else ["uses"]
@@ -158,6 +160,7 @@ def _fitted(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     note += ", of the starts that get there; in brackets the share of starts that get there, if not all do"
     note += " (95 % interval)." if interval else "."
     note += " The quartiles stand in brackets after each median." if quartiles else ""
+    note += " After the median stand the evaluations of the worst start that gets there." if worst else ""
     if any(str(one).startswith("image") for one in about["uses"]):
         note += " Where a task has no image, a method that uses the image uses the loss."
     return markdown(headers, rows), table, note
@@ -167,7 +170,7 @@ def _heading(task: str, n: float) -> str:
     return task.upper() if n != n else f"{task.upper()}, n = {n:.0f}"
 
 
-def _cell(row: dict[Any, Any], show: str, interval: bool, quartiles: bool) -> str:
+def _cell(row: dict[Any, Any], show: str, interval: bool, quartiles: bool, worst: bool) -> str:
     """A dash where fewer than half of the starts get there."""
     share = ""
     if row["reached"] < row["runs"]:
@@ -178,9 +181,10 @@ def _cell(row: dict[Any, Any], show: str, interval: bool, quartiles: bool) -> st
     if row["evaluations"] != row["evaluations"]:
         return "-" + share
     shown = {"evaluations": "", "seconds": " s"}
-    return (
-        ", ".join(_median(row, one, quartiles) + unit for one, unit in shown.items() if show in ("both", one)) + share
-    )
+    cells = [_median(row, one, quartiles) + unit for one, unit in shown.items() if show in ("both", one)]
+    if worst:
+        cells[0] += f" (at most {number(row['evaluations_worst'])})"
+    return ", ".join(cells) + share
 
 
 def _median(row: dict[Any, Any], measure: str, quartiles: bool) -> str:

@@ -6,7 +6,8 @@
 What is between the marks is written by the command. Marks in code are left alone. Options of a table:
 
 - medians of fits: `tasks=`, `methods=` (names with commas between them), `metric=image|parameter`, `level=90|99|99.9`,
-  `show=both|evaluations|seconds`, `share=plain|interval`, `quartiles=hide|show`, `titles=show|hide`;
+  `show=both|evaluations|seconds`, `share=plain|interval`, `quartiles=hide|show`, `worst=hide|show`,
+  `titles=show|hide`;
 - networks: `tasks=`, `methods=`, `titles=show|hide`;
 - `speed_up` in place of a name: mean ratios of methods to `reference=` over the tables in `of=`, and `methods=`;
 - `table_2` in place of a name: the ratios of the source's Table 2 beside our ratios from the tables in `of=`; `tasks=`,

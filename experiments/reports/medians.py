@@ -41,14 +41,14 @@ def reached(
 def medians(table: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Return a row per cell, in the order of `table`: runs, reached, share, and medians with quartiles.
 
-    Medians (`evaluations`, `seconds`) and quartiles (`..._low`, `..._high`) are over the runs that got there. They are
-    NaN if these are fewer than half.
+    Medians (`evaluations`, `seconds`), quartiles (`..._low`, `..._high`) and the worst (`..._worst`) are over the runs
+    that got there. They are NaN if these are fewer than half.
     """
     groups = table.groupby(list(by), sort=False)[list(MEASURES)]
     runs, there = groups.size(), groups.count()[MEASURES[0]]
     share = there / runs
     found = pd.DataFrame({"runs": runs, "reached": there, "share": share})
-    for name, quantile in (("", 0.5), ("_low", 0.25), ("_high", 0.75)):
+    for name, quantile in (("", 0.5), ("_low", 0.25), ("_high", 0.75), ("_worst", 1.0)):
         values = groups.quantile(quantile).where(share >= 0.5)
         for measure in MEASURES:
             found[measure + name] = values[measure]

@@ -13,6 +13,8 @@ import tyro
 from experiments.ensembles.provenance import read_command
 from experiments.methods import METHODS
 from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, chosen, fitting
+from experiments.problems.catalogue import load as load_task
+from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Preset
 from experiments.reports import result_files
 from experiments.reports.medians import medians, reached
@@ -37,7 +39,8 @@ def store(
     A fitting task has a row per method, error and level. A task that trains a network has a row per method. Rows say
     how many evaluations a run may use (`evaluation_limit`) and how many runs the limit of time ended. Refused if
     the runs are of several commits, of code with changes, of several machines, presets or limits, or not finished.
-    A task with a measure of its own, as the silhouettes of MESHFIT, has its median and least value where runs ended.
+    A task with a measure of its own, as the silhouettes of MESHFIT, has its median and least value where runs ended. A
+    task that trains a network has the median and the worst value of its measure, as the decibels of CNN-TEXTURE.
 
     Args:
         folder: written by `run` or `robustness`.
@@ -58,7 +61,8 @@ def store(
         raise SystemExit(f"{count} runs in {folder} are unfinished: the same `run` goes on with them")
     known = read_command(folder)
     whence = result_files.origin(known["commands"], f"results in {folder}") | _protocol(known["settings"], wanted)
-    table = trained(results) if networks else fitted(results, levels).merge(measured(results, whence["preset"]), "left")
+    preset = whence["preset"]
+    table = trained(results, preset) if networks else fitted(results, levels).merge(measured(results, preset), "left")
     table = table.assign(**whence)
     table = table[[*(one for one in table if one not in result_files.ORIGIN), *result_files.ORIGIN]]
     print(result_files.write(_added(table, name) if add else table, name))
@@ -122,7 +126,7 @@ def fitted(results: Results, levels: Sequence[float] = LEVELS) -> pd.DataFrame:
     found = medians(reached(cells, ("task", "method"), levels), ("task", "method", "metric", "level"))
     found["level"] = (100 * found["level"]).round(6)
     about = pd.DataFrame([_about(task, method, runs) for (task, method), runs in cells])
-    measures = [f"{one}{end}" for one in ("evaluations", "seconds") for end in ("", "_low", "_high")]
+    measures = [f"{one}{end}" for one in ("evaluations", "seconds") for end in ("", "_low", "_high", "_worst")]
     shares = with_intervals(found)
     return about.merge(shares, on=["task", "method"])[[*about, "metric", "level", *measures, *_SHARES]]
 
@@ -146,14 +150,17 @@ def measured(results: Results, preset: Preset) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*(rows[0] if rows else ("task", "method"))])
 
 
-def trained(results: Results) -> pd.DataFrame:
+def trained(results: Results, preset: Preset) -> pd.DataFrame:
     """Return a row per task and method: how far errors of held-out images went down, at the median and at worst.
+
+    And the task's own measure of the parameter error after training.
 
     A run that failed counts in `runs` alone.
     """
     rows = []
     for task, methods in results.runs.items():
-        path = results.folder / task / HELD_OUT
+        path, about = results.folder / task / HELD_OUT, load_task(task, preset)
+        assert isinstance(about, NetworkTask)
         known = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["method", "run"])
         for method, runs in methods.items():
             ended = [run.outcome.run for run in runs if run.outcome.status != "failed"]
@@ -161,6 +168,9 @@ def trained(results: Results) -> pd.DataFrame:
             if len(mine) < len(ended) or not ended:
                 raise SystemExit(f"{path} has {len(mine)} of {len(ended)} runs of {method}: call the same `run` again")
             (found,) = per_method(mine).to_dict("records")
+            errors = found["parameter_after"], mine["parameter_after"].max()
+            median, worst = (about.measured(float(one)) for one in errors)
+            found |= {"measure": about.measure, "measure_median": median, "measure_worst": worst}
             rows.append(_about(task, method, runs) | found | {"runs": len(runs), "share": found["reached"] / len(runs)})
     table = with_intervals(pd.DataFrame(rows)).drop(columns=["parameter_before", "parameter_after"])
     return table[[*(name for name in table if name not in _SHARES), *_SHARES]]

@@ -99,10 +99,10 @@ def compared(task: Task, samples: tuple[int, ...], calls: int, seed: int) -> lis
                 began = time.process_time()
                 loss = loss_of(network(inputs))
                 (gradient,) = torch.autograd.grad(loss, network.weight, retain_graph=True)
-                product = zh.hvp(loss, network.weight, v, mode="gauss_newton")
+                (product,) = zh.hvp(loss, [network.weight], [v], mode="gauss_newton")
                 seconds = time.process_time() - began
-                errors = (float((a - b).norm() / b.norm()) for a, b in zip((gradient, product), truth, strict=True))
-                rows.append(Accuracy(name, _BATCH * (2 * count + 1), call, *errors, seconds))
+                errors = [float((a - b).norm() / b.norm()) for a, b in zip((gradient, product), truth, strict=True)]
+                rows.append(Accuracy(name, _BATCH * (2 * count + 1), call, errors[0], errors[1], seconds))
     return rows
 
 

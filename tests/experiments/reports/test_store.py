@@ -1,6 +1,7 @@
 """Tables that are stored, and the documents that quote them, against numbers computed by hand."""
 
 import csv
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from scipy.stats import binomtest
 
 from experiments.ensembles import provenance
 from experiments.problems import catalogue
+from experiments.problems.tasks import cnn
 from experiments.reports import result_files
 from experiments.reports.document_tables import SPEED_UP, Query, number, table_of
 from experiments.reports.documents import filled, readme
@@ -84,8 +86,10 @@ def test_a_row_has_medians_quartiles_shares_and_its_origin(folder, results):
     there = {(one["method"], one["metric"], one["level"]): one for one in rows(results, "bowls")}
     assert len(there) == 2 * 2 * 3
     ours, theirs = there["descent", "image", "99"], there["fr22", "image", "99"]
-    assert [float(ours[f"evaluations{end}"]) for end in ("", "_low", "_high")] == [7.5, 6.75, 8.25]
-    assert [float(ours[f"seconds{end}"]) for end in ("", "_low", "_high")] == [1.25, 1.125, 1.375]
+    ends = ("", "_low", "_high", "_worst")
+    assert [float(ours[f"evaluations{end}"]) for end in ends] == [7.5, 6.75, 8.25, 9.0]
+    assert [float(ours[f"seconds{end}"]) for end in ends] == [1.25, 1.125, 1.375, 1.5]
+    assert "| 7.5 (at most 9) |" in table_of("bowls", Query.of(["show=evaluations", "worst=show"]))
     assert (ours["reached"], ours["runs"], ours["first_run"], ours["n"]) == ("2", "2", "3", "2")
     assert (ours["preset"], ours["limit"], ours["commit"]) == ("fast", "15", COMMIT)
     assert ours["command"] == "python -m experiments run bowl --limit 15"
@@ -129,6 +133,9 @@ def test_networks_have_a_row_per_method(tmp_path, results):
     assert [float(row[f"parameter_divided_{end}"]) for end in ("low", "high")] == [148, 316]
     assert float(row["image_divided"]) == (20 + 8) / 2
     assert float(row["image_divided_worst"]) == 8
+    assert row["measure"] == "rms error [degrees]"
+    assert float(row["measure_median"]) == pytest.approx(cnn.DEGREES * math.sqrt((0.02 + 0.125) / 2), rel=1e-5)
+    assert float(row["measure_worst"]) == pytest.approx(cnn.DEGREES * math.sqrt(0.125), rel=1e-5)
     assert (row["reached"], row["runs"], row["n"]) == ("1", "3", "")
     text = table_of("networks", Query())
     assert "parameter error divided by | at worst" in text

@@ -45,7 +45,7 @@ REFUSED = [
     ({"restarts": 1.5}, TypeError, "restarts must be an integer, got 1.5"),
     ({"noise": "a"}, TypeError, "noise must be a number, got 'a'"),
     ({"noise": math.inf}, ValueError, "noise must be finite and at least 0, got inf"),
-    ({"tolerance": 2.0}, ValueError, "tolerance must be between 0 and 1"),
+    ({"tolerance": 2.0}, ValueError, "tolerance must be positive and below 1"),
     ({"tolerance": "fine"}, TypeError, "tolerance must be a number, got 'fine'"),
     ({"pool": 10.5}, TypeError, "pool must be an integer, got 10.5"),
     ({"sigma": 0.0}, ValueError, "sigma must be positive"),

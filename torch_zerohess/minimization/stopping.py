@@ -36,7 +36,8 @@ class Stopping:
         if search.solved and (self.xtol, self.ftol) != (None, None):
             return running.ending(arrived=True), "the search has arrived at x"
         if self.agrees and not running.noise and search.agreed >= _AGREED:
-            return "solved", f"{search.agreed} rounds in a row have arrived at {search.where}"
+            where = "points with the loss at x: the minimum is not unique" if search.apart else "x"
+            return "solved", f"{search.agreed} rounds in a row have arrived at {where}"
         if running.spent:
             return "budget", running.budget
         if self.time_limit is not None and running.seconds > self.time_limit:

@@ -1,8 +1,7 @@
 """Ask and tell, the same for every search: the checks, the values told, and the state that is saved.
 
-A search is a `Method`, and `AskTell` puts the public classes around it. `tell` computes the whole next `State` and
-assigns it at the end, so a search is as it was if anything raises. `ask` reads the state, and notes which points it has
-given out.
+A search is a `Method` inside an `AskTell`. `tell` makes the whole next `State` and assigns it at the end. So a search
+is as it was if anything raises. `ask` reads the state, and notes which points it has given out.
 
 To add a search: a subclass of `Progress` with its fields, a subclass of `Method` with its step, and a subclass of
 `AskTell` that makes the method.
@@ -21,7 +20,7 @@ from torch_zerohess.arguments import check_callable, check_state, checked_intege
 from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
-from torch_zerohess.search.state import Evaluated, P, State, are_same, plain, restored
+from torch_zerohess.search.state import Evaluated, P, State, plain, restored
 from torch_zerohess.search.told import check_start, converted, joined
 from torch_zerohess.search.told import evaluated as told
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -63,11 +62,10 @@ class AskTell(ABC, Generic[P]):
         x0 = checked_start(x0)
         check_callable(loss=loss)
         restarts = checked_integer("restarts", restarts, 0)
+        pool = None if pool is None else checked_integer("pool", pool, 4)
         if not 0 <= checked_number("noise", noise) < math.inf:
             raise ValueError(f"noise must be finite and at least 0, got {noise}")
-        if not 0.0 < checked_number("tolerance", tolerance) < 1.0:
-            raise ValueError(f"tolerance must be between 0 and 1, got {tolerance}")
-        pool = None if pool is None else checked_integer("pool", pool, 4)
+        checked_number("tolerance", tolerance, above=0.0, below=1.0)
         seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_seed(seed)
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
@@ -141,10 +139,7 @@ class AskTell(ABC, Generic[P]):
     @property
     def solved(self) -> bool:
         """Whether the best point is one at which the search has arrived: a minimum, possibly a local one."""
-        progress, arrived = self._state.progress, self._state.progress.arrived
-        if arrived is None or progress.rounds == 0 or progress.best.loss > arrived.loss:
-            return False
-        return are_same(progress.best.point, arrived.point, self._method.settings.tolerance)
+        return self._state.progress.is_at_arrival(self._method.settings.tolerance)
 
     @property
     def agreed(self) -> int:
@@ -152,9 +147,9 @@ class AskTell(ABC, Generic[P]):
         return self._state.progress.agreed
 
     @property
-    def where(self) -> str:
-        """Where they have arrived, in words."""
-        return "points with the loss at x: the minimum is not unique" if self._state.progress.apart else "x"
+    def apart(self) -> bool:
+        """Whether these rounds have arrived at several points."""
+        return self._state.progress.apart
 
     @property
     def promise(self) -> float:

@@ -63,6 +63,13 @@ class Progress:
         """Return this progress with fields of another one: those of the names, or all that every search has."""
         return replace(self, **{name: getattr(other, name) for name in names or _COMMON})
 
+    def is_at_arrival(self, tolerance: float) -> bool:
+        """Whether the best point is one at which the search has arrived; tolerance: see `are_same`."""
+        end = self.arrived
+        if end is None or self.rounds == 0 or self.best.loss > end.loss:
+            return False
+        return are_same(self.best.point, end.point, tolerance)
+
     def ended_round(self: "P", reason: str, restarts: int) -> "P":
         """Count a round that ends. The search is done after `restarts` further rounds."""
         rounds = self.rounds + 1

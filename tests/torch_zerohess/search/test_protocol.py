@@ -267,7 +267,7 @@ SETTINGS = [
     ({"restarts": -1}, "restarts must be at least 0, got -1"),
     ({"noise": -1.0}, "noise must be finite and at least 0"),
     ({"noise": math.nan}, "noise must be a number, got nan"),
-    ({"tolerance": 0.0}, "tolerance must be between 0 and 1"),
+    ({"tolerance": 0.0}, "tolerance must be positive and below 1"),
     ({"pool": 2}, "pool must be at least 4, got 2"),
 ]
 

@@ -193,7 +193,6 @@ def _support(
 
     Each round subtracts the fit of the entries found so far, so the next round finds weaker entries.
     """
-    m = d.shape[1]
     index, values = previous.index, previous.values
     used = values != 0
     rounds = 1 if bool(used.any()) else _ROUNDS
@@ -202,11 +201,13 @@ def _support(
         least = thresholds(u, rest, grids, settings.rate)
         if number and least.own > 1.0 and least.joint > 1.0:
             break
-        blocks = list(candidates(u, rest, grids, least))
-        row, column = used.nonzero(as_tuple=True)
-        parts = [(row, index[used], values[used].abs()), *blocks]
-        row, column, size = (torch.cat([one[k] for one in parts]) for k in range(3))
-        index, used = largest(row, column, size, m, settings.keep)
+        chosen, kept = torch.zeros_like(index), torch.zeros_like(used)
+        for block, *found in candidates(u, rest, grids, least):  # one after the other: all of them are many
+            old = used[block]
+            known = old.nonzero()[:, 0], index[block][old], values[block][old].abs()
+            row, column, size = (torch.cat(pair) for pair in zip(known, found, strict=True))
+            chosen[block], kept[block] = largest(row, column, size, len(old), settings.keep)
+        index, used = chosen, kept
         if number + 1 < rounds:
             values, _ = slopes(u, d, index, used, previous, _RIDGES[1])
     return index, used

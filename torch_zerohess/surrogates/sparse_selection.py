@@ -120,16 +120,19 @@ def spaced(energy: Tensor, count: int) -> list[int]:
     return torch.searchsorted(total, aims).unique().tolist()
 
 
-def candidates(u: Tensor, rest: Tensor, grids: Grids, least: Thresholds) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield element, parameter and size of the pairs that count, tile by tile.
+def candidates(
+    u: Tensor, rest: Tensor, grids: Grids, least: Thresholds
+) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
+    """Yield a block of elements, and element, parameter and size of the pairs in it that count.
 
-    The size is the slope that the correlation stands for, |sum u d| / sum u^2.
+    An element is numbered from the first one of its block. The size is the slope that the correlation stands for,
+    |sum u d| / sum u^2.
     """
     n, row, beside = u.shape[1], grids.row, grids.beside
     directions, lengths = _normalized(u), u.norm(dim=0)
     rows = max(_ROWS, _SIDE // row)
     for pixels in _parts(grids.pixels[0], rows, int(grids.joint)):
-        part = rest[:, pixels.low * row : pixels.high * row]
+        part, found_here = rest[:, pixels.low * row : pixels.high * row], []
         changes, norms = _normalized(part).mT, part.norm(dim=0)
         columns = max(_ROWS if grids.parameters else 1, _TILE // (min(rows, grids.pixels[0]) * row * beside))
         for parameters in _parts(n // beside, columns, int(grids.parameters is not None)):
@@ -147,10 +150,11 @@ def candidates(u: Tensor, rest: Tensor, grids: Grids, least: Thresholds) -> Iter
                 near = mean[element, parameter]
                 found = torch.where(found >= least.own, found, 0.0)
                 found = torch.maximum(found, torch.where(near >= least.joint, near, 0.0))
-            element, parameter = element + inner[0].start, parameter + parameters.first * beside
-            size = found.sqrt() * norms[element]
-            size = size / lengths[parameter].clamp_min(torch.finfo(u.dtype).tiny)
-            yield element + pixels.low * row, parameter, size
+            parameter = parameter + parameters.first * beside
+            size = found.sqrt() * norms[element + inner[0].start]
+            found_here.append((element, parameter, size / lengths[parameter].clamp_min(torch.finfo(u.dtype).tiny)))
+        element, parameter, size = (torch.cat(one) for one in zip(*found_here, strict=True))
+        yield slice(pixels.first * row, pixels.last * row), element, parameter, size
 
 
 def largest(row: Tensor, column: Tensor, size: Tensor, m: int, keep: int) -> tuple[Tensor, Tensor]:

@@ -33,7 +33,7 @@ DEPTH = 4
 def check_caustic(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
     /,
-    method: str = "block_gauss_newton",
+    method: str = "local",
     run: int = 0,
     preset: Preset = "fast",
     spp: int = 1000,

@@ -40,9 +40,11 @@ def finite_values(
     left = int(kept[element].sum()) // (2 if smoothing.antithetic else 1)
     if left < fewest:
         first = element, int(bad[element].nonzero()[0])
+        never = (~torch.isfinite(values[element].reshape(len(bad[element]), -1))).all(0)
+        numbers_of = f" ({int(never.sum())} of their {len(never)} numbers never are)" if len(never) > 1 else ""
         raise ValueError(
             f"on_nonfinite='drop' left {left} of {smoothing.samples} draws, {fewest} are needed: "
-            f"{int(bad[element].sum())} of {bad.shape[1]} values are not finite; "
+            f"{int(bad[element].sum())} of {bad.shape[1]} values are not finite{numbers_of}; "
             f"{_wrong(values[first], outputs[first], points()[first])}"
         )
     if bool(bad[:, K:].any()):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess import BlackBox, Smoothing, estimate, sparse_jacobian
 from torch_zerohess.estimation.coefficients import mean_of_others
 from truths import spread, vector
 
@@ -333,3 +333,14 @@ def test_an_evaluator_of_the_caller_records_nothing() -> None:
     got = BlackBox(network, S, evaluator=lambda fn, points: fn(points))(X.clone().requires_grad_())
     assert torch.equal(got.detach(), BlackBox(network, S)(X))
     assert torch.equal(estimate(network, X, S, evaluator=lambda fn, points: fn(points)).value, got.detach())
+
+
+def test_numbers_of_an_output_that_are_never_finite_are_counted():
+    def image(z):
+        out = z[:, :1].expand(-1, 100).clone()
+        out[:, [3, 8]] = torch.nan
+        return out
+
+    message = r"24 of 24 values are not finite \(2 of their 100 numbers never are\); fn returned nan"
+    with pytest.raises(ValueError, match=message):
+        sparse_jacobian(image, torch.zeros(5).double(), Smoothing(sigma=1.0, samples=12), on_nonfinite="drop", keep=2)

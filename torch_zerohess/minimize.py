@@ -16,6 +16,7 @@ from torch_zerohess.estimation.inputs import working
 from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
+from torch_zerohess.minimization.blame import blamed
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation, Status
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.stopping import Stopping
@@ -183,17 +184,17 @@ def minimize(
 
     stopping = Stopping(target, xtol, ftol, time_limit, agrees=restarts is None)
     end: tuple[Status, str]
-    black_box = blamed = "fn" if loss is None else "fn or loss"
+    black_box = caller = "fn" if loss is None else "fn or loss"
     asked: tuple[Status, str] | None = None
     try:
         while True:
             reached = stopping.reason(running) or asked
             if reached is None:
                 running.step()
-                blamed = "callback"
+                caller = "callback"
                 if callback is not None and _is_true(callback(running.iterate)):
                     asked = "callback", "the callback asked to end"
-                blamed = black_box
+                caller = black_box
                 continue
             end = reached
             if end[0] != "time":
@@ -207,7 +208,7 @@ def minimize(
     except Exception as error:
         if running.evaluations:
             with contextlib.suppress(Exception):  # nothing takes the place of the caller's own error
-                error.minimum = running.minimum("failed", f"{blamed} raised {error!r}")  # type: ignore[attr-defined]
+                error.minimum = running.minimum("failed", f"{blamed(error, caller)} raised {error!r}")  # type: ignore[attr-defined]
         raise
     finally:
         running.write()

@@ -7,13 +7,14 @@ the points to evaluate next.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Generic
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.search.state import Evaluated, P
+from torch_zerohess.search.told import moderate
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 
@@ -68,6 +69,17 @@ class Method(ABC, Generic[P]):
     @abstractmethod
     def next(self, known: P, evaluated: Evaluated, generator: torch.Generator) -> tuple[P, Tensor]:
         """Return the progress after an evaluation, and the next points [K, n]."""
+
+    def after(self, known: P, told: Evaluated, generator: torch.Generator) -> tuple[P, Tensor]:
+        """Return `next` for what a caller told. Losses whose models fail numerically count as not finite."""
+        random, told = generator.get_state(), moderate(told)
+        try:
+            return self.next(known, told, generator)
+        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
+            if self.settings.loss is not None or not known.evaluations:  # the loss of the caller may have raised it
+                raise
+            generator.set_state(random)
+            return self.next(known, replace(told, losses=torch.full_like(told.losses, math.inf)), generator)
 
     def more(self, known: P, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Return up to `count` points that are worth evaluating at once with those [K, n] that the search asks for.

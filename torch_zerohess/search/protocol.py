@@ -255,7 +255,7 @@ class AskTell(ABC, Generic[P]):
             check_start(evaluated)
         generator = torch.Generator()
         generator.set_state(self._state.random)
-        self._state = self._after(*self._method.next(self._state.progress, evaluated, generator), generator)
+        self._state = self._after(*self._method.after(self._state.progress, evaluated, generator), generator)
         self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.losses
 
     def losses(self, values: Any) -> Tensor:

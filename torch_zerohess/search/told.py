@@ -3,6 +3,7 @@
 import math
 import reprlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,6 +13,11 @@ from torch_zerohess.arguments import checked_integer
 from torch_zerohess.estimation.inputs import times_changed
 from torch_zerohess.evaluators.values import stacked
 from torch_zerohess.search.state import Evaluated
+
+_LARGEST = 1e305
+"""Magnitude of losses beyond which models overflow: higher ones count as this one, lower ones as not finite."""
+_LARGEST_OUTPUT = 1e100
+"""Magnitude of numbers of an output, from which on they count as not finite: models square them."""
 
 
 def converted(values: Any, device: torch.device) -> Tensor:
@@ -76,15 +82,27 @@ def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count
     return early | {one: value.clone() for one, value in zip(numbers, values, strict=True)}
 
 
+def moderate(told: Evaluated) -> Evaluated:
+    """Return what was told, without numbers so large that models overflow."""
+    losses, outputs = told.losses, told.outputs
+    losses = torch.where(losses < -_LARGEST, -math.inf, losses)
+    losses = torch.where(torch.isfinite(losses), losses.clamp(max=_LARGEST), losses)
+    if outputs is not None and bool((outputs.abs() > _LARGEST_OUTPUT).any()):
+        outputs = torch.where(outputs.abs() > _LARGEST_OUTPUT, math.inf, outputs)
+    return replace(told, losses=losses, outputs=outputs)
+
+
 def check_start(start: Evaluated) -> None:
     """Raise ValueError if the first point, which is the start, has no finite value."""
+    loss, start = float(start.losses[0]), moderate(start)
     if bool(start.finite[0]):
         return
-    loss = float(start.losses[0])
+    if -math.inf < loss < -_LARGEST:
+        raise ValueError(f"the loss at the start x0 is {loss}, below {-_LARGEST}: scale the loss")
     if start.outputs is None or not math.isfinite(loss):
         raise ValueError(f"the black box is not finite at the start x0: {loss}")
     count = int((~torch.isfinite(start.outputs[0])).sum())
     raise ValueError(
-        f"{count} of {start.outputs.shape[1]} numbers of the output at the start x0 are not finite: the search "
-        f"models every number, also those that the loss ignores; return finite numbers there"
+        f"{count} of {start.outputs.shape[1]} numbers of the output at the start x0 are not finite, or beyond "
+        f"{_LARGEST_OUTPUT}: the search models every number, also those that the loss ignores; return moderate ones"
     )

@@ -1,0 +1,97 @@
+"""Losses that are larger than models can take, and numerical failures: whose they are, and that a search goes on."""
+
+import math
+import sys
+
+import pytest
+import torch
+from searches import bowl, zeros
+
+import torch_zerohess as zh
+from torch_zerohess.linalg.subproblem import ball_step
+from torch_zerohess.search import region_descent
+
+LARGEST = sys.float_info.max
+
+
+def failing() -> torch.Tensor:
+    """Fail in the library as a model with numbers that are not finite does."""
+    return ball_step(torch.zeros(3), torch.full((3, 3), math.nan), 1.0)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_penalty_may_be_the_largest_number(seed):
+    def penalised(z):
+        return torch.where(z[:, 0] > 0.5, LARGEST, (z - 0.3).square().sum(1))
+
+    fit = zh.minimize(penalised, [0.2, -0.5, -0.5, -0.5, -0.5], sigma=0.5, seed=seed, max_evaluations=150)
+    assert fit.success
+    assert fit.value < 1e-15
+    assert float(fit.values.max()) == LARGEST
+
+
+@pytest.mark.parametrize(("n", "bounds"), [(2, (-2.0, 2.0)), (3, None), (5, None)])
+def test_an_output_may_have_the_largest_number(n, bounds):
+    """The loss of such an output is finite."""
+    goal = torch.full((n,), 0.3, dtype=torch.float64)
+
+    def outputs(z):
+        return torch.where(z[:, :1] > 0.45, LARGEST, z)
+
+    loss = lambda y: (y - goal).tanh().square().mean()  # noqa: E731
+    fit = zh.minimize(outputs, zeros(n), sigma=0.5, bounds=bounds, loss=loss, seed=0, max_evaluations=100)
+    assert fit.value < 1e-10
+
+
+def test_a_start_that_models_cannot_take_is_refused():
+    with pytest.raises(ValueError, match=r"the loss at the start x0 is -1.7\S*, below -1e\+305: scale the loss"):
+        zh.minimize(lambda z: z[:, 0] - LARGEST, zeros(2), sigma=1.0)
+    with pytest.raises(ValueError, match=r"3 of 3 numbers of the output .* or beyond 1e\+100"):
+        zh.minimize(lambda z: z[:, :1].expand(-1, 3) + LARGEST, zeros(2), sigma=1.0, loss=lambda y: y.tanh().sum())
+
+
+def test_a_search_goes_on_after_a_numerical_failure(monkeypatch):
+    right, calls = region_descent.region_step, []
+
+    def step(*args):
+        calls.append(args)
+        return failing() if len(calls) in (2, 5) else right(*args)
+
+    monkeypatch.setattr(region_descent, "region_step", step)
+    fit = zh.minimize(bowl, zeros(2), sigma=2.0, seed=0, restarts=0)
+    assert fit.success
+    assert fit.value < 1e-8
+
+
+@pytest.mark.parametrize("loss", [None, torch.sum])
+def test_a_numerical_failure_of_the_search_is_not_blamed_on_fn(loss, monkeypatch):
+    """Here every step fails. With a loss, too, the models fail, and the loss is well."""
+    monkeypatch.setattr(region_descent, "region_step", lambda *args: failing())
+    with pytest.raises(torch.linalg.LinAlgError) as caught:
+        zh.minimize(lambda z: bowl(z) if loss is None else z.square(), zeros(2) + 1.0, sigma=2.0, seed=0, loss=loss)
+    assert caught.value.minimum.message.startswith("the search raised _LinAlgError")
+
+
+def test_a_numerical_failure_of_fn_is_its_own():
+    def fails(z):
+        return bowl(z) if not bool(z[0].any()) else torch.linalg.cholesky(-torch.eye(len(z)))
+
+    with pytest.raises(torch.linalg.LinAlgError) as caught:
+        zh.minimize(fails, zeros(2), sigma=2.0, seed=0)
+    assert caught.value.minimum.message.startswith("fn raised _LinAlgError")
+
+
+def test_a_numerical_failure_of_the_loss_passes():
+    """A loss may fail where a model expands it, not only at an output; here it does so once."""
+    expanded = []
+
+    def loss(y):
+        if y.requires_grad:
+            expanded.append(y)
+            if len(expanded) == 3:
+                torch.linalg.cholesky(-torch.eye(2))
+        return (y.sin() + 0.5).square().sum()
+
+    with pytest.raises(torch.linalg.LinAlgError) as caught:
+        zh.minimize(lambda z: z + 1.0, zeros(3), sigma=1.0, seed=0, loss=loss)
+    assert caught.value.minimum.message.startswith("fn or loss raised _LinAlgError")

@@ -535,3 +535,42 @@ def test_a_better_point_of_a_round_that_goes_on_is_no_arrival(beyond, engine):
     for seed in range(5):
         found = zh.minimize(cut, torch.tensor([1.75, 1.75]).double(), seed=seed, **settings)
         assert not found.success or found.value <= 1e-3
+
+
+@pytest.mark.parametrize("n", [1, 2, 8])
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda z: -torch.exp(z.sum(1)),
+        lambda z: -(z - 0.3).square().sum(1),
+        lambda z: -(z - 0.3).pow(4).sum(1),
+        lambda z: -(1e5 * (z - 0.3).square() + torch.log(1 + z.abs())).sum(1),
+    ],
+    ids=["exp", "square", "fourth", "likelihood"],
+)
+def test_a_loss_that_falls_without_end_is_not_solved(fn, n):
+    fit = zh.minimize(fn, zeros(n), sigma=0.5, seed=0)
+    assert (fit.status, fit.success) == ("stalled", False)
+    assert fit.message.startswith("the loss seems unbounded below")
+    assert fit.evaluations < 250
+
+
+@pytest.mark.parametrize("scale", [1e20, 1e120, 1e200])
+def test_a_large_loss_that_has_a_minimum_is_solved(scale):
+    fit = zh.minimize(lambda z: scale * ((z - 1000.0).square().sum(1) - 10.0), zeros(2), sigma=1.0, seed=0)
+    assert fit.success
+    assert float((fit.x - 1000.0).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize(("bounds", "most"), [(None, 1000), (None, 150), ((-3.0, 3.0), 300)])
+def test_minus_infinity_beside_x_is_no_minimum(bounds, most):
+    """Farther away it is avoided, and a minimum is one."""
+
+    def fn(z, center=2.0):
+        return torch.where(z[:, 0] > 1.0, -torch.inf, (z - center).square().sum(1))
+
+    settings = {"sigma": 0.5, "seed": 0, "bounds": bounds, "max_evaluations": most}
+    fit = zh.minimize(fn, zeros(1) + 0.2, **settings)
+    assert not fit.success
+    assert fit.message.endswith("the loss seems unbounded below, and x is no minimum: check its sign, or give bounds")
+    assert zh.minimize(lambda z: fn(z, -0.5), zeros(1) + 0.2, **settings).success

@@ -1,4 +1,4 @@
-"""Whether a black box jumps, fails or is constant next to a point: a search ends there as it does at a minimum."""
+"""Why a search may have ended at no minimum: the black box falls without end, or jumps, fails or is constant there."""
 
 import torch
 from torch import Tensor
@@ -11,6 +11,18 @@ _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 _PLATEAU = (1e-3, 0.3)
 """Distances, root mean square over the parameters in units of sigma, between which equal values are a plateau: nearer
 ones may differ by less than rounding, and farther ones may be other minima."""
+
+DEEP, _DEEPER = 1e100, 1e12
+"""Magnitude of a negative loss, and its ratio to the first loss: lower ones are no minimum of anything measured."""
+UNBOUNDED = "the loss seems unbounded below, and x is no minimum: check its sign, or give bounds"
+
+
+def is_unbounded(losses: Tensor) -> bool:
+    """Whether a finite loss [P] is out of all proportion to the first one, and below zero."""
+    if not len(losses):
+        return False
+    least = float(losses.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0).min())
+    return least < -DEEP and least < -_DEEPER * abs(float(losses[0]))
 
 
 def is_constant(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:
@@ -42,6 +54,9 @@ def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor)
 
 def doubt(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> str:
     """Return why x may be no minimum, in words; empty if there is no doubt. Arguments as of `jumps`."""
+    beside = ((points - x) / unit).norm(dim=1) <= _NEXT[-1][0]
+    if is_unbounded(losses) or bool((losses[beside] == -torch.inf).any()):
+        return UNBOUNDED
     if jumps(points, losses, x, value, unit):
         return "fn jumps or fails next to x, which may be no minimum"
     if is_constant(points, losses, x, value, unit):

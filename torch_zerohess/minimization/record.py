@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
+from torch_zerohess.minimization.doubt import DEEP, is_unbounded
 
 Call = Callable[[Tensor], tuple[list[int], Tensor, BaseException | None]]
 """Evaluate points [K, n]: the numbers of those that have a value, these values [k, *out], and what was raised."""
@@ -106,6 +107,11 @@ class Record:
         """Whether all values are equal."""
         losses = self.told[1]
         return bool((losses == losses[:1]).all())
+
+    @property
+    def unbounded(self) -> bool:
+        """Whether there is no minimum according to the losses of the last request, see `is_unbounded`."""
+        return bool((self.last[1] < -DEEP).any()) and is_unbounded(self.told[1])
 
     def state_dict(self) -> dict[str, Any]:
         """Everything, for `load_state_dict`."""

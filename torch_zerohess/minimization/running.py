@@ -15,6 +15,7 @@ from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status, on_untouched
 from torch_zerohess.minimization.noise import REPEATED, deviation, differs, reserved
 from torch_zerohess.minimization.record import Call, Record
+from torch_zerohess.minimization.wording import worded
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -199,13 +200,9 @@ class Running:
             hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
             slope, bend = model.full_errors()
             errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
-        if self.record.flat and len(search.unit) < self.evaluations and status != "target":
-            message += f"; all {self.evaluations} values are equal: enlarge sigma"
-        elif status == "stalled" and not self.noise and self.doubt:
-            message += f"; {self.doubt}"
+        equal = self.evaluations if self.record.flat and len(unit) < self.evaluations else 0
+        why = "" if self.noise else self.doubt
         success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
-        if success and status in ("budget", "time"):
-            message += "; the search had arrived at x, a minimum at least of its surroundings"
         return Minimum(
             x=x,
             value=value,
@@ -216,7 +213,8 @@ class Running:
             evaluations=self.evaluations,
             points=points,
             values=losses,
-            message=message + on_untouched(search.untouched),
+            message=worded(message, status, equal, why, arrived=search.solved, success=success)
+            + on_untouched(search.untouched),
             engine=search.engine,
             success=success,
             status=status,

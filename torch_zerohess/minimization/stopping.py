@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from torch_zerohess.minimization.doubt import UNBOUNDED
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.running import Running
 
@@ -29,6 +30,8 @@ class Stopping:
             return running.ending(arrived=search.solved), search.message
         if self.target is not None and running.reaches(self.target):
             return "target", f"the value is at most the target {self.target}"
+        if running.record.unbounded:
+            return "stalled", UNBOUNDED
         if self.xtol is not None and bool((search.width <= self.xtol).all()):
             return running.ending(arrived=True), f"the region is within xtol ({self.xtol}) of x"
         if self.ftol is not None and search.promise <= self.ftol:
@@ -37,7 +40,8 @@ class Stopping:
             return running.ending(arrived=True), "the search has arrived at x"
         if self.agrees and not running.noise and search.agreed >= _AGREED:
             where = "points with the loss at x: the minimum is not unique" if search.apart else "x"
-            return "solved", f"{search.agreed} rounds in a row have arrived at {where}"
+            status: Status = "stalled" if running.doubt == UNBOUNDED else "solved"
+            return status, f"{search.agreed} rounds in a row have arrived at {where}"
         if running.spent:
             return "budget", running.budget
         if self.time_limit is not None and running.seconds > self.time_limit:

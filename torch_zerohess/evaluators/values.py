@@ -23,7 +23,15 @@ def stacked(rows: Any) -> Any:
     for k, one in enumerate(parts):
         if one.shape != parts[0].shape:
             raise ValueError(f"rows must have one shape, got {[*one.shape]} for row {k} and {[*parts[0].shape]} before")
-    return _known(numpy.asarray(parts)) if arrays else torch.stack(parts)
+    return _known(numpy.asarray([_unmasked(one) for one in parts])) if arrays else torch.stack(parts)
+
+
+def _unmasked(array: Any) -> Any:
+    """Return an array of NumPy with NaN where it is masked."""
+    numpy = sys.modules["numpy"]
+    if not isinstance(array, numpy.ma.MaskedArray):
+        return numpy.asarray(array)
+    return (array if array.dtype.kind in "fc" else array.astype(float)).filled(numpy.nan)
 
 
 def _known(array: Any) -> Any:
@@ -44,15 +52,17 @@ def as_tensor(result: Any) -> Tensor:
     """Return what a black box returned as a tensor of real or complex numbers.
 
     A list of tensors or arrays of one shape is stacked. Numbers of Python are float64, alone and in lists, and so are
-    integers and truth values of any kind: counts, images of bytes, a loss that is 0 on a plateau.
+    integers and truth values of any kind: counts, images of bytes, a loss that is 0 on a plateau. Masked entries of a
+    NumPy array are NaN. Sparse tensors are filled.
     """
     try:
         result = stacked(result)
         if isinstance(result, Tensor):
+            result = result if result.layout is torch.strided else result.to_dense()
             return result if result.is_floating_point() or result.is_complex() else result.double()
         numpy = sys.modules.get("numpy")
         if numpy is not None and hasattr(result, "__array_interface__"):
-            result = _known(numpy.asarray(result))
+            result = _known(_unmasked(result))
         first = leaf(result)
         # Arrays that are on no GPU go to the CPU, whatever the default device of torch.
         device = None if hasattr(result, "__cuda_array_interface__") else "cpu"

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate, sparse_jacobian
 from torch_zerohess.estimation.coefficients import mean_of_others
+from torch_zerohess.evaluators.values import as_tensor
 from truths import spread, vector
 
 S = Smoothing(sigma=0.5, samples=8, proposal="gaussian", seed=1)
@@ -212,6 +213,25 @@ def test_what_has_the_array_interface_is_an_array() -> None:
     bytes_ = lambda z: (z.numpy() > 0.2).astype(np.uint8)  # noqa: E731
     got = estimate(lambda z: Picture(bytes_(z)), X, S).gradient
     assert torch.equal(got, estimate(bytes_, X, S).gradient)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("f4", torch.float32), ("f8", torch.float64), ("i8", torch.float64), ("u1", torch.float64)]
+)
+def test_masked_entries_are_not_a_number(kind, expected) -> None:
+    masked = np.ma.array([[1, 2], [3, 4]], mask=[[False, True], [False, False]], dtype=kind)
+    found = as_tensor(masked)
+    assert found.dtype == expected
+    assert torch.equal(found.nan_to_num(nan=9.0), torch.tensor([[1.0, 9.0], [3.0, 4.0]], dtype=expected))
+    assert torch.equal(as_tensor(list(masked)).isnan(), found.isnan())
+    assert masked[0, 1] is np.ma.masked
+
+
+def test_a_sparse_tensor_is_filled() -> None:
+    dense = vector(0.0, 2.0, 0.0)[:, None]
+    for sparse in (dense.to_sparse(), dense.long().to_sparse()):
+        assert torch.equal(as_tensor(sparse), dense)
+    estimate(lambda z: z.square().sum(1).to_sparse(), vector(1.0, 2.0), Smoothing(sigma=0.1, samples=8))
 
 
 def test_lists_of_arrays_are_one_array(recwarn) -> None:

@@ -105,10 +105,11 @@ def minimize(
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up, or three rounds in a row have arrived at the same point, or at points with the same loss.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
-            evaluations, and six more if the two differ. Give it if fn is noisy elsewhere but not at x0, as on a
-            plateau. The noise is taken to be the same everywhere. In noise, an eighth of `max_evaluations` (4 to 48) is
-            kept for the end: the best candidates are evaluated again, and x is the one with the lowest mean. `value` is
-            this mean and `value_error` its standard error.
+            evaluations, and six more if the two differ. Where losses are counts, which may be equal by chance, x is
+            evaluated twice again when the search arrives or is about to end. Give the noise if fn is noisy elsewhere
+            but not at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth of
+            `max_evaluations` (4 to 48) is kept for the end: the best candidates are evaluated again, and x is the one
+            with the lowest mean. `value` is this mean and `value_error` its standard error.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
             in it. The search does not read the memory: the result is the same as without one. The next `estimate`
@@ -188,6 +189,7 @@ def minimize(
     asked: tuple[Status, str] | None = None
     try:
         while True:
+            running.look_again()
             reached = stopping.reason(running) or asked
             if reached is None:
                 running.step()

@@ -22,6 +22,12 @@ def differs(one: Tensor, other: Tensor) -> bool:
     return float((one - other).abs().max()) > _ROUNDING * float(torch.maximum(one.abs(), other.abs()).max())
 
 
+def are_counts(losses: Tensor) -> bool:
+    """Whether losses [K] are whole numbers, or at most three quarters of them are distinct."""
+    losses = losses[torch.isfinite(losses)]
+    return bool((losses == losses.round()).all()) or 4 * len(losses.unique()) <= 3 * len(losses)
+
+
 def deviation(losses: Tensor) -> float:
     """Standard deviation of losses [K] at one point."""
     return float(losses.std())

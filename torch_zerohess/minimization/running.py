@@ -11,23 +11,20 @@ from torch import Tensor
 
 from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.decision import Decision, decide
+from torch_zerohess.minimization.derivatives import quadratic_at
 from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status, on_untouched
-from torch_zerohess.minimization.noise import REPEATED, deviation, differs, reserved
+from torch_zerohess.minimization.noise import REPEATED, are_counts, deviation, differs, reserved
 from torch_zerohess.minimization.record import Call, Record
-from torch_zerohess.minimization.wording import worded
+from torch_zerohess.minimization.wording import budget, worded
 from torch_zerohess.search.trust_region import TrustRegion
-from torch_zerohess.surrogates.local_fit import quadratic_around
-from torch_zerohess.surrogates.quadratic import LocalModel
 
 _PAUSE = 1.0
 """Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
 _LUCK = 2.0
 """Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
-_FITTED = 40
-"""Parameters up to which a quadratic is fitted to all evaluations at the end."""
-_RELIABLE, _MORE_RELIABLE = 0.1, 1e-3
-"""Largest relative standard error of its Hessian with which it replaces a model of the loss, and one of the output."""
+_AGAIN = 2
+"""Further evaluations of x where losses are counts: one would be equal to the first too often."""
 
 
 class Running:
@@ -60,6 +57,8 @@ class Running:
         """Standard deviation of repeated losses; None before it is known."""
         self._make, self._batch, self._least, self._most = make, batch, least, most
         self._path, self._verbose = path, verbose
+        self._sure = noise is not None
+        """Whether it is known, if there is no noise."""
         self._begun = self._written = self._said = time.monotonic()
         self._decided: Decision | None = None
         self._deciding: tuple[int, int] | None = None
@@ -105,11 +104,7 @@ class Running:
     @property
     def budget(self) -> str:
         """Why there is no further step where the evaluations are `spent`."""
-        given, count = f"max_evaluations ({self._most})", self.evaluations
-        if count > self._most:
-            return f"{given} allows no more than the {count} so far"
-        rest = count < self._most and (self.record.due or self._last is not None)  # a decision uses up the others
-        return f"{given} allows no step after the {count} so far" if rest else f"{given} used up"
+        return budget(self._most, self.evaluations, rest=bool(self.record.due) or self._last is not None)
 
     @property
     def doubt(self) -> str:
@@ -140,6 +135,25 @@ class Running:
         self.noise = self.noise or 0.0
         search.tell(self.record.values(points))
         self._noted(points, search.told)
+
+    def look_again(self) -> None:
+        """Evaluate x twice again where the search has arrived or is about to end, and losses are counts.
+
+        Counts of a noisy simulator may be equal at x0 by chance. The search then begins again as one in noise.
+        """
+        ends = self.search.solved or self.left <= min(reserved(self._most) + REPEATED, self._most // 4)
+        if self._sure or self.noise or not (ends and self.left and self.begun) or self.record.requested is not None:
+            return
+        x, (points, losses) = self.search.x[None], self.record.told
+        before = losses[(points == x).all(1)]
+        if are_counts(losses) and len(before):
+            again = self._evaluated(x.expand(min(_AGAIN, self.left), -1))
+            if differs(again, before[-1]):
+                count = min(REPEATED - _AGAIN, self.left)
+                further = self._evaluated(x.expand(count, -1)) if count else again[:0]
+                self.noise = deviation(torch.cat([before, again, further]))
+                self.search = self._make(self.noise)
+        self._sure = True
 
     def ending(self, *, arrived: bool) -> Status:
         """Return the status when the search ends by itself: a small region is no evidence in noise and in doubt."""
@@ -184,32 +198,28 @@ class Running:
         self._written = time.monotonic()
         draft = self._path.with_name(f"{self._path.name}.part")
         decided = None if self._decided is None else vars(self._decided)
-        saved = {"noise": self.noise, "decided": decided, "deciding": self._deciding, **self.record.state_dict()}
-        torch.save(saved | {"search": self.search.state_dict()}, draft)
+        saved = {
+            "noise": self.noise,
+            "sure": self._sure,
+            "decided": decided,
+            "deciding": self._deciding,
+            "search": self.search.state_dict(),
+        }
+        torch.save(saved | self.record.state_dict(), draft)
         draft.replace(self._path)
 
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""
         search = self.search
         (x, value, error), (points, losses) = self._best(), self.record.told
-        found = self._model(x)
-        gradient, hessian, errors, unit = None, None, None, search.unit
-        if found is not None:
-            model, unit = found[0], unit * found[1]
-            gradient = (model.full_gradient() / unit).to(x)
-            hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
-            slope, bend = model.full_errors()
-            errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
-        equal = self.evaluations if self.record.flat and len(unit) < self.evaluations else 0
+        around = quadratic_at(x, search, points, losses, self.noise or 0.0)
+        equal = self.evaluations if self.record.flat and len(search.unit) < self.evaluations else 0
         why = "" if self.noise else self.doubt
         success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
         return Minimum(
             x=x,
             value=value,
-            gradient=gradient,
-            hessian=hessian,
-            standard_errors=errors,
-            sigma=unit.to(x),
+            **around._asdict(),
             evaluations=self.evaluations,
             points=points,
             values=losses,
@@ -228,7 +238,7 @@ class Running:
         self.search = self._make(self.noise or 0.0)
         self.record.load_state_dict(saved, x := self.search.x)
         self.search.load_state_dict(saved["search"])
-        self._deciding = saved["deciding"]
+        self._deciding, self._sure = saved["deciding"], saved["sure"]
         if saved["decided"] is not None:
             self._decided = Decision(**saved["decided"] | {"x": saved["decided"]["x"].to(x)})
 
@@ -254,21 +264,6 @@ class Running:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
         points, losses = self.record.with_start(self.search.untouched)
         return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
-
-    def _model(self, x: Tensor) -> tuple[LocalModel, float] | None:
-        """Return the search's quadratic model around x and its sigma; or the regression on all evaluations, if better.
-
-        In noise the regression is better if there is one: its standard errors come from the noise.
-        """
-        found = self.search.model_at_best(x)
-        if len(x) > _FITTED:
-            return found
-        unit, (points, losses), noise = self.search.unit, self.record.told, self.noise or 0.0
-        around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
-        most = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
-        if around is None or (found is not None and not noise and around[2] > most):
-            return found
-        return around[:2]
 
     def _first(self, points: Tensor) -> None:
         """Evaluate the first points [K, n], and the start again; where its values differ, as often as noise needs."""

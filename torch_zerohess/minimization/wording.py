@@ -22,3 +22,11 @@ def worded(message: str, status: Status, equal: int, doubt: str, *, arrived: boo
     if success and cut:
         message += "; the search had arrived at x, a minimum at least of its surroundings"
     return message
+
+
+def budget(most: int, count: int, *, rest: bool) -> str:
+    """Return why there is no further step after `count` evaluations of `most`; `rest`: although some may be left."""
+    given = f"max_evaluations ({most})"
+    if count > most:
+        return f"{given} allows no more than the {count} so far"
+    return f"{given} allows no step after the {count} so far" if rest and count < most else f"{given} used up"

@@ -381,3 +381,39 @@ def test_losses_may_be_ten_thousand_times_the_noise():
     x, value, error = believed(points, losses, zeros(2), torch.ones(2), 0.1)
     assert error < 1.0
     assert value == pytest.approx(1e3 * float(x.square().sum()), abs=3 * error)
+
+
+@pytest.mark.parametrize(("per", "most"), [(1.0, 100), (7.0, 100), (1.0, 40), (2.0, 30)])
+def test_counts_that_are_equal_at_the_start_are_found_to_be_noisy(per, most):
+    """The two values at the start are the same; per says how many draws a value is the mean of."""
+    for seed in range(8):
+        generator, begun = torch.Generator().manual_seed(seed), []
+
+        def fn(z, generator=generator, begun=begun):
+            counts = torch.poisson(4.0 * per * (1.0 + (z - 0.3).square().sum(1)), generator=generator) / per
+            if not begun:
+                begun.append(z)
+                counts[(z == z[0]).all(1)] = 12.0
+            return counts
+
+        fit = zh.minimize(fn, [-0.7, 0.9], sigma=0.7, seed=seed, max_evaluations=most)
+        assert fit.evaluations == most
+        assert fit.noise > 0.3 / per
+        assert fit.value_error > 0.0
+        assert not fit.success
+
+
+def test_x_is_evaluated_again_where_losses_are_counts():
+    """Twice, and of other losses never; the values themselves are the same."""
+
+    def repeated(fit):
+        return len(fit.points) - len(fit.points.unique(dim=0))
+
+    def steps(z):
+        return (10.0 * (z - 0.3).abs().sum(1)).floor()
+
+    for fn, most, count in ((steps, 80, 3), (lambda z: (z - 0.3).square().sum(1), 80, 1)):
+        fit = zh.minimize(fn, [-0.7, 0.9], sigma=0.7, seed=0, max_evaluations=most)
+        assert repeated(fit) == count
+        assert (fit.noise, fit.value_error) == (0.0, 0.0)
+    assert repeated(zh.minimize(steps, [-0.7, 0.9], sigma=0.7, seed=0, max_evaluations=80, noise=0.0)) == 0

@@ -1,0 +1,53 @@
+"""Gradient and Hessian at the end of a search, from its own model or from all evaluations."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from torch_zerohess.search.trust_region import TrustRegion
+from torch_zerohess.surrogates.local_fit import quadratic_around
+from torch_zerohess.surrogates.quadratic import LocalModel
+
+_FITTED = 40
+"""Parameters up to which a quadratic is fitted to all evaluations at the end."""
+_RELIABLE, _MORE_RELIABLE = 0.1, 1e-3
+"""Largest relative standard error of its Hessian with which it replaces a model of the loss, and one of the output."""
+
+
+class Derivatives(NamedTuple):
+    """A quadratic around the best point, see `Minimum`; its width alone where too few evaluations lie there."""
+
+    gradient: Tensor | None
+    hessian: Tensor | None
+    standard_errors: dict[str, Tensor] | None
+    sigma: Tensor
+
+
+def quadratic_at(x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor, noise: float) -> Derivatives:
+    """Return the quadratic around x [n] of a search with evaluations [P, n] and [P]."""
+    unit, found = search.unit, _model(x, search, points, losses, noise)
+    if found is None:
+        return Derivatives(None, None, None, unit.to(x))
+    model, unit = found[0], unit * found[1]
+    gradient = (model.full_gradient() / unit).to(x)
+    hessian = (model.full_hessian() / (unit[:, None] * unit)).to(x)
+    slope, bend = model.full_errors()
+    errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
+    return Derivatives(gradient, hessian, errors, unit.to(x))
+
+
+def _model(
+    x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor, noise: float
+) -> tuple[LocalModel, float] | None:
+    """Return the search's quadratic model around x and its sigma; or the regression on all evaluations, if better.
+
+    In noise the regression is better if there is one: its standard errors come from the noise.
+    """
+    found, unit = search.model_at_best(x), search.unit
+    if len(x) > _FITTED:
+        return found
+    around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
+    most = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
+    if around is None or (found is not None and not noise and around[2] > most):
+        return found
+    return around[:2]

@@ -574,3 +574,15 @@ def test_minus_infinity_beside_x_is_no_minimum(bounds, most):
     assert not fit.success
     assert fit.message.endswith("the loss seems unbounded below, and x is no minimum: check its sign, or give bounds")
     assert zh.minimize(lambda z: fn(z, -0.5), zeros(1) + 0.2, **settings).success
+
+
+@pytest.mark.parametrize("bounds", [None, (-2.0, 2.0)])
+def test_a_cusp_is_no_evidence_of_a_minimum(bounds):
+    """Parameters that sit in a cusp shrink the region for all others, which are not at their minimum."""
+    for seed in range(5):
+        start = 2.0 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.0
+        settings = {"sigma": 0.5, "bounds": bounds, "restarts": 0, "seed": seed}
+        fit = zh.minimize(lambda z: (z - 0.3).abs().sqrt().sum(1), start, **settings)
+        assert (fit.status, fit.success) == ("stalled", False)
+        assert fit.message.endswith("which may be no minimum")
+        assert zh.minimize(lambda z: (z - 0.3).abs().sum(1), start, **settings).success

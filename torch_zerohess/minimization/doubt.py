@@ -1,4 +1,4 @@
-"""Why a search may have ended at no minimum: the black box falls without end, or jumps, fails or is constant there."""
+"""Why x may be no minimum: the black box falls without end, or it jumps, fails, is constant or has a cusp at x."""
 
 import torch
 from torch import Tensor
@@ -11,6 +11,12 @@ _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 _PLATEAU = (1e-3, 0.3)
 """Distances, root mean square over the parameters in units of sigma, between which equal values are a plateau: nearer
 ones may differ by less than rounding, and farther ones may be other minima."""
+
+_BESIDE, _APART, _STEEPER = 1e-3, 0.1, 8.0
+"""Distances in units of sigma up to which an evaluation is beside x, and from which it is apart; how many times as
+steep the loss is beside x at a cusp: a square root is so ten times."""
+_TOLD = 1e-3
+"""Difference, over the range of all values, from which it tells a cusp: less may be roughness."""
 
 DEEP, _DEEPER = 1e100, 1e12
 """Magnitude of a negative loss, and its ratio to the first loss: lower ones are no minimum of anything measured."""
@@ -52,6 +58,22 @@ def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor)
     return not all(bool((losses[distance <= near] - value <= part * range_).all()) for near, part in _NEXT)
 
 
+def has_cusp(points: Tensor, losses: Tensor, x: Tensor, unit: Tensor) -> bool:
+    """Whether the loss rises much more steeply next to x than farther away: other parameters may then have no effect.
+
+    At a kink it rises as steeply, and at the minimum of a smooth function less. Arguments as of `jumps`.
+    """
+    distance, finite = ((points - x) / unit).norm(dim=1), torch.isfinite(losses)
+    same = finite & (distance == 0.0)
+    if not bool(same.any()):
+        return False
+    rise, range_ = losses - losses[same].min(), losses[finite].max() - losses[finite].min()
+    told = finite & (distance > 0.0) & (rise > _TOLD * range_)
+    near, far = (told & (distance <= _BESIDE)), (finite & (distance >= _APART))
+    slopes = rise / distance
+    return bool(near.any() and far.any()) and bool(slopes[near].max() > _STEEPER * slopes[far].max())
+
+
 def doubt(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> str:
     """Return why x may be no minimum, in words; empty if there is no doubt. Arguments as of `jumps`."""
     beside = ((points - x) / unit).norm(dim=1) <= _NEXT[-1][0]
@@ -59,6 +81,8 @@ def doubt(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor)
         return UNBOUNDED
     if jumps(points, losses, x, value, unit):
         return "fn jumps or fails next to x, which may be no minimum"
+    if has_cusp(points, losses, x, unit):
+        return "fn has a cusp at x, which may be no minimum"
     if is_constant(points, losses, x, value, unit):
         return "fn is constant next to x, which may be no minimum: enlarge sigma"
     return ""

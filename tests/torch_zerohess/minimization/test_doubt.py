@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torch_zerohess.minimization.doubt import doubt, is_constant, jumps
+from torch_zerohess.minimization.doubt import doubt, has_cusp, is_constant, jumps
 from truths import vector
 
 
@@ -41,3 +41,20 @@ def test_an_equal_value_near_x_is_a_plateau(distance, constant):
     assert is_constant(points, values, points[0], 0.5, unit) == constant
     assert is_constant(points, values + vector(0.0, 1e-9, 0.0), points[0], 0.5, unit) is False
     assert ("constant" in doubt(points, values, points[0], 0.5, unit)) == constant
+
+
+@pytest.mark.parametrize(
+    ("fn", "expected"),
+    [
+        (lambda d: d.sqrt(), True),
+        (lambda d: d, False),
+        (lambda d: d.square(), False),
+        (lambda d: d.square() + 1e-4 * (d > 0.0), False),  # roughness
+    ],
+)
+def test_a_cusp_is_steeper_the_nearer(fn, expected):
+    """Distances are in units of sigma, here of 3, and from a kink, a quadratic or a square root of them."""
+    distance = vector(0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5)
+    points, unit = 7.0 + 3.0 * distance[:, None], vector(3.0)
+    assert has_cusp(points, fn(distance), points[0], unit) is expected
+    assert has_cusp(points[1:], fn(distance[1:]), points[0], unit) is False

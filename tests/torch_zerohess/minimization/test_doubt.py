@@ -54,7 +54,7 @@ def test_an_equal_value_near_x_is_a_plateau(distance, constant):
 )
 def test_a_cusp_is_steeper_the_nearer(fn, expected):
     """Distances are in units of sigma, here of 3, and from a kink, a quadratic or a square root of them."""
-    distance = vector(0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5)
+    distance = vector(0.0, 1e-5, 1e-4, 9e-4, 1e-2, 0.11, 0.5)
     points, unit = 7.0 + 3.0 * distance[:, None], vector(3.0)
     assert has_cusp(points, fn(distance), points[0], unit) is expected
     assert has_cusp(points[1:], fn(distance[1:]), points[0], unit) is False

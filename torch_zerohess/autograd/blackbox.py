@@ -71,7 +71,7 @@ class BlackBox(nn.Module):
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
     `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it. A layer with a memory
     is called between graphs: fullgraph=True is an error, and so is `torch.func.grad` inside of compiled code.
-    `torch.export` raises RuntimeError: no file holds a black box.
+    `torch.export` and `torch.jit.trace` raise RuntimeError: no file holds a black box.
 
     Example:
         >>> layer = BlackBox(lambda z: z.round().sum(1), Smoothing(sigma=1.0, samples=2000, seed=0))
@@ -301,6 +301,8 @@ def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
 
 
 def _before_compiling() -> None:
+    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+        raise RuntimeError("a BlackBox cannot be traced by torch.jit: what fn returns would become a constant")
     if torch.compiler.is_compiling():
         if torch.compiler.is_exporting():
             raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")

@@ -170,9 +170,9 @@ def test_compiled_code_serves_every_seed_and_sigma() -> None:
     assert len(graphs) == 1
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.trace` is deprecated")
+@pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning")
 def test_torch_jit_is_refused():
     """It would keep what fn returned for the example."""
     layer = BlackBox(lambda z: z.numpy().sum(1), Smoothing(sigma=0.1, samples=4))
-    with pytest.raises(RuntimeError, match="cannot be traced by torch.jit"):
+    with pytest.raises(RuntimeError, match=r"cannot be traced by torch\.jit"):
         torch.jit.trace(layer, torch.zeros(3, 2))

@@ -24,7 +24,7 @@ def on_untouched(untouched: Tensor | None) -> str:
     if untouched is None or not numbers:
         return ""
     names = ", ".join(map(str, numbers[:_NAMED])) + (", ..." if len(numbers) > _NAMED else "")
-    return f"; {len(numbers)} of {len(untouched)} parameters ({names}) changed no output and were left where they are"
+    return f"; {len(numbers)} of {len(untouched)} parameters ({names}) were not found to change any output, and stay"
 
 
 class Observation(NamedTuple):

@@ -27,10 +27,10 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     Where its steps hardly lower the loss, it hops to a random point close by, at 0.3 sigma per parameter, and goes on
     from there. It stays with what it finds if the loss is lower, and returns otherwise.
 
-    A parameter that no output depends on stays where it is, and `untouched` names it. Only parameters that outputs
-    change with beyond chance are moved. With a probability of at most 1 % per search another one is moved, too. A
-    parameter that changes outputs by little beside noise is named until more samples tell. Samples move all parameters.
-    So no sample is the best point once some parameters are moved and others stay.
+    Only parameters that some output was found to depend on are moved. The others stay where they are, and `untouched`
+    names them. Of the parameters found in a batch, 0.5 % are expected to be without effect. A parameter with a weak
+    effect counts as untouched until there is enough evidence. Samples perturb all parameters. So no sample is the best
+    point while some parameters stay.
 
     Args:
         x0: start [n], float32 or float64, within the bounds.

@@ -5,7 +5,7 @@ The start and a few dozen samples of all parameters at once tell a sparse Jacobi
 
 An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths then minimise
 the model g J s + s J^T H J s / 2 by conjugate gradients, where g and H are gradient and Hessian of the loss after the
-output; see `gauss_newton`. Steps and hops move only the parameters that some output depends on for certain, see
+output; see `gauss_newton`. Steps and hops move only the parameters that some output was found to depend on, see
 `surrogates.sparse_evidence`. If the output at the end of the step was predicted well, the next steps use the same J.
 Sigma is a share of the radius.
 
@@ -48,8 +48,8 @@ _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
 LOCAL_TOLERANCE = 5e-4
 """Radius, in units of sigma, at which the search has arrived, if the caller says nothing."""
-_CERTAIN = 0.3
-"""Share of the entries that must be of certain parameters before steps follow, or else more samples."""
+_FOUND = 0.3
+"""Share of the entries that must be of parameters that were found, before steps follow, or else more samples."""
 _ITERATIONS = 100
 """Products of the Hessian for a step."""
 _FULL = 1000
@@ -126,7 +126,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         hops = known.hops
         if hops:
             assert known.evidence is not None
-            step = _HOP * known.evidence.certain * normal(generator, known.center, self.settings.n)
+            step = _HOP * known.evidence.found * normal(generator, known.center, self.settings.n)
             known = replace(known, center=self._inside(known.center + step))
         points = self._inside(
             known.center + known.sigma * normal(generator, known.center, known.samples, self.settings.n)
@@ -159,7 +159,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         fitted = fit_sparse(u, changes, known.shape, self.own.sparse, known.fitted)
         evidence = known.evidence or Evidence.none(self.settings.n, u.device)
         known = known.fitting(fitted, evidence.with_batch(fitted, known.fitted, u, changes))
-        if known.certain_share < _CERTAIN and known.samples < _MOST * self.own.samples:
+        if known.found_share < _FOUND and known.samples < _MOST * self.own.samples:
             return replace(known, samples=_MOST * self.own.samples, phase="sample")
         if first and fitted.explained > _TRUSTED:
             known = replace(known, radius=max(1.0, known.radius))
@@ -249,8 +249,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
         return super().promise(known) if known.predicts and not known.failed else math.inf
 
     def untouched(self, known: LocalProgress) -> Tensor | None:
-        """Return the parameters on which no output is certain to depend, if some output is on others."""
-        return ~known.evidence.certain if known.some_stay and known.evidence is not None else None
+        """Return the parameters that no output was found to depend on, if some were found."""
+        return ~known.evidence.found if known.some_stay and known.evidence is not None else None
 
     def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
         home = known.home

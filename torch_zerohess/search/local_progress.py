@@ -19,12 +19,12 @@ class LocalProgress(JacobianProgress):
     """The output at the center, the sparse Jacobian there, and the samples asked for next."""
 
     jacobian: SparseJacobian | None = None
-    """By the parameters that some output depends on for certain. float32: errors of sampling are far above its
+    """By the parameters that some output was found to depend on. float32: errors of sampling are far above its
     rounding."""
     fitted: SparseJacobian | None = None
     """With the other entries that were found, some of them by chance."""
     evidence: Evidence | None = None
-    """Which parameters are certain."""
+    """Which parameters these are."""
     samples: int
     """Of the next batch."""
     slow: int = 0
@@ -55,15 +55,15 @@ class LocalProgress(JacobianProgress):
 
     @property
     def some_stay(self) -> bool:
-        """Whether some parameters stay at their start, because some output is certain to depend on others alone."""
-        certain = None if self.evidence is None else self.evidence.certain
-        return certain is not None and bool(certain.any()) and not bool(certain.all())
+        """Whether some parameters stay at their start, because outputs were found to depend on others alone."""
+        found = None if self.evidence is None else self.evidence.found
+        return found is not None and bool(found.any()) and not bool(found.all())
 
     @property
-    def certain_share(self) -> float:
-        """Share of the entries found that are by certain parameters; 1 if none was found."""
-        certain, every = (0 if one is None else int(one.found.sum()) for one in (self.jacobian, self.fitted))
-        return certain / every if every else 1.0
+    def found_share(self) -> float:
+        """Share of the entries that are of parameters that were found; 1 if there is none."""
+        some, every = (0 if one is None else int(one.found.sum()) for one in (self.jacobian, self.fitted))
+        return some / every if every else 1.0
 
     def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "LocalProgress":
         """Return the progress with a new Jacobian.
@@ -71,7 +71,7 @@ class LocalProgress(JacobianProgress):
         If it is the first one with some certain parameters, the best point is the center again: samples move all
         parameters, also those that stay where they are.
         """
-        after = replace(self, jacobian=fitted.within(evidence.certain), fitted=fitted, evidence=evidence)
+        after = replace(self, jacobian=fitted.within(evidence.found), fitted=fitted, evidence=evidence)
         if self.some_stay or not after.some_stay:
             return after
         at = self.home if self.home is not None and self.failed else self

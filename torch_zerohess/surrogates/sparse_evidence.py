@@ -1,13 +1,15 @@
-"""The parameters that some output depends on for certain, by sparse Jacobians that are fitted one after the other.
+"""The parameters that some output was found to depend on, by sparse Jacobians that are fitted one after the other.
 
-A selection at a rate of false discoveries has false entries. Two tests tell the parameters that some output depends on.
-An entry of a fit is certain if its chance is small even among all pairs of an output and a parameter (Bonferroni). And
-new samples test each parameter j with the slopes J of the fit before. The Jacobian without parameter j leaves e of the
-changes, [K, m]. If no output depends on j, the sums c = sum_i J_ij e_i are independent of the directions u_j, [K]. So
-their correlation has a known distribution, whatever J is. The sum over batches of these numbers, each standard normal
-by chance, grows where the slopes are true.
+A selection at a rate of false discoveries among pairs has false entries, and they hit many parameters. So each
+parameter is tested by itself, and those that are found are chosen at a rate of false discoveries among parameters
+(Benjamini and Hochberg 1995).
 
-Batch b has the share 1 / (b (b + 1)) of the level. These shares sum to 1, so the level is one of all batches together.
+The first batch tests a parameter by its most significant entry, times the number of outputs (Bonferroni). Every later
+batch tests parameter j by new samples, with the slopes J of the fit before. The Jacobian without parameter j leaves e
+of the changes, [K, m]. If no output depends on j, the sums c = sum_i J_ij e_i are independent of the directions u_j,
+[K]. So their correlation has a known distribution, whatever J is, and z is the normal number of its probability. The
+sum of z over b batches grows where the slopes are true. Both z and sum / sqrt(b) are tested on one side, and the larger
+one of them has at most the probability erfc(z / sqrt 2).
 """
 
 import math
@@ -19,8 +21,8 @@ from torch import Tensor
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_regression import chances, normal_from_t
 
-_LEVEL = 5e-3
-"""Probability, for each of the two tests, that any of the parameters that no output depends on is ever certain."""
+_RATE = 5e-3
+"""Of parameters that no output depends on, among those that are found in a batch."""
 
 _ROUNDING = 1e-6
 """Sums below this share of what parameter j adds to them are rounding."""
@@ -30,8 +32,8 @@ _ROUNDING = 1e-6
 class Evidence:
     """What the batches so far tell about every parameter."""
 
-    certain: Tensor
-    """Whether some output depends on it, bools [n]."""
+    found: Tensor
+    """Whether some output was found to depend on it, bools [n]."""
     sums: Tensor
     """Of the normal numbers of the tests by new samples, float64 [n]."""
     batches: int = 0
@@ -52,16 +54,22 @@ class Evidence:
         if before is None:
             used = fitted.found
             chance = chances(fitted.values, fitted.standard_error, used, len(u))
-            certain = self.certain.clone()
-            certain[fitted.index[used & (chance <= _LEVEL / (len(used) * fitted.n))]] = True
-            return replace(self, certain=certain)
+            least = torch.ones(fitted.n, dtype=torch.float64, device=u.device)
+            least.scatter_reduce_(0, fitted.index[used], chance[used], "amin")
+            return replace(self, found=self.found | _found(least * len(used)))
         batches = self.batches + 1
-        level = _LEVEL / (batches * (batches + 1))
         z = confirmed(before, u, d)
         sums = self.sums + z
         z = torch.maximum(z, sums / math.sqrt(batches))
-        certain = self.certain | (torch.erfc(z * math.sqrt(0.5)) <= level / fitted.n)
-        return Evidence(certain, sums, batches)
+        found = self.found | _found(torch.erfc(z * math.sqrt(0.5)))
+        return Evidence(found, sums, batches)
+
+
+def _found(chance: Tensor) -> Tensor:
+    """Return which parameters are found, by the probabilities [n] of their tests if no output depends on them."""
+    ordered = chance.sort().values
+    fine = (ordered <= _RATE * torch.arange(1, len(ordered) + 1, device=chance.device) / len(ordered)).nonzero()
+    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
 
 
 def confirmed(jacobian: SparseJacobian, u: Tensor, d: Tensor) -> Tensor:

@@ -275,16 +275,17 @@ def test_bounds_are_kept_and_hold_parameters():
 def test_parameters_that_no_pixel_depends_on_stay_and_are_named(f, engine, seed):
     """Through hops, and where the target is out of reach, so that samples beat the center and hops end near it.
 
-    It fails by chance for 1 % of new seeds.
+    By chance one or two without effect may be moved.
     """
     start = torch.linspace(0.1, 0.9, 100).double()  # some of these numbers change when divided by 0.7 and multiplied
     settings = {"sigma": 0.7, "loss": square(-2.0), "seed": seed, "max_evaluations": 300}
     fit = zh.minimize(lambda x: f(x).view(-1, 6, 10), start, engine=engine, **settings)
-    assert torch.equal(fit.x[60:], start[60:])
-    assert not torch.isclose(fit.x[:60], start[:60]).any()
-    assert fit.message.endswith(
-        "; 40 of 100 parameters (60, 61, 62, 63, 64, ...) changed no output and were left where they are"
-    )
+    moved = fit.x != start
+    assert moved[:60].all()
+    assert int(moved[60:].sum()) <= 2
+    first = ", ".join(str(60 + k) for k in (~moved[60:]).nonzero()[:5, 0].tolist())
+    said = f"; {int((~moved).sum())} of 100 parameters ({first}, ...) were not found to change any output, and stay"
+    assert fit.message.endswith(said)
 
 
 def test_parameters_that_no_pixel_depends_on_stay_in_noise():
@@ -302,7 +303,7 @@ def test_parameters_that_no_pixel_depends_on_stay_in_noise():
 
 def test_a_message_names_a_few_parameters():
     untouched = torch.tensor([True, False, True, True])
-    assert on_untouched(untouched) == "; 3 of 4 parameters (0, 2, 3) changed no output and were left where they are"
+    assert on_untouched(untouched) == "; 3 of 4 parameters (0, 2, 3) were not found to change any output, and stay"
     assert on_untouched(~untouched & untouched) == on_untouched(None) == ""
 
 
@@ -311,7 +312,7 @@ def test_a_dense_map_calls_no_parameter_untouched():
     assert search.untouched is None
 
 
-def test_where_few_entries_are_certain_more_samples_follow():
+def test_where_few_parameters_are_found_more_samples_follow():
     """A perfect fit would predict a third of the change."""
     search, generator = search_for(image, normal(N)), torch.Generator().manual_seed(0)
     points = search.ask()

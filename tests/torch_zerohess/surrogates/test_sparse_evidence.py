@@ -1,4 +1,4 @@
-"""Which parameters outputs depend on for certain: the rate of false ones, and that weak ones are found."""
+"""Which parameters outputs are found to depend on: the rate of false ones, and that most true ones are found."""
 
 import math
 
@@ -33,11 +33,11 @@ def after(black_box, batches, seed):
 
 
 @pytest.mark.parametrize("black_box", [curved, noisy])
-def test_no_other_parameter_is_certain_and_most_of_the_others_are(black_box):
-    """20 searches: at 1 % each, more than two with a false parameter have a probability of 0.1 %."""
-    found = torch.stack([after(black_box, 6, seed).certain for seed in range(20)])
-    assert int(found[:, TOUCHED:].any(1).sum()) <= 2
-    assert float(found[:, :TOUCHED].double().mean()) > 0.8
+def test_few_others_are_found_and_most_of_those_with_an_effect(black_box):
+    """In six batches at a rate of 0.5 % there are at most 3 % false ones, by expectation: 36 of 1200 in 20 searches."""
+    found = torch.stack([after(black_box, 6, seed).found for seed in range(20)])
+    assert int(found[:, TOUCHED:].sum()) <= 36
+    assert float(found[:, :TOUCHED].double().mean()) > 0.9
 
 
 def test_new_samples_are_standard_normal_where_nothing_depends_on_a_parameter():

@@ -252,10 +252,10 @@ def settings_of(smoothing: Smoothing) -> dict[str, Any]:
     return {one.name: getattr(smoothing, one.name) for one in fields(Smoothing)}
 
 
-def smoothing_of(settings: Mapping[str, Any]) -> Smoothing:
-    """Return the smoothing that `settings_of` described; KeyError if a name is none of a setting."""
+def smoothing_of(settings: Mapping[str, Any], what: str) -> Smoothing:
+    """Return the smoothing that `settings_of` described, in the state of `what`; KeyError for a name of no setting."""
     if unknown := settings.keys() - {one.name for one in fields(Smoothing)}:
-        raise KeyError(f"state must be a state_dict of such a layer, this one has {', '.join(sorted(unknown))}")
+        raise KeyError(f"state must be a state_dict of {what}, this one has {', '.join(sorted(unknown))}")
     return Smoothing(**settings)
 
 

@@ -160,7 +160,7 @@ def _fitted(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     note += ", of the starts that get there; in brackets the share of starts that get there, if not all do"
     note += " (95 % interval)." if interval else "."
     note += " The quartiles stand in brackets after each median." if quartiles else ""
-    note += " After the median stand the evaluations of the worst start that gets there." if worst else ""
+    note += " In brackets: the most evaluations that any of these starts needed." if worst else ""
     if any(str(one).startswith("image") for one in about["uses"]):
         note += " Where a task has no image, a method that uses the image uses the loss."
     return markdown(headers, rows), table, note
@@ -182,7 +182,7 @@ def _cell(row: dict[Any, Any], show: str, interval: bool, quartiles: bool, worst
         return "-" + share
     shown = {"evaluations": "", "seconds": " s"}
     cells = [_median(row, one, quartiles) + unit for one, unit in shown.items() if show in ("both", one)]
-    if worst:
+    if worst and show != "seconds":
         cells[0] += f" (at most {number(row['evaluations_worst'])})"
     return ", ".join(cells) + share
 

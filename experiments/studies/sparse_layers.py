@@ -1,4 +1,4 @@
-"""Derivatives behind a network with thousands of outputs: the dense layer, one with a memory, and the sparse layer.
+"""Derivatives behind a network that makes thousands of parameters: by `BlackBox`, with a memory, and `SparseBlackBox`.
 
 A linear network makes four textures, POSTER renders them, and the loss is the mean squared distance of the images from
 others. The error is relative, of the gradient in the weights and of the product of the Gauss-Newton matrix with a

@@ -233,7 +233,7 @@ class BlackBox(nn.Module):
         memory = settings.pop("memory", None)
         if memory is not None and self.memory is None:
             raise ValueError("the state has a memory, but the layer has none: make it with memory=Memory()")
-        smoothing = smoothing_of(settings)
+        smoothing = smoothing_of(settings, "a BlackBox")
         if memory is not None and self.memory is not None:
             self.memory.load_state_dict(memory)
         self.smoothing = smoothing  # after what may fail
@@ -301,7 +301,7 @@ def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
 
 
 def _before_compiling() -> None:
-    if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+    if transforms.jit_traces():
         raise RuntimeError("a BlackBox cannot be traced by torch.jit: what fn returns would become a constant")
     if torch.compiler.is_compiling():
         if torch.compiler.is_exporting():

@@ -14,7 +14,7 @@ from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing, following_seed, settings_of, smoothing_of
-from torch_zerohess.surrogates.sparse_fit import SparseSettings
+from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_grid, checked_rate
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 
@@ -30,12 +30,16 @@ class SparseBlackBox(nn.Module):
     the Gauss-Newton matrix, with the Hessian H of the loss in the outputs.
 
     `backward`, double backward and `torch.autograd.functional` work, and curvature="gauss_newton" of `optim.NewtonCG`.
-    Inside of `torch.func` transforms and `torch.compile` use `BlackBox`: here they raise RuntimeError.
+    Inside of `torch.func` transforms, `torch.compile` and `torch.jit.trace` it raises RuntimeError. `BlackBox` serves
+    the first two.
+
+    Each element begins with the latest Jacobian, of the element before it or of the call before. So a seed repeats the
+    samples, not the derivatives, and a state_dict does not keep what was found.
 
     Args:
-        fn: [K, n] -> [K, *out], an output of at least two numbers. It gets detached tensors.
-        smoothing: how to sample around each element of the batch; its evaluations per element are 2 * samples, besides
-            f(x).
+        fn: [K, n] -> [K, *out], an output of at least two numbers. It gets detached, contiguous tensors.
+        smoothing: how to sample around each element of the batch; its evaluations per element are 2 * samples, or
+            samples without antithetic pairs, besides f(x).
         keep, rate, grid: see `sparse_jacobian`.
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
@@ -70,6 +74,9 @@ class SparseBlackBox(nn.Module):
     ) -> None:
         super().__init__()
         check_smoothing(smoothing)
+        checked_rate(rate)
+        if grid is not None:
+            check_grid(grid)
         self.smoothing = smoothing
         self.call = BlackBoxCall(fn, vectorized, evaluator, on_nonfinite=on_nonfinite)
         self.settings: dict[str, Any] = {"keep": keep, "rate": rate, "grid": grid}
@@ -77,9 +84,9 @@ class SparseBlackBox(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n]."""
-        x = checked_input(x)
-        if transforms.watched(x) or transforms.has_tangent(x):
+        if transforms.jit_traces() or transforms.watched(x) or transforms.has_tangent(x):
             raise RuntimeError("a SparseBlackBox has no torch.func transforms and is not compiled: use BlackBox")
+        x = checked_input(x)
         batch, n = x.shape[:-1], x.shape[-1]
         SparseSettings.checked(n, **self.settings)
         center = working(x).detach().reshape(-1, n).clone()
@@ -117,7 +124,7 @@ class SparseBlackBox(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         check_state(state, {}, "a SparseBlackBox")
-        self.smoothing = smoothing_of(state)
+        self.smoothing = smoothing_of(state, "a SparseBlackBox")
 
     def extra_repr(self) -> str:
         return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"

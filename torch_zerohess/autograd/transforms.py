@@ -41,6 +41,11 @@ def transform_active() -> bool:
     return torch._C._functorch.maybe_current_level() is not None
 
 
+def jit_traces() -> bool:
+    """Whether `torch.jit.trace` records operations."""
+    return bool(torch.jit.is_tracing())  # type: ignore[attr-defined, no-untyped-call]
+
+
 def forward_mode_active() -> bool:
     """Whether a level of forward-mode differentiation is open in any thread, so that a tensor may carry a tangent."""
     return forward_ad._current_level >= 0

@@ -14,7 +14,7 @@ ones may differ by less than rounding, and farther ones may be other minima."""
 
 _BESIDE, _APART, _STEEPER = 1e-3, 0.1, 8.0
 """Distances in units of sigma up to which an evaluation is beside x, and from which it is apart; how many times as
-steep the loss is beside x at a cusp: a square root is so ten times."""
+steep the loss is beside x at a cusp: a square root is ten times as steep at 1e-3 as at 0.1."""
 _TOLD = 1e-3
 """Difference, over the range of all values, from which it tells a cusp: less may be roughness."""
 

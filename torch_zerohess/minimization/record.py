@@ -96,7 +96,7 @@ class Record:
             self.note(*self._interrupted)
 
     def with_start(self, untouched: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return `told` with the loss NaN of points where untouched parameters, bools [n], are not as at the start."""
+        """Return `told`, with the loss NaN wherever an untouched parameter, bools [n], differs from the start."""
         points, losses = self.told
         if untouched is None:
             return points, losses
@@ -110,7 +110,7 @@ class Record:
 
     @property
     def unbounded(self) -> bool:
-        """Whether there is no minimum according to the losses of the last request, see `is_unbounded`."""
+        """Whether the last request found a loss so low that there seems to be no minimum, see `is_unbounded`."""
         return bool((self.last[1] < -DEEP).any()) and is_unbounded(self.told[1])
 
     def state_dict(self) -> dict[str, Any]:

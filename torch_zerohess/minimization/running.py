@@ -148,10 +148,12 @@ class Running:
         before = losses[(points == x).all(1)]
         if are_counts(losses) and len(before):
             again = self._evaluated(x.expand(min(_AGAIN, self.left), -1))
-            if differs(again, before[-1]):
+            again = again[torch.isfinite(again)]
+            if len(again) and differs(again, before[-1]):
                 count = min(REPEATED - _AGAIN, self.left)
                 further = self._evaluated(x.expand(count, -1)) if count else again[:0]
-                self.noise = deviation(torch.cat([before, again, further]))
+                every = torch.cat([before, again, further])
+                self.noise = deviation(every[torch.isfinite(every)])
                 self.search = self._make(self.noise)
         self._sure = True
 

@@ -85,7 +85,7 @@ def _layers_of(module_or_modules: nn.Module | Iterable[nn.Module]) -> list[Black
         parts = one.modules() if isinstance(one, nn.Module) else []
         inside = [part for part in parts if isinstance(part, (BlackBox, SparseBlackBox))]
         if not inside:
-            raise TypeError(f"module_or_modules must be a BlackBox, or modules with a BlackBox inside, got {one!r}")
+            raise TypeError(f"module_or_modules must be a (Sparse)BlackBox, or modules with one inside, got {one!r}")
         found.update(dict.fromkeys(inside))
     if not found:
         raise TypeError(f"module_or_modules must have at least one BlackBox, got {module_or_modules!r}")

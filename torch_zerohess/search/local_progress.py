@@ -68,7 +68,7 @@ class LocalProgress(JacobianProgress):
     def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "LocalProgress":
         """Return the progress with a new Jacobian.
 
-        If it is the first one with some certain parameters, the best point is the center again: samples move all
+        If it is the first one with which some parameters stay, the best point is the center again: samples move all
         parameters, also those that stay where they are.
         """
         after = replace(self, jacobian=fitted.within(evidence.found), fitted=fitted, evidence=evidence)

@@ -11,8 +11,8 @@ from torch import Tensor
 T = TypeVar("T")
 _SCALAR = torch.Size()
 
-_EQUAL = 1e-6
-"""Difference between two losses that are the same, over the distance of the median of all losses from the lowest."""
+_EQUAL = 1e-4
+"""Difference between two losses that are the same, over the distance of the lower quartile of all from the lowest."""
 LOST = 10
 """Batches in a row that are lost, after which a round or the search ends."""
 
@@ -104,10 +104,11 @@ def agreeing(known: P, end: Best, tolerance: float, losses: Tensor | None = None
         known: the progress.
         end: the lowest point of the round.
         tolerance: see `are_same`.
-        losses: evaluations [P], against whose median two losses are the same; None if they are not to be compared.
+        losses: evaluations [P], against whose lower quartile two losses are the same: penalties are above it. None if
+            losses are not to be compared.
     """
     best = known.best
-    slack = -math.inf if losses is None else _EQUAL * (float(losses.median()) - best.loss)
+    slack = -math.inf if losses is None else _EQUAL * (float(losses.quantile(0.25)) - best.loss)
 
     def is_best(one: Best) -> bool:
         return are_same(one.point, best.point, tolerance) or one.loss - best.loss <= slack

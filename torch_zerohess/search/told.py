@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.estimation.inputs import times_changed
-from torch_zerohess.evaluators.values import stacked
+from torch_zerohess.evaluators.values import as_tensor
 from torch_zerohess.search.state import Evaluated
 
 _LARGEST = 1e305
@@ -23,7 +23,10 @@ _LARGEST_OUTPUT = 1e100
 def converted(values: Any, device: torch.device) -> Tensor:
     """Return what a caller told as float64, detached; TypeError if it is no tensor, array or list of numbers."""
     try:
-        values = torch.as_tensor(stacked(values), dtype=torch.float64, device=device)
+        values = as_tensor(values)
+        if values.is_complex():
+            raise TypeError("they are complex")
+        values = torch.as_tensor(values, dtype=torch.float64, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}: {error}") from error
     found: Tensor = values.detach()

@@ -85,9 +85,7 @@ def check_grid(grid: Sequence[int]) -> None:
 
 def checked_rate(rate: float) -> float:
     """Return a rate; TypeError for no number, ValueError for one that is not between 0 and 1."""
-    if not 0.0 < checked_number("rate", rate) < 1.0:
-        raise ValueError(f"rate must be between 0 and 1, got {rate}")
-    return rate
+    return checked_number("rate", rate, above=0.0, below=1.0)
 
 
 def fewest_samples(keep: int) -> int:

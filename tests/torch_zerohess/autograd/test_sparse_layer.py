@@ -153,3 +153,13 @@ def test_what_it_refuses():
         zh.SparseBlackBox(lambda z: blurred(z) * math.nan, SMOOTHING)(x)
     with pytest.raises(TypeError, match="smoothing must be a Smoothing"):
         zh.SparseBlackBox(blurred, 0.1)
+    with pytest.raises(ValueError, match="rate must be positive and below 1, got 0"):
+        zh.SparseBlackBox(blurred, SMOOTHING, rate=0.0)
+    with pytest.raises(TypeError, match="grid must be rows and columns"):
+        zh.SparseBlackBox(blurred, SMOOTHING, grid="abc")
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning")
+def test_torch_jit_is_refused():
+    with pytest.raises(RuntimeError, match="is not compiled"):
+        torch.jit.trace(zh.SparseBlackBox(lambda z: z.numpy(), SMOOTHING), X)

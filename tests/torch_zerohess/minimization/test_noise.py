@@ -417,3 +417,21 @@ def test_x_is_evaluated_again_where_losses_are_counts():
         assert repeated(fit) == count
         assert (fit.noise, fit.value_error) == (0.0, 0.0)
     assert repeated(zh.minimize(steps, [-0.7, 0.9], sigma=0.7, seed=0, max_evaluations=80, noise=0.0)) == 0
+
+
+def test_counts_that_are_missing_at_times_have_a_noise():
+    """One of the values at x is not finite: the deviation is of the others."""
+    for seed in range(4):
+        generator, begun = torch.Generator().manual_seed(seed), []
+
+        def fn(z, generator=generator, begun=begun):
+            counts = torch.poisson(4.0 * (1.0 + (z - 0.3).square().sum(1)), generator=generator)
+            counts[torch.rand(len(z), generator=generator) < 0.2] = torch.nan
+            if not begun:
+                begun.append(z)
+                counts = counts.nan_to_num(nan=9.0)
+                counts[(z == z[0]).all(1)] = 12.0
+            return counts
+
+        fit = zh.minimize(fn, [-0.7, 0.9], sigma=0.7, seed=seed, max_evaluations=100)
+        assert 0.0 < fit.noise < 20.0

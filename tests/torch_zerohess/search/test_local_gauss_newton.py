@@ -356,7 +356,7 @@ def test_values_that_are_not_finite_are_avoided():
         ({"loss": None}, "loss must be a function of one output for the engine 'local', got None"),
         ({"keep": 0}, "keep must be between 1 and the number of parameters, 144, got 0"),
         ({"keep": 40}, r"samples must be at least 42 to fit 40 parameters per output \(keep\), got 32"),
-        ({"rate": 1.0}, "rate must be between 0 and 1, got 1.0"),
+        ({"rate": 1.0}, "rate must be positive and below 1, got 1.0"),
         ({"grid": (12, 13)}, r"grid must be rows and columns \(and channels\) of 144 parameters, got \(12, 13\)"),
         ({"radius": 0.0}, "radius must be positive and finite, got 0.0"),
         ({"share": 2.0}, "share must be positive and at most 1, got 2.0"),

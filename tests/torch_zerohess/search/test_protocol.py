@@ -484,3 +484,14 @@ def test_steps_below_the_rounding_of_float32(seed):
         max_evaluations=60,
     )
     assert found.value < 1e-12
+
+
+def test_masked_values_are_told_as_missing():
+    search, other = (TrustRegion(zeros(2), sigma=1.0, seed=0) for _ in range(2))
+    values = search.ask().square().sum(1).numpy()
+    search.tell(np.ma.array(values, mask=[False, True, False]))
+    other.ask()
+    other.tell([values[0], math.nan, values[2]])
+    assert torch.equal(search.ask(), other.ask())
+    with pytest.raises(TypeError, match="complex"):
+        search.tell(search.ask()[:, 0] * 1j)

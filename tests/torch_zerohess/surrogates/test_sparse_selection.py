@@ -79,12 +79,12 @@ def test_thresholds_of_large_images_are_those_of_all_pairs(monkeypatch):
 
 def test_few_pairs_count_and_chance_alone_does_not():
     """Of 200 outputs of pure noise at most a tenth should have any pair: 40 is more than four standard errors more."""
-    generator, none = torch.Generator().manual_seed(0), 0
+    generator, some = torch.Generator().manual_seed(0), 0
     grids = Grids.of(torch.Size([3]), None)
     for _ in range(200):
         u, noise = (centered(torch.randn(60, k, generator=generator)) for k in (150, 3))
-        none += bool(len(next(candidates(u, noise, grids, thresholds(u, noise, grids, 0.1)))[1]))
-    assert none < 40
+        some += bool(len(next(candidates(u, noise, grids, thresholds(u, noise, grids, 0.1)))[1]))
+    assert some < 40
     found = list(candidates(u, u[:, :3], grids, thresholds(u, u[:, :3], grids, 0.1)))
     assert {(0, 0), (1, 1), (2, 2)} <= {
         pair for one in found for pair in zip(one[1].tolist(), one[2].tolist(), strict=True)

@@ -137,7 +137,7 @@ def test_very_few_points_give_their_mean():
     [
         ({"keep": 0}, "keep must be at least 1, got 0"),
         ({"capacity": 1}, "capacity must be at least 2, got 1"),
-        ({"rate": 2.0}, "rate must be between 0 and 1, got 2.0"),
+        ({"rate": 2.0}, "rate must be positive and below 1, got 2.0"),
         ({"grid": (3, 4)}, "grid must be rows and columns"),
     ],
 )
@@ -149,7 +149,7 @@ def test_wrong_settings_are_named(settings, message):
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"rate": 0.0}, ValueError, "rate must be between 0 and 1, got 0.0"),
+        ({"rate": 0.0}, ValueError, "rate must be positive and below 1, got 0.0"),
         ({"rate": "a"}, TypeError, "rate must be"),
         ({"grid": (3,)}, ValueError, "grid must be rows and columns"),
         ({"grid": [True, True]}, TypeError, "grid must be rows and columns"),

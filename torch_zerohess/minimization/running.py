@@ -133,7 +133,13 @@ class Running:
             self._first(points)
             return
         self.noise = self.noise or 0.0
-        search.tell(self.record.values(points))
+        values = self.record.values(points)
+        if self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0])):
+            # A search that begins again in noise, without a value at its start: there was one before.
+            search.tell(torch.cat([self.record.told[1][:1].to(values), values[1:]]))
+            self._noted(points, values.to(search.told))
+            return
+        search.tell(values)
         self._noted(points, search.told)
 
     def look_again(self) -> None:

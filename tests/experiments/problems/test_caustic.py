@@ -265,10 +265,10 @@ def test_particle_tracer_sees_the_same_light() -> None:
 
 def test_check_reads_a_run(tmp_path, capsys) -> None:
     x = 1e3 * quadratic(0.1)
-    attempt(TASK, "block_gauss_newton", 0, lambda trial: trial.report(x), tmp_path)
+    attempt(TASK, "local", 0, lambda trial: trial.report(x), tmp_path)
     same = check_caustic(tmp_path, spp=20)
     assert f"particle tracer {same:.4f}" in capsys.readouterr().out
     assert same > 0.5
-    assert (tmp_path / "caustic-block_gauss_newton-0.png").stat().st_size > 1000
-    with pytest.raises(SystemExit, match="run 5 of block_gauss_newton on caustic"):
+    assert (tmp_path / "caustic-local-0.png").stat().st_size > 1000
+    with pytest.raises(SystemExit, match="run 5 of local on caustic"):
         check_caustic(tmp_path, run=5)

@@ -134,13 +134,10 @@ class Running:
             return
         self.noise = self.noise or 0.0
         values = self.record.values(points)
-        if self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0])):
-            # A search that begins again in noise, without a value at its start: there was one before.
-            search.tell(torch.cat([self.record.told[1][:1].to(values), values[1:]]))
-            self._noted(points, values.to(search.told))
-            return
-        search.tell(values)
-        self._noted(points, search.told)
+        # A search that begins again in noise may get no value at its start, where there was one before.
+        lost = self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0]))
+        search.tell(torch.cat([self.record.told[1][:1].to(values), values[1:]]) if lost else values)
+        self._noted(points, values.to(search.told) if lost else search.told)
 
     def look_again(self) -> None:
         """Evaluate x twice again where the search has arrived or is about to end, and losses are counts.

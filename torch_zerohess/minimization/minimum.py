@@ -78,7 +78,7 @@ class Minimum:
             one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and, unless
             three rounds agree, where fn jumps, fails, is constant or has a cusp at x; or the loss falls without end.
             budget, time: evaluations or seconds are used up. callback, interrupted: the caller has ended it. failed:
-            the black box, the loss or the callback has raised.
+            the black box, the loss, the callback or the search has raised.
         message: why the search ended, in words.
         engine: which search it was: "gaussian_process", "descent" or "local".
     """

@@ -28,9 +28,9 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     from there. It stays with what it finds if the loss is lower, and returns otherwise.
 
     Only parameters that some output was found to depend on are moved. The others stay where they are, and `untouched`
-    names them. Of the parameters found in a batch, 0.5 % are expected to be without effect. A parameter with a weak
-    effect counts as untouched until there is enough evidence. Samples perturb all parameters. So no sample is the best
-    point while some parameters stay.
+    names them. Of the parameters found in a batch, at most 0.5 % have no effect, by expectation. A parameter with a
+    weak effect counts as untouched until there is enough evidence. Samples perturb all parameters. So no sample is the
+    best point while some parameters stay.
 
     Args:
         x0: start [n], float32 or float64, within the bounds.

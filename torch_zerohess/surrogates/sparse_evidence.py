@@ -22,7 +22,7 @@ from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_regression import chances, normal_from_t
 
 _RATE = 5e-3
-"""Of parameters that no output depends on, among those that are found in a batch."""
+"""Expected share of parameters that no output depends on, among those that are found in a batch, at most."""
 
 _ROUNDING = 1e-6
 """Sums below this share of what parameter j adds to them are rounding."""

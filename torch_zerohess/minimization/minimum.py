@@ -14,18 +14,6 @@ if TYPE_CHECKING:
 
 Status = Literal["target", "solved", "stalled", "budget", "time", "callback", "interrupted", "failed"]
 
-_NAMED = 5
-"""Untouched parameters in a message, at most."""
-
-
-def on_untouched(untouched: Tensor | None) -> str:
-    """Return what a message says about parameters that no output was found to depend on, bools [n]."""
-    numbers = [] if untouched is None else untouched.nonzero()[:, 0].tolist()
-    if untouched is None or not numbers:
-        return ""
-    names = ", ".join(map(str, numbers[:_NAMED])) + (", ..." if len(numbers) > _NAMED else "")
-    return f"; {len(numbers)} of {len(untouched)} parameters ({names}) were not found to change any output, and stay"
-
 
 class Observation(NamedTuple):
     """A point at which the function was evaluated [n], and the loss there."""

@@ -95,7 +95,7 @@ class Record:
         if self.requested is not None:
             self.note(*self._interrupted)
 
-    def with_start(self, untouched: Tensor | None) -> tuple[Tensor, Tensor]:
+    def keeping(self, untouched: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return `told`, with the loss NaN wherever an untouched parameter, bools [n], differs from the start."""
         points, losses = self.told
         if untouched is None:

@@ -13,7 +13,7 @@ from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.decision import Decision, decide
 from torch_zerohess.minimization.derivatives import quadratic_at
 from torch_zerohess.minimization.doubt import doubt
-from torch_zerohess.minimization.minimum import Iterate, Minimum, Status, on_untouched
+from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
 from torch_zerohess.minimization.noise import REPEATED, are_counts, deviation, differs, reserved
 from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.minimization.wording import budget, worded
@@ -189,7 +189,7 @@ class Running:
             return
         self._deciding = before, allowed
         search, believed = self.search, self._believed(before).x
-        points, losses = self.record.with_start(search.untouched)
+        points, losses = self.record.keeping(search.untouched)
         likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
         found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise, trusted=search.averages)
         if found is not None:
@@ -228,8 +228,7 @@ class Running:
             evaluations=self.evaluations,
             points=points,
             values=losses,
-            message=worded(message, status, equal, why, arrived=search.solved, success=success)
-            + on_untouched(search.untouched),
+            message=worded(message, status, equal, why, search.untouched, arrived=search.solved, success=success),
             engine=search.engine,
             success=success,
             status=status,
@@ -260,14 +259,14 @@ class Running:
         search = self.search
         if not self.noise and search.evaluations and self.record.requested is None:
             return Belief(search.x, search.value, 0.0)
-        points, losses = self.record.with_start(search.untouched)  # with what was not told to the search
+        points, losses = self.record.keeping(search.untouched)  # with what was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):
             return self._believed(self.evaluations)
         return lowest(points, losses, search.x)
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
-        points, losses = self.record.with_start(self.search.untouched)
+        points, losses = self.record.keeping(self.search.untouched)
         return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
 
     def _first(self, points: Tensor) -> None:

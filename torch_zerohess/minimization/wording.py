@@ -1,9 +1,16 @@
 """Why a search has ended, in words, with what its evaluations say about the end."""
 
+from torch import Tensor
+
 from torch_zerohess.minimization.minimum import Status
 
+_NAMED = 5
+"""Untouched parameters in a message, at most."""
 
-def worded(message: str, status: Status, equal: int, doubt: str, *, arrived: bool, success: bool) -> str:
+
+def worded(
+    message: str, status: Status, equal: int, doubt: str, untouched: Tensor | None, *, arrived: bool, success: bool
+) -> str:
     """Return the message of a result.
 
     Args:
@@ -11,6 +18,7 @@ def worded(message: str, status: Status, equal: int, doubt: str, *, arrived: boo
         status: of the result.
         equal: how many evaluations there were, if all values are equal; otherwise 0.
         doubt: why x may be no minimum; empty if there is no doubt.
+        untouched: which parameters no output was found to depend on, bools [n]; or None.
         arrived: whether the search has arrived at x.
         success: of the result.
     """
@@ -21,7 +29,7 @@ def worded(message: str, status: Status, equal: int, doubt: str, *, arrived: boo
         message += f"; {doubt}"
     if success and cut:
         message += "; the search had arrived at x, a minimum at least of its surroundings"
-    return message
+    return message + _on_untouched(untouched)
 
 
 def budget(most: int, count: int, *, rest: bool) -> str:
@@ -30,3 +38,11 @@ def budget(most: int, count: int, *, rest: bool) -> str:
     if count > most:
         return f"{given} allows no more than the {count} so far"
     return f"{given} allows no step after the {count} so far" if rest and count < most else f"{given} used up"
+
+
+def _on_untouched(untouched: Tensor | None) -> str:
+    numbers = [] if untouched is None else untouched.nonzero()[:, 0].tolist()
+    if untouched is None or not numbers:
+        return ""
+    names = ", ".join(map(str, numbers[:_NAMED])) + (", ..." if len(numbers) > _NAMED else "")
+    return f"; {len(numbers)} of {len(untouched)} parameters ({names}) were not found to change any output, and stay"

@@ -8,7 +8,6 @@ import torch
 from searches import run
 
 import torch_zerohess as zh
-from torch_zerohess.minimization.minimum import on_untouched
 from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
 from torch_zerohess.search.gauss_newton import LENGTHS
 from torch_zerohess.search.state import Evaluated
@@ -299,12 +298,6 @@ def test_parameters_that_no_pixel_depends_on_stay_in_noise():
     assert fit.noise > 0.0
     assert torch.equal(fit.x[60:], start[60:])
     assert not torch.equal(fit.x[:60], start[:60])
-
-
-def test_a_message_names_a_few_parameters():
-    untouched = torch.tensor([True, False, True, True])
-    assert on_untouched(untouched) == "; 3 of 4 parameters (0, 2, 3) were not found to change any output, and stay"
-    assert on_untouched(~untouched & untouched) == on_untouched(None) == ""
 
 
 def test_a_dense_map_calls_no_parameter_untouched():

@@ -2,9 +2,6 @@
 
 | method | perturbed | derivatives of | step |
 |---|---|---|---|
-| large_steps_adam | vertices | the loss, with the white box (I + w L)^-1 before the black box | Adam |
-| levels_adam | handles | the loss | Adam |
-| levels_newton_cg | handles | the loss | Newton-CG |
 | handles_adam | handles | the losses of the handles | Adam |
 | handles_newton, **recommended** | handles | the losses of the handles | Newton, a Hessian per handle; then Adam |
 
@@ -22,13 +19,10 @@ diagonal blocks of the Hessian of the whole loss.
 
 A pixel that only mesh or only target covers counts as more than its difference in shading. With the difference alone, a
 missing ear and a dark web beside an ear are local minima.
-
-Large steps: Nicolet, Jacobson and Jakob 2021, "Large steps in inverse rendering of geometry".
 """
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,7 +45,6 @@ DAMPING = 0.5
 def handles(
     trial: Trial,
     *,
-    credit: Literal["all", "local"],
     newton: int = 0,
     levels: tuple[int, ...] = LEVELS,
     steps: int = 80,
@@ -67,10 +60,8 @@ def handles(
 
     Args:
         trial: the run.
-        credit: whether a handle answers for all pixels or for those that it can change.
-        newton: number of levels, from the first, with Newton steps by blocks of the Hessian, which needs credit
-            "local"; the other levels have Adam steps. The finer the level, the fewer pixels a handle has, and the more
-            of its sampled curvature is noise.
+        newton: number of levels, from the first, with Newton steps by blocks of the Hessian; the other levels have Adam
+            steps. The finer the level, the fewer pixels a handle has, and the more of its sampled curvature is noise.
         levels: of the handles; one may come again.
         steps: on each level.
         samples: antithetic pairs; a step costs twice as many evaluations.
@@ -81,8 +72,8 @@ def handles(
             pixels, each as if it were alone.
         size: of a step of Adam, in units of sigma.
         momentum: shares of what was before in the means of the gradient and of the curvature.
-        silhouette: added to the square of a pixel that only one of mesh and target covers, with credit "local". A thin
-            part that is dark, or missing, is a small error of the shading and a local minimum of it.
+        silhouette: added to the square of a pixel that only one of mesh and target covers. A thin part that is dark,
+            or missing, is a small error of the shading and a local minimum of it.
     """
     mesh, x = _mesh(trial.task), trial.start
     first_order = zh.Smoothing(sigma=1.0, samples=samples, order=1, baseline="none")
@@ -96,95 +87,15 @@ def handles(
         for number in range(steps):
             width = sigma[0] + (sigma[1] - sigma[0]) * number / max(steps - 1, 1)
             smoothing = smoothing.replace(sigma=width)
-            if credit == "local":
-                reach = BEYOND * width * float(unit[0]) * mesh.cameras.pixels + 1
-                local = _losses(trial, control, x, unit, reach, silhouette)
-                estimate = zh.estimate(local, zero, smoothing, value="smoothed", joint=True)
-            else:
-                estimate = zh.estimate(_loss(trial, control, x, unit), zero.flatten(), smoothing, value="smoothed")
-            gradient = estimate.gradient.view_as(zero)
+            reach = BEYOND * width * float(unit[0]) * mesh.cameras.pixels + 1
+            local = _losses(trial, control, x, unit, reach, silhouette)
+            estimate = zh.estimate(local, zero, smoothing, value="smoothed", joint=True)
             if visit < newton:
-                move = _newton(*means(gradient, estimate.hessian()), rate, width)
+                move = _newton(*means(estimate.gradient, estimate.hessian()), rate, width)
             else:
-                move = _adam(*means(gradient, gradient.square()), size * width)
+                move = _adam(*means(estimate.gradient, estimate.gradient.square()), size * width)
             x = control.displaced(x, (move * unit)[None])[0]
-            trial.report(x, sigma=width * float(unit[0]), loss=estimate.value.sum() if credit == "all" else None)
-
-
-def newton_cg(
-    trial: Trial,
-    *,
-    levels: tuple[int, ...] = LEVELS,
-    steps: int = 5,
-    samples: int = 64,
-    sigma: tuple[float, float] = (0.15, 0.075),
-    color: float = 0.5,
-    radius: float = 3.0,
-) -> None:
-    """Newton-CG on the smoothed loss as a function of all handles of a level; arguments as for `handles`.
-
-    radius: of the trust region, in units of sigma.
-    """
-    mesh, x = _mesh(trial.task), trial.start
-    for level in levels:
-        control = mesh.control(level)
-        unit = torch.full((mesh.channels,), mesh.spacing(trial.start, level), dtype=torch.float64)
-        unit[3:] = color
-        z = torch.zeros(len(control) * mesh.channels, dtype=torch.float64, requires_grad=True)
-        smoothing = zh.Smoothing(sigma=sigma[0], samples=samples, baseline="mean")
-        layer = zh.BlackBox(_loss(trial, control, x, unit), smoothing, value="smoothed")
-        optimizer = zh.optim.NewtonCG([z], radius=radius * sigma[0], adapt=False)
-        annealing = zh.LinearSigma(layer, *sigma, max(steps - 1, 1))
-        for _ in range(steps):
-            optimizer.param_groups[0]["radius"] = radius * annealing.sigma
-            loss = optimizer.step(partial(layer, z))
-            moved = z.detach().view(1, -1, mesh.channels) * unit
-            trial.report(control.displaced(x, moved)[0], sigma=annealing.sigma * float(unit[0]), loss=loss)
-            annealing.step()
-        x = trial.x
-
-
-def large_steps(
-    trial: Trial,
-    *,
-    samples: int = 8,
-    sigma: tuple[float, float] = (0.3, 0.1),
-    color: float = 0.5,
-    weight: float = 20.0,
-    rate: float = 0.05,
-    steps: int = 200,
-) -> None:
-    """Adam on z, vertices x = (I + weight L)^-1 z, with L the Laplacian of the triangles; arguments as for `handles`.
-
-    The step size is the same for all elements, by the greatest of Adam's second moments, as in the source.
-
-    rate: size of a step of z, in units of the mean length of edges.
-    """
-    mesh = _mesh(trial.task)
-    edge = mesh.spacing(trial.start, mesh.level)
-    unit = torch.full((mesh.channels,), edge, dtype=torch.float64)
-    unit[3:] = color
-    stiff = mesh.laplacian * weight
-    stiff.diagonal().add_(1.0)
-    smooth = torch.linalg.inv(stiff)
-    z = (stiff @ (mesh.rows(trial.start) / unit)).requires_grad_()
-    smoothing = zh.Smoothing(sigma=sigma[0], samples=samples, baseline="none", order=1)
-    layer = zh.BlackBox(lambda x: trial.loss((mesh.rows(x) * unit).flatten(1)), smoothing, value="smoothed")
-    annealing, means = zh.LinearSigma(layer, *sigma, max(steps - 1, 1)), _Means((0.9, 0.999))
-    for _ in range(steps):
-        loss = layer((smooth @ z).flatten())
-        (gradient,) = torch.autograd.grad(loss, z)
-        first, second = means(gradient, gradient.square().max())
-        with torch.no_grad():
-            z -= rate * first / second.sqrt().clamp(min=1e-300)
-            x = ((smooth @ z) * unit).flatten()
-        trial.report(x, sigma=annealing.sigma * edge, loss=loss.detach())
-        annealing.step()
-
-
-def _loss(trial: Trial, control: Control, x: Tensor, unit: Tensor) -> Callable[[Tensor], Tensor]:
-    """The loss [K] of displacements [K, handles * channels] in units of `unit`."""
-    return lambda z: trial.loss(control.displaced(x, z.unflatten(1, (-1, len(unit))) * unit))
+            trial.report(x, sigma=width * float(unit[0]))
 
 
 def _losses(
@@ -251,17 +162,12 @@ def is_mesh(task: Task) -> str | None:
     return None if task.output and task.output.residuals else "the black box returns no residuals"
 
 
-def _method(name: str, title: str, solve: Callable[..., None], **fixed: Any) -> Method:
-    uses = "image, cameras, triangles" if fixed.get("credit") == "local" else "loss, triangles"
-    return Method(name, title, with_settings(solve, **fixed), is_mesh, ("scipy",), uses=uses)
+def _method(name: str, title: str, **fixed: Any) -> Method:
+    uses = "image, cameras, triangles"
+    return Method(name, title, with_settings(handles, **fixed), is_mesh, ("scipy",), uses=uses)
 
 
 METHODS = (
-    _method(
-        "handles_newton", "ours for meshes: Newton, then Adam, a loss per handle", handles, credit="local", newton=2
-    ),
-    _method("handles_adam", "Adam, a loss per handle of a mesh", handles, credit="local"),
-    _method("levels_adam", "Adam, handles of a mesh from coarse to fine", handles, credit="all"),
-    _method("levels_newton_cg", "Newton-CG, handles of a mesh from coarse to fine", newton_cg),
-    _method("large_steps_adam", "Adam behind the inverse Laplacian of a mesh", large_steps),
+    _method("handles_newton", "ours for meshes: Newton, then Adam, a loss per handle", newton=2),
+    _method("handles_adam", "Adam, a loss per handle of a mesh"),
 )

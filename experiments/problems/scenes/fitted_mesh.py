@@ -45,14 +45,6 @@ class FittedMesh:
         return torch.from_numpy(icosphere(self.level)[1])
 
     @property
-    def laplacian(self) -> Tensor:
-        """Number of neighbours on the diagonal and -1 for each of them, [m, m]."""
-        edges = self.faces[:, [0, 1, 1, 2, 2, 0]].view(-1, 2)
-        joined = torch.zeros(len(self.sphere), len(self.sphere), dtype=torch.float64)
-        joined[edges[:, 0], edges[:, 1]] = 1.0  # every edge is met in both directions
-        return joined.sum(1).diag() - joined
-
-    @property
     def n(self) -> int:
         return len(self.sphere) * self.channels
 

@@ -174,23 +174,14 @@ def meshfit_damping(blocks):
 SHORT = {"levels": (1,), "steps": 6, "samples": 4}
 
 
-@pytest.mark.parametrize(
-    ("method", "settings", "share"),
-    [
-        ("handles_adam", SHORT, 0.95),
-        ("handles_newton", SHORT, 0.95),
-        ("levels_adam", {**SHORT, "levels": (0,)}, 1.0),
-        ("levels_newton_cg", {"levels": (0,), "steps": 1, "samples": 24}, 1.0),
-        ("large_steps_adam", {"steps": 6, "samples": 4}, 1.0),
-    ],
-)
-def test_a_few_steps_lower_the_error(method, settings, share) -> None:
+@pytest.mark.parametrize("method", ["handles_adam", "handles_newton"])
+def test_a_few_steps_lower_the_error(method) -> None:
     torch.manual_seed(0)
     trial = Trial(TASK, method, 1000)
-    METHODS[method].solve(trial, settings)
+    METHODS[method].solve(trial, SHORT)
     assert trial.evaluations == 48
     first, last = trial.rows[0], trial.rows[-1]
-    assert last.image_error < share * first.image_error
+    assert last.image_error < 0.95 * first.image_error
 
 
 def test_colors_are_fitted_with_the_vertices() -> None:

@@ -76,10 +76,6 @@ def _made(name: str, query: Query) -> tuple[str, pd.DataFrame, str]:
 
 def rows_of(name: str, query: Query) -> pd.DataFrame:
     """Return the rows of a stored table that have all values of a query."""
-    if name == SPEED_UP:
-        method = query.take("method", "all")
-        table = _ratios(query)
-        return table[table["method"] == method]
     return _where(result_files.read(name), query)
 
 
@@ -243,8 +239,13 @@ def _table_2(query: Query) -> tuple[str, pd.DataFrame, str]:
     return markdown(source_table.HEADERS, rows), table[table["task"].isin(tasks)], note
 
 
-def _ratios(query: Query) -> pd.DataFrame:
-    """Return a row per method with its mean ratios to the reference, under `speed_up`'s own column names."""
+def _only(table: pd.DataFrame, column: str) -> str:
+    """Return the values of a column as one text."""
+    return "; ".join(dict.fromkeys(number(one) for one in table[column]))
+
+
+def _speed_up(query: Query) -> tuple[str, pd.DataFrame, str]:
+    """Rows are methods, with their mean ratios to the reference."""
     table = _fits(SPEED_UP, query)
     reference = query.names("reference", list(table["method"].unique()))[0]
     if "methods" in query.options:
@@ -252,21 +253,10 @@ def _ratios(query: Query) -> pd.DataFrame:
     table, *_ = _selected(table, query)
     query.end()
     found = pd.DataFrame(speed_ups(with_ratios(table, reference), reference))
-    return found.assign(reference=reference, **{one: _only(table, one) for one in result_files.ORIGIN if one in table})
-
-
-def _only(table: pd.DataFrame, column: str) -> str:
-    """Return the values of a column as one text."""
-    return "; ".join(dict.fromkeys(number(one) for one in table[column]))
-
-
-def _speed_up(query: Query) -> tuple[str, pd.DataFrame, str]:
-    table = _ratios(query)
-    reference = table["reference"].iloc[0]
-    rows = table[["method", "seconds", "seconds_geometric", "evaluations", "evaluations_geometric", "cases"]]
     note = f"Median seconds and evaluations of a method divided by those of `{reference}`: means over all tasks, "
     note += "errors and levels that both reach."
-    return markdown(HEADERS, rows.to_numpy().tolist()), table, note
+    origin = found.assign(**{one: _only(table, one) for one in result_files.ORIGIN if one in table})
+    return markdown(HEADERS, found.to_numpy().tolist()), origin, note
 
 
 def _origin(table: pd.DataFrame, note: str, whole: bool) -> str:

@@ -9,8 +9,6 @@
 
 The faults are kills of workers at random times, and evaluations that hang. All values must equal the values of an
 undisturbed call, bit by bit. No process may remain, and no file may be open that was not open before.
-
-`scaling` has a module of its own.
 """
 
 import json
@@ -35,7 +33,6 @@ from experiments.reports.progress import progress
 from experiments.reports.tables import table
 from experiments.runs.records import write
 from experiments.studies.bench_ratios import in_turn
-from experiments.studies.scaling import scaling as scaling_of
 from torch_zerohess.evaluators import Factory, Inline, ProcessPool
 
 _CALL = 200
@@ -99,7 +96,6 @@ def workers(
     kills: int = 200,
     hangs: int = 50,
     seed: int = 0,
-    scaling: Path | None = None,
     out: Path | None = None,
 ) -> tuple[list[Cost], Faults | None]:
     """Measure the cost of worker processes, and disturb them.
@@ -113,7 +109,6 @@ def workers(
         kills: of workers, at random times.
         hangs: evaluations that hang.
         seed: of the times.
-        scaling: CSV file to write: batches in up to `count` workers, measured, and in up to 10 000, simulated.
         out: JSON file to write.
 
     Raises:
@@ -135,8 +130,6 @@ def workers(
     if out is not None:
         written = {"costs": [asdict(one) for one in costs], "faults": None if faults is None else asdict(faults)}
         write(out, json.dumps(written, indent=1))
-    if scaling is not None:
-        scaling_of(count, scaling)
     if faults and not faults.right:
         raise SystemExit(1)
     return costs, faults

@@ -46,11 +46,3 @@ def test_wrong_arguments_are_named() -> None:
     for task in ("mugs", "cnn"):  # a name that is not known, and a network
         with pytest.raises(SystemExit, match=f"task must be some of .*, got {task}"):
             study.workers(task=task)
-
-
-def test_scaling_is_asked_for(monkeypatch, tmp_path) -> None:
-    called = []
-    monkeypatch.setattr(study, "scaling_of", lambda *given: called.append(given))
-    study.workers(repeats=0, evaluations=0)
-    study.workers(count=3, repeats=0, evaluations=0, scaling=tmp_path)
-    assert called == [(3, tmp_path)]

@@ -140,7 +140,6 @@ def rendered(
     moving: Callable[[Setting], MitsubaScene],
     variant: str,
     setting: Setting,
-    full: Setting,
     solution: Tensor,
     needs: str,
     parameter_error: Callable[[Tensor], float] | None = None,
@@ -155,27 +154,12 @@ def rendered(
         moving: the same with shapes in place of instances, for derivatives.
         variant: of both.
         setting: of this task.
-        full: the setting of the source.
         solution: [n].
         needs: why the setting is enough.
         parameter_error: of x [n]; the mean squared difference to the solution if None.
         facts: `name`, `title`, `parameters`, `start`, `sigma`, `bounds` and `evaluations` of the task.
     """
     reference = Reference(scene, moving, setting, solution)
-
-    def whole() -> RenderedTask:
-        return rendered(
-            scene=scene,
-            moving=moving,
-            variant=variant,
-            setting=full,
-            full=full,
-            solution=solution,
-            needs=needs,
-            parameter_error=parameter_error,
-            **facts,
-        )
-
     return RenderedTask(
         **facts,
         solution=solution,
@@ -194,7 +178,6 @@ def rendered(
             no_adjoint=lambda: unavailable(variant),
             prepare=reference.prepare,
             release=reference.release,
-            full=None if setting == full else whole,
         ),
     )
 

@@ -65,7 +65,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Renderer:
-    """The program behind the black box: its own derivative, when it is loaded and freed, and its full setting."""
+    """The program behind the black box: its own derivative, and when it is loaded and freed.
+
+    A task that has one leaves out something of the source's setting in preset "fast", and nothing in preset "paper".
+    """
 
     adjoint: Callable[[Tensor, str, int], tuple[Tensor, Tensor]] | None = None
     """x [n], one of `adjoints` and the seed of the adjoint pass -> loss [], gradient [n].
@@ -80,8 +83,6 @@ class Renderer:
     """Free the scene; the next call loads it again. Two loaded scenes slow each other down."""
     skip: Callable[[int, int], None] = _nothing
     """Advance fresh noise by so many calls and points, which a replay has answered without the renderer."""
-    full: "Callable[[], Task] | None" = None
-    """The same task with film, samples, depth and channels of the source, to measure what leaving them out saves."""
 
 
 @dataclass(frozen=True, kw_only=True)

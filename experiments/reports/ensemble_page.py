@@ -62,11 +62,12 @@ def page(folder: Path, tasks: Mapping[str, Task] | None = None) -> str:
         parts.append(_speed_ups(summary))
     for name, methods in results.runs.items():
         settings = known["settings"].get(name, {})
-        task = (tasks or {}).get(name) or _load(name, *preset_and_variant(settings))
+        preset, variant = preset_and_variant(settings)
+        task = (tasks or {}).get(name) or _load(name, preset, variant)
         parts += [f"<h2 id='{html_text(name)}'>{html_text(name)}</h2>", _about(task), _tables(summary, name)]
         parts.append(_curves(name, methods, chosen))
         if task is not None:
-            parts += [_pictures(task, *first_run(task, methods)), _left_out(task, folder)]
+            parts += [_pictures(task, *first_run(task, methods)), _left_out(task, preset, folder)]
         parts.append(_settings(settings))
     title = f"Results of {', '.join(results.runs)}"
     if summary.unfinished:
@@ -147,9 +148,9 @@ def _figure(name: str, picture: Tensor | None, caption: str) -> str:
     return f"<figure>{image}<figcaption><b>{html_text(name)}</b><br>{html_text(caption)}</figcaption></figure>"
 
 
-def _left_out(task: Task, folder: Path) -> str:
+def _left_out(task: Task, preset: Preset, folder: Path) -> str:
     """Say what the setting of the task saves over the source's."""
-    if task.renderer is None or task.renderer.full is None:
+    if task.renderer is None or preset == "paper":
         return ""
     found = (
         kept_saving(folder / task.name)

@@ -34,39 +34,38 @@ def full_setting(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(met
     """
     settings = read_command(folder)["settings"]
     runs = load(folder).runs
-    tasks = [catalogue.fitting(name, *preset_and_variant(settings.get(name, {}))) for name in runs if name in FITTING]
-    reduced = [task for task in tasks if task.renderer is not None and task.renderer.full is not None]
+    made = {name: preset_and_variant(settings.get(name, {})) for name in runs if name in FITTING}
+    tasks = {name: catalogue.fitting(name, *made[name]) for name in made if made[name][0] == "fast"}
+    reduced = {name: task for name, task in tasks.items() if task.renderer is not None}
     if not reduced:
         raise SystemExit(f"DIR must have a task that leaves out something of the source's, got {', '.join(runs)}")
-    for task in reduced:
-        print(f"{task.name}: {measured(task, runs[task.name], folder / task.name)}", flush=True)
+    for name, task in reduced.items():
+        whole = catalogue.fitting(name, "paper", made[name][1])
+        print(f"{name}: {measured(task, whole, runs[name], folder / name)}", flush=True)
 
 
-def measured(task: Task, methods: Mapping[str, Sequence[Run]], folder: Path) -> Saving:
+def measured(task: Task, whole: Task, methods: Mapping[str, Sequence[Run]], folder: Path) -> Saving:
     """Return the saving that is kept in a task's folder of results, measured first if there is none."""
     found = kept_saving(folder)
     if found is None:
         _, ends = first_run(task, methods)
-        found = saving(task, line(ends["start"], min(ends.values(), key=task.truth.image_error)))
+        found = saving(task, whole, line(ends["start"], min(ends.values(), key=task.truth.image_error)))
         found.keep(folder)
     return found
 
 
-def saving(task: Task, points: Tensor) -> Saving:
-    """Measure a task against its full setting at points [P, n], one evaluation at a time.
+def saving(task: Task, whole: Task, points: Tensor) -> Saving:
+    """Measure a task against the whole task, in the source's setting, at points [P, n], one evaluation at a time.
 
     One is released before the other is loaded; the first evaluation of each, which loads and compiles, is not timed.
-    Raises ValueError if the task has no other setting.
     """
-    if task.renderer is None or task.renderer.full is None:
-        raise ValueError(f"task must have a full setting to be measured against, {task.name} has none")
     if points.ndim != 2 or points.shape[1] != task.n or not len(points):
         raise ValueError(f"points must be [P, {task.n}], got {list(points.shape)}")
-    used, whole = (_measured(one, points) for one in (task, task.renderer.full()))
+    used, full = (_measured(one, points) for one in (task, whole))
     return Saving(
         statistics.median(seconds for seconds, _ in used),
-        statistics.median(seconds for seconds, _ in whole),
-        _difference([value for _, value in used], [value for _, value in whole]),
+        statistics.median(seconds for seconds, _ in full),
+        _difference([value for _, value in used], [value for _, value in full]),
     )
 
 

@@ -74,7 +74,7 @@ def slab(name: str, preset: Preset, coefficients: int, sizes: dict[str, tuple[in
         bounds=(torch.full((n,), -LARGEST).double(), torch.full((n,), LARGEST).double()),
         output=least_squares(caustic.image, residuals),
         picture=Picture(lambda x: (caustic.image(x[None])[0] / brightest).clamp(0, 1), lambda: target / brightest),
-        renderer=Renderer(full=lambda: slab(name, "paper", coefficients, sizes, unit)),
+        renderer=Renderer(),
     )
 
 

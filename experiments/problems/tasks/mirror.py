@@ -18,8 +18,7 @@ from experiments.problems.scenes.bunny import IN_MIRRORS, SEEN_AT, as_mesh, in_m
 from experiments.problems.task import Preset, Task, around
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
-FULL = Setting((64, 64), 32, 6)
-PRESETS = {"fast": Setting((48, 48), 8, 4), "paper": FULL}
+PRESETS = {"fast": Setting((48, 48), 8, 4), "paper": Setting((64, 64), 32, 6)}
 
 
 def task(preset: Preset = "fast", variant: str = "auto") -> Task:
@@ -36,7 +35,6 @@ def task(preset: Preset = "fast", variant: str = "auto") -> Task:
         moving=partial(scene, instances=False),
         variant=variant,
         setting=PRESETS[preset],
-        full=FULL,
         needs="two mirrors and direct light",
         solution=torch.zeros(3).double(),
         start=around(3, 0.25, 0.1),

@@ -19,8 +19,7 @@ from experiments.problems.task import Preset, Task, uniform
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 TURN = 360.0 / DEGREES
-FULL = Setting((256, 192), 32, 6)
-PRESETS = {"fast": Setting((64, 48), 8, 2), "paper": FULL}
+PRESETS = {"fast": Setting((64, 48), 8, 2), "paper": Setting((256, 192), 32, 6)}
 
 
 def parameter_error(x: Tensor) -> float:
@@ -49,7 +48,6 @@ def task(preset: Preset = "fast", variant: str = "auto") -> Task:
         moving=partial(scene, instances=False),
         variant=variant,
         setting=PRESETS[preset],
-        full=FULL,
         needs="direct light",
         solution=torch.zeros(1).double(),
         start=uniform(torch.tensor([9.0]).double(), torch.tensor([10.0]).double()),

@@ -17,8 +17,7 @@ from experiments.problems.scenes.poster import SIDE, TEXTURE, poster
 from experiments.problems.task import Preset, Task, uniform
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
-FULL = Setting((192, 192), 32, 2)
-PRESETS = {"fast": Setting((96, 96), 4, 2), "paper": FULL}
+PRESETS = {"fast": Setting((96, 96), 4, 2), "paper": Setting((192, 192), 32, 2)}
 
 
 def task(preset: Preset = "fast", variant: str = "auto") -> Task:
@@ -35,7 +34,6 @@ def task(preset: Preset = "fast", variant: str = "auto") -> Task:
         moving=scene,
         variant=variant,
         setting=PRESETS[preset],
-        full=FULL,
         needs="one light, direct light",
         solution=photograph.flip(0).flatten(),
         start=uniform(lowest, highest),

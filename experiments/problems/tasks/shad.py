@@ -18,8 +18,7 @@ from experiments.problems.scenes.shadow import POSITION, shadow
 from experiments.problems.task import Preset, Task, uniform
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
-FULL = Setting((256, 192), 32, 6)
-PRESETS = {"fast": Setting((64, 48), 8, 2), "paper": FULL}
+PRESETS = {"fast": Setting((64, 48), 8, 2), "paper": Setting((256, 192), 32, 6)}
 
 
 def task(preset: Preset = "fast", variant: str = "auto") -> Task:
@@ -36,7 +35,6 @@ def task(preset: Preset = "fast", variant: str = "auto") -> Task:
         moving=partial(scene, instances=False),
         variant=variant,
         setting=PRESETS[preset],
-        full=FULL,
         needs="direct light",
         solution=torch.tensor([-1.5, 1.0]).double(),
         start=uniform(start - 0.1, start + 0.1),

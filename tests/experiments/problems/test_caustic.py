@@ -199,7 +199,6 @@ def test_more_coefficients_have_the_same_blur_in_smaller_pixels() -> None:
     random = torch.randn(4, 4096, generator=generator, dtype=torch.float64)
     moved = [optics.landing(one)[0] - optics.landing(0 * one)[0] for one in random]
     assert 0.7 < float(torch.stack(moved).std()) < 1.4
-    assert task.renderer.full().name == "caustic64"
 
 
 def test_there_is_no_parameter_error(tmp_path) -> None:

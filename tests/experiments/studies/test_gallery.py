@@ -192,7 +192,6 @@ def test_stills_are_finer_than_what_the_run_saw():
         moving=scene,
         variant="scalar_rgb",
         setting=Setting((30, 20), 8, 2),
-        full=Setting((30, 20), 8, 2),
         needs="",
         solution=torch.zeros(1),
         start=lambda run: torch.ones(1),

@@ -63,7 +63,6 @@ def task(scenes):
         moving=scene,
         variant="scalar_rgb",
         setting=Setting((16, 8), 8, 2),
-        full=Setting((16, 8), 8, 2),
         needs="",
         solution=SOLUTION,
         start=uniform(torch.full((2,), 0.5).double(), torch.ones(2).double()),

@@ -22,8 +22,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.levenberg_marquardt import damped_steps
-from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress, check_share
+from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
@@ -176,7 +177,7 @@ class BlockGaussNewton(AskTell[BlockProgress]):
         seed: int | None = None,
     ) -> None:
         for name, value, most in (("radius", radius, math.inf), ("share", share, 1.0), ("block", block, 1.0)):
-            check_share(name, value, most)
+            checked_number(name, value, above=0.0, most=most, below=math.inf)
         if not callable(loss):
             raise ValueError(f"loss must be a function of one output, got {loss!r}: without one use Descent")
         self._shape = {"radius": radius, "share": share, "block": block}

@@ -11,8 +11,8 @@ from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.random_points import further_start, normal, reflect
-from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.random_points import further_start, normal
+from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
 
@@ -70,8 +70,7 @@ class LocalQuadratics(Method[DescentProgress]):
         """Return the progress after an evaluation, with a step or the number of samples to ask for next."""
         known = self._remembered(known, evaluated)
         if known.lost >= LOST:
-            reason = f"{LOST} batches in a row had values that are not finite"
-            return self.arrive(known, reason, generator, last=known.rounds == 0)
+            return self.arrive(known, NOT_FINITE, generator, last=known.rounds == 0)
         loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
         if known.phase == "trial":
             known = self._judged(replace(known, iterations=known.iterations + 1), evaluated, loss)
@@ -125,8 +124,7 @@ class LocalQuadratics(Method[DescentProgress]):
     # What was evaluated.
 
     def _remembered(self, known: DescentProgress, evaluated: Evaluated) -> DescentProgress:
-        finite = evaluated.finite
-        new = evaluated.those(finite)
+        new = evaluated.those(evaluated.finite)
         own, more = new.needed, new.further
         pool = known.pool.add(own.points, own.losses, own.outputs, known.center, known.sigma)
         if len(more):
@@ -134,16 +132,11 @@ class LocalQuadratics(Method[DescentProgress]):
             drawn = (evaluated.points[0], _BESIDE * known.sigma) if trial else (known.center, known.sigma)
             pool = pool.add(more.points, more.losses, more.outputs, *drawn)
         pool = pool.latest(self.capacity)
-        best, lowest = known.best, known.lowest
-        if len(new):
-            k = int(new.losses.argmin())
-            found = Best(new.points[k], float(new.losses[k]), known.sigma)
-            best, lowest = (found if found.loss < one.loss else one for one in (best, lowest))
         return replace(
             known,
             pool=pool,
-            best=best,
-            lowest=lowest,
+            best=known.best.or_lower(new, known.sigma),
+            lowest=known.lowest.or_lower(new, known.sigma),
             shape=evaluated.shape,
             evaluations=known.evaluations + len(evaluated),
             lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,
@@ -201,7 +194,7 @@ class LocalQuadratics(Method[DescentProgress]):
         """Draw about `count` points from N(center, sigma^2), orthogonal in blocks, and mirror them into the bounds."""
         rows = self._directions(known, (count + 1) // 2 if paired else count, generator)
         u = torch.cat([rows, -rows]) if paired else rows
-        return reflect(known.center + known.sigma * u, self.settings.lower, self.settings.upper)
+        return self.settings.inside(known.center + known.sigma * u)
 
     def _directions(self, known: DescentProgress, count: int, generator: torch.Generator) -> Tensor:
         """Normal vectors [count, n], orthogonal to each other and, in many dimensions, to what the pool spans."""

@@ -13,9 +13,8 @@ from typing import Literal, TypeVar
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_number
 from torch_zerohess.search.method import Method
-from torch_zerohess.search.state import LOST, Best, Evaluated, Progress
+from torch_zerohess.search.state import LOST, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
@@ -51,11 +50,7 @@ class JacobianProgress(Progress):
 
     def recorded(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with the lowest loss so far as the best one. Samples count as steps do."""
-        finite = evaluated.those(evaluated.finite)
-        k = int(finite.losses.argmin()) if len(finite) else -1
-        if k < 0 or float(finite.losses[k]) >= self.best.loss:
-            return self
-        return replace(self, best=Best(finite.points[k].clone(), float(finite.losses[k]), self.sigma))
+        return replace(self, best=self.best.or_lower(evaluated.those(evaluated.finite), self.sigma))
 
 
 class GaussNewton(Method[Q]):
@@ -183,8 +178,3 @@ class GaussNewton(Method[Q]):
         gradient, unknown = gradient + hessian @ away, torch.full_like(known.center, math.inf)
         model = LocalModel(value, sigma * gradient, sigma**2 * hessian, None, unknown, unknown.clone())
         return model, sigma
-
-
-def check_share(name: str, value: float, most: float) -> None:
-    """Raise TypeError or ValueError for a value that is no positive, finite number of at most `most`."""
-    checked_number(name, value, above=0.0, most=most, below=math.inf)

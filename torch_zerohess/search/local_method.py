@@ -22,11 +22,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.krylov import krylov_steps
-from torch_zerohess.search.gauss_newton import GaussNewton, check_share
+from torch_zerohess.search.gauss_newton import GaussNewton
 from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.random_points import normal, reflect
+from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -88,7 +89,7 @@ class LocalSettings:
         sparse = SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid)
         result = cls(replace(sparse, robust=False), **own)  # no step needs standard errors
         for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
-            check_share(name, getattr(result, name), most)
+            checked_number(name, getattr(result, name), above=0.0, most=most, below=math.inf)
         check_samples(result.samples, result.sparse.keep)
         return result
 
@@ -127,14 +128,11 @@ class LocalMethod(GaussNewton[LocalProgress]):
         if hops:
             assert known.evidence is not None
             step = _HOP * known.evidence.found * normal(generator, known.center, self.settings.n)
-            known = replace(known, center=self._inside(known.center + step))
-        points = self._inside(
+            known = replace(known, center=self.settings.inside(known.center + step))
+        points = self.settings.inside(
             known.center + known.sigma * normal(generator, known.center, known.samples, self.settings.n)
         )
         return known, torch.cat([known.center[None], points]) if hops else points
-
-    def _inside(self, points: Tensor) -> Tensor:
-        return reflect(points, self.settings.lower, self.settings.upper)
 
     def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         if not known.hops:

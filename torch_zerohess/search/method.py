@@ -13,6 +13,7 @@ from typing import ClassVar, Generic
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.random_points import reflect
 from torch_zerohess.search.state import Evaluated, P
 from torch_zerohess.search.told import moderate
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -42,6 +43,10 @@ class Settings:
     def bounded(self) -> bool:
         """Whether every bound is finite."""
         return bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())
+
+    def inside(self, points: Tensor) -> Tensor:
+        """Mirror points [K, n] into the bounds."""
+        return reflect(points, self.lower, self.upper)
 
 
 class Method(ABC, Generic[P]):

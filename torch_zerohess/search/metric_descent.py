@@ -115,7 +115,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Ask for another point along every axis, twice as far if the first one was better, else on the other side."""
         if not len(known.values):
             start = known.center + known.sigma * normal(generator, known.center, 1, self._n)
-            return known, self._inside(start)
+            return known, self.settings.inside(start)
         losses = evaluated.losses
         if len(losses) > 1 and int((losses[1:] == losses[0]).sum()) > len(losses[1:]) // 2:
             return self._on_plateau(known, generator)
@@ -123,7 +123,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         other = torch.where((losses[1:] < losses[0])[:, None], 2.0 * steps, -steps)
         if not len(other) or self._n <= _FEW:
             return self.plan(known, generator)
-        return replace(known, phase="axes"), self._inside(evaluated.points[0] + other)
+        return replace(known, phase="axes"), self.settings.inside(evaluated.points[0] + other)
 
     def _arrived(
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False

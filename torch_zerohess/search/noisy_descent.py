@@ -18,9 +18,9 @@ from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.random_points import further_start, normal, reflect
+from torch_zerohess.search.random_points import further_start, normal
 from torch_zerohess.search.region_progress import latest
-from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, arriving
+from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, Progress, arriving
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
@@ -113,8 +113,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
     ) -> tuple[NoisyProgress, Tensor]:
         known = self._remembered(known, evaluated)
         if known.lost >= LOST:
-            reason = f"{LOST} batches in a row had values that are not finite"
-            return self._arrived(known, reason, generator, last=known.rounds == 0)
+            return self._arrived(known, NOT_FINITE, generator, last=known.rounds == 0)
         values = evaluated.losses[evaluated.finite]
         if known.lost or float(values.min()) > known.highest + _LOW * self._noise:
             factor = _HALVING if known.lost else _SHRINKING
@@ -273,7 +272,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         n = self.settings.n
         u = normal(generator, known.center, count, n) / n**0.25
         points = known.center + known.sigma * u @ known.root.mT
-        return reflect(points, self.settings.lower, self.settings.upper)
+        return self.settings.inside(points)
 
 
 def _weights(u: Tensor, count: int) -> Tensor:

@@ -21,8 +21,8 @@ from torch_zerohess.search.candidates import farthest, is_known, least_known, lo
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.process_progress import ProcessProgress
-from torch_zerohess.search.random_points import normal, reflect
-from torch_zerohess.search.state import LOST, Best, Evaluated
+from torch_zerohess.search.random_points import normal
+from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -79,7 +79,7 @@ class ProcessMethod(Method[Q]):
         )
         before = known.best.point
         if known.lost >= LOST:
-            return known.ended_round(f"{LOST} batches in a row had values that are not finite", 0)
+            return known.ended_round(NOT_FINITE, 0)
         known = self.remembered(known, evaluated.those(finite))
         known = self.avoiding(known, evaluated.points[~finite])
         if evaluated.extra:
@@ -198,12 +198,12 @@ class ProcessMethod(Method[Q]):
         """Draw n orthogonal steps of length sqrt(n), mirrored into the box."""
         n = len(x)
         directions, _ = torch.linalg.qr(normal(generator, x, n, n))
-        return reflect(x + math.sqrt(n) * directions.mT, self.settings.lower, self.settings.upper)
+        return self.settings.inside(x + math.sqrt(n) * directions.mT)
 
     def _drawn(self, x: Tensor, sigma: float, count: int, generator: torch.Generator) -> Tensor:
         """Draw points [count, n] from N(x, sigma^2), mirrored into the box."""
         steps = sigma * normal(generator, x, count, len(x))
-        return reflect(x + steps, self.settings.lower, self.settings.upper)
+        return self.settings.inside(x + steps)
 
     def _length(self, step: Tensor) -> float:
         """Length of a step [n] in units of the first sigma sqrt(n)."""

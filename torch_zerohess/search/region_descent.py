@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torch_zerohess.linalg.metric import region_step
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.random_points import normal, reflect
+from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.region_progress import R, RegionProgress
-from torch_zerohess.search.state import LOST, Best, Evaluated
+from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
 _FINEST = 1e-6
@@ -95,8 +95,7 @@ class RegionDescent(Method[R]):
         confirmed = known.phase == "geometry" and abs(told - known.expected) <= _CONFIRMED * abs(told - before)
         known = replace(known, confirmed=confirmed)
         if known.lost >= LOST:
-            reason = f"{LOST} batches in a row had values that are not finite"
-            return self._arrived(known, reason, generator, last=known.rounds == 0)
+            return self._arrived(known, NOT_FINITE, generator, last=known.rounds == 0)
         if not bool(evaluated.finite.any()):
             known = replace(known, sigma=_HALVING * known.sigma)
         if known.phase == "start":
@@ -144,7 +143,7 @@ class RegionDescent(Method[R]):
             if float((ends - x - step).norm(dim=1).min()) > _STILL * known.sigma:
                 ends = torch.cat([ends, (x + step)[None]])
         steps = normal(generator, x, count + 1 - len(ends), self._n) @ (known.sigma / math.sqrt(self._n) * known.root)
-        return self._inside(torch.cat([ends[1:], (points[0] if trial else x) + steps]))
+        return self.settings.inside(torch.cat([ends[1:], (points[0] if trial else x) + steps]))
 
     def model_at_best(self, known: R) -> tuple[LocalModel, float] | None:
         best = known.best
@@ -191,7 +190,7 @@ class RegionDescent(Method[R]):
         side = torch.where(torch.rand(self._n, generator=generator, device="cpu").to(center.device) < 0.5, -1.0, 1.0)
         side = torch.where(center + known.sigma > upper, -1.0, side)
         side = torch.where(center - known.sigma < self.settings.lower, 1.0, side).to(center)
-        return known, torch.cat([center[None], self._inside(center + known.sigma * torch.diag(side))])
+        return known, torch.cat([center[None], self.settings.inside(center + known.sigma * torch.diag(side))])
 
     def _judged(self, known: R, ratio: float) -> tuple[R, Tensor | None]:
         """Change sigma by the part of its promise that a step achieved; or return where the model knows least [n]."""
@@ -211,7 +210,7 @@ class RegionDescent(Method[R]):
         """Ask for a point of the region in a direction u [n] or its opposite."""
         step = known.sigma * (known.root @ direction)
         step = -step if float(torch.rand((), generator=generator, device="cpu")) < 0.5 else step
-        x = self._inside((known.lowest.point + step)[None])
+        x = self.settings.inside((known.lowest.point + step)[None])
         step = x[0] - known.lowest.point
         expected = known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))
         return replace(known, phase="geometry", expected=expected), x
@@ -224,9 +223,6 @@ class RegionDescent(Method[R]):
         nearest = order[: self._fitted]
         enough = torch.arange(len(nearest), device=nearest.device) < least
         return nearest[(distance[nearest] <= far) | enough]
-
-    def _inside(self, points: Tensor) -> Tensor:
-        return reflect(points, self.settings.lower, self.settings.upper)
 
 
 def _is_sound(known: RegionProgress) -> bool:

@@ -58,11 +58,7 @@ class RegionProgress(Progress):
         """Add evaluations; a value that is not finite counts as the highest one of the round."""
         finite = evaluated.finite
         new = evaluated.those(finite)
-        best, lowest = self.best, self.lowest
-        if len(new):
-            k = int(new.losses.argmin())
-            found = Best(new.points[k], float(new.losses[k]), self.sigma)
-            best, lowest = (found if found.loss < one.loss else one for one in (best, lowest))
+        lowest = self.lowest.or_lower(new, self.sigma)
         points, values = torch.cat([self.points, new.points]), torch.cat([self.values, new.losses])
         if len(values) and len(new) < len(evaluated):
             holes = evaluated.points[~finite]
@@ -70,7 +66,7 @@ class RegionProgress(Progress):
         which = latest(points, lowest.point, capacity)
         return replace(
             self,
-            best=best,
+            best=self.best.or_lower(new, self.sigma),
             lowest=lowest,
             center=lowest.point,
             points=points[which],

@@ -15,6 +15,8 @@ _EQUAL = 1e-4
 """Difference between two losses that are the same, over the distance of the lower quartile of all from the lowest."""
 LOST = 10
 """Batches in a row that are lost, after which a round or the search ends."""
+NOT_FINITE = f"{LOST} batches in a row had values that are not finite"
+"""Why it then ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +26,14 @@ class Best:
     point: Tensor
     loss: float = math.inf
     sigma: float = 1.0
+
+    def or_lower(self, new: "Evaluated", sigma: float) -> "Best":
+        """Return this point, or the lowest of new points with finite values where that is lower."""
+        if not len(new):
+            return self
+        k = int(new.losses.argmin())
+        loss = float(new.losses[k])
+        return Best(new.points[k].clone(), loss, sigma) if loss < self.loss else self
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -22,7 +22,7 @@ from torch_zerohess.search.random_points import further_start, normal
 from torch_zerohess.search.region_progress import latest
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, Progress, arriving
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
 
 _FITTED = 3
 """Evaluations per coefficient that a quadratic is fitted to, at least."""
@@ -142,8 +142,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
             return None
         n, before = self.settings.n, known.sigma**2 * known.hessian
         fit = self._fit(known, u, near, self._least, before)
-        i, j = torch.triu_indices(n, n, device=u.device)
-        curvature = fit.errors[1 + n :][i == j]
+        curvature = symmetric(fit.errors[1 + n :], n).diagonal()
         return LocalModel(fit.value, fit.gradient, fit.hessian, None, fit.errors[1 : 1 + n], curvature), known.sigma
 
     def width(self, known: NoisyProgress) -> Tensor:

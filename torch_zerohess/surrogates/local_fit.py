@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.surrogates.gaussian_process import DEVIATION_DEGREES
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms, symmetric
 
 _SPARE = 5
 """Evaluations beyond the coefficients of a quadratic, at least: the residuals give the standard errors."""
@@ -79,9 +79,7 @@ def _least_squares(u: Tensor, values: Tensor, noise: float) -> tuple[LocalModel,
     size = float((values - base).max())
     if size == 0.0:
         return None
-    row, column = torch.triu_indices(n, n, device=u.device)
-    half = torch.where(row == column, 0.5, 1.0).to(u)
-    design = torch.cat([u.new_ones(P, 1), u, half * u[:, row] * u[:, column]], 1)
+    design = quadratic_terms(u)
     q, r = torch.linalg.qr(design)
     pivots = r.diagonal().abs()
     if float(pivots.min()) < _RANK * float(pivots.max()):
@@ -98,15 +96,14 @@ def _least_squares(u: Tensor, values: Tensor, noise: float) -> tuple[LocalModel,
         missed = math.sqrt(P * max(variance - averaged * (1.0 + _CHANCE * math.sqrt(2.0 / spare)), 0.0))
     # What is not quadratic is no noise: it does not average out over the evaluations (Cauchy and Schwarz).
     error = math.hypot(missed, math.sqrt(averaged)) * inverse.norm(dim=1)
-    gradient, bend = solution[1 : n + 1], solution[n + 1 :]
-    hessian = u.new_zeros(n, n)
-    hessian[row, column] = bend
-    hessian[column, row] = bend
+    hessian = symmetric(solution[n + 1 :], n)
     scale = float(hessian.norm())
+    row, column = torch.triu_indices(n, n, device=u.device)
+    half = torch.where(row == column, 0.5, 1.0).to(u)
     relative = float((error[n + 1 :] / half).norm()) / scale if scale > 0.0 else math.inf
     model = LocalModel(
         float(base) + size * float(solution[0]),
-        size * gradient,
+        size * solution[1 : n + 1],
         size * hessian,
         None,
         size * error[1 : n + 1],

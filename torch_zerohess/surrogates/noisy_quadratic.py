@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.quadratic import quadratic_terms, symmetric
+
 _CURVED = 2.0
 """Prior standard deviation of a change of curvature, over the variation of the values."""
 _FLAT = 10.0
@@ -47,10 +49,7 @@ class NoisyQuadratic:
     @property
     def hessian(self) -> Tensor:
         """[n, n]"""
-        i, j = torch.triu_indices(self.n, self.n, device=self.coefficients.device)
-        hessian = self.coefficients.new_zeros(self.n, self.n)
-        hessian[i, j] = hessian[j, i] = self.size * self.coefficients[1 + self.n :]
-        return hessian
+        return symmetric(self.size * self.coefficients[1 + self.n :], self.n)
 
     @property
     def errors(self) -> Tensor:
@@ -59,7 +58,7 @@ class NoisyQuadratic:
 
     def change(self, u: Tensor) -> tuple[float, float]:
         """Return the value at u [n] less the value at 0, and its standard error."""
-        terms = _terms(u[None])[0]
+        terms = quadratic_terms(u[None])[0]
         terms[0] = 0.0
         error = math.sqrt(max(float(terms @ self.covariance @ terms), 0.0))
         return self.size * float(terms @ self.coefficients), self.size * error
@@ -81,7 +80,7 @@ def fit_noisy(u: Tensor, values: Tensor, weights: Tensor, noise: float, before: 
     """
     n, size = u.shape[1], float(values.abs().max()) or 1.0
     values, noise, before = values / size, noise / size, before / size  # their squares neither overflow nor vanish
-    terms = _terms(u)
+    terms = quadratic_terms(u)
     middle = values.median()
     spread = float((values - middle).abs().median()) + noise + math.ulp(1.0)
     i, j = torch.triu_indices(n, n, device=u.device)
@@ -105,10 +104,3 @@ def fit_noisy(u: Tensor, values: Tensor, weights: Tensor, noise: float, before: 
     covariance = (axes * (variance / (variance + told))) @ axes.mT
     misfit = residual > _UNSURE * least * (1.0 + _UNLIKELY * math.sqrt(2.0 / degrees))
     return NoisyQuadratic(size, coefficients, covariance, misfit, n)
-
-
-def _terms(u: Tensor) -> Tensor:
-    """Return 1, u_i and the products of the Hessian's upper triangle at u [P, n], [P, q]."""
-    i, j = torch.triu_indices(u.shape[1], u.shape[1], device=u.device)
-    products = u[:, i] * u[:, j]
-    return torch.cat([torch.ones_like(u[:, :1]), u, torch.where(i == j, 0.5 * products, products)], 1)

@@ -99,6 +99,24 @@ def coefficients(n: int) -> int:
     return (n + 1) * (n + 2) // 2
 
 
+def quadratic_terms(u: Tensor) -> Tensor:
+    """Return what the coefficients of c + g.u + u.H u/2 are multiplied with at u [P, n], [P, q].
+
+    The coefficients are c, g and the upper triangle of H, row by row.
+    """
+    row, column = torch.triu_indices(u.shape[1], u.shape[1], device=u.device)
+    products = u[:, row] * u[:, column]
+    return torch.cat([torch.ones_like(u[:, :1]), u, torch.where(row == column, 0.5 * products, products)], 1)
+
+
+def symmetric(upper: Tensor, n: int) -> Tensor:
+    """Return the symmetric matrix [n, n] with these numbers in its upper triangle, row by row."""
+    row, column = torch.triu_indices(n, n, device=upper.device)
+    matrix = upper.new_zeros(n, n)
+    matrix[row, column] = matrix[column, row] = upper
+    return matrix
+
+
 def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
     """Fit a quadratic to values [P] at u [P, n] with weights [P], for any P >= 1 and n.
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.sparse_regression import chances, normal_from_t
+from torch_zerohess.surrogates.sparse_regression import chances, normal_from_t, threshold
 
 _RATE = 5e-3
 """Expected share of parameters that no output depends on, among those that are found in a batch, at most."""
@@ -67,9 +67,7 @@ class Evidence:
 
 def _found(chance: Tensor) -> Tensor:
     """Return which parameters are found, by the probabilities [n] of their tests if no output depends on them."""
-    ordered = chance.sort().values
-    fine = (ordered <= _RATE * torch.arange(1, len(ordered) + 1, device=chance.device) / len(ordered)).nonzero()
-    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
+    return chance <= threshold(chance, _RATE)
 
 
 def confirmed(jacobian: SparseJacobian, u: Tensor, d: Tensor) -> Tensor:

@@ -100,14 +100,20 @@ def predicted(index: Tensor, values: Tensor, u: Tensor) -> Tensor:
 
 
 def significant(values: Tensor, errors: Tensor, used: Tensor, K: float, rate: float) -> Tensor:
-    """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries.
-
-    The threshold for their `chances` is by Benjamini and Hochberg (1995).
-    """
+    """Return the slopes [m, keep] that errors alone do not explain, at a rate of false discoveries."""
     chance = chances(values, errors, used, K)
-    ordered = chance[used].sort().values
+    return chance <= threshold(chance[used], rate)
+
+
+def threshold(chance: Tensor, rate: float) -> Tensor | float:
+    """Return the chance up to which tests are discoveries, by Benjamini and Hochberg (1995).
+
+    chance: probabilities [N] of tests in which there is nothing to discover.
+    rate: expected share of false discoveries, at most.
+    """
+    ordered = chance.sort().values
     fine = (ordered <= rate * torch.arange(1, len(ordered) + 1, device=chance.device) / max(len(ordered), 1)).nonzero()
-    return chance <= (ordered[fine[-1, 0]] if len(fine) else -1.0)
+    return ordered[fine[-1, 0]] if len(fine) else -1.0
 
 
 def chances(values: Tensor, errors: Tensor, used: Tensor, K: float) -> Tensor:

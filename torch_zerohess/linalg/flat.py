@@ -15,3 +15,10 @@ def split_like(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
     """Return the parts of a vector [N] in the shapes of tensors, N numbers in all."""
     parts = vector.split([one.numel() for one in tensors])
     return [part.view_as(one) for part, one in zip(parts, tensors, strict=True)]
+
+
+def add_parts(tensors: Sequence[Tensor], vector: Tensor) -> None:
+    """Add the parts of a vector [N] to tensors, N numbers in all, in place and in their types."""
+    with torch.no_grad():
+        for one, part in zip(tensors, split_like(vector, tensors), strict=True):
+            one.add_(part.to(one.dtype))

@@ -1,14 +1,13 @@
 """A step on the weights of a network that moves its outputs by what is asked for."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
-from torch_zerohess.linalg.flat import split_like
+from torch_zerohess.linalg.flat import add_parts
 
 
 def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative_damping: float = 0.3) -> None:
@@ -62,11 +61,4 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
     if h == 0.0:
         raise ValueError("the outputs of the network do not change with its weights: all are saturated")
     gram.diagonal().add_(relative_damping * h)
-    step = J.rmatvec(torch.linalg.solve(gram, change.detach().reshape(-1).double()))
-    _add(weights, step)
-
-
-def _add(weights: Sequence[Tensor], step: Tensor) -> None:
-    with torch.no_grad():
-        for one, part in zip(weights, split_like(step, weights), strict=True):
-            one.add_(part.to(one.dtype))
+    add_parts(weights, J.rmatvec(torch.linalg.solve(gram, change.detach().reshape(-1).double())))

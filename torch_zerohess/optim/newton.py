@@ -30,19 +30,15 @@ class Newton(NewtonStep):
       beyond its own magnitude (Dauphin et al. 2014): the safer choice for sampled Hessians.
 
     Eigenvalues within rounding of zero count as zero, and so do components of the gradient along their eigenvectors.
-    With `adapt` the closure is called again, without derivatives: a step that does not lower the loss is taken
-    back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Without
-    `adapt` every step is taken.
 
     Args:
         params: parameters, one group, 10 000 numbers at most.
         radius: of the trust region, in units of the parameters; the initial one with `adapt`.
         curvature: "exact", or "gauss_newton" for J^T H J of the black boxes behind a network.
         modification: "shift" or "abs".
-        adapt: whether to test the step and adapt the radius.
+        adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`.
         max_radius: the radius never grows beyond it.
-        lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change. With `adapt`
-            the radius does not grow while it is below 1.
+        lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change.
 
     The closure of `step` returns a loss with a graph, as for `NewtonCG`; of several losses the mean is taken.
 

@@ -31,10 +31,6 @@ class NewtonCG(NewtonStep):
       (`linalg.dual.dual_step`). It costs one product J J^T: for batches of few outputs and many weights. If the
       curvature over the outputs is indefinite, and not modified, the step is the step of "clip".
 
-    With `adapt` the closure is called again, without derivatives, up to ten times if the loss is not finite. A step
-    that does not lower the loss is taken back, and the radius follows the ratio of actual to predicted decrease
-    (Nocedal and Wright, algorithm 4.1). Without it every step is taken, as suits a loss over small batches.
-
     Noise. Sampled derivatives have an error, which exact steps amplify in flat directions. The closure may return
     several losses [R], independent estimates whose mean is the loss (`layer(x.expand(R, n))`, or one per image of a
     batch). The spread of the R gives the errors of residual and curvature, and conjugate gradients stop when one of
@@ -53,15 +49,14 @@ class NewtonCG(NewtonStep):
         iterations: conjugate-gradient products per step, at most.
         tolerance: relative residual at which conjugate gradients stop.
         damping: added to the diagonal of H.
-        adapt: whether to test the step and adapt the radius.
+        adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`.
         max_radius: the radius never grows beyond it.
         noise: number of standard errors by which residual and curvature must differ from zero, if there are several
             losses (see `steihaug.noise_level`); 0 takes the mean of the losses for exact, and so does solver "dual".
         output_radius: longest move of the input y [n] of a black box, for every element of the batch, in units of y;
             None: any. Sampled derivatives describe a black box within about sigma of y. Steps of the weights that are
             short can still move y far beyond it. Needs curvature "gauss_newton".
-        lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change. With `adapt`
-            the radius does not grow while it is below 1.
+        lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change.
 
     The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
     pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them. For solver

@@ -17,10 +17,11 @@ _ROUNDING = 10.0
 class NewtonStep(SecondOrder):
     """Steps to the minimum of a quadratic model inside |s| <= radius, with or without a test.
 
-    With `adapt` the closure is called again, without derivatives: a step that does not lower the loss is taken
-    back, and the radius follows the ratio of actual to predicted decrease (Nocedal and Wright, algorithm 4.1). Where
-    the predicted decrease is within the rounding of the loss no step is taken, and the radius stays. The length
-    compared with the radius is the length of the step times `lr`.
+    With `adapt` the closure is called again, without derivatives, up to ten times if the loss is not finite. A step
+    that does not lower the loss is taken back, and the radius follows the ratio of actual to predicted decrease
+    (Nocedal and Wright, algorithm 4.1). Where the predicted decrease is within the rounding of the loss no step is
+    taken, and the radius stays. The length compared with the radius is the length of the step times `lr`, so the radius
+    does not grow while `lr` is below 1. Without `adapt` every step is taken, as suits a loss over small batches.
     """
 
     exit: str | None = None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
-from torch_zerohess.linalg.flat import flattened
+from torch_zerohess.linalg.flat import flattened, split_like
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr
 
 MODIFICATIONS = ("abs", "radius")
@@ -174,5 +174,5 @@ class NonlinearCG(SecondOrder):
         return flattened(parts).double()
 
     def _set(self, name: str, vector: Tensor) -> None:
-        for one, part in zip(self._parameters, self._split(vector), strict=True):
-            self.state[one][name] = part
+        for one, part in zip(self._parameters, split_like(vector, self._parameters), strict=True):
+            self.state[one][name] = part.to(one.dtype)

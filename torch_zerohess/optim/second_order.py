@@ -14,7 +14,7 @@ from torch_zerohess.autograd.blocks import output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.dual import dual_step
-from torch_zerohess.linalg.flat import flattened, split_like
+from torch_zerohess.linalg.flat import add_parts, flattened, split_like
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.magnitudes import magnitudes
 from torch_zerohess.linalg.step import Step
@@ -190,14 +190,7 @@ class SecondOrder(Optimizer):
 
     def _add(self, step: Tensor) -> None:
         """Add step [N] to the parameters."""
-        with torch.no_grad():
-            for one, part in zip(self._parameters, self._split(step), strict=True):
-                one.add_(part)
-
-    def _split(self, vector: Tensor) -> list[Tensor]:
-        """Return the parts of a vector [N] in the shapes and types of the parameters."""
-        parts = split_like(vector, self._parameters)
-        return [part.to(one.dtype) for part, one in zip(parts, self._parameters, strict=True)]
+        add_parts(self._parameters, step)
 
     def _copy(self) -> list[Tensor]:
         """Return a copy of the parameters, to `_restore`."""

@@ -77,7 +77,8 @@ def _finished(function: Callable[[], object], device: str) -> Callable[[], objec
     return run if device == "cuda" else function
 
 
-def _hessian(n: int, repeats: int, samples: int = 64) -> Ratio:
+def _hessian(n: int, repeats: int) -> Ratio:
+    samples = 64
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(n, generator=generator, dtype=torch.float64)
     estimate = zh.estimate(lambda z: z.sin().sum(1), x, zh.Smoothing(sigma=0.1, samples=samples, seed=0))
@@ -86,7 +87,8 @@ def _hessian(n: int, repeats: int, samples: int = 64) -> Ratio:
     return Ratio("Hessian", n, samples, seconds, compared, 0.85)
 
 
-def _redrawn(n: int, repeats: int, samples: int = 32) -> Ratio:
+def _redrawn(n: int, repeats: int) -> Ratio:
+    samples = 32
     x, sigma = torch.zeros(1, n), torch.ones(n, dtype=torch.float64)
     v, a = torch.ones(1, 1, n, dtype=torch.float64), torch.ones(1, 1, 2 * samples, dtype=torch.float64)
     rows = kernels.pick_rows(0, 0, samples, n, proposals.SECOND_ORDER, x.device)
@@ -100,7 +102,8 @@ def _redrawn(n: int, repeats: int, samples: int = 32) -> Ratio:
     return Ratio("gradient + HVP, drawn again", n, samples, seconds, 3 * compared, 0.6)
 
 
-def _threads(repeats: int, n: int = 4096, samples: int = 256) -> Ratio:
+def _threads(repeats: int) -> Ratio:
+    n, samples = 4096, 256
     noise = _sampler(torch.zeros(1, n), torch.ones(n, dtype=torch.float64), samples)
     threads = torch.get_num_threads()
 

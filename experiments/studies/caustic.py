@@ -116,12 +116,12 @@ def description(mi: Any, x: Tensor, side: int) -> dict[str, Any]:
     }
 
 
-def surface(x: Tensor, patches: int = 8) -> Surface:
+def surface(x: Tensor) -> Surface:
     """Return vertices, exact normals and triangles of the surface of a slab of coefficients x [1024], facing along z.
 
-    Every patch of the spline is cut into `patches`^2 squares.
+    Every patch of the spline is cut into 8^2 squares.
     """
-    places = torch.linspace(0, 1, patches * (COEFFICIENTS - 3) + 1, dtype=torch.float64)
+    places = torch.linspace(0, 1, 8 * (COEFFICIENTS - 3) + 1, dtype=torch.float64)
     value, slope = basis(places), basis(places, derivative=1)
     c = caustic.UNIT * x.double().view(COEFFICIENTS, COEFFICIENTS)
     z, dx, dy = value @ c @ value.mT, value @ c @ slope.mT, slope @ c @ value.mT

@@ -187,7 +187,7 @@ class Hanging:
         return (x**3).sin().sum(1)
 
 
-def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, timeout: float = 1.0) -> Faults:
+def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int) -> Faults:
     """Evaluate in workers of which some are killed and some hang, and count the faults in the result."""
     resource_tracker.ensure_running()  # by multiprocessing, with a pipe, for as long as the interpreter lives
     before, start = _open_files(), time.monotonic()
@@ -196,7 +196,7 @@ def disturb(count: int, evaluations: int, kills: int, hangs: int, seed: int, tim
     calls, chance = x.split(_CALL), random.Random(seed)
     hanging = [chance.randrange(len(calls)) for _ in range(hangs)]
     different = lost = done = 0
-    with tempfile.TemporaryDirectory() as folder, ProcessPool(count, timeout=timeout, retries=20) as pool:
+    with tempfile.TemporaryDirectory() as folder, ProcessPool(count, timeout=1.0, retries=20) as pool:
         fn = Hanging(folder)
         due, killed_before = [0], [0]
         with _killer(kills, chance, due, killed_before) as killed:

@@ -42,9 +42,9 @@ class LinearSurrogate:
         self._middle, self._mean = z.mean(0), y.mean(0)
         z, y = z - self._middle, y - self._mean
         if len(z) > z.shape[1]:
-            self._slope = _solve(z.mT @ z, z.mT @ y, _RIDGE)
+            self._slope = _solve(z.mT @ z, z.mT @ y)
         else:
-            self._slope = z.mT @ _solve(z @ z.mT, y, _RIDGE)
+            self._slope = z.mT @ _solve(z @ z.mT, y)
         self._squares = self._slope.square().sum(1)
 
     def __call__(self, z: Tensor) -> Tensor:
@@ -59,7 +59,7 @@ class LinearSurrogate:
         return squares @ sigma.to(squares).square()
 
 
-def _solve(square: Tensor, right: Tensor, ridge: float) -> Tensor:
-    """Solve (square + ridge) x = right for a positive matrix, the ridge in units of its mean diagonal."""
-    square.diagonal().add_(ridge * float(square.diagonal().mean()) or 1.0)
+def _solve(square: Tensor, right: Tensor) -> Tensor:
+    """Solve (square + _RIDGE h) x = right for a positive matrix, h the mean of its diagonal."""
+    square.diagonal().add_(_RIDGE * float(square.diagonal().mean()) or 1.0)
     return torch.cholesky_solve(right, torch.linalg.cholesky(square))

@@ -34,6 +34,7 @@ LABEL = Value("sticker.mesh.bsdf.reflectance.data")
 RADIUS, HEIGHT, WALL = 0.040, 0.098, 0.0036
 HANDLE_REACH, HANDLE_LEVEL, HANDLE_SPAN, HANDLE_POWER = 0.032, 0.051, 0.030, 2.7
 HANDLE_TUBE = (0.0062, 0.0040)  # half widths across and along the plane of the handle
+BODY_SIDES, LABEL_COLUMNS, HANDLE_RINGS, HANDLE_SIDES = 64, 32, 32, 12  # of the meshes
 LABEL_SIDE, LABEL_HEIGHTS, LABEL_ARC = 32, (0.016, 0.086), 1.9  # pixels, metres, radians about the camera's azimuth
 CAMERA, FIELD_OF_VIEW = (0.27507, 0.084647, 0.060803), 39.6  # the field of view is along the width of the film
 LIGHTS = (((0.0, 0.75, -0.35), 0.15, 7.0), ((0.55, 0.6, 0.35), 0.2, 12.0))  # centre, radius, radiance
@@ -101,12 +102,12 @@ def mug(mi: Any, label: bool = False, instances: bool = True) -> dict[str, Any]:
     return scene
 
 
-def body(sides: int = 64) -> Surface:
+def body() -> Surface:
     """The mug without its handle: a profile with rounded foot, lip and inner floor, turned about the y axis."""
     inner = RADIUS - WALL
     corners = ((0.0, 0.0), (RADIUS, 0.0), (RADIUS, HEIGHT), (inner, HEIGHT), (inner, 0.006), (0.0, 0.006))
     profile, normals = _rounded(corners, (0.0, 0.006, 0.49 * WALL, 0.49 * WALL, 0.012, 0.0))
-    turn = np.linspace(0.0, 2.0 * math.pi, sides + 1)[:, None]
+    turn = np.linspace(0.0, 2.0 * math.pi, BODY_SIDES + 1)[:, None]
     ring = np.cos(turn), np.ones_like(turn), np.sin(turn)
     vertices, directions = (
         np.stack([axis * curve[:, k] for axis, k in zip(ring, (0, 1, 0), strict=True)], -1)
@@ -115,10 +116,10 @@ def body(sides: int = 64) -> Surface:
     return grid(vertices, directions)
 
 
-def sticker(columns: int = 32) -> tuple[Surface, Array]:
+def sticker() -> tuple[Surface, Array]:
     """The label, a part of a cylinder just off the body that faces the camera, and its texture coordinates."""
     middle = math.atan2(CAMERA[2], CAMERA[0])
-    u, v = np.meshgrid(np.linspace(0.0, 1.0, columns + 1), np.array([0.0, 1.0]))
+    u, v = np.meshgrid(np.linspace(0.0, 1.0, LABEL_COLUMNS + 1), np.array([0.0, 1.0]))
     turn = middle - LABEL_ARC * (u - 0.5)
     low, high = LABEL_HEIGHTS
     normals = np.stack([np.cos(turn), np.zeros_like(turn), np.sin(turn)], -1)
@@ -127,19 +128,19 @@ def sticker(columns: int = 32) -> tuple[Surface, Array]:
     return grid(vertices, normals), np.stack([u, v], -1).reshape(-1, 2)
 
 
-def handle(rings: int = 32, sides: int = 12) -> Surface:
+def handle() -> Surface:
     """A flattened tube swept along half a superellipse (a D) that points to -z; its open ends are inside the wall."""
     t = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 2001)
     bend = 2.0 / HANDLE_POWER
     reach = RADIUS - 0.6 * WALL + HANDLE_REACH * np.abs(np.cos(t)) ** bend
     level = HANDLE_LEVEL + HANDLE_SPAN * np.sign(t) * np.abs(np.sin(t)) ** bend
     length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(reach), np.diff(level)))])
-    equal = np.linspace(0.0, length[-1], rings + 1)
+    equal = np.linspace(0.0, length[-1], HANDLE_RINGS + 1)
     reach, level = np.interp(equal, length, reach), np.interp(equal, length, level)
     run, rise = np.gradient(reach), np.gradient(level)
     run, rise = run / np.hypot(run, rise), rise / np.hypot(run, rise)
     flare = 1.0 + 0.35 * np.exp(-np.minimum(equal, equal[::-1]) / 0.006)
-    turn = np.linspace(0.0, 2.0 * math.pi, sides + 1)[:, None]
+    turn = np.linspace(0.0, 2.0 * math.pi, HANDLE_SIDES + 1)[:, None]
     cos, sin = np.cos(turn), np.sin(turn) + 0.0 * reach
     across, along = HANDLE_TUBE
     vertices = np.stack(

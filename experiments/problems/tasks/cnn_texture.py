@@ -37,15 +37,11 @@ class Decoder(nn.Module):
     in the image are learned.
     """
 
-    def __init__(self, film: int, channels: int = 8) -> None:
+    def __init__(self, film: int) -> None:
         super().__init__()
-        self.see = nn.Sequential(
-            nn.Conv2d(3, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, channels, 3, padding=1)
-        )
+        self.see = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.ReLU(), nn.Conv2d(8, 8, 3, padding=1))
         self.across, self.down = nn.Linear(film, LABEL_SIDE), nn.Linear(film, LABEL_SIDE)
-        self.show = nn.Sequential(
-            nn.ReLU(), nn.Conv2d(channels, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, 1, 3, padding=1)
-        )
+        self.show = nn.Sequential(nn.ReLU(), nn.Conv2d(8, 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, 1, 3, padding=1))
         for one in (self.across, self.down):
             nn.init.zeros_(one.bias)
             with torch.no_grad():

@@ -7,8 +7,8 @@ from experiments.methods import (
     gauss_newton,
     learned,
     memory_networks,
+    mesh_handles,
     mesh_levels,
-    meshes,
     mitsuba,
     ours,
     paper,
@@ -22,7 +22,7 @@ METHODS: dict[str, Method] = {
     method.name: method
     for family in (
         *(paper, ours, memory_networks, rendered_pairs, gauss_newton, derivative_free, quasi_newton),
-        *(bayesian, turbo, learned, analytic, meshes, mesh_levels, mitsuba),
+        *(bayesian, turbo, learned, analytic, mesh_handles, mesh_levels, mitsuba),
     )
     for method in family.METHODS
 }

@@ -4,9 +4,9 @@
 |---|---|---|---|
 | levels_local | handles | every pixel, found from samples | Gauss-Newton |
 
-*Handles* are the vertices of a coarser mesh, as in `experiments.methods.meshes`. Subdivision makes their displacements
-smooth, so that no other prior on the mesh is needed. Each stage is one `zh.optim.LocalGaussNewton` over the handles of
-a level. Samples tell which pixels a handle changes: no camera and no footprint is given.
+*Handles* are the vertices of a coarser mesh, as in `mesh_handles`. Subdivision makes their displacements smooth, so
+that no other prior on the mesh is needed. Each stage is one `zh.optim.LocalGaussNewton` over the handles of a level.
+Samples tell which pixels a handle changes: no camera and no footprint is given.
 
 Fine handles stretch triangles between the ears and the back into a dark web. Its two sides hide each other: the
 silhouette changes only if both move. In two stages the handles are therefore points in space, each of which moves both.
@@ -23,7 +23,7 @@ from torch import Tensor
 
 import torch_zerohess as zh
 from experiments.methods.keywords import with_settings
-from experiments.methods.meshes import is_mesh
+from experiments.methods.mesh_handles import is_mesh
 from experiments.methods.method import Method
 from experiments.runs.trial import Trial
 

@@ -66,7 +66,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Descent:
+class Progression:
     """Every evaluation with a lower value than all before, without noise."""
 
     first: float
@@ -118,13 +118,13 @@ def least_squares(
     names = chosen("problems", problems or tuple(there), list(there))
     chosen("kinds", kinds, list(get_args(more_wild.Kind)))
     wanted = SUITE.wanted(methods, over)
-    parts, done = KeptParts(out), dict[Job, Descent]()
+    parts, done = KeptParts(out), dict[Job, Progression]()
     for kind, name, (method, settings) in progress(list(itertools.product(kinds, names, wanted)), "runs"):
         problem, job = there[name], Job(name, kind, method, budget, run, settings)
         task = more_wild.task(problem, budget * (problem.n + 1), kind)
         if SUITE.method(method).unusable(task) is None:
             make = partial(_run, job, task, limit)
-            (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Descent, make)
+            (done[job],) = parts.rows(asdict(job) | {"limit": limit}, Progression, make)
     if not done:
         raise SystemExit(
             f"methods must have one that applies to {', '.join(kinds)}, got {', '.join(name for name, _ in wanted)}"
@@ -132,13 +132,13 @@ def least_squares(
     SUITE.conclude(list(rows(done)), profiles(done), budget, out, store)
 
 
-def _run(job: Job, task: Task, limit: float) -> list[Descent]:
+def _run(job: Job, task: Task, limit: float) -> list[Progression]:
     return [descent(task, SUITE.method(job.method), limit, job.run, dict(job.settings))]
 
 
 def descent(
     task: Task, method: Method, limit: float = 600.0, run: int = 0, settings: Mapping[str, Any] | None = None
-) -> Descent:
+) -> Progression:
     """Run a method from a start of a task until its evaluations are used up. SystemExit if the method fails."""
     seen: list[Tensor] = []
 
@@ -161,10 +161,10 @@ def descent(
         if not found or value < found[-1][1]:
             found.append((count, value))
     counts, values = zip(*found, strict=True)
-    return Descent(error(task.start(run)), counts, values, outcome.seconds, len(seen))
+    return Progression(error(task.start(run)), counts, values, outcome.seconds, len(seen))
 
 
-def rows(done: Mapping[Job, Descent]) -> Iterator[list[object]]:
+def rows(done: Mapping[Job, Progression]) -> Iterator[list[object]]:
     """Yield a row per kind and method; None for more evaluations than the runs could use."""
     most = min(job.budget for job in done)
     for (kind, name), group in _grouped(done).items():
@@ -179,7 +179,7 @@ def rows(done: Mapping[Job, Descent]) -> Iterator[list[object]]:
         yield [kind, name, uses, *shares, milliseconds, len(group)]
 
 
-def profiles(done: Mapping[Job, Descent]) -> dict[str, dict[str, data_profiles.Profile]]:
+def profiles(done: Mapping[Job, Progression]) -> dict[str, dict[str, data_profiles.Profile]]:
     """Return, by kind with tau and by method, evaluations over n + 1 until problems are solved, and their number."""
     found: dict[str, dict[str, data_profiles.Profile]] = defaultdict(dict)
     for (kind, name), group in _grouped(done).items():
@@ -188,15 +188,15 @@ def profiles(done: Mapping[Job, Descent]) -> dict[str, dict[str, data_profiles.P
     return found
 
 
-def _grouped(done: Mapping[Job, Descent]) -> dict[tuple[str, str], list[tuple[Job, Descent]]]:
+def _grouped(done: Mapping[Job, Progression]) -> dict[tuple[str, str], list[tuple[Job, Progression]]]:
     """Return the runs by kind and name of the row."""
-    groups: dict[tuple[str, str], list[tuple[Job, Descent]]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[tuple[Job, Progression]]] = defaultdict(list)
     for job, one in done.items():
         groups[job.kind, row_name(job.method, job.settings)].append((job, one))
     return groups
 
 
-def _lowest(done: Mapping[Job, Descent]) -> dict[tuple[str, str], float]:
+def _lowest(done: Mapping[Job, Progression]) -> dict[tuple[str, str], float]:
     """Return the lowest value of any method by kind and problem."""
     lowest: dict[tuple[str, str], float] = defaultdict(lambda: math.inf)
     for job, one in done.items():
@@ -204,7 +204,9 @@ def _lowest(done: Mapping[Job, Descent]) -> dict[tuple[str, str], float]:
     return lowest
 
 
-def _solved(group: Sequence[tuple[Job, Descent]], lowest: Mapping[tuple[str, str], float]) -> dict[float, list[float]]:
+def _solved(
+    group: Sequence[tuple[Job, Progression]], lowest: Mapping[tuple[str, str], float]
+) -> dict[float, list[float]]:
     """Return by tau the evaluations over n + 1 until each problem is solved."""
     sizes, found = {one.name: one.n for one in more_wild.PROBLEMS}, {tau: list[float]() for tau in TAUS}
     for job, one in group:

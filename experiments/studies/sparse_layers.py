@@ -28,7 +28,7 @@ HEADERS = ("layer", "renders per call", "call", "error of the gradient", "error 
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class LayerError:
     """How well one call of a layer tells the derivatives."""
 
     layer: str
@@ -43,7 +43,7 @@ class Accuracy:
 
 def sparse_layers(
     samples: tuple[int, ...] = (24, 48, 96), calls: int = 4, seed: int = 0, store: str | None = None
-) -> list[Accuracy]:
+) -> list[LayerError]:
     """Print how well layers tell the derivatives of a loss behind a network, POSTER and 1 024 texels.
 
     Args:
@@ -63,7 +63,7 @@ def sparse_layers(
     return rows
 
 
-def compared(task: Task, samples: tuple[int, ...], calls: int, seed: int) -> list[Accuracy]:
+def compared(task: Task, samples: tuple[int, ...], calls: int, seed: int) -> list[LayerError]:
     """Return the accuracy of every layer on a task whose image is nearly linear in its parameters."""
     assert task.output is not None
     image = task.output.image
@@ -102,7 +102,7 @@ def compared(task: Task, samples: tuple[int, ...], calls: int, seed: int) -> lis
                 (product,) = zh.hvp(loss, [network.weight], [v], mode="gauss_newton")
                 seconds = time.process_time() - began
                 errors = [float((a - b).norm() / b.norm()) for a, b in zip((gradient, product), truth, strict=True)]
-                rows.append(Accuracy(name, _BATCH * (2 * count + 1), call, errors[0], errors[1], seconds))
+                rows.append(LayerError(name, _BATCH * (2 * count + 1), call, errors[0], errors[1], seconds))
     return rows
 
 

@@ -24,8 +24,8 @@ from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.payload import dumped, loaded_error
-from torch_zerohess.evaluators.process import Process, ready
 from torch_zerohess.evaluators.worker import ERROR, VALUES
+from torch_zerohess.evaluators.worker_process import Process, ready
 
 _STARTS = 25
 """Workers in a row that may end before they have a black box: they are killed from outside."""

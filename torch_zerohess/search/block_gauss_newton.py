@@ -90,7 +90,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         jacobian = (
             known.jacobian if len(known.jacobian) else known.jacobian.new_zeros(self.settings.n, len(known.output))
         )
-        jacobian = renewed(jacobian, told.points - known.center, told.outputs - known.output)
+        jacobian = broyden_update(jacobian, told.points - known.center, told.outputs - known.output)
         wanted = known.wanted - count
         phase: Literal["sample", "trial"] = "sample" if wanted > 0 else "trial"
         return replace(known, jacobian=jacobian, unused=known.unused[count:], wanted=wanted, phase=phase)
@@ -105,7 +105,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         return self._derivatives(known)[0]
 
     def moved(self, known: BlockProgress, step: Tensor, change: Tensor) -> BlockProgress:
-        return replace(known, jacobian=renewed(known.jacobian, step[None], change[None]))
+        return replace(known, jacobian=broyden_update(known.jacobian, step[None], change[None]))
 
     def arrived(self, known: BlockProgress) -> BlockProgress:
         known = arriving(known, Best(known.center, known.loss, known.sigma))
@@ -187,7 +187,7 @@ class BlockGaussNewton(AskTell[BlockProgress]):
         return BlockMethod(settings, **self._shape)
 
 
-def renewed(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
+def broyden_update(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
     """Return the Jacobian [n, m] nearest to `jacobian` that explains changes [k, m] of the output along steps [k, n].
 
     Nearest in the Frobenius norm: with one step it is Broyden's update.

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.finished_process import PATIENCE, FinishedProcess, FinishedProgress
+from torch_zerohess.search.gaussian_process_finish import PATIENCE, FinishedProcess, FinishedProgress
+from torch_zerohess.search.gaussian_process_method import APART, ROUND
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_descent import MetricProgress, MetricQuadratics
-from torch_zerohess.search.process_method import APART, ROUND
 from torch_zerohess.search.random_points import uniform
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.descent_progress import DescentProgress
+from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.region_descent import BAD, RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress, latest
 from torch_zerohess.search.state import Best, Evaluated

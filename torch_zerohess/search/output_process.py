@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.finished_process import PATIENCE, FinishedProcess, FinishedProgress
+from torch_zerohess.search.gaussian_process_finish import PATIENCE, FinishedProcess, FinishedProgress
+from torch_zerohess.search.gaussian_process_method import ROUND
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
-from torch_zerohess.search.process_method import ROUND
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel

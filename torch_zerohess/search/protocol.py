@@ -21,8 +21,7 @@ from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored
-from torch_zerohess.search.told import check_start, converted, joined
-from torch_zerohess.search.told import evaluated as told
+from torch_zerohess.search.told import as_evaluated, check_start, converted, joined
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 
@@ -316,5 +315,5 @@ class AskTell(ABC, Generic[P]):
 
     def _evaluated(self, values: Tensor, points: Tensor) -> Evaluated:
         """Return what was told about points [K, n], of which those beyond the search's own are from `Method.more`."""
-        found = told(values, points, self._method.settings.loss, self._state.progress.shape)
+        found = as_evaluated(values, points, self._method.settings.loss, self._state.progress.shape)
         return replace(found, extra=max(len(points) - len(self._state.asked), 0))

@@ -33,7 +33,9 @@ def converted(values: Any, device: torch.device) -> Tensor:
     return found
 
 
-def evaluated(values: Tensor, points: Tensor, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size) -> Evaluated:
+def as_evaluated(
+    values: Tensor, points: Tensor, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size
+) -> Evaluated:
     """Return the values told about points [K, n] as losses and outputs.
 
     values: [K], or [K, *out] if there is a loss, float64.

@@ -215,7 +215,7 @@ RETUNED: dict[str, dict[str, Settings]] = {
             "steps": 60,
         },
     },
-    # Single trials; the methods for meshes (`experiments.methods.meshes`) have their defaults.
+    # Single trials; the methods for meshes (`experiments.methods.mesh_handles`) have their defaults.
     **{name: dict.fromkeys(("fr22", "our_g"), _MESH) for name in ("meshfit", "meshfit_color", "suzanne", "banana")},
 }
 """What replaces Table 3, or stands for it; `tune` is `python -m experiments tune`."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from experiments.methods import METHODS
-from experiments.methods.meshes import DAMPING, _losses, _newton
+from experiments.methods.mesh_handles import DAMPING, _losses, _newton
 from experiments.problems import catalogue
 from experiments.problems.scenes import mesh_targets
 from experiments.problems.scenes.fitted_mesh import FittedMesh

@@ -9,13 +9,13 @@ import pytest
 from experiments.methods import METHODS
 from experiments.methods.method import Method
 from experiments.problems import more_wild
-from experiments.studies.least_squares import OURS, Descent, Job, descent, least_squares, profiles, rows
+from experiments.studies.least_squares import OURS, Job, Progression, descent, least_squares, profiles, rows
 
 
 def test_shares_are_counted_from_the_lowest_value_of_any_method() -> None:
     """f(x0) = 1, the lowest value is 0: solved to 1e-3 and 1e-5. Bard's function has 3 parameters, n + 1 = 4."""
-    slow = Descent(1.0, [1, 12, 41], [1.0, 9e-4, 9e-6], 0.5, 400)
-    fast = Descent(1.0, [2, 8], [7.0, 0.0], 0.1, 8)
+    slow = Progression(1.0, [1, 12, 41], [1.0, 9e-4, 9e-6], 0.5, 400)
+    fast = Progression(1.0, [2, 8], [7.0, 0.0], 0.1, 8)
     done = {Job("bard_n3", "smooth", "ours", 100): slow, Job("bard_n3", "smooth", "dfo_ls", 100): fast}
     ours, other = rows(done)
     assert ours == ["smooth", "ours", "image", 1.0, 1.0, 1.0, 0.0, 0.0, 1.0, pytest.approx(1e3 * 0.5 / 400), 1]

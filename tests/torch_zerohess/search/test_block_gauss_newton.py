@@ -8,7 +8,7 @@ import torch
 from searches import run
 
 import torch_zerohess as zh
-from torch_zerohess.search.block_gauss_newton import renewed
+from torch_zerohess.search.block_gauss_newton import broyden_update
 from torch_zerohess.search.gauss_newton import LENGTHS
 from truths import normal
 
@@ -21,28 +21,28 @@ def test_a_jacobian_is_known_after_a_basis_of_samples():
     a, basis = normal(8, 20), torch.linalg.qr(normal(8, 8, seed=1))[0]
     jacobian = torch.zeros(8, 20)
     for steps in (0.3 * basis).split(3):
-        jacobian = renewed(jacobian, steps, steps @ a)
+        jacobian = broyden_update(jacobian, steps, steps @ a)
     torch.testing.assert_close(jacobian, a.float(), atol=1e-4, rtol=0)
 
 
 def test_along_the_samples_it_is_renewed_and_across_them_it_stays():
     before, a, steps = normal(8, 20).float(), normal(8, 20, seed=1), 0.1 * normal(3, 8, seed=2)
-    after = renewed(before, steps, steps @ a).double()
+    after = broyden_update(before, steps, steps @ a).double()
     torch.testing.assert_close(steps @ after, steps @ a, atol=1e-4, rtol=0)
     across = torch.linalg.qr(steps.mT, mode="complete")[0][:, 3:].mT
     torch.testing.assert_close(across @ after, across @ before.double(), atol=1e-4, rtol=0)
     # Broyden's formula for a single step, and nothing from a step of no length.
     one, change = steps[:1], normal(1, 20, seed=3)
     broyden = before.double() + one.mT @ (change - one @ before.double()) / one.square().sum()
-    torch.testing.assert_close(renewed(before, one, change).double(), broyden, atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(renewed(before, 0.0 * one, 0.0 * change), before)
+    torch.testing.assert_close(broyden_update(before, one, change).double(), broyden, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(broyden_update(before, 0.0 * one, 0.0 * change), before)
 
 
 def test_samples_that_bounds_have_made_dependent():
     """Twelve steps in a space of three dimensions."""
     a, before = normal(4, 6), torch.zeros(4, 6)
     steps = normal(12, 3, seed=1) @ normal(3, 4, seed=2)
-    after = renewed(before, steps, steps @ a).double()
+    after = broyden_update(before, steps, steps @ a).double()
     torch.testing.assert_close(steps @ after, steps @ a, atol=1e-3, rtol=0)
 
 

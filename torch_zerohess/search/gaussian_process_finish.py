@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.process_method import APART, ProcessMethod
-from torch_zerohess.search.process_progress import ProcessProgress
+from torch_zerohess.search.gaussian_process_method import APART, ProcessMethod
+from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import Evaluated

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.candidates import farthest, is_known, least_known, lowest
+from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.process_progress import ProcessProgress
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess

@@ -1,7 +1,6 @@
 """How sigma and the size of a step go from their first to their last value in the course of a run.
 
-Results differ from those with `zh.LinearSigma` by rounding: each method keeps the function that its stored results were
-made with.
+`zh.LinearSigma` needs a layer, whose sigma it sets; these need none.
 """
 
 from dataclasses import dataclass

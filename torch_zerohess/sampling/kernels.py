@@ -1,10 +1,10 @@
 """The operations that the C++ extension speeds up, each beside its literal reference in torch.
 
 CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms` and `sample`
-go to Triton kernels, which were never run on a real GPU. The first call on a device compares some of their numbers
-with the reference. If they differ, or a kernel fails, a warning says so and the reference is used from then on. All
-other tensors go to the reference, and so do CPU tensors without the extension. All of them draw the same bits.
-Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
+go to Triton kernels. The first call on a device compares some of their numbers with the reference. If they differ, or a
+kernel fails, a warning says so and the reference is used from then on. All other tensors go to the reference, and so do
+CPU tensors without the extension. All of them draw the same bits. Their sums of n terms differ by rounding: n units in
+the last place of the sum of magnitudes at most.
 """
 
 import functools

@@ -86,15 +86,15 @@ def test_rows_have_sigma_and_loss_of_the_search():
     assert trial.rows[-1].loss == best == pytest.approx(trial.rows[-1].image_error)
 
 
-def test_block_gauss_newton_is_for_images_of_many_parameters():
-    method = METHODS["block_gauss_newton"]
+@pytest.mark.parametrize(
+    ("name", "small", "reason"),
+    [
+        ("block_gauss_newton", "box10", "made for 100 parameters and more"),
+        ("local", "brdf", "made for 20 parameters and more, the task has 7"),
+    ],
+)
+def test_gauss_newton_is_for_images_of_many_parameters(name, small, reason):
+    method = METHODS[name]
     assert method.unusable(catalogue.load("texture")) is None
-    assert "made for 100 parameters and more" in method.unusable(catalogue.load("box10"))
-    assert "returns the loss only" in method.unusable(catalogue.load("quad"))
-
-
-def test_local_is_for_images_of_twenty_parameters_and_more():
-    method = METHODS["local"]
-    assert method.unusable(catalogue.load("texture")) is None
-    assert "made for 20 parameters and more, the task has 7" in method.unusable(catalogue.load("brdf"))
+    assert reason in method.unusable(catalogue.load(small))
     assert "returns the loss only" in method.unusable(catalogue.load("quad"))

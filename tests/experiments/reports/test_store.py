@@ -405,25 +405,14 @@ def test_documents_are_written_and_checked(folder, tmp_path, capsys):
         ("table: bowls methods=ours", "methods must be some of fr22, descent, got ours"),
         ("table: bowls level", "options must be name=value, got level"),
         (f"table: {SPEED_UP} reference=fr22", "must have of=NAME"),
+        ("value: bowls seconds method=fr22", "must name a column and one row"),
+        ("value: bowls speed task=bowl", "must name a column and one row"),
+        ("value: bowls seconds taste=sweet", "columns are task, .*got taste"),
+        ("value: bowls seconds method=ours", "no row of the table"),
+        ("value: bowls seconds n=two", "no row of the table"),
     ],
 )
 def test_wrong_marks_are_named(folder, mark, message):
     store(folder, name="bowls")
     with pytest.raises(SystemExit, match=message):
-        filled(f"<!-- {mark} -->\n<!-- end -->\n")
-
-
-@pytest.mark.parametrize(
-    ("mark", "message"),
-    [
-        ("bowls seconds method=fr22", "must name a column and one row"),
-        ("bowls speed task=bowl", "must name a column and one row"),
-        ("bowls seconds taste=sweet", "columns are task, .*got taste"),
-        ("bowls seconds method=ours", "no row of the table"),
-        ("bowls seconds n=two", "no row of the table"),
-    ],
-)
-def test_wrong_values_are_named(folder, mark, message):
-    store(folder, name="bowls")
-    with pytest.raises(SystemExit, match=message):
-        filled(f"<!-- value: {mark} -->1<!-- /value -->")
+        filled(f"<!-- {mark} -->\n<!-- end -->\n<!-- /value -->")

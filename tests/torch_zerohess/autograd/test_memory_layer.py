@@ -122,8 +122,7 @@ def test_a_surrogate_without_derivatives_is_smoothed_by_stein(function: Callable
     x, r = point()
     memory = remembering(Fixed(function), draws=1024)
     box = layer(memory, samples=16).eval()
-    exact = x.clone().requires_grad_()
-    (g,) = torch.autograd.grad(truth(exact, r).sum(), exact)
+    g = torch.func.grad(lambda z: truth(z, r).sum())(x)
     gradients = []
     for _ in range(32):
         y = x.clone().requires_grad_()
@@ -209,8 +208,7 @@ def test_an_exact_surrogate_leaves_no_noise_of_new_samples() -> None:
     box = layer(memory, samples=1).eval()
     y = x.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(box(y, r).sum(), y)
-    exact = x.clone().requires_grad_()
-    (g,) = torch.autograd.grad(truth(exact, r).sum(), exact)
+    g = torch.func.grad(lambda z: truth(z, r).sum())(x)
     torch.testing.assert_close(gradient, g, rtol=0.02, atol=0.002)
     plain = layer(None, samples=1)
     (alone,) = torch.autograd.grad(plain(y, r).sum(), y)
@@ -220,8 +218,7 @@ def test_an_exact_surrogate_leaves_no_noise_of_new_samples() -> None:
 def test_memory_lowers_the_error_and_a_bad_one_does_no_harm() -> None:
     torch.manual_seed(2)
     x, r = point()
-    exact = x.clone().requires_grad_()
-    (g,) = torch.autograd.grad(truth(exact, r).sum(), exact)
+    g = torch.func.grad(lambda z: truth(z, r).sum())(x)
 
     def error(box: zh.BlackBox) -> float:
         total = 0.0

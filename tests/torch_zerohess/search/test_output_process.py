@@ -47,6 +47,17 @@ def test_the_process_alone_does_not(monkeypatch):
     assert found.value > 1e-9
 
 
+def test_it_promises_what_gauss_newton_promises_in_its_turn_and_nothing_before():
+    found, promises = search(), {True: [], False: []}
+    while not found.done and found.evaluations < 150:
+        found.tell(swing(found.ask()))
+        promises[finishing(found)].append((found.promise, found.value))
+    assert all(promise == float("inf") for promise, _ in promises[False])
+    known = [(promise, value) for promise, value in promises[True] if promise < float("inf")]
+    assert known
+    assert all(promise == pytest.approx(value, rel=0.1) for promise, value in known)  # the least loss is 0
+
+
 def test_it_does_not_begin_where_little_is_left_to_gain():
     found, seen = search(shift=1.0), []
     while not found.done and found.evaluations < 100:

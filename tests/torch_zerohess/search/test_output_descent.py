@@ -43,6 +43,16 @@ def test_it_converges_fast_where_residuals_are_not_zero(n, most, seed, monkeypat
     assert evaluations(search(), bent, 1 + 1e-8) > 2 * most
 
 
+def test_it_promises_what_gauss_newton_promises_in_its_turn():
+    def nearly_affine(x):
+        return torch.cat([bent(x)[:, :-1], (0.01 * x).tanh()], 1)
+
+    search = Descent(torch.full((5,), 2.0, dtype=torch.float64), sigma=0.5, loss=squares, seed=0)
+    while not (smooth(search) and search.promise < float("inf")):
+        search.tell(nearly_affine(search.ask()))
+    assert search.promise == pytest.approx(search.value, rel=0.1)  # the least loss is 0
+
+
 def test_a_step_that_was_predicted_is_the_evidence():
     search, before = Descent(zeros(5), sigma=1.0, loss=rays_loss(5), seed=0, restarts=0), None
     while not smooth(search):

@@ -100,6 +100,25 @@ def test_a_solution_that_is_far_is_reached_in_steps_of_growing_length():
     assert search.value < 1e-6 * losses[0]
 
 
+def test_the_decrease_to_a_minimum_within_reach_is_promised_and_no_other():
+    a = normal(5, 12) / 2
+
+    def outputs(x):
+        return x @ a + 0.02 * (x @ a).square()
+
+    goal = outputs(torch.full((1, 5), 3.0, dtype=torch.float64))[0]  # farther than the longest first step
+    search, reached = zh.optim.BlockGaussNewton(torch.zeros(5).double(), sigma=1.0, loss=square(goal), seed=0), 0
+    while search.value > 1e-6:
+        search.tell(outputs(search.ask()))
+        if search.promise < math.inf:
+            assert search.promise == pytest.approx(search.value, rel=0.1)  # the least loss is 0
+            assert float((search.x - 3.0).norm()) < LENGTHS[-1] * float(search.width.norm())
+            reached += 1
+        else:
+            assert bool((search.width == math.inf).all())
+    assert reached >= 3
+
+
 def test_where_a_long_step_overshoots_a_short_one_of_the_same_batch_is_taken():
     """Newton's step for atan(5 x) from 1 ends at -6.1; all steps from 2 upward raise the loss."""
     search = zh.optim.BlockGaussNewton(

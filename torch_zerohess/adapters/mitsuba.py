@@ -17,6 +17,7 @@ Example: where is the ball, and how bright is it? The points are [K, 3]: two len
 
 import difflib
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -43,6 +44,9 @@ class MitsubaScene:
 
     Just-in-time variants render slower the more scenes a process has loaded (half as slow again with three small ones):
     delete those that are not needed.
+
+    Several threads may call one scene: they take turns, point by point. The variant is one for the whole process, so
+    threads must not render scenes of different variants at the same time.
 
     Args:
         description: what `mitsuba.load_dict` takes, a function that returns it for the `mitsuba` module (for what needs
@@ -124,6 +128,7 @@ class MitsubaScene:
         """[n], the scene as it was loaded, or the nearest within the bounds."""
         self.values.keep([name for one in self.parameters for name in one.names])
         self._calls = seed
+        self._lock = threading.RLock()  # from the writing of a point to the end of its render
 
     def __repr__(self) -> str:
         width, height = (int(one) for one in self.scene.sensors()[0].film().size())
@@ -138,7 +143,6 @@ class MitsubaScene:
             ValueError: x has another shape, or is not finite.
             FloatingPointError: a pixel is not finite.
         """
-        self._select()
         if x.ndim != 2 or x.shape[1] != self.n:
             columns = ", ".join(self.labels)
             raise ValueError(f"x must have shape [K, {self.n}] for {columns}, got {list(x.shape)}")
@@ -146,8 +150,10 @@ class MitsubaScene:
             k, i = (int(one) for one in (~torch.isfinite(x)).nonzero()[0])
             raise ValueError(f"x must be finite, got {float(x[k, i])} for {self.labels[i]} in point {k}")
         points = x.detach().cpu().double().clamp(*self.bounds)
-        self._calls += self.noise == "call"
-        images = [self._image(point) for point in points]
+        with self._lock:
+            self._calls += self.noise == "call"
+            seed = self._calls
+        images = [self._image(point, seed) for point in points]
         if self.loss is None:
             out = torch.stack(images) if images else torch.empty(0, dtype=torch.float32, device="cpu")
         else:
@@ -165,26 +171,31 @@ class MitsubaScene:
         """Give the scene the parameters x [n], for renders of one's own."""
         if x.shape != (self.n,):
             raise ValueError(f"x must have shape [{self.n}] for {', '.join(self.labels)}, got {list(x.shape)}")
-        self._select()
-        for parameter, part in zip(self.parameters, x.split([one.n for one in self.parameters]), strict=True):
-            parameter.write(self.values, part.tolist())
-        self.values.update()
+        with self._lock:
+            self._select()
+            for parameter, part in zip(self.parameters, x.split([one.n for one in self.parameters]), strict=True):
+                parameter.write(self.values, part.tolist())
+            self.values.update()
 
     def skip(self, calls: int, points: int) -> None:
         """Let fresh noise go on as after so many calls with so many points in all."""
-        self._calls += {"fixed": 0, "call": calls, "point": points}[self.noise]
+        with self._lock:
+            self._calls += {"fixed": 0, "call": calls, "point": points}[self.noise]
 
     def _select(self) -> None:
         """Make the variant of this scene the current one of the process: another scene may have another."""
         if self.mi.variant() != self.variant:
             self.mi.set_variant(self.variant)
 
-    def _image(self, x: Tensor) -> Tensor:
-        self.set(x)
-        self._calls += self.noise == "point"
+    def _image(self, x: Tensor, seed: int) -> Tensor:
         more = {} if self.spp is None else {"spp": self.spp}
-        pixels = self.mi.render(self.scene, integrator=self.integrator, seed=self._calls, **more)
-        image = np.array(pixels, dtype=np.float32)
+        with self._lock:
+            self.set(x)
+            if self.noise == "point":
+                self._calls += 1
+                seed = self._calls
+            pixels = self.mi.render(self.scene, integrator=self.integrator, seed=seed, **more)
+            image = np.array(pixels, dtype=np.float32)
         if self.nan == "raise" and not np.isfinite(image).all():
             wrong = np.argwhere(~np.isfinite(image))
             where = x.tolist() if self.n < 20 else "[...]"

@@ -1,6 +1,9 @@
 """Mitsuba scenes as black boxes: small scenes whose images are known in closed form, in every variant that works."""
 
+import concurrent.futures
+import contextlib
 import math
+import threading
 from pathlib import Path
 from unittest.mock import patch
 
@@ -12,6 +15,7 @@ from small_scenes import RADIANCE, REFLECTANCE, VARIANTS, WITHOUT_NOISE, camera,
 import torch_zerohess as zh
 from experiments.problems.scenes.parts import mi_mesh
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Transform, Value
+from torch_zerohess.evaluators import Executor
 
 
 def things(mi):
@@ -273,6 +277,43 @@ def test_scenes_of_two_variants_live_together() -> None:
     for scene in scenes * 2:
         assert scene(x)[0, 2, 2].tolist() == pytest.approx(x[0].tolist(), rel=1e-5)
         scene.mi.set_variant("scalar_spectral")  # as other code of the process may
+
+
+def test_threads_take_turns_with_a_scene() -> None:
+    """A renderer that lets another thread in, if that one can come, returns the radiance that it then finds."""
+    scene = scalar(lamp, [Value(RADIANCE)], noise="point")
+    meeting, seeds = threading.Barrier(2), []
+
+    def render(_, seed, **more):
+        seeds.append(seed)
+        with contextlib.suppress(threading.BrokenBarrierError):
+            meeting.wait(0.2)
+        return np.broadcast_to(np.array(scene.values[RADIANCE]).reshape(-1), (4, 4, 3))
+
+    x = torch.rand(8, 3, generator=torch.Generator().manual_seed(0))
+    with patch.object(scene.mi, "render", render), concurrent.futures.ThreadPoolExecutor(2) as threads:
+        images = Executor(threads)(scene, x)
+    torch.testing.assert_close(images, x[:, None, None].expand(8, 4, 4, 3))
+    assert sorted(seeds) == list(range(1, 9))
+
+
+def test_the_points_of_a_call_share_their_noise_whatever_other_threads_call() -> None:
+    scene = scalar(lamp, [Value(RADIANCE)], noise="call")
+    seeds: dict[str, list[int]] = {"first": [], "other": []}
+    other = threading.Thread(target=lambda: scene(torch.zeros(1, 3)), name="other")
+
+    def render(_, seed, **more):
+        own = seeds["other" if threading.current_thread() is other else "first"]
+        own.append(seed)
+        if own is seeds["first"] and len(own) == 1:
+            other.start()
+            other.join(0.2)
+        return np.zeros((4, 4, 3))
+
+    with patch.object(scene.mi, "render", render):
+        scene(torch.zeros(2, 3))
+        other.join()
+    assert seeds == {"first": [1, 1], "other": [2]}
 
 
 def test_start_is_within_the_bounds() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from torch_zerohess.evaluators.process_identity import own_seed
 from torch_zerohess.evaluators.transfer import packed, unpacked
 
 
@@ -23,6 +24,11 @@ def picture(z):
 
 def points(count: int, n: int = 3) -> torch.Tensor:
     return torch.rand(count, n, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
+
+
+def numbered(z):
+    """Seed of the call whose number is the point: [K, 1] -> [K]."""
+    return torch.tensor([own_seed(int(one), 2**31) for one in z[:, 0]], dtype=torch.float64)
 
 
 def of_one(point):

@@ -30,6 +30,7 @@ from torch import Tensor
 from torch_zerohess.adapters.mitsuba_parameters import Parameter, Transform, Value
 from torch_zerohess.adapters.mitsuba_variants import select_variant
 from torch_zerohess.arguments import checked_integer
+from torch_zerohess.evaluators.process_identity import own_seed
 
 __all__ = ["MitsubaScene", "Parameter", "Transform", "Value"]
 
@@ -60,7 +61,10 @@ class MitsubaScene:
         integrator: dictionary for `load_dict`, in place of the scene's integrator.
         seed: of the renders, at least 0.
         noise: "fixed" has the same seed always; "call" a new one for every call, shared by its points; "point" a new
-            one for every point.
+            one for every point. In a worker process of an evaluator new seeds also depend on the process: workers never
+            repeat each other's noise, and it is not reproducible from `seed`. With "call" every worker's part of a
+            batch has its own noise, since each part is a call. A process of one's own making has the seeds that follow
+            `seed`: give each another one.
         loss: of an image [height, width, channels] tensor, a scalar: the black box then returns losses.
         nan: "raise" refuses pixels that are not finite; "keep" leaves them to what receives them, see `on_nonfinite`
             of `BlackBox`.
@@ -152,7 +156,7 @@ class MitsubaScene:
         points = x.detach().cpu().double().clamp(*self.bounds)
         with self._lock:
             self._calls += self.noise == "call"
-            seed = self._calls
+            seed = self._fresh()
         images = [self._image(point, seed) for point in points]
         if self.loss is None:
             out = torch.stack(images) if images else torch.empty(0, dtype=torch.float32, device="cpu")
@@ -187,13 +191,17 @@ class MitsubaScene:
         if self.mi.variant() != self.variant:
             self.mi.set_variant(self.variant)
 
+    def _fresh(self) -> int:
+        """Return the seed that the count of calls stands for in this process."""
+        return self._calls if self.noise == "fixed" else own_seed(self._calls, _MOST)
+
     def _image(self, x: Tensor, seed: int) -> Tensor:
         more = {} if self.spp is None else {"spp": self.spp}
         with self._lock:
             self.set(x)
             if self.noise == "point":
                 self._calls += 1
-                seed = self._calls
+                seed = self._fresh()
             pixels = self.mi.render(self.scene, integrator=self.integrator, seed=seed, **more)
             image = np.array(pixels, dtype=np.float32)
         if self.nan == "raise" and not np.isfinite(image).all():

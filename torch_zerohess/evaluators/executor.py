@@ -16,6 +16,7 @@ from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
+from torch_zerohess.evaluators.process_identity import become_worker, identity
 from torch_zerohess.evaluators.values import checked_values
 
 _HELD = 4
@@ -111,7 +112,7 @@ class Executor(Closing):
             while batch.waiting:
                 chunk = batch.take()
                 data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
-                tasks.append((chunk, self.executor.submit(evaluated, name, fn, data)))
+                tasks.append((chunk, self.executor.submit(evaluated, name, fn, data, identity())))
         except BaseException:
             for _, task in tasks:
                 task.cancel()
@@ -161,8 +162,9 @@ def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[
         task.add_done_callback(one_less)
 
 
-def evaluated(name: str, fn: Callable[..., Any], data: bytes) -> bytes:
+def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str) -> bytes:
     """Return the values of a chunk, in a worker. The first fn with a name stays: what comes later is a copy of it."""
+    become_worker(caller)
     with _lock:
         fn = _held.setdefault(name, fn)
         while len(_held) > _HELD:

@@ -13,6 +13,7 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.executor import values_of
+from torch_zerohess.evaluators.process_identity import become_worker
 
 _LOOK = 0.05
 """Seconds after which a wait looks for calls that were submitted meanwhile."""
@@ -162,6 +163,7 @@ class Actor:
 
     def __init__(self) -> None:
         torch.set_num_threads(1)
+        become_worker()
         self._held: Any = None
         self._fn: Any = None
 

@@ -14,6 +14,7 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.factory import Each, built
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
+from torch_zerohess.evaluators.process_identity import become_worker
 from torch_zerohess.evaluators.values import checked_values
 
 READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
@@ -64,6 +65,7 @@ class Messages:
 def main(connection: "Connection[Any, Any]") -> None:
     """Serve until the pipe is closed."""
     end_with_parent()
+    become_worker()
     _leave_no_core()
     torch.set_num_threads(1)
     messages = Messages(connection)

@@ -15,7 +15,7 @@ from small_scenes import RADIANCE, REFLECTANCE, VARIANTS, WITHOUT_NOISE, camera,
 import torch_zerohess as zh
 from experiments.problems.scenes.parts import mi_mesh
 from torch_zerohess.adapters.mitsuba import MitsubaScene, Transform, Value
-from torch_zerohess.evaluators import Executor
+from torch_zerohess.evaluators import Executor, Factory, Inline, ProcessPool
 
 
 def things(mi):
@@ -189,6 +189,17 @@ def test_noise_is_the_same_in_all_renders_in_a_call_or_in_none(variant) -> None:
     assert torch.equal(call[2], call[3])
     assert not torch.equal(call[0], call[2])
     assert len({tuple(one.flatten().tolist()) for one in point}) == 4
+
+
+def test_workers_do_not_repeat_the_noise_of_each_other() -> None:
+    """The first renders of two workers and of this process, of 48 noisy values each; fixed noise is the same in all."""
+    x = torch.full((1, 3), 0.5)
+    with ProcessPool(1) as first, ProcessPool(1) as second:
+        for noise, count in (("point", 6), ("call", 6), ("fixed", 1)):
+            fn = Factory(scalar, plane, [Value(REFLECTANCE)], integrator={"type": "path", "max_depth": 2}, noise=noise)
+            images = [evaluator(fn, x) for evaluator in (Inline(), first, second) for _ in range(2)]
+            assert len({tuple(one.flatten().tolist()) for one in images}) == count
+            assert torch.equal(images[0], scalar(*fn.args, **fn.kwargs)(x))
 
 
 def test_seed_changes_the_noise_and_nothing_else() -> None:

@@ -49,6 +49,12 @@ def test_calls_that_do_not_wait_share_the_actors(actors, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
+def test_actors_have_random_numbers_of_their_own(actors):
+    count = torch.arange(8.0, dtype=torch.float64)[:, None]
+    assert not bool((actors(black_boxes.numbered, count) == count[:, 0]).any())
+
+
+@pytest.mark.filterwarnings("ignore")
 def test_errors(actors):
     with pytest.raises(ArithmeticError, match="no value above one half"):
         actors(black_boxes.failing, Z)

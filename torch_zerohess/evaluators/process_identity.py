@@ -1,0 +1,35 @@
+"""Which process this is, for black boxes that draw random numbers of their own.
+
+A black box that is made in every worker counts its calls from the same seed in each of them. Its random numbers must
+differ between workers, because estimates of noise compare repeated values.
+"""
+
+import hashlib
+import os
+import uuid
+
+_START = uuid.uuid4().hex
+"""Of this process and of those that it forks; other processes, also on other machines, have others."""
+_worker = False
+
+
+def identity() -> str:
+    """Return a name that no other process has."""
+    return f"{_START}-{os.getpid()}"
+
+
+def become_worker(caller: str = "") -> None:
+    """Remember that this process evaluates black boxes for another one.
+
+    caller: identity of the process that asks for values; nothing is remembered if it is this one.
+    """
+    global _worker
+    _worker = _worker or caller != identity()
+
+
+def own_seed(seed: int, below: int) -> int:
+    """Return the seed itself, or in a worker a pseudorandom one of 0 to below - 1 that depends on the process."""
+    if not _worker:
+        return seed
+    digest = hashlib.blake2b(f"{identity()} {seed}".encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") % below

@@ -82,5 +82,9 @@ class Inline(Closing):
             return fn(points, *aux)
 
     def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:
-        """Call at once, and return a future that is done: see `ProcessPool.submit`, for which this stands in."""
-        return Evaluation.of(lambda: checked_values(self(fn, points, *aux), points))
+        """Call at once, and return a future that is done: see `ProcessPool.submit`, for which this stands in.
+
+        As there, fn has its own copy of the points, and the values are a copy of what fn returned.
+        """
+        own = [one.detach().clone() for one in (points, *aux)]
+        return Evaluation.of(lambda: checked_values(self(fn, *own), points).clone())

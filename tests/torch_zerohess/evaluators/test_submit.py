@@ -19,6 +19,12 @@ def threads():
         yield Executor(executor)
 
 
+@pytest.fixture(scope="module")
+def one_thread():
+    with concurrent.futures.ThreadPoolExecutor(1) as executor:
+        yield Executor(executor)
+
+
 @pytest.fixture(params=["pool", "threads", "inline"])
 def evaluator(request):
     return Inline() if request.param == "inline" else request.getfixturevalue(request.param)
@@ -44,6 +50,18 @@ def test_the_bits_of_calls_that_wait(evaluator):
 
 def expected_with(aux):
     return black_boxes.waves(points(len(aux)), aux)
+
+
+@pytest.mark.parametrize("name", ["pool", "one_thread", "inline"])
+def test_a_black_box_may_use_its_arrays_again(name, request):
+    """One that returns the same buffer every time, and writes to its points."""
+    evaluator = Inline() if name == "inline" else request.getfixturevalue(name)
+    fn, given, aux = black_boxes.Reusing(3), [torch.full((3, 2), float(k)) for k in range(3)], torch.ones(3)
+    futures = [evaluator.submit(fn, z, aux) for z in given]
+    for k, future in enumerate(futures):
+        assert torch.equal(future.result(), torch.full((3,), 2.0 * k + 1.0))
+        assert torch.equal(given[k], torch.full((3, 2), float(k)))
+    assert torch.equal(aux, torch.ones(3))
 
 
 def test_an_error_is_that_of_its_own_call(evaluator):

@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+
+from torch_zerohess.arguments import checked_number
 
 Vector = Sequence[float]
 Range = tuple[float, float]
@@ -53,7 +55,8 @@ class Transform:
 
     The pose is T(sum_i x_i unit_i move_i) P R(turn_1, x_j unit_j) ... P^-1 (pose in the scene), with P the translation
     to the pivot. A mesh has no `to_world`: name its `vertex_positions`, and its normals follow. Moving an instance of a
-    shape group is faster, since a mesh writes all vertices.
+    shape group is faster, since a mesh writes all vertices. Wherever several numbers are asked for, a list, an array of
+    NumPy or a tensor will do.
 
     Args:
         name: of a `to_world` or of `vertex_positions`, or several that move together.
@@ -77,21 +80,20 @@ class Transform:
         return (self.name,) if isinstance(self.name, str) else tuple(self.name)
 
     def bind(self, mi: Any, values: Any) -> "Pose":
-        n = len(self.move) + len(self.turn)
+        first, unit = self.names[0], plain(self.unit)
+        move, turn = (_vectors(f"{first}: {what}", plain(getattr(self, what))) for what in ("move", "turn"))
+        n = len(move) + len(turn)
         if n == 0:
-            raise ValueError(f"{self.names[0]}: move and turn must have at least one vector, got none")
-        for what, vectors in (("move", self.move), ("turn", self.turn)):
-            for vector in vectors:
-                if not hasattr(vector, "__len__") or len(vector) != 3 or not any(vector):
-                    raise ValueError(f"{self.names[0]}: {what} must be vectors of 3 numbers, not all 0, got {vector!r}")
+            raise ValueError(f"{first}: move and turn must have at least one vector, got none")
+        pivot = None if self.pivot is None else _vector(f"{first}: pivot", "a point", plain(self.pivot))
         for name in self.names:
             kind = type(values[name]).__name__
             if "Transform4f" not in kind and not name.endswith(_POSITIONS):
                 raise ValueError(f"Transform is for a to_world or vertex_positions, but {name} is a {kind}: take Value")
-        units = [float(one) for one in self.unit] if isinstance(self.unit, Sequence) else [float(self.unit)] * n
+        units = [checked_number(f"{first}: unit", one) for one in (unit if _several(unit) else [unit] * n)]
         if len(units) != n or not all(math.isfinite(one) and one != 0.0 for one in units):
-            raise ValueError(f"{self.names[0]}: unit must be a number or {n} numbers, not 0, got {self.unit!r}")
-        return Pose(self, mi, values, units)
+            raise ValueError(f"{first}: unit must be a number or {n} numbers, not 0, got {unit!r}")
+        return Pose(replace(self, move=move, turn=turn, pivot=pivot), mi, values, units)
 
 
 class Pose:
@@ -100,8 +102,8 @@ class Pose:
     def __init__(self, transform: Transform, mi: Any, values: Any, units: list[float]) -> None:
         first = transform.names[0]
         self.n, self._mi, self._units = len(units), mi, units
-        self._moves = [[float(c) for c in one] for one in transform.move]
-        self._turns = [[float(c) / math.hypot(*one) for c in one] for one in transform.turn]  # of length 1
+        self._moves = transform.move
+        self._turns = [[c / math.hypot(*one) for c in one] for one in transform.turn]  # of length 1
         self._objects = [(_Mesh if one.endswith(_POSITIONS) else _Frame)(one, mi, values) for one in transform.names]
         self.names = tuple(name for one in self._objects for name in one.names)
         self._pivot = [float(c) for c in (self._objects[0].origin if transform.pivot is None else transform.pivot)]
@@ -192,7 +194,8 @@ class Value:
         return (self.name,) if isinstance(self.name, str) else tuple(self.name)
 
     def bind(self, mi: Any, values: Any) -> "Numbers":
-        if not (math.isfinite(self.unit) and self.unit != 0.0):
+        unit = checked_number(f"{self.names[0]}: unit", plain(self.unit))
+        if not (math.isfinite(unit) and unit != 0.0):
             raise ValueError(f"{self.names[0]}: unit must be a number other than 0, got {self.unit!r}")
         if self.elements not in (None, 1):
             raise ValueError(f"{self.names[0]}: elements must be 1 or None, got {self.elements!r}")
@@ -202,7 +205,7 @@ class Value:
         shapes = {name: np.array(values[name]).size for name in self.names}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"names that share a value must have the same size, got {shapes}")
-        return Numbers(self, mi, values)
+        return Numbers(replace(self, unit=unit), mi, values)
 
 
 class Numbers:
@@ -221,7 +224,7 @@ class Numbers:
         takes = [accepted(name) for name in self.names]
         ends = max(one for one, _ in takes) / value.unit, min(one for _, one in takes) / value.unit
         low, high = min(ends), max(ends)
-        self.limits = ranges(first, value.bounds or (low, high), self.n)
+        self.limits = ranges(first, (low, high) if value.bounds is None else value.bounds, self.n)
         for least, most in self.limits:
             if least < low or most > high:
                 raise ValueError(
@@ -271,11 +274,45 @@ def ranges(name: str, bounds: Range | Sequence[Range] | None, n: int) -> list[Ra
     """Return n pairs of a lower and an upper bound."""
     if bounds is None:
         return [(-math.inf, math.inf)] * n
-    several: Sequence[Any] = bounds if isinstance(bounds[0], Sequence) else [bounds] * n
-    if len(several) != n or any(len(one) != 2 for one in several):
-        raise ValueError(f"bounds of {name} must be a pair (lower, upper) or {n} of them, got {bounds!r}")
-    pairs = [(float(low), float(high)) for low, high in several]
+    given: Any = plain(bounds)
+    several = given if _several(given) and any(_several(one) for one in given) else [given] * n
+    if len(several) != n or not all(_several(one) and len(one) == 2 for one in several):
+        raise ValueError(f"bounds of {name} must be a pair (lower, upper) or {n} of them, got {given!r}")
+    low_high = [[checked_number(f"bounds of {name}", end) for end in one] for one in several]
+    pairs = [(low, high) for low, high in low_high]
     for low, high in pairs:
         if not low < high:
             raise ValueError(f"bounds of {name} must be lower < upper, got {low:g}, {high:g}")
     return pairs
+
+
+def plain(value: Any) -> Any:
+    """Return arrays and tensors as numbers or lists of numbers; also those in a list, whose kind stays."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if not hasattr(value, "__len__") or isinstance(value, (str, bytes, dict)):
+        return value
+    rows = [plain(one) for one in value]
+    return tuple(rows) if isinstance(value, tuple) else rows
+
+
+def _several(value: Any) -> bool:
+    return isinstance(value, (list, tuple))
+
+
+def _vectors(name: str, vectors: Any) -> list[list[float]]:
+    """Return vectors [m][3], none of them 0."""
+    if not _several(vectors):
+        raise ValueError(f"{name} must be a list of vectors, got {vectors!r}")
+    checked = [_vector(name, "vectors", one, ", not all 0") for one in vectors]
+    for one in checked:
+        if not any(one):
+            raise ValueError(f"{name} must be vectors of 3 numbers, not all 0, got {one!r}")
+    return checked
+
+
+def _vector(name: str, what: str, vector: Any, more: str = "") -> list[float]:
+    """Return 3 finite numbers."""
+    if not _several(vector) or len(vector) != 3:
+        raise ValueError(f"{name} must be {what} of 3 numbers{more}, got {vector!r}")
+    return [checked_number(name, one, below=math.inf) for one in vector]

@@ -114,6 +114,29 @@ def test_labels_bounds_and_start() -> None:
     assert [side.tolist() for side in scene.bounds] == [[-2, -1, -math.inf], [3, 1, math.inf]]
 
 
+@pytest.mark.parametrize("kind", [np.array, torch.tensor, lambda rows: [np.array(one) for one in rows]])
+def test_arrays_and_tensors_are_taken_as_lists_are(kind) -> None:
+    move, turn, unit = [[1.0, 0.0, 2.0]], [[0.0, 1.0, 0.0]], [2.0, 90.0]
+    bounds, pivot = [[-1.0, 3.0], [-2.0, 1.0]], [0.5, -1.0, 0.0]
+    arguments = [move, turn, unit, bounds, pivot]
+    scenes = [scalar(things, [Transform("ball.to_world", *map(one, arguments))]) for one in (list, kind)]
+    for scene in scenes:
+        assert [side.tolist() for side in scene.bounds] == [[-1, -2], [3, 1]]
+        scene.set(torch.tensor([0.3, 0.7]).double())
+    first, second = (np.array(one.values["ball.to_world"].matrix) for one in scenes)
+    np.testing.assert_array_equal(first, second)
+
+
+def test_arrays_and_tensors_for_all_columns() -> None:
+    """One unit and one pair for all, and the bounds of a value."""
+    pair, moves = torch.tensor([-1.0, 2.0]), np.eye(3)[:2]
+    scene = scalar(things, [Transform("ball.to_world", moves, unit=np.array(2.0), bounds=pair)])
+    assert [side.tolist() for side in scene.bounds] == [[-1, -1], [2, 2]]
+    scene = scalar(plane, [Value(REFLECTANCE, unit=torch.tensor(0.5), bounds=np.array([0.5, 1.5]))])
+    assert [side.tolist() for side in scene.bounds] == [[0.5] * 3, [1.5] * 3]
+    torch.testing.assert_close(scene.x0, torch.ones(3).double())
+
+
 # Values
 
 
@@ -376,10 +399,33 @@ def test_bounds_of_names_that_share_a_value_are_those_that_all_accept() -> None:
         ([Transform("plane.to_world", move=(1, 0, 0))], "vectors of 3 numbers, not all 0, got 1"),
         ([Transform("plane.to_world", move=((1, 0, 0),), unit=(1.0, 2.0))], "unit must be a number or 1"),
         ([Value((REFLECTANCE, "sensor.film.size"))], "must have the same size"),
+        (
+            [Transform("plane.to_world", move=np.array(1.0))],
+            r"plane.to_world: move must be a list of vectors, got 1\.0",
+        ),
+        ([Transform("plane.to_world", move=np.eye(3)[0])], r"move must be vectors of 3 numbers, not all 0, got 1\.0"),
+        ([Transform("plane.to_world", move=[[1, math.nan, 0]])], "plane.to_world: move must be finite, got nan"),
+        ([Transform("plane.to_world", move=["abc"])], "move must be vectors of 3 numbers, not all 0, got 'abc'"),
+        (
+            [Transform("plane.to_world", turn=np.eye(3), pivot=np.ones(2))],
+            r"pivot must be a point .*got \[1\.0, 1\.0\]",
+        ),
+        (
+            [Transform("plane.to_world", move=np.eye(3), unit=np.ones(2))],
+            r"unit must be a number or 3 .*\[1\.0, 1\.0\]",
+        ),
+        ([Transform("plane.to_world", move=np.eye(3), unit="a")], "plane.to_world: unit must be a number, got 'a'"),
+        (
+            [Transform("plane.to_world", move=np.eye(3), bounds=torch.ones(3))],
+            r"or 3 of them, got \[1\.0, 1\.0, 1\.0\]",
+        ),
+        ([Transform("plane.to_world", move=np.eye(3), bounds=(0, None))], "bounds of .* must be a number, got None"),
+        ([Transform("plane.to_world", move=np.eye(3), bounds=())], r"bounds of .* must be a pair .*got \(\)"),
+        ([Value(REFLECTANCE, unit=np.ones(2))], r"unit must be a number, got \[1\.0, 1\.0\]"),
     ],
 )
 def test_wrong_parameters(parameters, message) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, TypeError), match=message):
         scalar(plane, parameters)
 
 

@@ -15,6 +15,7 @@ Example: where is the ball, and how bright is it? The points are [K, 3]: two len
     fit = zh.minimize(scene, scene.x0, sigma=0.3, bounds=scene.bounds, loss=zh.losses.mse(target))
 """
 
+import copy
 import difflib
 import os
 import threading
@@ -48,6 +49,10 @@ class MitsubaScene:
 
     Several threads may call one scene: they take turns, point by point. The variant is one for the whole process, so
     threads must not render scenes of different variants at the same time.
+
+    A deep copy shares the scene, which a copy of a model with such a layer needs no second time; copies take turns with
+    it as threads do. A copy has a loss of its own, and counts its calls from where the count of the first one was. A
+    scene cannot be pickled: pass `evaluators.Factory(MitsubaScene, ...)` to other processes.
 
     Args:
         description: what `mitsuba.load_dict` takes, a function that returns it for the `mitsuba` module (for what needs
@@ -139,6 +144,11 @@ class MitsubaScene:
         settings = f"film=({width}, {height}), spp={self.spp}, noise={self.noise!r}, variant={self.variant!r}"
         some = ", ".join(self.labels[:4]) + ", ..." * (self.n > 4)
         return f"MitsubaScene(n={self.n}, parameters=[{some}], {settings})"
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "MitsubaScene":
+        memo[id(self)] = other = copy.copy(self)
+        other.loss, other.x0, other.bounds = copy.deepcopy((self.loss, self.x0, self.bounds), memo)
+        return other
 
     def __call__(self, x: Tensor) -> Tensor:
         """Render points [K, n].

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import contextlib
+import copy
 import math
 import threading
 from pathlib import Path
@@ -348,6 +349,56 @@ def test_the_points_of_a_call_share_their_noise_whatever_other_threads_call() ->
         scene(torch.zeros(2, 3))
         other.join()
     assert seeds == {"first": [1, 1], "other": [2]}
+
+
+def test_a_deep_copy_shares_the_scene_and_counts_its_own_calls() -> None:
+    weights = torch.nn.Linear(3, 1)
+    scene = scalar(plane, [Value(REFLECTANCE)], noise="point", depth=2)
+    scene.loss = torch.nn.Sequential(
+        weights, torch.nn.Flatten(0), torch.nn.Unflatten(0, (1, 16)), torch.nn.AvgPool1d(16)
+    )
+    x = torch.full((1, 3), 0.5)
+    scene(x)
+    other = copy.deepcopy(scene)
+    assert other.scene is scene.scene
+    first, second = scene(x), scene(x)
+    assert not torch.equal(first, second)
+    assert torch.equal(torch.cat([other(x), other(x)]), torch.cat([first, second]))
+    with torch.no_grad():
+        weights.weight.zero_()
+        weights.bias.fill_(7.0)
+    assert float(scene(x)) == 7.0
+    assert float(other(x)) != 7.0
+    other.x0.zero_()
+    assert bool((scene.x0 == 0.5).all())
+
+
+def test_the_average_of_a_model_with_a_scene() -> None:
+    """Its images are those of its own network: the mean of the weights, whichever model was called last."""
+    scene = scalar(lamp, [Value(RADIANCE)])
+    model = torch.nn.Sequential(torch.nn.Linear(1, 3), zh.BlackBox(scene, zh.Smoothing(sigma=0.1)))
+    average = torch.optim.swa_utils.AveragedModel(model)
+    for bias in (1.0, 2.0):
+        torch.nn.init.constant_(model[0].bias, bias)
+        average.update_parameters(model)
+    zero = torch.zeros(1, 1)
+    for expected, one in ((2.0, model), (1.5, average), (2.0, model)):
+        torch.testing.assert_close(one(zero), torch.full((1, 4, 4, 3), expected))
+
+
+def test_copies_take_turns() -> None:
+    scene = scalar(lamp, [Value(RADIANCE)])
+    both, meeting = (scene, copy.deepcopy(scene)), threading.Barrier(2)
+
+    def render(*_, **more):
+        with contextlib.suppress(threading.BrokenBarrierError):
+            meeting.wait(0.2)
+        return np.broadcast_to(np.array(scene.values[RADIANCE]).reshape(-1), (4, 4, 3))
+
+    x = torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    with patch.object(scene.mi, "render", render), concurrent.futures.ThreadPoolExecutor(2) as threads:
+        images = torch.cat([*threads.map(lambda one, point: one(point[None]), both, x)])
+    torch.testing.assert_close(images, x[:, None, None].expand(2, 4, 4, 3))
 
 
 def test_start_is_within_the_bounds() -> None:

@@ -286,3 +286,8 @@ def test_values_in_a_column():
     plain = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=20)
     column = zh.minimize(lambda z: tilted(z)[:, None], zeros(2), sigma=2.0, seed=0, max_evaluations=20)
     assert torch.equal(plain.x, column.x)
+
+
+def test_derivatives_of_a_loss_in_inference_mode():
+    with torch.inference_mode(), pytest.raises(RuntimeError, match=r"inference mode forbids: use torch\.no_grad"):
+        zh.minimize(lambda z: z, zeros(3), sigma=1.0, loss=lambda y: y.square().sum(), engine="descent")

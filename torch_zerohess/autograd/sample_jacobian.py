@@ -1,5 +1,6 @@
 """The Jacobian of a network whose outputs each depend on one sample of the batch."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -52,7 +53,8 @@ class SampleJacobian:
     def __init__(self, network: nn.Module, inputs: Tensor) -> None:
         if not isinstance(network, nn.Module):
             raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
-        self._network, self._inputs = network, inputs
+        self._network = network
+        self.inputs = inputs
 
     def __call__(self, parameters: Sequence[Tensor]) -> Tensor:
         """Return J [B n, N] by parameters of the network, N numbers in all.
@@ -76,7 +78,7 @@ class SampleJacobian:
                     "evaluation mode, too: it has no Jacobian per sample"
                 )
             dropout = isinstance(one, _WITH_DROPOUT) and float(one.dropout) > 0.0
-            if one.training and (dropout or isinstance(one, _OF_TRAINING)):
+            if one.training and (dropout or (isinstance(one, _OF_TRAINING) and getattr(one, "p", 1.0) > 0.0)):
                 kind = type(one).__name__ + " with dropout" * dropout
                 raise ValueError(
                     f"network has a {kind} in training mode ({name!r}), and no Jacobian per sample: call "
@@ -101,7 +103,7 @@ class SampleJacobian:
             torch.func.jacrev(output, argnums=(0, 1), has_aux=True), in_dims=(None, None, 0)
         )
         try:
-            (by_rows, by_slopes), inputs = differentiated(rows, slopes, self._inputs)
+            (by_rows, by_slopes), inputs = differentiated(rows, slopes, self.inputs)
         except RuntimeError as error:  # torch's vmap does not know the operations of GRU and PReLU, among others
             if "random" in str(error):
                 raise ValueError(_DRAWS) from error
@@ -114,14 +116,21 @@ class SampleJacobian:
 
         return Blocks([part(at) for at in chosen], [one.numel() for one in chosen.values()])
 
+    def mixes_samples(self) -> bool:
+        """Whether the outputs [1, n] of the last sample are others without the samples before it."""
+        with torch.no_grad():
+            together, alone = _tensor(self._called({}, self.inputs)), _tensor(self._called({}, self.inputs[-1:]))
+        most = math.sqrt(torch.finfo(alone.dtype).eps) * float(together.abs().max())
+        return float((together[-1:] - alone).abs().max()) > most
+
     def _one_by_one(self, parameters: Sequence[Tensor]) -> Tensor:
         """Return the rows by a backward pass for every output of every sample."""
         rows = []
-        for sample in self._inputs:
-            before = _generators(self._inputs)
+        for sample in self.inputs:
+            before = _generators(self.inputs)
             with torch.enable_grad():
-                outputs = _checked(self._network(sample[None]))[0]
-            if not all(map(torch.equal, before, _generators(self._inputs))):
+                outputs = _checked(self._called({}, sample[None]))[0]
+            if not all(map(torch.equal, before, _generators(self.inputs))):
                 raise ValueError(_DRAWS)
             for one in outputs:
                 gradients = torch.autograd.grad(one, parameters, retain_graph=True, materialize_grads=True)
@@ -137,15 +146,17 @@ class SampleJacobian:
         return found
 
     def _called(self, values: Mapping[Places, Tensor], samples: Tensor) -> object:
-        """Return the outputs with other values of parameters."""
+        """Return the outputs with other values of parameters. Buffers stay as they are, whatever the network does."""
+        buffers = {id(one): one.clone() for one in self._network.buffers()}
+        given = {name: buffers[id(one)] for name, one in self._network.named_buffers(remove_duplicate=False)}
+        given |= {name: one for names, one in values.items() for name in names}
         # torch's own handling of shared parameters (tie_weights) loses a parameter of a module with two names.
-        given = {name: one for names, one in values.items() for name in names}
         return functional_call(self._network, given, (samples,), tie_weights=False)
 
     def _outer(self, chosen: Mapping[Places, Tensor]) -> set[Places]:
         """Return the weights [p, q] whose only use, for one sample, is one product with a vector."""
         with torch.enable_grad(), _Uses(chosen.values()) as uses:
-            self._called(chosen, self._inputs[:1])
+            self._called(chosen, self.inputs[:1])
         return {at for at, one in chosen.items() if uses.count[id(one)] == 1 and id(one) in uses.products}
 
 
@@ -155,10 +166,15 @@ def _generators(inputs: Tensor) -> list[Tensor]:
     return [torch.get_rng_state(), *on_device]
 
 
-def _checked(outputs: object) -> Tensor:
-    """Return outputs [1, n] of a network; ValueError for another shape, TypeError for what is no tensor."""
+def _tensor(outputs: object) -> Tensor:
     if not isinstance(outputs, Tensor):
         raise TypeError(f"network must return a tensor [B, n], got {type(outputs).__name__}")
+    return outputs
+
+
+def _checked(outputs: object) -> Tensor:
+    """Return outputs [1, n] of a network; ValueError for another shape, TypeError for what is no tensor."""
+    outputs = _tensor(outputs)
     if outputs.ndim != 2 or len(outputs) != 1:
         raise ValueError(f"network must return [1, n] for one sample, got {list(outputs.shape)}: flatten the outputs")
     return outputs

@@ -13,6 +13,7 @@ from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate_center
 from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
 from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.precision import without_autocast
 from torch_zerohess.smoothing import Smoothing, check_smoothing, following_seed, settings_of, smoothing_of
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_grid, checked_rate
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -92,9 +93,10 @@ class SparseBlackBox(nn.Module):
         center = working(x).detach().reshape(-1, n).clone()
         values = evaluate_center(self.call, center, ()).to(center.dtype)
         if transforms.derivative_possible(x):
-            self.jacobians = self._jacobians(center)
+            self.jacobians = jacobians = self._jacobians(center)
             change = Input.apply(working(x)).reshape(-1, n) - center
-            values = values + torch.stack([J.matvec(d) for J, d in zip(self.jacobians, change, strict=True)])
+            with without_autocast(x.device):
+                values = values + torch.stack([J.matvec(d) for J, d in zip(jacobians, change, strict=True)])
         return values.reshape((*batch, *values.shape[1:])).to(x.dtype)
 
     def _jacobians(self, points: Tensor) -> list[SparseJacobian]:

@@ -122,12 +122,14 @@ class Prediction:
         space = coordinates_of(surrogate, control.outer)
         if space is not None and not self.encoded:
             SquaredError.check(space.shape, aux[0])
-            self.encoded = list(space.split(aux[0]))
+            with without_autocast(aux[0].device):
+                self.encoded = list(space.split(aux[0]))
 
     def __call__(self, z: Tensor) -> Tensor:
         if self.encoded:
             known, outside = self.encoded
-            coordinates: Tensor = self._surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
+            with without_autocast(z.device):
+                coordinates: Tensor = self._surrogate.coordinates(z.flatten(0, 1)).unflatten(0, z.shape[:2])
             return (coordinates - known[:, None]).square().sum(2) + outside[:, None]
         outputs = self._outputs(z)
         return outputs if self._head is None else apply_head(self._head, outputs, self._aux)

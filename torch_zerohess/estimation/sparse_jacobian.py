@@ -13,6 +13,7 @@ from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values
 from torch_zerohess.estimation.perturbations import perturb
 from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.precision import without_autocast
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples, fewest_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -100,7 +101,8 @@ def sparse_jacobian(
     _check_weights(weights, smoothing, settings.keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)
     earlier = None if previous is None else _checked(previous, len(x), shape).to(work).times(sigma)
-    found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
+    with without_autocast(work.device):
+        found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
     return replace(found.times(1.0 / sigma), evaluations=evaluations)
 
 

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.flat import add_parts
+from torch_zerohess.precision import without_autocast
 
 
 def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative_damping: float = 0.3) -> None:
@@ -48,13 +49,20 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
         raise ValueError("network must have weights that require grad, got none")
     if not len(inputs):
         raise ValueError("inputs must be at least one, got none")
-    J = SampleJacobian(network, inputs).products(weights)
+    with without_autocast(inputs.device):
+        _move(SampleJacobian(network, inputs), weights, change, relative_damping)
+
+
+def _move(jacobian: SampleJacobian, weights: list[nn.Parameter], change: Tensor, relative_damping: float) -> None:
+    J = jacobian.products(weights)
     gram = J.gram().double()
-    shape = [len(inputs), len(gram) // len(inputs)]
+    shape = [len(jacobian.inputs), len(gram) // len(jacobian.inputs)]
     if list(change.shape) != shape:
         raise ValueError(f"change must be {shape}, one for each output, got {list(change.shape)}")
     if not bool(torch.isfinite(change).all()):
         raise ValueError("change must be finite")
+    if jacobian.mixes_samples():
+        raise ValueError("the outputs of the network for one sample depend on the others: it mixes samples")
     h = float(gram.diagonal().mean())
     if not math.isfinite(h):
         raise ValueError("the Jacobian of the network is not finite")

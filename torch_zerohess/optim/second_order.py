@@ -14,7 +14,7 @@ from torch_zerohess.autograd.blocks import output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.dual import dual_step
-from torch_zerohess.linalg.flat import add_parts, flattened, split_like
+from torch_zerohess.linalg.flat import add_parts, flattened, overwrite, split_like
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.magnitudes import magnitudes
 from torch_zerohess.linalg.step import Step
@@ -146,6 +146,9 @@ class SecondOrder(Optimizer):
         super().__init__(params, defaults)
         if not self._parameters:
             raise ValueError("params must have a parameter that requires grad, got none")
+        for one in self._parameters:
+            if one.is_complex():
+                raise TypeError(f"params must be real, got {one.dtype}: optimize torch.view_as_real of a parameter")
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Refuse a second group of parameters, because the quadratic model has one Hessian, and settings in a group."""
@@ -198,9 +201,7 @@ class SecondOrder(Optimizer):
 
     def _restore(self, place: list[Tensor]) -> None:
         """Put the parameters back, to the last bit."""
-        with torch.no_grad():
-            for one, before in zip(self._parameters, place, strict=True):
-                one.copy_(before)
+        overwrite(self._parameters, place)
 
 
 def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, SampleJacobian | None]:

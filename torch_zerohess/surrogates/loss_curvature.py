@@ -35,7 +35,11 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
 
     Derivatives that are not finite, such as the derivative of a norm at zero, count as zero. If the second
     derivative is a multiple of the identity, as for a mean square, products take no call of autograd.
+
+    Raises RuntimeError in inference mode, and ValueError for a loss that autograd does not differentiate.
     """
+    if torch.is_inference_mode_enabled():
+        raise RuntimeError("a search needs derivatives of the loss, which inference mode forbids: use torch.no_grad")
     with torch.enable_grad():
         y = output.detach().requires_grad_(True)
         value = loss(y)

@@ -173,7 +173,10 @@ class Memory:
     def _fit_rows(self) -> None:
         if hasattr(self.surrogate, "fit"):
             with outside_inference(), without_autocast(self.points.device):
-                self.surrogate.fit(self.points[: self._rows], self.outputs[: self._rows])
+                points, outputs = self.points[: self._rows], self.outputs[: self._rows]
+                if type(self.surrogate) is not AutomaticSurrogate:  # another one may change them in place
+                    points, outputs = points.clone(), outputs.clone()
+                self.surrogate.fit(points, outputs)
 
     def refresh(self) -> None:
         """Fit the surrogate if that is due: `evaluations` has grown by 30 % since the last fit."""

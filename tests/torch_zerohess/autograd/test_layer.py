@@ -14,8 +14,9 @@ from torch.autograd import forward_ad
 from torch_zerohess import BlackBox, Memory, Smoothing, estimate, smooth
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation import perturbations
+from torch_zerohess.heads import SquaredError
 from torch_zerohess.sampling import kernels, stein_sums
-from truths import spread, vector
+from truths import normal, spread, vector
 
 
 def test_value_gradient_and_hessian_cost_one_call() -> None:
@@ -291,3 +292,21 @@ def test_any_number_of_threads_gives_the_same_bits(
         assert not [number for number, (one, two) in enumerate(pairs) if not torch.equal(one, two)]
     finally:
         torch.set_num_threads(before)
+
+
+def test_autocast_does_not_reach_the_coordinates_of_an_affine_memory() -> None:
+    n = 64
+    W = normal(n, 100).float() / 8.0
+
+    def gradient(*, autocast: bool) -> torch.Tensor:
+        smoothing = Smoothing(sigma=0.1, samples=20, seed=0)
+        layer = BlackBox(lambda z: z @ W, smoothing, head=SquaredError(), memory=Memory())
+        x = torch.ones(4, n, requires_grad=True)
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            for _ in range(6):
+                y = layer(x, torch.zeros(4, 100))
+        assert layer.memory is not None
+        assert layer.memory.coefficient > 0.5
+        return torch.autograd.grad(y.sum(), x)[0]
+
+    assert torch.equal(gradient(autocast=True), gradient(autocast=False))

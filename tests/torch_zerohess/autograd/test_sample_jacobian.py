@@ -276,3 +276,11 @@ def test_a_network_that_draws_random_numbers_is_refused(inner: nn.Module) -> Non
     net = Drawing(inner, dropout=0.5).double()
     with pytest.raises(ValueError, match="network draws random numbers, and has no Jacobian per sample"):
         SampleJacobian(net, SAMPLES).products(list(net.parameters()))
+
+
+def test_dropout_of_rate_zero_is_no_dropout() -> None:
+    net = nn.Sequential(nn.Flatten(), nn.Linear(4, 3), nn.Dropout(0.0)).double()
+    parameters, inputs = list(net.parameters()), torch.arange(8.0).double().view(2, 4)
+    found = SampleJacobian(net, inputs)(parameters)
+    net.eval()
+    assert torch.equal(found, SampleJacobian(net, inputs)(parameters))

@@ -1,12 +1,15 @@
 """A layer with sparse Jacobians: against the exact Jacobian of a blurred image, and against the dense layer."""
 
 import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 from torch import nn
 
 import torch_zerohess as zh
+from torch_zerohess.autograd import sparse_layer
 
 SIDE, N = 12, 144
 SMOOTHING = zh.Smoothing(sigma=0.1, samples=64, seed=0)
@@ -163,3 +166,36 @@ def test_what_it_refuses():
 def test_torch_jit_is_refused():
     with pytest.raises(RuntimeError, match="is not compiled"):
         torch.jit.trace(zh.SparseBlackBox(lambda z: z.numpy(), SMOOTHING), X)
+
+
+def test_calls_of_several_threads_do_not_take_each_others_jacobians(monkeypatch):
+    """The slope of output k by x_k is x_0, another number in every thread. Both are known before either is used."""
+    together = threading.Barrier(2)
+
+    class Waiting:
+        @staticmethod
+        def apply(x):
+            together.wait(60.0)
+            return x
+
+    monkeypatch.setattr(sparse_layer, "Input", Waiting)
+    layer = zh.SparseBlackBox(lambda z: z[:, :1] * z[:, 1:], zh.Smoothing(sigma=1e-3, samples=40), keep=2)
+
+    def slope(size):
+        x = torch.full((1, 33), size, dtype=torch.float64, requires_grad=True)
+        layer(x).sum().backward()
+        return float(x.grad[0, 1:].mean()) / size
+
+    with ThreadPoolExecutor(2) as threads:
+        slopes = list(threads.map(slope, [1.0, 10.0]))
+    assert slopes == pytest.approx([1.0, 1.0], rel=0.1)
+
+
+def test_autocast_does_not_reach_the_fit():
+    def gradient(*, autocast):
+        layer, x = zh.SparseBlackBox(blurred, SMOOTHING, grid=(SIDE, SIDE)), X.float().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            y = layer(x)
+        return torch.autograd.grad((y - TARGET).square().sum(), x)[0]
+
+    assert torch.equal(gradient(autocast=True), gradient(autocast=False))

@@ -75,3 +75,57 @@ def test_what_cannot_be_moved_is_said() -> None:
     assert torch.equal(weights(network), before)
     with pytest.raises(ValueError, match="network must have weights that require grad, got none"):
         zh.optim.move_outputs(network.requires_grad_(False), x, change)
+
+
+class Counted(nn.Module):
+    """Outputs over a running mean of the inputs, which a forward pass in training mode changes."""
+
+    def __init__(self, *, in_place: bool) -> None:
+        super().__init__()
+        self.layer, self.in_place = nn.Linear(4, 2), in_place
+        self.mean: Tensor
+        self.register_buffer("mean", torch.ones(4))
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.layer(x / self.mean.detach().clone())
+        mean = 0.9 * self.mean + 0.1 * x.detach().mean(0)
+        if self.in_place:
+            self.mean.copy_(mean)
+        else:
+            self.mean = mean
+        return y
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_buffers_stay_as_they_are(*, in_place: bool) -> None:
+    _, x, change = made()
+    network = Counted(in_place=in_place).double()
+    before = copy.deepcopy(network)(x).detach()
+    zh.optim.move_outputs(network, x, change, relative_damping=1e-9)
+    assert torch.equal(network.mean, torch.ones(4).double())
+    torch.testing.assert_close(copy.deepcopy(network)(x) - before, change, rtol=0, atol=1e-4)
+
+
+class Centered(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(4, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layer(x - x.mean(0))
+
+
+def test_a_network_that_mixes_samples_is_refused() -> None:
+    network, (_, x, change) = Centered().double(), made()
+    with pytest.raises(ValueError, match="it mixes samples"):
+        zh.optim.move_outputs(network, x, change)
+
+
+def test_the_step_is_the_same_under_autocast() -> None:
+    network, x, change = made()
+    network, x, change = network.float(), x.float(), change.float()
+    other = copy.deepcopy(network)
+    zh.optim.move_outputs(network, x, change)
+    with torch.autocast("cpu", torch.bfloat16):
+        zh.optim.move_outputs(other, x, change)
+    assert torch.equal(weights(network), weights(other))

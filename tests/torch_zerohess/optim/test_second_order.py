@@ -127,3 +127,20 @@ def test_truth_values_and_texts_are_no_numbers(make, names: tuple[str, ...]) -> 
         for value in (True, "1"):
             with pytest.raises(TypeError, match=f"{name} must be a number, got {value!r}"):
                 make([torch.ones(1, requires_grad=True)], **{name: value})
+
+
+@pytest.mark.parametrize("make", [zh.optim.Newton, zh.optim.NewtonCG, zh.optim.NonlinearCG])
+def test_steps_under_autocast_see_the_weights_that_they_have_changed(make) -> None:
+    """Autocast keeps its copies of the weights in bfloat16 until its block ends, or is told that they have changed."""
+    torch.manual_seed(0)
+    network, inputs = torch.nn.Linear(5, 2), torch.randn(16, 5)
+    optimizer = make(network.parameters())
+    with torch.autocast("cpu", torch.bfloat16):
+        losses = [float(optimizer.step(lambda: (network(inputs).float() - 1.0).square().mean())) for _ in range(10)]
+    assert losses[-1] < 0.2 * losses[0]
+
+
+@pytest.mark.parametrize("make", [zh.optim.Newton, zh.optim.NewtonCG, zh.optim.NonlinearCG])
+def test_complex_parameters_are_refused(make) -> None:
+    with pytest.raises(TypeError, match=r"params must be real, got torch.complex64: optimize torch.view_as_real"):
+        make([torch.ones(2, dtype=torch.complex64, requires_grad=True)])

@@ -191,3 +191,20 @@ def test_a_parameter_that_is_constant_does_not_decide_what_is_kept() -> None:
     generator = torch.Generator().manual_seed(0)
     latest = torch.rand(300, 1, generator=generator)[200:, 0]
     assert 0.3 < float(torch.isin(memory.outputs, latest).double().mean()) < 0.9
+
+
+class Scaling(LinearSurrogate):
+    """It scales what it is fitted to in place, as preprocessors of other libraries may."""
+
+    def fit(self, points: torch.Tensor, outputs: torch.Tensor) -> None:
+        points.numpy()[:] -= 1.0
+        outputs.numpy()[:] *= 2.0
+        super().fit(points, outputs)
+
+
+def test_a_surrogate_cannot_change_what_is_kept() -> None:
+    memory, z, y = Memory(Scaling()), normal(6, 2), normal(6, 3, seed=1)
+    memory.add(z, y)
+    memory.fit()
+    assert torch.equal(memory.points, z)
+    assert torch.equal(memory.outputs, y)

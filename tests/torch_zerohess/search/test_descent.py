@@ -182,6 +182,17 @@ def test_a_rejected_step_is_shortened(noise):
     assert torch.equal(search.center, x)
 
 
+def test_an_isotropic_step_without_a_value_halves_sigma():
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    search._method = LocalQuadratics(search._method.settings)
+    search._state = search._after(*search._method.first(torch.Generator().manual_seed(0)), torch.Generator())
+    while search._state.progress.phase != "trial":
+        search.tell(bowl(search.ask()))
+    before = search.sigma
+    search.tell(torch.full((len(search.ask()),), math.nan))
+    assert search.sigma == 0.5 * before
+
+
 @pytest.mark.parametrize(("finite", "asked"), [(4, 2), (5, 1)])
 def test_a_model_takes_four_evaluations_besides_the_center(finite, asked):
     """With fewer of seven, a pair of samples is asked for before the end of a step."""

@@ -106,3 +106,11 @@ def test_it_takes_no_more_than(name):
         search = run(case.search(seed), case.f, case.most, case.target)
         total += search.evaluations if search.value <= case.target else case.most
     assert total <= case.limit
+
+
+def test_an_entropy_is_expanded_again_where_its_first_quadratic_led():
+    """One expansion does not predict the entropy there from half of the starts, and the outputs are given up."""
+    case = CASES["an entropy"]
+    for seed in range(6):
+        search = run(case.search(seed), case.f, case.most, case.target)
+        assert search.state_dict()["progress"]["expands"]

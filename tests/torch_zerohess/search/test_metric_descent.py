@@ -35,6 +35,14 @@ def test_a_narrow_valley(n, most, seed):
     assert evaluations_to(Descent(zeros(n), sigma=2.0, seed=seed, restarts=0), f, 1e-8) < most
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_a_narrow_valley_that_is_no_quadratic(seed):
+    """The root of one: its curvature changes from point to point, and the ratio of its axes does not."""
+    f = ellipsoid(1e4, 5, seed)
+    search = Descent(zeros(5), sigma=2.0, seed=seed, restarts=0)
+    assert evaluations_to(search, lambda z: f(z).sqrt(), 1e-3) < 400
+
+
 def test_a_curved_valley():
     search = TrustRegion(vector(-1.2, 1.0), sigma=1.0, seed=0, restarts=0)
     assert evaluations_to(search, rosenbrock, 1e-8) < 120
@@ -171,11 +179,13 @@ def test_where_a_quadratic_is_known_sigma_falls_at_once(seed):
 
 @pytest.mark.parametrize("seed", [4, 12, 28, 51])
 def test_a_wall_near_the_largest_number_is_forgotten(seed):
-    """A curvature of 1e240 in units of the values that remain is not squared: it would be infinite."""
-    search = Descent(vector(2.0, 0.0, 0.0), sigma=0.5, seed=seed)
-    slopes = vector(1.0, -0.5, 2.0)
-    run(search, lambda x: (x - slopes).square().sum(1) + (800 * (x[:, 1] - 1.2)).clamp(max=600).exp() * 1e-20, 200)
-    assert search.value < 1e-12
+    """A curvature of 1e60, in units of the values that remain, is made of their roundings."""
+    search = Descent(torch.full((3,), 2.0, dtype=torch.float64), sigma=0.7, seed=seed, restarts=0)
+
+    def wall_beside_a_bowl(x):
+        return (x - 1.0).square().sum(1) + 1e60 * (x[:, 1] - 2.05).clamp(min=0)
+
+    assert evaluations_to(search, wall_beside_a_bowl, 1e-10) < 60
 
 
 @pytest.mark.parametrize("n", [4, 10])

@@ -117,11 +117,12 @@ class SampleJacobian:
         return Blocks([part(at) for at in chosen], [one.numel() for one in chosen.values()])
 
     def mixes_samples(self) -> bool:
-        """Whether the outputs [1, n] of the last sample are others without the samples before it."""
+        """Whether the last sample has other outputs in a batch of its copies, of the same size and precision."""
+        copies = self.inputs[-1:].expand_as(self.inputs).contiguous()
         with torch.no_grad():
-            together, alone = _tensor(self._called({}, self.inputs)), _tensor(self._called({}, self.inputs[-1:]))
+            together, alone = _tensor(self._called({}, self.inputs)), _tensor(self._called({}, copies))
         most = math.sqrt(torch.finfo(alone.dtype).eps) * float(together.abs().max())
-        return float((together[-1:] - alone).abs().max()) > most
+        return float((together[-1] - alone[-1]).abs().max()) > most
 
     def _one_by_one(self, parameters: Sequence[Tensor]) -> Tensor:
         """Return the rows by a backward pass for every output of every sample."""
@@ -147,11 +148,17 @@ class SampleJacobian:
 
     def _called(self, values: Mapping[Places, Tensor], samples: Tensor) -> object:
         """Return the outputs with other values of parameters. Buffers stay as they are, whatever the network does."""
-        buffers = {id(one): one.clone() for one in self._network.buffers()}
-        given = {name: buffers[id(one)] for name, one in self._network.named_buffers(remove_duplicate=False)}
-        given |= {name: one for names, one in values.items() for name in names}
+        given = self._copied_buffers() | {name: one for names, one in values.items() for name in names}
         # torch's own handling of shared parameters (tie_weights) loses a parameter of a module with two names.
         return functional_call(self._network, given, (samples,), tie_weights=False)
+
+    def _copied_buffers(self) -> dict[str, Tensor]:
+        """Return a copy of every buffer by its names: several if modules share it, one if a module repeats."""
+        copies, given = dict[int, Tensor](), dict[str, Tensor]()
+        for prefix, module in self._network.named_modules():
+            for name, one in module.named_buffers(prefix, recurse=False, remove_duplicate=False):
+                given[name] = copies.setdefault(id(one), one.clone())
+        return given
 
     def _outer(self, chosen: Mapping[Places, Tensor]) -> set[Places]:
         """Return the weights [p, q] whose only use, for one sample, is one product with a vector."""

@@ -18,14 +18,18 @@ def split_like(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
 
 
 def add_parts(tensors: Sequence[Tensor], vector: Tensor) -> None:
-    """Add the parts of a vector [N] to tensors, N numbers in all, in place and in their types."""
-    overwrite(
-        tensors, [one + part.to(one.dtype) for one, part in zip(tensors, split_like(vector, tensors), strict=True)]
-    )
+    """Add the parts of a vector [N] to tensors, N numbers in all, in place and in their types.
+
+    Autocast keeps copies of parameters in lower precision. It forgets them here and in `overwrite`.
+    """
+    with torch.no_grad():
+        for one, part in zip(tensors, split_like(vector, tensors), strict=True):
+            one.add_(part.to(one.dtype))
+    torch.clear_autocast_cache()
 
 
 def overwrite(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> None:
-    """Copy values into tensors of the same shapes. Autocast forgets its copies of the tensors in lower precision."""
+    """Copy values into tensors of the same shapes."""
     with torch.no_grad():
         for one, value in zip(tensors, values, strict=True):
             one.copy_(value)

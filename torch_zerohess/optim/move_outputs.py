@@ -49,6 +49,8 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
         raise ValueError("network must have weights that require grad, got none")
     if not len(inputs):
         raise ValueError("inputs must be at least one, got none")
+    if torch.is_autocast_enabled(inputs.device.type) and inputs.is_floating_point():
+        inputs = inputs.to(weights[0].dtype)
     with without_autocast(inputs.device):
         _move(SampleJacobian(network, inputs), weights, change, relative_damping)
 

@@ -128,4 +128,26 @@ def test_the_step_is_the_same_under_autocast() -> None:
     zh.optim.move_outputs(network, x, change)
     with torch.autocast("cpu", torch.bfloat16):
         zh.optim.move_outputs(other, x, change)
-    assert torch.equal(weights(network), weights(other))
+        assert torch.equal(weights(network), weights(other))
+        zh.optim.move_outputs(other, x.bfloat16(), change)  # as another network under autocast makes them
+
+
+def test_a_network_in_which_one_module_stands_twice_keeps_its_buffers() -> None:
+    norm = nn.BatchNorm1d(4)
+    network = nn.Sequential(norm, nn.Linear(4, 4), norm, nn.Linear(4, 2)).double().eval()
+    before = norm.running_mean
+    _, x, change = made()
+    zh.optim.move_outputs(network, x, change)
+    assert norm.running_mean is before
+    copy.deepcopy(network)
+
+
+def test_matrix_products_of_lower_precision_mix_no_samples() -> None:
+    torch.manual_seed(0)
+    layers = [nn.Linear(64, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 4)]
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        zh.optim.move_outputs(nn.Sequential(*layers), torch.randn(64, 64), 0.01 * torch.randn(64, 4))
+    finally:
+        torch.set_float32_matmul_precision(before)

@@ -50,9 +50,9 @@ class MitsubaScene:
     Several threads may call one scene: they take turns, point by point. The variant is one for the whole process, so
     threads must not render scenes of different variants at the same time.
 
-    A deep copy shares the scene, which a copy of a model with such a layer needs no second time; copies take turns with
-    it as threads do. A copy has a loss of its own, and counts its calls from where the count of the first one was. A
-    scene cannot be pickled: pass `evaluators.Factory(MitsubaScene, ...)` to other processes.
+    A deep copy, as of a model with such a layer, shares the loaded scene. Copies take turns as threads do. A copy has a
+    loss of its own, and its count of calls begins at the count of the original. A scene cannot be pickled: pass
+    `evaluators.Factory(MitsubaScene, ...)` to other processes.
 
     Args:
         description: what `mitsuba.load_dict` takes, a function that returns it for the `mitsuba` module (for what needs

@@ -40,8 +40,8 @@ class BlackBox(nn.Module):
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
             operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
             Parameters and other tensors in it are constants: they must not require grad, except under `torch.no_grad`.
-            A module given as head is not registered. What is trained belongs behind a layer without a head; there
-            second derivatives of what is not linear are biased by the variance of the sampled Jacobian.
+            A module given as head is not registered. What is trained belongs behind a layer without a head.
+            Second derivatives of a nonlinear loss there are biased by the variance of the sampled Jacobian.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
             are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless value="smoothed". Calls of several

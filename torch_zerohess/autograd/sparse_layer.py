@@ -25,8 +25,7 @@ class SparseBlackBox(nn.Module):
     `BlackBox` estimates first derivatives without bias and with a noise that grows with n. This layer finds which
     parameters each output depends on, from the evaluations of the call and what earlier calls have found, see
     `sparse_jacobian`. Its derivatives have far less noise where Jacobians are sparse. They are biased by the entries
-    that are not found, and useless where the Jacobian is dense: look at `jacobians[b].explained`, which should be near
-    1.
+    that are not found, and useless where the Jacobian is dense. `jacobians[b].explained` should be near 1.
 
     The layer is linear in x around the point of the call. So the second derivatives of a loss behind it are J^T H J,
     the Gauss-Newton matrix, with the Hessian H of the loss in the outputs.

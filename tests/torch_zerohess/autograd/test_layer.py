@@ -10,8 +10,9 @@ import torch
 from layers import AGGREGATE, BATCH, BOTH, SCALAR, N, V, X, close, counting, leaf
 from torch import Tensor, nn
 from torch.autograd import forward_ad
+from torch.utils.checkpoint import checkpoint
 
-from torch_zerohess import BlackBox, Memory, Smoothing, estimate, smooth
+from torch_zerohess import BlackBox, Memory, Smoothing, SparseBlackBox, estimate, smooth
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.heads import SquaredError
@@ -310,3 +311,20 @@ def test_autocast_does_not_reach_the_coordinates_of_an_affine_memory() -> None:
         return torch.autograd.grad(y.sum(), x)[0]
 
     assert torch.equal(gradient(autocast=True), gradient(autocast=False))
+
+
+@pytest.mark.parametrize("kind", [BlackBox, SparseBlackBox])
+def test_a_layer_that_learns_in_a_reentrant_checkpoint(kind: type[nn.Module]) -> None:
+    """Of the mean square of (x0 + x1, x0 - 2 x1) the gradient at (2, 2) is (2, 8)."""
+    W = torch.tensor([[1.0, 1.0], [1.0, -2.0]], dtype=torch.float64)
+    smoothing = Smoothing(sigma=0.1, samples=20, seed=0)
+    layer = (
+        BlackBox(lambda z: z @ W, smoothing, memory=Memory())
+        if kind is BlackBox
+        else SparseBlackBox(lambda z: z @ W, smoothing, keep=2)
+    )
+    for _ in range(4):
+        x = torch.full((4, 2), 2.0, dtype=torch.float64, requires_grad=True)
+        checkpoint(layer, x, use_reentrant=True).square().mean(1).sum().backward()
+    assert x.grad is not None
+    torch.testing.assert_close(x.grad, vector(2.0, 8.0).expand(4, 2), rtol=0.05, atol=0.0)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from subproblems import random_problem, rosenbrock
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 import torch_zerohess as zh
 from torch_zerohess.linalg.steihaug import noise_level, steihaug
@@ -282,3 +283,22 @@ def test_a_loss_in_place_of_a_closure_is_named() -> None:
         zh.optim.NewtonCG([x]).step(None)
     with pytest.raises(TypeError, match="adapt must be True or False, got 'x'"):
         zh.optim.NewtonCG([x], adapt="x")
+
+
+class Attending(torch.nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner, self.last = torch.nn.MultiheadAttention(4, 1, batch_first=True), torch.nn.Linear(4, 2)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.last(self.inner(x, x, x, need_weights=False)[0][:, 0])
+
+
+def test_a_network_with_attention_in_plain_operations() -> None:
+    torch.manual_seed(0)
+    network, x = Attending(), torch.randn(8, 3, 4)
+    layer = zh.BlackBox(lambda z: (z - 1.0).square().sum(1), zh.Smoothing(sigma=0.1, samples=16))
+    optimizer = zh.optim.NewtonCG(network.parameters(), radius=0.5, curvature="gauss_newton")
+    with sdpa_kernel(SDPBackend.MATH):
+        losses = [float(optimizer.step(lambda: layer(network(x)).mean())) for _ in range(8)]
+    assert losses[-1] < 0.1 * losses[0]

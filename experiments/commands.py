@@ -72,6 +72,11 @@ COMMANDS = {
     "bench": Command(
         "experiments.studies.bench:bench", "time of the extension against pure torch and torch", long=True
     ),
+    "bench_device": Command(
+        "experiments.studies.bench_device:bench_device",
+        "the same on a CUDA device, against its memory and torch",
+        long=True,
+    ),
     "workers": Command(
         "experiments.studies.workers:workers", "cost and gain of worker processes, and faults", long=True
     ),

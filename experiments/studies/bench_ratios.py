@@ -3,7 +3,6 @@
 | row | measured | compared with |
 |---|---|---|
 | noise | picks, perturbations, points and density ratios of proposal "aggregate" | `torch.randn` of the same count |
-| noise on cuda | the same on a CUDA device, where there is one | the same |
 | Hessian | `Estimate.hessian` | the bare matrix product of its samples |
 | gradient + HVP | one gradient and one product from perturbations that are drawn again | three passes of noise |
 | threads | the noise with one thread | with two |
@@ -48,63 +47,58 @@ def ratios(repeats: int, wide: tuple[int, ...] = (512, 2048), large: int = 1_000
         wide: parameters of the Hessians.
         large: parameters of the gradient and the product that draw their perturbations again.
     """
-    rows = [_noise(dtype, repeats) for dtype in (torch.float32, torch.float64)]
-    if torch.cuda.is_available():
-        rows += [_noise(dtype, repeats, 1 << 20, 16, "cuda") for dtype in (torch.float32, torch.float64)]
-    rows += [_hessian(n, repeats) for n in wide]
-    rows.append(_redrawn(large, max(1, repeats // 5)))
+    rows = [noise(dtype, repeats) for dtype in (torch.float32, torch.float64)]
+    rows += [hessian(n, repeats) for n in wide]
+    rows.append(redrawn(large, max(1, repeats // 5)))
     rows.append(_threads(repeats))
     return rows
 
 
-def _noise(dtype: torch.dtype, repeats: int, n: int = 1024, samples: int = 64, device: str = "cpu") -> Ratio:
+def noise(
+    dtype: torch.dtype,
+    repeats: int,
+    n: int = 1024,
+    samples: int = 64,
+    device: str = "cpu",
+    proposal: int = proposals.SECOND_ORDER,
+) -> Ratio:
+    """Compare a batch of perturbations, placed and weighted, with `torch.randn` of as many numbers."""
     x, sigma = torch.zeros(1, n, dtype=dtype, device=device), torch.ones(n, dtype=torch.float64, device=device)
-    noise = _finished(_sampler(x, sigma, samples), device)
-    compared_with = _finished(lambda: torch.randn(samples, n, dtype=dtype, device=device), device)
-    seconds, compared = in_turn(noise, compared_with, repeats)
-    name = f"noise{'' if device == 'cpu' else ' on ' + device}, {str(dtype).removeprefix('torch.')}"
-    return Ratio(name, n, samples, seconds, compared, 2.0 if device == "cpu" else 1.0)
+    plain = finished(lambda: torch.randn(samples, n, dtype=dtype, device=device), device)
+    seconds, compared = in_turn(sampler(x, sigma, samples, proposal), plain, repeats)
+    return Ratio(f"noise, {str(dtype).removeprefix('torch.')}", n, samples, seconds, compared, 2.0)
 
 
-def _finished(function: Callable[[], object], device: str) -> Callable[[], object]:
-    """Return the function with a wait for what it left running on the device."""
-
-    def run() -> object:
-        result = function()
-        torch.cuda.synchronize()
-        return result
-
-    return run if device == "cuda" else function
-
-
-def _hessian(n: int, repeats: int) -> Ratio:
+def hessian(n: int, repeats: int, device: str = "cpu") -> Ratio:
+    """Compare the Hessian of an estimate with the bare matrix product of its samples."""
     samples = 64
     generator = torch.Generator().manual_seed(0)
-    x = torch.randn(n, generator=generator, dtype=torch.float64)
+    x = torch.randn(n, generator=generator, dtype=torch.float64).to(device)
     estimate = zh.estimate(lambda z: z.sin().sum(1), x, zh.Smoothing(sigma=0.1, samples=samples, seed=0))
-    u, a = torch.randn(2 * samples, n, dtype=torch.float64), torch.randn(2 * samples, 1, dtype=torch.float64)
-    seconds, compared = in_turn(estimate.hessian, lambda: u.mT @ (a * u), repeats)
+    u, a = (torch.randn(2 * samples, columns, dtype=torch.float64, device=device) for columns in (n, 1))
+    product = finished(lambda: u.mT @ (a * u), device)
+    seconds, compared = in_turn(finished(estimate.hessian, device), product, repeats)
     return Ratio("Hessian", n, samples, seconds, compared, 0.85)
 
 
-def _redrawn(n: int, repeats: int) -> Ratio:
+def redrawn(n: int, repeats: int, device: str = "cpu") -> Ratio:
+    """Compare a gradient and a product from perturbations that are drawn again with three passes of noise."""
     samples = 32
-    x, sigma = torch.zeros(1, n), torch.ones(n, dtype=torch.float64)
-    v, a = torch.ones(1, 1, n, dtype=torch.float64), torch.ones(1, 1, 2 * samples, dtype=torch.float64)
+    x, sigma = torch.zeros(1, n, device=device), torch.ones(n, dtype=torch.float64, device=device)
+    v, a = (torch.ones(1, 1, count, dtype=torch.float64, device=device) for count in (n, 2 * samples))
     rows = kernels.pick_rows(0, 0, samples, n, proposals.SECOND_ORDER, x.device)
     stein = LikelihoodRatio(kernels.Redrawn(rows, x, sigma, True, True), a[:, 0])
 
     def derivatives() -> object:
         return stein.gradient(a), stein.hvp(a, v)
 
-    noise = _sampler(x, sigma, samples)
-    seconds, compared = in_turn(derivatives, noise, repeats)
+    seconds, compared = in_turn(finished(derivatives, device), sampler(x, sigma, samples), repeats)
     return Ratio("gradient + HVP, drawn again", n, samples, seconds, 3 * compared, 0.6)
 
 
 def _threads(repeats: int) -> Ratio:
     n, samples = 4096, 256
-    noise = _sampler(torch.zeros(1, n), torch.ones(n, dtype=torch.float64), samples)
+    noise = sampler(torch.zeros(1, n), torch.ones(n, dtype=torch.float64), samples)
     threads = torch.get_num_threads()
 
     def of(number: int) -> Callable[[], object]:
@@ -121,11 +115,21 @@ def _threads(repeats: int) -> Ratio:
     return Ratio("noise, two threads against one", n, samples, seconds, compared, 1.6)
 
 
-def _sampler(x: torch.Tensor, sigma: torch.Tensor, samples: int) -> Callable[[], object]:
-    def run() -> object:
-        return kernels.sample(0, samples, x, sigma, False, proposals.SECOND_ORDER, False, False)
+def sampler(
+    x: torch.Tensor, sigma: torch.Tensor, samples: int, proposal: int = proposals.SECOND_ORDER
+) -> Callable[[], object]:
+    return finished(lambda: kernels.sample(0, samples, x, sigma, False, proposal, False, False), x.device.type)
 
-    return run
+
+def finished(function: Callable[[], object], device: str) -> Callable[[], object]:
+    """Return the function with a wait for what it left running on the device."""
+
+    def run() -> object:
+        result = function()
+        torch.cuda.synchronize()
+        return result
+
+    return run if device == "cuda" else function
 
 
 def in_turn(first: Callable[[], object], second: Callable[[], object], repeats: int) -> tuple[float, float]:

@@ -305,9 +305,10 @@ def _before_compiling() -> None:
     if transforms.jit_traces():
         raise RuntimeError("a BlackBox cannot be traced by torch.jit: what fn returns would become a constant")
     if torch.compiler.is_compiling():
-        if torch.compiler.is_exporting():
+        from torch_zerohess.autograd import in_graph  # late: it loads the compiler
+
+        if in_graph.exporting():
             raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
-        from torch_zerohess.autograd import in_graph  # noqa: F401 loaded late: it loads the compiler
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -21,5 +21,11 @@ def _called(layer: Any, x: Tensor, *aux: Tensor) -> Tensor:
     return result
 
 
+def _exporting() -> bool:
+    return torch.compiler.is_exporting()
+
+
+exporting = torch.compiler.assume_constant_result(_exporting)
+"""Whether this is an export. Up to torch 2.11 compiled code that asks torch is always told that it is."""
 eager = torch.compiler.disable(_called, reason="the surrogate of a layer with a memory changes from call to call")
 """Calls a layer between two graphs. With fullgraph=True torch raises an error, which has the reason."""

@@ -192,7 +192,12 @@ def hessian(u: Samples, a: Tensor) -> Tensor:
 
 
 def _upper(u: Tensor, a: Tensor) -> Tensor:
-    """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] for i <= j, and numbers below; about half of the whole product."""
+    """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] for i <= j, and numbers below.
+
+    On the processor in strips, which is about half of the whole product; elsewhere by one launch for all b and m.
+    """
+    if u.device.type != "cpu":
+        return (a[..., None] * u[:, None]).mT @ u[:, None]
     n = u.shape[2]
     result = u.new_empty(*a.shape[:2], n, n)
     for b, m in itertools.product(range(len(u)), range(a.shape[1])):

@@ -30,7 +30,8 @@ NORMAL, GRADIENT_LOBE, DIAGONAL_LOBE, OFF_DIAGONAL_LOBE, EVERY_GRADIENT_LOBE, BO
 GAUSSIAN, FIRST_ORDER, SECOND_ORDER, UNIFORM, SIGNED_LOBES = range(5)
 """Densities of whole rows."""
 
-_KIND = {GAUSSIAN: NORMAL, UNIFORM: BOX, SIGNED_LOBES: EVERY_GRADIENT_LOBE}
+KIND = {GAUSSIAN: NORMAL, UNIFORM: BOX, SIGNED_LOBES: EVERY_GRADIENT_LOBE}
+"""Kind of all rows of the densities that are no mixtures."""
 
 BOX_HALF_WIDTH = 5.0
 _SQRT_HALF_PI = 1.2533141373155003
@@ -52,8 +53,8 @@ def mixture_rows(seeds: Tensor, index: Tensor, p: Tensor, n: int, proposal: int)
     i, j = (p[:, 1] * n).long(), (p[:, 2] * n).long()
     hessian = torch.where(i == j, DIAGONAL_LOBE, OFF_DIAGONAL_LOBE)
     kind = torch.where(component == 0, NORMAL, torch.where(component == 1, GRADIENT_LOBE, hessian))
-    if proposal in _KIND:
-        kind = torch.full_like(index, _KIND[proposal])
+    if proposal in KIND:
+        kind = torch.full_like(index, KIND[proposal])
     plain = (kind == NORMAL) | (kind >= EVERY_GRADIENT_LOBE)
     i = torch.where(plain, 0, i)
     return torch.stack([seeds, index, kind, i, torch.where(plain | (kind == GRADIENT_LOBE), i, j)], 1)

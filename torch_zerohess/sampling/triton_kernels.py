@@ -1,11 +1,11 @@
-"""Noise on a CUDA device, in one pass of a Triton kernel: `draw`, `uniforms` and `sample` of `kernels`.
-
-**These kernels were never run on a real GPU**: they were run in Triton's interpreter, and compiled to PTX.
+"""Noise on a CUDA device by Triton kernels: `draw`, `uniforms` and `sample` of `kernels`.
 
 Rows, uniforms, perturbations and points have the bits of the references: integers, + - * / sqrt in float64 and + - * in
 float32, each rounded as IEEE 754 says, never contracted. No logarithm of the device is used. Weights are made of sums
 of n terms in float64, in another order than elsewhere: they differ by (2 n + 9) 2^-52 of their size at most. For
 proposal "uniform" they are exponentials, and differ by (12 n + 8) 2^-52.
+
+Triton 3.6 rounds the constants of comparisons to float32: only numbers that float32 holds are compared with.
 """
 
 import functools
@@ -42,21 +42,14 @@ def _of_pair(high, low):
 
 
 @triton.jit
-def _uniforms_of_columns(seed, row, block, stream):
-    a, b, c, d = _words(seed, row, block, stream)
-    return tl.interleave(_of_pair(a, b), _of_pair(c, d))
+def _of_word(word):
+    return (word.to(tl.float64) + 0.5) * 2.0**-32
 
 
 @triton.jit
-def _uniform_at(seed, row, column, SINGLE: tl.constexpr):
-    """Uniform of one column for each row, all [R, 1]."""
-    a, b, c, d = _words(seed, row, column // (4 if SINGLE else 2), DIMENSIONS)
-    if SINGLE:
-        word = tl.where(column % 4 < 2, tl.where(column % 4 == 0, a, b), tl.where(column % 4 == 2, c, d))
-        p = (word.to(tl.float64) + 0.5) * 2.0**-32
-    else:
-        p = tl.where(column % 2 == 0, _of_pair(a, b), _of_pair(c, d))
-    return p
+def _uniforms_of_columns(seed, row, block, stream):
+    a, b, c, d = _words(seed, row, block, stream)
+    return tl.interleave(_of_pair(a, b), _of_pair(c, d))
 
 
 @triton.jit
@@ -97,11 +90,11 @@ def _normal(p):
     if tl.max(r) > 5.0:
         tail = tl.where(r <= 5.0, tail, _rational(FAR, r - 5.0))
     tail = tl.where(q < 0.0, -tail, tail)
-    return tl.where(tl.abs(q) <= 0.425, q * _rational(CENTRAL, 0.180625 - q * q), tail)
+    return tl.where(tl.abs(q) - 0.425 <= 0.0, q * _rational(CENTRAL, 0.180625 - q * q), tail)
 
 
 @triton.jit
-def _normal_of_words(words, p, ratios):
+def _normal_of_words(words, ratios):
     """In float32; ratios: the table of `single`, [8, 16]."""
     upper = words >> 31 == 1
     beyond = tl.where(upper, words ^ 0xFFFFFFFF, words).to(tl.int32)
@@ -115,7 +108,7 @@ def _normal_of_words(words, p, ratios):
     u = tl.where(upper, u, -u)
     tail = beyond < TAIL
     if tl.max(tail.to(tl.int32)) > 0:
-        u = tl.where(tail, _normal(p).to(tl.float32), u)
+        u = tl.where(tail, _normal(_of_word(words)).to(tl.float32), u)
     return u
 
 
@@ -131,14 +124,14 @@ def _hessian_lobe(p):
     y = tl.where(outer, 4.0 * tl.minimum(p, 1.0 - p), tl.abs(4.0 * p - 2.0))
     c = -_log(tl.maximum(y, TINY))
     near = tl.where(outer, tl.sqrt(c), -tl.sqrt(c)) + c / 6.0
-    f = tl.where(c < 0.2, near, tl.sqrt(1.0 + 2.0 * c + _log(1.0 + 2.0 * c)) - 1.0)
+    f = tl.where(c - 0.2 < 0.0, near, tl.sqrt(1.0 + 2.0 * c + _log(1.0 + 2.0 * c)) - 1.0)
     small = y * EXP_MINUS_HALF
     t = small + 0.5 * small * small * small
     for _ in tl.static_range(4):  # from one, in f, and from zero, in t
         one = 1.0 + f
         half_square = 0.5 * f * f
         wide = f + half_square - _log(tl.maximum(one, TINY))
-        excess = tl.where((f > -0.25) & (f < 0.4), 2.0 * half_square - _log_tail(f, half_square), wide) - c
+        excess = tl.where((f > -0.25) & (f - 0.4 < 0.0), 2.0 * half_square - _log_tail(f, half_square), wide) - c
         slope = f * (2.0 + f) / one
         scale = slope * slope - 0.5 * excess * (1.0 + 1.0 / (one * one))
         f = f - tl.where(scale > 0.0, excess * slope / tl.maximum(scale, TINY), 0.0)
@@ -146,11 +139,11 @@ def _hessian_lobe(p):
         slope = t - 1.0 / tl.maximum(t, TINY)
         scale = slope * slope - 0.5 * excess * (1.0 + 1.0 / tl.maximum(t * t, TINY))
         t = t - tl.where(scale > 0.0, excess * slope / tl.maximum(scale, TINY), 0.0)
-    t = tl.where(outer | (c < 0.2), 1.0 + f, t)
+    t = tl.where(outer | (c - 0.2 < 0.0), 1.0 + f, t)
     return tl.where(p < 0.5, -t, t)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["R", "first", "count"])
 def _uniforms(seeds, indices, out, R, first, count, stream, ROWS: tl.constexpr, BLOCK: tl.constexpr):
     blocks = tl.cdiv(count, BLOCK)
     program = tl.program_id(0).to(tl.int64)
@@ -162,56 +155,88 @@ def _uniforms(seeds, indices, out, R, first, count, stream, ROWS: tl.constexpr, 
 
 
 @triton.jit
+def _uniform_at(seed, row, column, SINGLE: tl.constexpr):
+    """Uniform of one column for each row, all [R, 1]."""
+    a, b, c, d = _words(seed, row, column // (4 if SINGLE else 2), DIMENSIONS)
+    if SINGLE:
+        word = tl.where(column % 4 < 2, tl.where(column % 4 == 0, a, b), tl.where(column % 4 == 2, c, d))
+        p = _of_word(word)
+    else:
+        p = tl.where(column % 2 == 0, _of_pair(a, b), _of_pair(c, d))
+    return p
+
+
+@triton.jit
+def _shaped(p, KIND: tl.constexpr):
+    if KIND == NORMAL:
+        u = _normal(p)
+    elif KIND == EVERY:
+        u = _gradient_lobe(p)
+    else:
+        u = (2.0 * p - 1.0) * BOX_HALF_WIDTH
+    return u
+
+
+@triton.jit(do_not_specialize=["R"])
+def _lobes(rows, values, R, SINGLE: tl.constexpr, ROWS: tl.constexpr, BLOCK: tl.constexpr):
+    """Write u_i and u_j of the rows that have a lobe in the dimensions i and j, [R, 2]."""
+    r = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
+    seed, row = tl.load(rows + 5 * r, r < R, 0), tl.load(rows + 5 * r + 1, r < R, 0)
+    kind = tl.load(rows + 5 * r + 2, r < R, 0)
+    for which in tl.static_range(2):
+        p = _uniform_at(seed, row, tl.load(rows + 5 * r + 3 + which, r < R, 0), SINGLE)
+        u = _gradient_lobe(p)
+        if which == 0:
+            u = tl.where(kind == DIAGONAL, _hessian_lobe(p), u)
+        tl.store(values + 2 * r + which, u.to(values.dtype.element_ty), r < R)
+
+
+@triton.jit(do_not_specialize=["R", "S", "E"])
 def _sample(
-    rows, x, sigma, ratios, points, out, sums, R, S, E, n,
-    SINGLE: tl.constexpr, SIGNS: tl.constexpr, ROWS: tl.constexpr, BLOCK: tl.constexpr,
+    rows, lobes, x, sigma, ratios, points, out, sums, R, S, E, n,
+    KIND: tl.constexpr, SINGLE: tl.constexpr, SIGNS: tl.constexpr, ROWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Draw rows b * S + s; write row b * E + s of points, b * SIGNS * S + s of out, sums of magnitudes; None: not."""
+    """Draw the rows b * S + s of a kind, NORMAL with or without lobes, EVERY or BOX, and leave the other rows alone.
+
+    Writes row b * E + s of points, row b * SIGNS * S + s of out, and sums of magnitudes; None: does not.
+    """
     blocks = tl.cdiv(n, BLOCK)
     program = tl.program_id(0).to(tl.int64)
     r, first = program // blocks * ROWS + tl.arange(0, ROWS)[:, None], program % blocks * BLOCK
     d = first + tl.arange(0, BLOCK)[None, :]
     seed, row = tl.load(rows + 5 * r, r < R, 0), tl.load(rows + 5 * r + 1, r < R, 0)
-    kind = tl.load(rows + 5 * r + 2, r < R, 0)
-    if SINGLE:
-        a, b, c, e = _words(seed, row, first // 4 + tl.arange(0, BLOCK // 4)[None, :], DIMENSIONS)
-        words = tl.interleave(tl.interleave(a, c), tl.interleave(b, e))
-        p = (words.to(tl.float64) + 0.5) * 2.0**-32
-        u = _normal_of_words(words, p, ratios)
-    else:
-        p = _uniforms_of_columns(seed, row, first // 2 + tl.arange(0, BLOCK // 2)[None, :], DIMENSIONS)
-        u = _normal(p)
-    u = tl.where(kind == BOX, ((2.0 * p - 1.0) * BOX_HALF_WIDTH).to(u.dtype), u)
-    if tl.max((kind == EVERY).to(tl.int32)) > 0:
-        u = tl.where(kind == EVERY, _gradient_lobe(p).to(u.dtype), u)
-    for which in tl.static_range(2):  # the lobe in dimension i, then the one in dimension j
-        at = tl.load(rows + 5 * r + 3 + which, r < R, 0)
-        curved = (kind == DIAGONAL) & (which == 0)
-        lobe = curved | (kind == OFF_DIAGONAL) | ((kind == GRADIENT) & (which == 0))
-        lobe = lobe & (at >= first) & (at < first + BLOCK)
-        if tl.max(lobe.to(tl.int32)) > 0:
-            p_at = _uniform_at(seed, row, at, SINGLE)
-            quantile = _gradient_lobe(p_at)
-            if tl.max((lobe & curved).to(tl.int32)) > 0:
-                quantile = tl.where(curved, _hessian_lobe(p_at), quantile)
-            u = tl.where(lobe & (d == at), quantile.to(u.dtype), u)
-    mask, b, s, wide = (r < R) & (d < n), r // S, r % S, u.to(tl.float64)
-    if points is not None:
-        centre = tl.load(x + b * n + d, mask, 0.0).to(tl.float64)
-        step = tl.load(sigma + d, d < n, 0.0) * wide
-        tl.store(points + (b * E + s) * n + d, (centre + step).to(points.dtype.element_ty), mask)
-        if SIGNS == 2:
-            tl.store(points + (b * E + s + S) * n + d, (centre - step).to(points.dtype.element_ty), mask)
-    if out is not None:
-        tl.store(out + (b * SIGNS * S + s) * n + d, u.to(out.dtype.element_ty), mask)
-        if SIGNS == 2:
-            tl.store(out + (b * SIGNS * S + s + S) * n + d, -u.to(out.dtype.element_ty), mask)
-    if sums is not None:
-        place = sums + 3 * (r * blocks + program % blocks)
-        size = tl.where(mask, tl.abs(wide), 0.0)
-        tl.store(place, tl.sum(size, 1, keep_dims=True), r < R)
-        tl.store(place + 1, tl.sum(size * size, 1, keep_dims=True), r < R)
-        tl.store(place + 2, tl.sum(tl.where(mask, tl.abs(wide * wide - 1.0), 0.0), 1, keep_dims=True), r < R)
+    kind = tl.load(rows + 5 * r + 2, r < R, -1)
+    of_kind = (kind >= 0) & (kind < EVERY) if KIND == NORMAL else kind == KIND
+    if tl.max(of_kind.to(tl.int32)) > 0:
+        if SINGLE:
+            a, b, c, e = _words(seed, row, first // 4 + tl.arange(0, BLOCK // 4)[None, :], DIMENSIONS)
+            words = tl.interleave(tl.interleave(a, c), tl.interleave(b, e))
+            u = _normal_of_words(words, ratios) if KIND == NORMAL else _shaped(_of_word(words), KIND).to(tl.float32)
+        else:
+            u = _shaped(
+                _uniforms_of_columns(seed, row, first // 2 + tl.arange(0, BLOCK // 2)[None, :], DIMENSIONS), KIND
+            )
+        if KIND == NORMAL and lobes is not None:
+            i, j = tl.load(rows + 5 * r + 3, r < R, 0), tl.load(rows + 5 * r + 4, r < R, 0)
+            u = tl.where((kind > NORMAL) & (d == i), tl.load(lobes + 2 * r, r < R, 0.0), u)
+            u = tl.where((kind == OFF_DIAGONAL) & (d == j), tl.load(lobes + 2 * r + 1, r < R, 0.0), u)
+        mask, b, s, wide = of_kind & (d < n), r // S, r % S, u.to(tl.float64)
+        if points is not None:
+            centre = tl.load(x + b * n + d, mask, 0.0).to(tl.float64)
+            step = tl.load(sigma + d, d < n, 0.0) * wide
+            tl.store(points + (b * E + s) * n + d, (centre + step).to(points.dtype.element_ty), mask)
+            if SIGNS == 2:
+                tl.store(points + (b * E + s + S) * n + d, (centre - step).to(points.dtype.element_ty), mask)
+        if out is not None:
+            tl.store(out + (b * SIGNS * S + s) * n + d, u.to(out.dtype.element_ty), mask)
+            if SIGNS == 2:
+                tl.store(out + (b * SIGNS * S + s + S) * n + d, -u.to(out.dtype.element_ty), mask)
+        if sums is not None:
+            place = sums + 3 * (r * blocks + program % blocks)
+            size = tl.where(mask, tl.abs(wide), 0.0)
+            tl.store(place, tl.sum(size, 1, keep_dims=True), of_kind)
+            tl.store(place + 1, tl.sum(size * size, 1, keep_dims=True), of_kind)
+            tl.store(place + 2, tl.sum(tl.where(mask, tl.abs(wide * wide - 1.0), 0.0), 1, keep_dims=True), of_kind)
 
 
 def _launch(kernel: Any, R: int, n: int, *arguments: Any, **constants: int) -> None:
@@ -228,6 +253,12 @@ def _ratios(device: torch.device) -> Tensor:
     return torch.tensor(single._RATIO, dtype=torch.float32, device=device)
 
 
+def _lobes_of(rows: Tensor, dtype: torch.dtype) -> Tensor:
+    values = rows.new_empty(len(rows), 2, dtype=dtype)
+    _launch(_lobes, len(rows), 1, rows, values, len(rows), SINGLE=dtype == torch.float32)
+    return values
+
+
 def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> Tensor:
     """See `philox.uniforms`; first is even."""
     out = row.new_empty(len(row), count, dtype=torch.float64)
@@ -237,9 +268,10 @@ def uniforms(seed: Tensor, row: Tensor, first: int, count: int, stream: int) -> 
 
 def draw(rows: Tensor, n: int, in_single: bool = False) -> Tensor:
     """See `proposals.draw`."""
-    u = rows.new_empty(len(rows), n, dtype=torch.float32 if in_single else torch.float64)
-    R, pointers = len(rows), (rows, None, None, _ratios(rows.device), None, u, None)
-    _launch(_sample, R, n, *pointers, R, R, R, n, SINGLE=in_single, SIGNS=1)
+    R, u = len(rows), rows.new_empty(len(rows), n, dtype=torch.float32 if in_single else torch.float64)
+    pointers = rows, _lobes_of(rows, u.dtype), None, None, _ratios(rows.device), None, u, None
+    for kind in (proposals.NORMAL, proposals.EVERY_GRADIENT_LOBE, proposals.BOX):
+        _launch(_sample, R, n, *pointers, R, R, R, n, KIND=kind, SINGLE=in_single, SIGNS=1)
     return u
 
 
@@ -247,13 +279,17 @@ def sample(
     seed: int, S: int, x: Tensor, sigma: Tensor, antithetic: bool, proposal: int, center: bool, keep: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `kernels.sample`."""
-    (B, n), signs = x.shape, 2 if antithetic else 1
-    rows = kernels.pick_rows(seed, 0, B * S, n, proposal, x.device)
+    (B, n), signs, single = x.shape, 2 if antithetic else 1, x.dtype == torch.float32
+    rows, mixture = kernels.pick_rows(seed, 0, B * S, n, proposal, x.device), proposal not in proposals.KIND
     points, u = x.new_empty(B, signs * S + center, n), sigma.new_empty(B if keep else 0, signs * S, n)
-    sums = sigma.new_empty(B * S, triton.cdiv(n, _TILE), 3)
-    pointers = rows, x, sigma, _ratios(x.device), points, u if keep else None, sums
-    _launch(_sample, B * S, n, *pointers, B * S, S, points.shape[1], n, SINGLE=x.dtype == torch.float32, SIGNS=signs)
+    lobes = _lobes_of(rows, x.dtype) if mixture else None
+    sums = sigma.new_empty(B * S, triton.cdiv(n, _TILE), 3) if mixture or proposal == proposals.UNIFORM else None
+    pointers = rows, lobes, x, sigma, _ratios(x.device), points, u if keep else None, sums
+    kind = proposals.KIND.get(proposal, proposals.NORMAL)
+    _launch(_sample, B * S, n, *pointers, B * S, S, points.shape[1], n, KIND=kind, SINGLE=single, SIGNS=signs)
     if center:
         points[:, -1] = x
+    if sums is None:
+        return rows, points, u, sigma.new_ones(B, signs * S)
     l1, l2, hole = sums.sum(1).unbind(1)
     return rows, points, u, proposals.density_ratio(l1, l2, hole, n, proposal).view(B, S).repeat(1, signs)

@@ -94,14 +94,20 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from torch_zerohess.sampling import triton_kernels
 
-names = triton_kernels._sample.arg_names
+
+def compiled(kernel, types, **constants):
+    signature = {name: "constexpr" if name in constants else types.get(name, "i32") for name in kernel.arg_names}
+    source = ASTSource(kernel, signature, constants)
+    made = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=triton_kernels._OPTIONS)
+    print(made.asm["ttir"], made.asm["ptx"])
+
+
 for x, single in (("*fp64", False), ("*fp32", True)):
-    types = {"rows": "*i64", "x": x, "points": x, "sigma": "*fp64", "ratios": "*fp32", "out": "*fp64", "sums": "*fp64"}
-    constants = {"SINGLE": single, "SIGNS": 2, "ROWS": 32, "BLOCK": 4}
-    signature = {name: "constexpr" if name in constants else types.get(name, "i32") for name in names}
-    source = ASTSource(triton_kernels._sample, signature, constants)
-    compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=triton_kernels._OPTIONS)
-    print(compiled.asm["ptx"])
+    types = {"rows": "*i64", "lobes": x, "x": x, "points": x, "sigma": "*fp64", "ratios": "*fp32", "out": "*fp64"}
+    for kind in (triton_kernels.NORMAL, triton_kernels.EVERY, triton_kernels.BOX):
+        sizes = {"ROWS": 32, "BLOCK": 4}
+        compiled(triton_kernels._sample, {**types, "sums": "*fp64"}, KIND=kind, SINGLE=single, SIGNS=2, **sizes)
+    compiled(triton_kernels._lobes, {"rows": "*i64", "values": x}, SINGLE=single, ROWS=32, BLOCK=4)
 """
 
 
@@ -122,8 +128,10 @@ def test_same_bits_in_the_interpreter(tmp_path: Path) -> None:
 
 @needs_triton
 def test_every_operation_of_the_compiled_kernels_is_rounded_to_nearest(tmp_path: Path) -> None:
-    ptx = python(PTX, tmp_path)
-    operations = set(re.findall(r"^\s+(?:@\S+ )?([a-z]+\.[\w.]+)", ptx, re.MULTILINE))
+    code = python(PTX, tmp_path)
+    compared = {float(number) for number in re.findall(r"dense<([^>]*)> : tensor<[0-9x]*f64>", code)}
+    assert compared >= {0.425, 0.4, 0.2}  # and not rounded to float32
+    operations = set(re.findall(r"^\s+(?:@\S+ )?([a-z]+\.[\w.]+)", code, re.MULTILINE))
     arithmetic = {
         one for one in operations if re.match(r"(add|sub|mul|div|sqrt|fma|mad|rcp|ex2|lg2).*\.f(32|64)$", one)
     }

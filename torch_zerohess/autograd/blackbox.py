@@ -15,6 +15,7 @@ from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.limit import limited
 from torch_zerohess.autograd.linear_map import project
 from torch_zerohess.autograd.marker import Input
+from torch_zerohess.autograd.tracing import check_traceable
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.expansion import Expansion
@@ -109,7 +110,7 @@ class BlackBox(nn.Module):
 
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
-        _before_compiling()
+        check_traceable()
         if self.memory is not None and torch.compiler.is_compiling():
             from torch_zerohess.autograd.in_graph import eager  # loaded late, as there
 
@@ -149,7 +150,7 @@ class BlackBox(nn.Module):
         smoothed black box and has derivatives of every order. With proposal "optimal" and order=2 it has two
         derivatives, with "fr22" one. Higher ones raise ValueError. The function makes no further evaluation.
         """
-        _before_compiling()
+        check_traceable()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = working(x).detach().reshape(-1, n).clone()
         check_aux(aux, self.memory, self.call.head)
@@ -299,16 +300,6 @@ def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
     slope = expansion.stein.gradient(expansion.coefficients.mT.contiguous()) / expansion.sigma
     change = (slope @ (x.double() - center.double())[..., None])[..., 0]
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
-
-
-def _before_compiling() -> None:
-    if transforms.jit_traces():
-        raise RuntimeError("a BlackBox cannot be traced by torch.jit: what fn returns would become a constant")
-    if torch.compiler.is_compiling():
-        from torch_zerohess.autograd import in_graph  # late: it loads the compiler
-
-        if in_graph.exporting():
-            raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -176,3 +176,9 @@ def test_torch_jit_is_refused():
     layer = BlackBox(lambda z: z.numpy().sum(1), Smoothing(sigma=0.1, samples=4))
     with pytest.raises(RuntimeError, match=r"cannot be traced by torch\.jit"):
         torch.jit.trace(layer, torch.zeros(3, 2))
+
+
+def test_older_compilers_are_refused(monkeypatch) -> None:
+    monkeypatch.setattr("torch_zerohess.autograd.tracing._WRONG", True)
+    with pytest.raises(Exception, match=r"torch.compile of a BlackBox needs torch 2.15"):
+        torch.compile(BlackBox(F, S), backend="eager", fullgraph=True)(X)

@@ -10,12 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.arguments import check_state
-from torch_zerohess.autograd import control_variate, opaque, transforms
+from torch_zerohess.autograd import control_variate, opaque, tracing, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.limit import limited
 from torch_zerohess.autograd.linear_map import project
 from torch_zerohess.autograd.marker import Input
-from torch_zerohess.autograd.tracing import check_traceable
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.expansion import Expansion
@@ -110,8 +109,8 @@ class BlackBox(nn.Module):
 
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
-        check_traceable()
-        if self.memory is not None and torch.compiler.is_compiling():
+        tracing.check_traceable()
+        if torch.compiler.is_compiling() and (self.memory is not None or not tracing.GRAPHS):
             from torch_zerohess.autograd.in_graph import eager  # loaded late, as there
 
             return eager(self, x, *aux)
@@ -150,7 +149,7 @@ class BlackBox(nn.Module):
         smoothed black box and has derivatives of every order. With proposal "optimal" and order=2 it has two
         derivatives, with "fr22" one. Higher ones raise ValueError. The function makes no further evaluation.
         """
-        check_traceable()
+        tracing.check_traceable()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
         center = working(x).detach().reshape(-1, n).clone()
         check_aux(aux, self.memory, self.call.head)

@@ -178,7 +178,12 @@ def test_torch_jit_is_refused():
         torch.jit.trace(layer, torch.zeros(3, 2))
 
 
-def test_older_compilers_are_refused(monkeypatch) -> None:
-    monkeypatch.setattr("torch_zerohess.autograd.tracing._WRONG", True)
-    with pytest.raises(Exception, match=r"torch.compile of a BlackBox needs torch 2.15"):
-        torch.compile(BlackBox(F, S), backend="eager", fullgraph=True)(X)
+def test_older_compilers_get_the_layer_between_two_graphs(monkeypatch) -> None:
+    """Where the compiler makes one of two calls that draw different noise."""
+    monkeypatch.setattr("torch_zerohess.autograd.tracing.GRAPHS", False)
+    graphs, layer = [], BlackBox(F, S.replace(seed=None), value="smoothed")
+    difference = torch.compile(lambda x: layer(x.cos()) - layer(x.cos()), backend=lambda g, _: graphs.append(g) or g)(X)
+    assert float(difference) != 0.0
+    assert len(graphs) > 1
+    with pytest.raises(Exception, match=r"needs the compiler of torch 2\.15"):
+        torch.compile(layer, backend="eager", fullgraph=True)(X)

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 _BLOCK = 1 << 20
 """Correlations of whole rows of the image held at a time, about."""
@@ -68,13 +69,13 @@ class Grids:
 
     def mean(self, squares: Tensor) -> Tensor:
         """Return the mean over neighbours, for whole rows of the image and of the grid of parameters, [b, c]."""
-        grid = (1, squares.shape[1], 1) if self.parameters is None else (-1, *self.parameters[1:])
-        whole = squares.view(len(squares) // self.row, *self.pixels[1:], *grid)
         if self.pixels[1] > 1:
-            whole = _of_three(_of_three(whole, 0), 1)
+            image = squares.view(1, -1, self.pixels[1], self.pixels[2] * squares.shape[1]).permute(0, 3, 1, 2)
+            squares = avg_pool2d(image, 3, 1, 1, count_include_pad=False).permute(0, 2, 3, 1).reshape(squares.shape)
         if self.parameters is not None:
-            whole = _of_three(_of_three(whole, 3), 4)
-        return whole.view_as(squares)
+            grid = squares.view(len(squares), -1, *self.parameters[1:])
+            squares = _of_three(_of_three(grid, 1), 2).view_as(squares)
+        return squares
 
 
 @dataclass(frozen=True)
@@ -138,18 +139,14 @@ def candidates(
         for parameters in _parts(n // beside, columns, int(grids.parameters is not None)):
             squares = (changes @ directions[:, parameters.low * beside : parameters.high * beside]).square_()
             inner = pixels.inner(row), parameters.inner(beside)
-            strength = squares[inner]
-            counts = strength >= least.own
-            mean = None
+            measured = [(squares[inner], least.own)]
             if grids.joint and least.joint <= 1.0:
-                mean = grids.mean(squares)[inner]
-                counts |= mean >= least.joint
-            element, parameter = counts.nonzero(as_tuple=True)
-            found = strength[element, parameter]
-            if mean is not None:
-                near = mean[element, parameter]
-                found = torch.where(found >= least.own, found, 0.0)
-                found = torch.maximum(found, torch.where(near >= least.joint, near, 0.0))
+                measured.append((grids.mean(squares)[inner], least.joint))
+            highest = torch.stack([one.amax(1) >= lowest for one, lowest in measured])
+            some = highest.any(0).nonzero()[:, 0]  # few elements have a pair in this tile
+            found = torch.stack([one[some].where(one[some] >= lowest, 0.0) for one, lowest in measured]).amax(0)
+            element, parameter = found.nonzero(as_tuple=True)
+            found, element = found[element, parameter], some[element]
             parameter = parameter + parameters.first * beside
             size = found.sqrt() * norms[element + inner[0].start]
             found_here.append((element, parameter, size / lengths[parameter].clamp_min(torch.finfo(u.dtype).tiny)))
@@ -211,9 +208,11 @@ def _normalized(columns: Tensor) -> Tensor:
 
 
 def _histogram(squares: Tensor, least: float) -> Tensor:
-    high = squares[squares >= least]
-    bins = (high * _BINS).long().clamp_(0, _BINS - 1)
-    return torch.bincount(bins, minlength=_BINS).double().cpu()
+    """Count the squares, from the bin of `least` on."""
+    bins = (squares * _BINS).int().clamp_(max=_BINS - 1).flatten()
+    counts = torch.bincount(bins, minlength=_BINS).double().cpu()
+    counts[: int(least * _BINS)] = 0.0
+    return counts
 
 
 def _threshold(found: Tensor, decoys: Tensor, rate: float) -> float:

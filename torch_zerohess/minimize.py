@@ -201,7 +201,10 @@ def minimize(
             end = reached
             if end[0] != "time":
                 running.decide()
-            if end[0] != "target" or stopping.reason(running) == end:  # in noise the decision may refute it
+            decided = stopping.reason(running)  # in noise the decision may refute the target, or find it reached
+            if decided is not None and decided[0] == "target" and end[0] != "callback":
+                end = decided
+            if end[0] != "target" or decided == end:
                 break
     except KeyboardInterrupt:
         if not running.evaluations:

@@ -598,3 +598,15 @@ def test_penalties_do_not_make_two_minima_the_same():
     for seed in range(6):
         fit = zh.minimize(rastrigin, [0.9, 0.9], sigma=1.0, bounds=(-8, 8), seed=seed, max_evaluations=200)
         assert "not unique" not in fit.message
+
+
+def test_a_target_that_the_last_decision_finds_reached() -> None:
+    """The noise is twice the target: no single value is far enough below it to call for a decision."""
+    generator = torch.Generator().manual_seed(2)
+
+    def noisy(z):
+        return (z - 1.0).square().sum(1) + 0.1 * torch.randn(len(z), generator=generator, dtype=torch.float64)
+
+    fit = zh.minimize(noisy, zeros(2), sigma=1.0, target=0.05, seed=2, max_evaluations=150)
+    assert (fit.status, fit.success, fit.evaluations) == ("target", True, 150)
+    assert fit.value <= 0.05

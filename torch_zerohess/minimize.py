@@ -76,7 +76,8 @@ def minimize(
         x0: start [n]: a tensor, a NumPy array, a list or a tuple. Integers become float64.
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution.
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
-            there is one, give it: each evaluation then tells as many equations as the output has numbers.
+            there is one, give it: each evaluation then tells as many equations as the output has numbers. Leave
+            constants out: "gaussian_process" ends where little of the loss is left to gain.
         bounds: (lower, upper), numbers or [n] or None; n pairs (lower, upper), a list of tuples or an array [n, 2]; or
             `scipy.optimize.Bounds`. ValueError for two rows of two numbers that can be read either way.
         max_evaluations: points that fn may be called with.
@@ -92,7 +93,8 @@ def minimize(
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.
-        target: the search ends when the value is at most this.
+        target: the search ends when the value is at most this. In noise, values lie above and below their mean, so the
+            search ends when one is below the target by twice the noise, or when the last decision finds it reached.
         xtol: the search ends when the region in which it looks is at most this wide on either side of the best point,
             in every parameter, and a step has been tried.
         ftol: the search ends when its quadratic model promises a decrease of at most this. Without `loss` the latest

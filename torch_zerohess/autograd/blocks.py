@@ -57,7 +57,7 @@ def jacobian(operator: CurvatureOperator) -> Tensor:
 def _rows(operator: CurvatureOperator, index: int) -> Tensor:
     y, rows = operator.through[index], []
     for element in range(y.numel()):
-        d = [torch.zeros_like(one) for one in operator.through]
+        d = [torch.zeros_like(one, memory_format=torch.contiguous_format) for one in operator.through]
         d[index].view(-1)[element] = 1.0
         rows.append(operator.pull(d))
     return torch.stack(rows)

@@ -8,10 +8,21 @@ from torch import Tensor
 
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation.control import Control, Prediction
-from torch_zerohess.estimation.surrogate_term import MOST_STEIN, nodes, prefers_pathwise, smoothed
+from torch_zerohess.estimation.surrogate_term import LOOKED, MOST_STEIN, jumps, nodes, prefers_pathwise, smoothed
+from torch_zerohess.surrogates.memory import Memory
 
 Part = Callable[[Tensor], Tensor]
 """x [B, n] -> [B, *out], differentiable."""
+
+
+def _pathwise_in_transforms(memory: Memory, center: Tensor) -> bool:
+    """Choose the derivatives where a transform hides the values at center [B, n], which would tell their variances."""
+    if center.shape[1] <= MOST_STEIN:
+        return False
+    if not (transforms.transform_active() or transforms.forward_mode_active()):
+        return True
+    with transforms.outside():
+        return jumps(memory.surrogate, memory.points[-LOOKED:].to(center.dtype)) is False
 
 
 def around(
@@ -64,7 +75,7 @@ def around(
             u = nodes(seed, memory.draws, center.shape[1], B).to(center.device)
         if memory.pathwise is None and not (transforms.watched(center) or transforms.forward_mode_active()):
             memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
-        pathwise = len(sigma) > MOST_STEIN if memory.pathwise is None else memory.pathwise
+        pathwise = _pathwise_in_transforms(memory, center) if memory.pathwise is None else memory.pathwise
     else:  # the mean over all points is known from the center
         u, pathwise = sigma.new_zeros(1, len(sigma)), True
     if not fresh:

@@ -87,8 +87,11 @@ class SparseBlackBox(nn.Module):
         """Return values [*batch, *out] for x [*batch, n]."""
         if transforms.jit_traces() or transforms.watched(x) or transforms.has_tangent(x):
             raise RuntimeError("a SparseBlackBox has no torch.func transforms and is not compiled: use BlackBox")
-        x = checked_input(x)
+        known = self.jacobians[-1].shape if self.jacobians else None
+        x = checked_input(x, empty=known is not None)
         batch, n = x.shape[:-1], x.shape[-1]
+        if known is not None and not batch.numel():
+            return x.sum(-1).view(*batch, *[1] * len(known)).expand(*batch, *known)
         SparseSettings.checked(n, **self.settings)
         center = working(x).detach().reshape(-1, n).clone()
         values = evaluate_center(self.call, center, ()).to(center.dtype)

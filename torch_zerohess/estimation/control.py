@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.func import functional_call
 
 from torch_zerohess.estimation.head import apply_head
 from torch_zerohess.estimation.outer import Outer
@@ -147,7 +148,7 @@ class Prediction:
     def _outputs(self, z: Tensor) -> Tensor:
         """Return the predictions [B, E, *out] at points z [B, E, n]."""
         with without_autocast(z.device):
-            outputs: Tensor = self._surrogate(z.flatten(0, 1))
+            outputs: Tensor = _as_constant(self._surrogate, z.flatten(0, 1))
         return self._checked(outputs, z.shape[:2].numel()).unflatten(0, z.shape[:2])
 
     def _checked(self, outputs: Tensor, count: int) -> Tensor:
@@ -186,6 +187,18 @@ def _negligible(values: Tensor, dtype: torch.dtype) -> Tensor:
     deviation = (every - every.mean(1, keepdim=True)).square().mean((1, 2)).sqrt()
     size = _ROUNDING * torch.finfo(dtype).eps * every.abs().amax((1, 2)) + _DEVIATION * deviation
     return signs * size[:, None]
+
+
+def _as_constant(surrogate: Any, z: Tensor) -> Tensor:
+    """Call a surrogate without a graph to its parameters, which are constants of the estimate."""
+    try:
+        if isinstance(surrogate, nn.Module):
+            return functional_call(surrogate, {name: one.detach() for name, one in surrogate.named_parameters()}, (z,))
+        return surrogate(z)
+    except RuntimeError as error:
+        if "data pointer" in str(error):  # NumPy got a tensor of a transform
+            raise RuntimeError("the surrogate of the memory is not made of torch: torch.func cannot map it") from error
+        raise
 
 
 def coordinates_of(surrogate: Any, outer: Outer) -> LowRank | None:

@@ -41,7 +41,7 @@ _PAIRS = 2
 quadratic in an affine map are exact from one pair, and two pairs tell an error."""
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
-_LOOKED = 512
+LOOKED = 512
 """Points around the elements of a batch at which a surrogate is looked at for jumps, at most."""
 _EDGE = 1e-9
 """Probability at which the normal quantile is cut off."""
@@ -233,10 +233,10 @@ def prefers_pathwise(
     tree or a model outside of autograd are 0, without variance, and wrong: the answer is no. It is None where the
     surrogate is constant wherever it was looked at: both derivatives are 0 there, and another call decides.
     """
-    surrogate, step = control.memory.surrogate, -(-len(x) * len(u) // _LOOKED)
-    jumps = _jumps(surrogate, (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype))
-    if jumps is not False:
-        return None if jumps is None else False
+    surrogate, step = control.memory.surrogate, -(-len(x) * len(u) // LOOKED)
+    found = jumps(surrogate, (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype))
+    if found is not False:
+        return None if found is None else False
     if len(sigma) > MOST_STEIN:
         return True
     few = SurrogateTerm(surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
@@ -244,7 +244,7 @@ def prefers_pathwise(
     return float(few.variance(quantity).sum()) < float(replace(few, pathwise=False).variance(quantity).sum())
 
 
-def _jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
+def jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
     """Whether outputs at points z [Q, n] differ where their derivative says that they are constant; None if they do not
     differ.
     """

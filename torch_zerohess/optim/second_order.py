@@ -131,9 +131,17 @@ class Model:
         return 0.5 * (dense + dense.mT)
 
 
+_ROUNDING = 1e-9
+"""Of a learning rate."""
+
+
 def checked_lr(group: dict[str, Any]) -> float:
-    """Return the learning rate of a group, which a scheduler may have set; ValueError if it is not in [0, 1]."""
-    return checked_number("lr", group["lr"], 0.0, most=1.0)
+    """Return the learning rate of a group, which a scheduler may have set; ValueError if it is not in [0, 1].
+
+    What a scheduler multiplies up to 1 may be rounded to a little more.
+    """
+    lr = group["lr"]
+    return 1.0 if isinstance(lr, float) and 1.0 < lr < 1.0 + _ROUNDING else checked_number("lr", lr, 0.0, most=1.0)
 
 
 class SecondOrder(Optimizer):

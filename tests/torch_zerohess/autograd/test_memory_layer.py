@@ -134,6 +134,39 @@ def test_a_surrogate_without_derivatives_is_smoothed_by_stein(function: Callable
 
 
 @pytest.mark.parametrize("n", [2, 10])
+def test_a_table_is_told_in_transforms(n: int) -> None:
+    """The slope of a linear function through the table of its rounded values, which alone has slope 0."""
+    torch.manual_seed(0)
+    table = Fixed(lambda z: (8.0 * z).round().sum(1) / 4.0)
+    box = zh.BlackBox(lambda z: 2.0 * z.sum(1), zh.Smoothing(sigma=0.5, samples=8), memory=zh.Memory(table))
+    x = torch.zeros(3, n, dtype=torch.float64)
+    means = torch.stack([torch.func.grad(lambda z: box(z).sum())(x).mean() for _ in range(60)])[20:]
+    assert abs(float(means.mean()) - 2.0) < 5.0 * float(means.std()) / math.sqrt(len(means)) < 0.5
+
+
+def test_a_surrogate_of_numpy_is_named_where_a_transform_needs_it() -> None:
+    table = Fixed(lambda z: torch.from_numpy(2.0 * z.detach().numpy().sum(1)))
+    box = zh.BlackBox(lambda z: 2.0 * z.sum(1), zh.Smoothing(sigma=0.5, samples=8), memory=zh.Memory(table))
+    x = torch.zeros(2, 2, dtype=torch.float64)
+    for _ in range(3):
+        box(x.clone().requires_grad_())
+    with pytest.raises(RuntimeError, match="the surrogate of the memory is not made of torch"):
+        torch.func.grad(lambda z: box(z).sum())(x)
+
+
+def test_parameters_of_a_surrogate_get_no_gradient() -> None:
+    """The caller trains them, with another loss."""
+    torch.manual_seed(0)
+    memory = zh.Memory(Untrained())
+    box = zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=8), head=zh.heads.SquaredError(), memory=memory)
+    x = torch.zeros(8, 2, dtype=torch.float64, requires_grad=True)
+    for _ in range(4):
+        box(x, torch.zeros(8, 3, dtype=torch.float64)).mean().backward()
+    assert float(x.grad.norm()) > 0.0
+    assert [one.grad for one in memory.surrogate.parameters()] == [None] * 4
+
+
+@pytest.mark.parametrize("n", [2, 10])
 @pytest.mark.parametrize("numpy", [True, False])
 def test_a_table_is_told_wherever_it_jumps(n: int, numpy: bool) -> None:
     """A step at 0 under sigma .5: the slope of the smoothed step is .798, also where the first element is far away."""

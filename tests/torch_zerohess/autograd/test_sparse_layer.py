@@ -107,6 +107,16 @@ def test_shapes_and_types(batch, dtype):
     assert x.grad.shape == x.shape
 
 
+def test_an_empty_batch_after_another_one():
+    layer, x = zh.SparseBlackBox(blurred, SMOOTHING), torch.zeros(0, N, requires_grad=True)
+    with pytest.raises(ValueError, match="every batch dimension > 0"):
+        layer(x)
+    layer(drawn(1, N).requires_grad_())
+    y = layer(x)
+    y.sum().backward()
+    assert (y.shape, x.grad.shape) == ((0, 10, 10), (0, N))
+
+
 def test_one_seed_gives_the_same_bits_and_every_element_its_own_noise():
     x, seen = X[:1].repeat(2, 1).requires_grad_(), []
 

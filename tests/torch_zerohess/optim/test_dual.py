@@ -146,6 +146,24 @@ def test_indefinite_curvature_is_descended(solver) -> None:
     assert seen[0] > seen[1] > seen[2]
 
 
+def test_the_input_of_the_black_box_may_be_a_permuted_view() -> None:
+    layer = zh.BlackBox(lambda z: (z - 1.0).square().sum(1), zh.Smoothing(sigma=0.1, samples=32, seed=0))
+    images = torch.randn(2, 1, 5, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = []
+    for copied in (True, False):
+        torch.manual_seed(0)
+        weights = nn.Conv2d(1, 3, 3).double()
+
+        def loss(copied=copied, weights=weights) -> Tensor:
+            y = weights(images).permute(0, 2, 3, 1)
+            return layer(y.contiguous() if copied else y).mean()
+
+        settings = {"curvature": "gauss_newton", "solver": "dual", "damping": 0.01, "adapt": False}
+        zh.optim.NewtonCG(weights.parameters(), radius=1.0, **settings).step(loss)
+        ends.append(torch.cat([one.detach().flatten() for one in weights.parameters()]))
+    torch.testing.assert_close(*ends)
+
+
 def test_a_gradient_from_elsewhere_is_refused() -> None:
     net = network()
     optimizer = zh.optim.NewtonCG(net.parameters(), curvature="gauss_newton", solver="dual", damping=1e-2, adapt=False)

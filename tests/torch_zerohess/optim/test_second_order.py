@@ -106,6 +106,16 @@ def test_a_schedule_out_of_range_is_refused(kind: type, settings: dict) -> None:
     assert torch.equal(x.detach(), vector(3.0, -2.0))
 
 
+def test_a_warm_up_may_end_at_a_little_more_than_one() -> None:
+    x = vector(3.0, -2.0).requires_grad_()
+    optimizer = zh.optim.NewtonCG([x], radius=0.1)
+    warm_up = lr_scheduler.LinearLR(optimizer)
+    for _ in range(8):
+        optimizer.step(lambda: 0.5 * x.square().sum())
+        warm_up.step()
+    assert optimizer.param_groups[0]["lr"] == 1.0000000000000002
+
+
 @pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
 @pytest.mark.parametrize("lr", [-0.1, 1.5, float("nan")])
 def test_lr_is_a_factor_from_0_to_1(kind: type, lr: float) -> None:

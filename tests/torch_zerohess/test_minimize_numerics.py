@@ -10,6 +10,7 @@ from searches import bowl, zeros
 import torch_zerohess as zh
 from torch_zerohess.linalg.subproblem import ball_step
 from torch_zerohess.search import region_descent
+from truths import normal
 
 LARGEST = sys.float_info.max
 
@@ -95,3 +96,42 @@ def test_a_numerical_failure_of_the_loss_passes():
     with pytest.raises(torch.linalg.LinAlgError) as caught:
         zh.minimize(lambda z: z + 1.0, zeros(3), sigma=1.0, seed=0, loss=loss)
     assert caught.value.minimum.message.startswith("fn or loss raised _LinAlgError")
+
+
+@pytest.mark.parametrize("engine", ["auto", "descent"])
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_derivatives_across_a_bound_are_true_within_their_errors(engine, seed):
+    """Outputs A z with the loss |A z - b|^2: the gradient is 2 A'(A z - b), the Hessian 2 A'A."""
+    A = torch.eye(3, dtype=torch.float64) + 0.3 * normal(3, 3)
+    b = A @ torch.tensor([2.0, 0.5, -0.3], dtype=torch.float64)
+    fit = zh.minimize(
+        lambda z: z @ A.mT,
+        [0.2, 0.0, 0.0],
+        loss=lambda output: (output - b).square().sum(),
+        sigma=0.5,
+        bounds=([-1.0] * 3, [1.0] * 3),
+        engine=engine,
+        seed=seed,
+        max_evaluations=100,
+    )
+    gradient, hessian = 2 * A.mT @ (A @ fit.x.double() - b), 2 * A.mT @ A
+    errors = fit.standard_errors
+    assert float(fit.x[0]) == 1.0
+    assert bool(((fit.gradient - gradient).abs() <= 3 * errors["gradient"] + 1e-3).all())
+    assert bool(((fit.hessian - hessian).diagonal().abs() <= 3 * errors["hessian_diagonal"] + 0.02).all())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_rounding_of_the_loss_is_in_the_errors_of_the_hessian(seed):
+    """Next to a bound the evaluations are so near each other that the curvature is of the size of rounding."""
+    fit = zh.minimize(
+        lambda z: (z[:, 0] - 2).square() + (z[:, 1] - z[:, 0]).square(),
+        [0.0, 0.0],
+        sigma=0.5,
+        bounds=([-1, -1], [1, 1]),
+        seed=seed,
+        max_evaluations=100,
+    )
+    missed = fit.hessian.diagonal() - torch.tensor([4.0, 2.0])
+    assert bool((missed.abs() <= 3 * fit.standard_errors["hessian_diagonal"]).all())
+    assert float(missed.abs().max()) < 0.1

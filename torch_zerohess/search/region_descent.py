@@ -17,6 +17,7 @@ from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.region_progress import R, RegionProgress
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
+from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
 _FINEST = 1e-6
@@ -157,7 +158,8 @@ class RegionDescent(Method[R]):
                 break
             sigma *= _NEAR
         u, values = (known.points[near] - best.point) / sigma, known.values[near]
-        return fit_values(u, values, torch.ones_like(values)), sigma
+        weights = torch.ones_like(values)
+        return with_true_errors(fit_values(u, values, weights), u, weights), sigma
 
     def promise(self, known: R) -> float:
         return known.promised if _is_sound(known) else math.inf

@@ -94,8 +94,9 @@ def _least_squares(u: Tensor, values: Tensor, noise: float) -> tuple[LocalModel,
         variance = missed**2 / P
         averaged = (DEVIATION_DEGREES * (noise / size) ** 2 + spare * variance) / (DEVIATION_DEGREES + spare)
         missed = math.sqrt(P * max(variance - averaged * (1.0 + _CHANCE * math.sqrt(2.0 / spare)), 0.0))
+    rounding = torch.finfo(values.dtype).eps * float(values.abs().max()) / size
     # What is not quadratic is no noise: it does not average out over the evaluations (Cauchy and Schwarz).
-    error = math.hypot(missed, math.sqrt(averaged)) * inverse.norm(dim=1)
+    error = math.hypot(missed, math.sqrt(averaged), rounding) * inverse.norm(dim=1)
     hessian = symmetric(solution[n + 1 :], n)
     scale = float(hessian.norm())
     row, column = torch.triu_indices(n, n, device=u.device)

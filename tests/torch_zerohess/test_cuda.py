@@ -1,5 +1,6 @@
 """Tensors on a CUDA device give the numbers of the processor. Without a device the processor stands for it."""
 
+import contextlib
 import itertools
 
 import pytest
@@ -61,17 +62,23 @@ def test_samples_have_the_same_bits(proposal: int, dtype: torch.dtype) -> None:
             assert bool(((made[2].cpu() - weights).abs() <= bound * weights).all())
 
 
-@pytest.mark.parametrize("antithetic", [False, True])
-@pytest.mark.parametrize("baseline", ["none", "mean", "center"])
-@pytest.mark.parametrize("sampler", ["random", "orthogonal", "sobol"])
-@pytest.mark.parametrize("proposal", ["gaussian", "aggregate", "optimal", "uniform"])
-def test_estimates_are_the_same(proposal: str, sampler: str, baseline: str, antithetic: bool) -> None:
-    settings = {"proposal": proposal, "sampler": sampler, "baseline": baseline, "antithetic": antithetic}
-    try:
-        smoothing = zh.Smoothing(sigma=0.2, samples=16, seed=3, **settings)
-        there, here = zh.estimate(smooth, X.to(DEVICE), smoothing), zh.estimate(smooth, X, smoothing)
-    except ValueError:
-        return  # settings that no device has
+def settings_that_there_are():
+    for proposal, sampler, baseline, antithetic in itertools.product(
+        ("gaussian", "aggregate", "optimal", "uniform"),
+        ("random", "orthogonal", "sobol"),
+        ("none", "mean", "center"),
+        (False, True),
+    ):
+        with contextlib.suppress(ValueError):
+            given = {"proposal": proposal, "sampler": sampler, "baseline": baseline, "antithetic": antithetic}
+            smoothing = zh.Smoothing(sigma=0.2, samples=16, seed=3, **given)
+            zh.estimate(smooth, X, smoothing)
+            yield smoothing
+
+
+@pytest.mark.parametrize("smoothing", list(settings_that_there_are()), ids=repr)
+def test_estimates_are_the_same(smoothing: zh.Smoothing) -> None:
+    there, here = zh.estimate(smooth, X.to(DEVICE), smoothing), zh.estimate(smooth, X, smoothing)
     one, other = ((e.value, e.gradient, e.hessian(), e.hvp(X.to(e.value.device))) for e in (there, here))
     same(one, other)
 

@@ -21,8 +21,12 @@ def _pathwise_in_transforms(memory: Memory, center: Tensor) -> bool:
         return False
     if not (transforms.transform_active() or transforms.forward_mode_active()):
         return True
+    if len(memory.points) < 2:
+        return True
     with transforms.outside():
-        return jumps(memory.surrogate, memory.points[-LOOKED:].to(center.dtype)) is False
+        found = jumps(memory.surrogate, memory.points[-LOOKED:].to(center.dtype))
+    memory.pathwise = None if found is None else not found
+    return found is not True
 
 
 def around(

@@ -28,6 +28,6 @@ def _exporting() -> bool:
 exporting = torch.compiler.assume_constant_result(_exporting)
 """Whether this is an export. Up to torch 2.11 compiled code that asks torch is always told that it is."""
 eager = torch.compiler.disable(
-    _called, reason="a layer with a memory changes from call to call, and one without needs the compiler of torch 2.15"
+    _called, reason="the memory of a layer changes from call to call, and without one the layer needs torch 2.15"
 )
 """Calls a layer between two graphs. With fullgraph=True torch raises an error, which has the reason."""

@@ -84,14 +84,16 @@ class SparseBlackBox(nn.Module):
         self.jacobians = []
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return values [*batch, *out] for x [*batch, n]."""
+        """Return values [*batch, *out] for x [*batch, n]; an empty batch needs a call with derivatives before it."""
         if transforms.jit_traces() or transforms.watched(x) or transforms.has_tangent(x):
             raise RuntimeError("a SparseBlackBox has no torch.func transforms and is not compiled: use BlackBox")
-        known = self.jacobians[-1].shape if self.jacobians else None
+        known = self.jacobians[-1] if self.jacobians else None
         x = checked_input(x, empty=known is not None)
         batch, n = x.shape[:-1], x.shape[-1]
         if known is not None and not batch.numel():
-            return x.sum(-1).view(*batch, *[1] * len(known)).expand(*batch, *known)
+            if n != known.n:
+                raise ValueError(f"x must have {known.n} parameters like the call before it if it is empty, got {n}")
+            return x.sum(-1).view(*batch, *[1] * len(known.shape)).expand(*batch, *known.shape)
         SparseSettings.checked(n, **self.settings)
         center = working(x).detach().reshape(-1, n).clone()
         values = evaluate_center(self.call, center, ()).to(center.dtype)

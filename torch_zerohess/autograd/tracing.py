@@ -5,8 +5,8 @@ import torch
 from torch_zerohess.autograd import transforms
 
 GRAPHS = torch.__version__ >= "2.15"
-"""Whether compiled code may hold a layer. Up to torch 2.13 it makes one of two calls that draw different noise. With
-torch 2.14 it loses second derivatives."""
+"""Whether compiled code may hold a layer. Up to torch 2.13 two calls become one, and both get the same noise. In torch
+2.14 second derivatives of first-order samples are zero."""
 
 
 def check_traceable() -> None:

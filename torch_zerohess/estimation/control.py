@@ -3,6 +3,7 @@
 The surrogate and the coefficient come from earlier calls. They do not change during a call.
 """
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
+from torch.nn.parameter import is_lazy
 
 from torch_zerohess.estimation.head import apply_head
 from torch_zerohess.estimation.outer import Outer
@@ -26,6 +28,12 @@ _WITH_COORDINATES = (AutomaticSurrogate, LowRankSurrogate)
 
 _ROUNDING, _DEVIATION = 16.0, 0.01
 """Errors of values that are negligible: in units of their rounding, and of their deviation."""
+
+
+_PLAIN = (torch.jit.ScriptModule, nn.DataParallel)
+"""Modules whose parameters cannot be exchanged for a call."""
+_exchanged = threading.RLock()
+"""Held while a module has other parameters."""
 
 
 @dataclass(frozen=True)
@@ -190,10 +198,13 @@ def _negligible(values: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _as_constant(surrogate: Any, z: Tensor) -> Tensor:
-    """Call a surrogate without a graph to its parameters, which are constants of the estimate."""
+    """Call a surrogate, a module without a graph to its parameters: they are constants of the estimate."""
     try:
-        if isinstance(surrogate, nn.Module):
-            return functional_call(surrogate, {name: one.detach() for name, one in surrogate.named_parameters()}, (z,))
+        if isinstance(surrogate, nn.Module) and not isinstance(surrogate, _PLAIN):
+            named = dict(surrogate.named_parameters())
+            if any(one.requires_grad for one in named.values()) and not any(map(is_lazy, named.values())):
+                with _exchanged:
+                    return functional_call(surrogate, {name: one.detach() for name, one in named.items()}, (z,))
         return surrogate(z)
     except RuntimeError as error:
         if "data pointer" in str(error):  # NumPy got a tensor of a transform

@@ -13,12 +13,14 @@ from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
 from torch_zerohess.search.random_points import further_start, normal
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, agreeing, arriving
-from torch_zerohess.surrogates.determined import NEAR, WIDENING, nearest_told, with_true_errors
+from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
 
 _FEW = 2
 """Parameters up to which a full quadratic of the loss takes so few evaluations that an output is not needed."""
+_NEAR = 1e-3
+"""Weight from which an evaluation counts as near."""
 _ENOUGH = 4
 """Near evaluations, besides the center, that a model needs at least; n if that is less."""
 _SHARPNESS = 0.1
@@ -29,8 +31,8 @@ _HALVING = 0.5
 """Factor for sigma after a step to a point whose value is not finite."""
 _RESTART = 1.5
 """First sigma of a further round."""
-_WIDENINGS = 8
-"""How often sigma is widened, at most, to find evaluations around the best point."""
+_WIDENINGS, _WIDENING = 8, 1.5
+"""How often, and by which factor, sigma is widened to find evaluations around the best point."""
 
 _POOL, _POOL_PER_PARAMETER, _POOL_OF_QUADRATIC = 60, 6, 500
 """Evaluations kept at least, per parameter at least, and at most for a full quadratic of the loss."""
@@ -102,15 +104,15 @@ class LocalQuadratics(Method[DescentProgress]):
         return self._drawn(around, count, generator, paired=False)
 
     def model_at_best(self, known: DescentProgress) -> tuple[LocalModel, float] | None:
-        best, pool, least = known.best, known.pool, min(self._n, self.capacity - 2)
-        patience = best.sigma * WIDENING**_WIDENINGS
-        found = nearest_told(
-            pool.points, best.point, best.sigma, least, lambda sigma: pool.weights(best.point, sigma), patience
-        )
-        if found is None:
-            return None
-        near, u, weights, sigma = found
-        return with_true_errors(self._fitted(known, u, near, weights), u, weights), sigma
+        best, sigma = known.best.point, known.best.sigma
+        for _ in range(_WIDENINGS):
+            weights = known.pool.weights(best, sigma)
+            near = weights > _NEAR
+            if int(near.sum()) > min(self._n, self.capacity - 2):
+                u = (known.pool.points[near] - best) / sigma
+                return with_true_errors(self._fitted(known, u, near, weights[near]), u, weights[near]), sigma
+            sigma *= _WIDENING
+        return None
 
     def width(self, known: DescentProgress) -> Tensor:
         """Return sigma for every parameter, and infinity before a step."""
@@ -221,7 +223,7 @@ class LocalQuadratics(Method[DescentProgress]):
         if known.faithful:  # the model is about to interpolate: the nearest evaluations count most
             distance = ((points - center) / sigma).square().mean(1)
             weights = weights / (_SHARPNESS + distance).square()
-        near = weights > NEAR
+        near = weights > _NEAR
         if int(near.sum()) < (min(self._n, _ENOUGH) + 1 if known.need == 0 else 1):
             return known.sampling(2)
         model = self._fitted(known, (points[near] - center) / sigma, near, weights[near])

@@ -23,7 +23,7 @@ from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
-from torch_zerohess.surrogates.determined import nearest_told, with_true_errors
+from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -51,6 +51,8 @@ _EXPANSIONS = 3
 of the loss itself from then on."""
 _POOL, _BATCHES = 60, 8
 """Evaluations kept, and batches of several points kept at least, unless `pool` says it."""
+_NEAR, _WIDENING, _WIDEST = 1e-3, 1.5, 10.0
+"""Weight from which an evaluation counts as near the best point; sigma is widened by the factor up to the last one."""
 
 Q = TypeVar("Q", bound=ProcessProgress)
 
@@ -125,20 +127,19 @@ class ProcessMethod(Method[Q]):
         return torch.stack(every[len(points) :])
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
-        pool, best = known.pool, known.best.point
-
-        def weigh(sigma: float) -> Tensor:
-            return torch.exp(-0.5 * ((pool.points - best) / sigma).square().sum(1))
-
-        found = nearest_told(pool.points, best, known.best.sigma, min(self.settings.n, self.capacity - 2), weigh)
-        if found is None:
-            return None
-        near, u, weights, sigma = found
-        if self.settings.loss is None or pool.outputs is None:
-            model = fit_values(u, pool.values[near], weights)
-        else:
-            model = fit_outputs(u, pool.outputs[near], weights, self.settings.loss, known.shape)
-        return with_true_errors(model, u, weights), sigma
+        pool, best, sigma = known.pool, known.best.point, known.best.sigma
+        while len(pool) and sigma < _WIDEST:
+            weights = torch.exp(-0.5 * ((pool.points - best) / sigma).square().sum(1))
+            near = weights > _NEAR
+            if int(near.sum()) > min(self.settings.n, self.capacity - 2):
+                u = (pool.points[near] - best) / sigma
+                if self.settings.loss is None or pool.outputs is None:
+                    model = fit_values(u, pool.values[near], weights[near])
+                else:
+                    model = fit_outputs(u, pool.outputs[near], weights[near], self.settings.loss, known.shape)
+                return with_true_errors(model, u, weights[near]), sigma
+            sigma *= _WIDENING
+        return None
 
     def begun(self) -> dict[str, Any]:
         """Return the fields of a progress before anything was evaluated."""

@@ -23,7 +23,7 @@ _STUCK, _BETTER = 4, 0.1
 """Evaluations over n + 1 after which it looks elsewhere, if none of them took away this part of the loss."""
 _PATIENCE = 2
 """Rejected steps in a row of Gauss-Newton after which the process goes on."""
-_WORTH = 0.01
+_WORTH = 0.1
 """Part of the loss that the first step of Gauss-Newton must promise to take away."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""

@@ -209,7 +209,7 @@ def _normalized(columns: Tensor) -> Tensor:
 
 def _histogram(squares: Tensor, least: float) -> Tensor:
     """Count the squares, from the bin of `least` on."""
-    bins = (squares * _BINS).int().clamp_(max=_BINS - 1).flatten()
+    bins = (squares * _BINS).nan_to_num_(nan=0.0).int().clamp_(max=_BINS - 1).flatten()
     counts = torch.bincount(bins, minlength=_BINS).double().cpu()
     counts[: int(least * _BINS)] = 0.0
     return counts

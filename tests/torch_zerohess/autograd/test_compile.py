@@ -132,7 +132,7 @@ def test_a_layer_with_a_memory_is_one_graph_break_without_warnings() -> None:
     plain(leaf(BATCH))
     assert model.layer.memory.evaluations == plain.layer.memory.evaluations > 0
     torch.compiler.reset()
-    with pytest.raises(RuntimeError, match="a layer with a memory changes from call to call"):
+    with pytest.raises(RuntimeError, match="the memory of a layer changes from call to call"):
         torch.compile(model, fullgraph=True, backend="eager")(x)
 
 

@@ -166,6 +166,26 @@ def test_parameters_of_a_surrogate_get_no_gradient() -> None:
     assert [one.grad for one in memory.surrogate.parameters()] == [None] * 4
 
 
+@pytest.mark.parametrize("wrapped", [torch.jit.script, nn.DataParallel, lambda net: nn.LazyLinear(3).double()])
+def test_surrogates_of_every_kind_of_module(wrapped: Callable[[nn.Module], Any]) -> None:
+    memory = zh.Memory(wrapped(nn.Linear(2, 3).double()))
+    box = zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=8), memory=memory)
+    for _ in range(3):
+        x = torch.zeros(4, 2, dtype=torch.float64, requires_grad=True)
+        box(x).mean().backward()
+        assert bool(x.grad.isfinite().all())
+
+
+def test_a_memory_without_points_in_transforms() -> None:
+    memory = zh.Memory(nn.Linear(10, 1).double(), fresh=0)
+    box = zh.BlackBox(lambda z: z.sum(1, keepdim=True), zh.Smoothing(sigma=SIGMA, samples=8), memory=memory)
+    x = torch.zeros(3, 10, dtype=torch.float64)
+    slope = torch.func.grad(lambda z: box(z).sum())(x)
+    y = x.clone().requires_grad_()
+    box(y).sum().backward()
+    torch.testing.assert_close(slope, y.grad)
+
+
 @pytest.mark.parametrize("n", [2, 10])
 @pytest.mark.parametrize("numpy", [True, False])
 def test_a_table_is_told_wherever_it_jumps(n: int, numpy: bool) -> None:

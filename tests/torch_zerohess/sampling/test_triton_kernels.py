@@ -143,6 +143,7 @@ def test_float32_holds_what_is_compared() -> None:
     source = Path(kernels.__file__).with_name("triton_kernels.py").read_text()
     compared = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Compare)]
     ends = [one for node in compared for one in (node.left, *node.comparators)]
+    ends = [one.operand if isinstance(one, ast.UnaryOp) else one for one in ends]
     numbers = {one.value for one in ends if isinstance(one, ast.Constant) and isinstance(one.value, float)}
     assert numbers >= {0.0, 0.25, 0.75, 0.5, 5.0}
     assert all(float(torch.tensor(one, dtype=torch.float32)) == one for one in numbers)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torch_zerohess.surrogates.determined import nearest_told, with_true_errors
+from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.quadratic import fit_outputs, fit_values
 from truths import normal
 
@@ -42,21 +42,3 @@ def test_two_places_along_a_parameter_tell_a_slope_of_outputs_alone(kind):
     model = fitted(u, kind)
     assert model.gradient_error.isinf().tolist() == unknown
     assert model.curvature_error.isinf().tolist() == unknown
-
-
-def test_a_neighbourhood_is_widened_until_it_tells_all_slopes():
-    near, far = 1e-3 * normal(10, 2), torch.tensor([[0.5, 0.0], [0.4, 0.1]], dtype=torch.float64)
-    near[:, 0] = 0.0
-
-    def found(points, patience=10.0):
-        x = torch.zeros(2, dtype=torch.float64)
-        return nearest_told(
-            points, x, 1e-3, 2, lambda sigma: torch.exp(-0.5 * (points / sigma).square().sum(1)), patience
-        )
-
-    narrow, wide = found(near), found(torch.cat([near, far]))
-    assert narrow.sigma == 1e-3  # none tells them: the first
-    assert 0.05 < wide.sigma < 0.5
-    assert wide.near[-1]
-    torch.testing.assert_close(wide.u * wide.sigma, torch.cat([near, far])[wide.near])
-    assert found(far, patience=2e-3) is None

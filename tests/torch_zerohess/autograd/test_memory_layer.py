@@ -161,6 +161,7 @@ def test_parameters_of_a_surrogate_get_no_gradient() -> None:
     box = zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=8), head=zh.heads.SquaredError(), memory=memory)
     x = torch.zeros(8, 2, dtype=torch.float64, requires_grad=True)
     for _ in range(4):
+        memory.pathwise = True
         box(x, torch.zeros(8, 3, dtype=torch.float64)).mean().backward()
     assert float(x.grad.norm()) > 0.0
     assert [one.grad for one in memory.surrogate.parameters()] == [None] * 4

@@ -79,7 +79,7 @@ def test_thresholds_of_large_images_are_those_of_all_pairs(monkeypatch):
 
 def test_an_output_beyond_float32_does_not_stop_the_others():
     u, rest = normal(40, 20).float(), normal(40, 20, seed=1).float()
-    rest[:, 3] = 1e39  # infinite
+    rest[:, 3] = torch.inf
     rest[:, 5] = u[:, 5]
     least = thresholds(u, rest, Grids.of(torch.Size([20]), None), 0.01)
     assert least.own < 1.0

@@ -169,7 +169,7 @@ def test_parameters_of_a_surrogate_get_no_gradient() -> None:
     """The caller trains them, with another loss."""
     memory = zh.Memory(Shifted())
     box = zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=8), head=zh.heads.SquaredError(), memory=memory)
-    x = torch.zeros(8, 2, dtype=torch.float64, requires_grad=True)
+    x = torch.full((8, 2), 0.3, dtype=torch.float64, requires_grad=True)
     for _ in range(4):
         box(x, torch.zeros(8, 3, dtype=torch.float64)).mean().backward()
     assert memory.coefficient > 0.5

@@ -42,7 +42,8 @@ class Memory:
         surrogate: an object with `fit(points [P, n], outputs [P, *out])` and a differentiable
             `__call__(z [K, n]) -> [K, *out]`; an `nn.Module` without `fit`, which the caller trains; or None: a
             Gaussian process or an affine map, of the coordinates of large outputs, chosen by held-out evaluations. An
-            affine map of hundreds of parameters is sparse where its outputs depend on few of them each.
+            affine map of hundreds of parameters is sparse where its outputs depend on few of them each. The layer gives
+            the parameters of a module no gradient. Do not call the module in another thread during a call of the layer.
         capacity: evaluations that are kept. Beyond it, of points that are close to each other the older are dropped.
             Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.

@@ -93,8 +93,8 @@ def minimize(
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.
-        target: the search ends when the value is at most this. In noise, values lie above and below their mean, so the
-            search ends when one is below the target by twice the noise, or when the last decision finds it reached.
+        target: the search ends when the value is at most this. In noise a single value is too uncertain: the search
+            ends when a value lies below the target by twice the noise, or when its last decision finds it reached.
         xtol: the search ends when the region in which it looks is at most this wide on either side of the best point,
             in every parameter, and a step has been tried.
         ftol: the search ends when its quadratic model promises a decrease of at most this. Without `loss` the latest

@@ -13,7 +13,7 @@ A ratio above 1 says that the package is faster.
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -22,27 +22,10 @@ import torch_zerohess as zh
 from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
 from experiments.runs.records import write
-from experiments.studies.bench_ratios import finished, hessian, in_turn, noise, redrawn, sampler
+from experiments.studies.bench_ratios import Ratio, finished, hessian, in_turn, noise, redrawn, sampler
 from torch_zerohess.sampling import proposals
 
 _PROPOSALS = {"gaussian": proposals.GAUSSIAN, "aggregate": proposals.SECOND_ORDER}
-
-
-@dataclass(frozen=True)
-class Row:
-    """Median seconds of a measured operation and of what it is compared with."""
-
-    operation: str
-    compared_with: str
-    n: int
-    samples: int
-    seconds: float
-    compared: float
-
-    @property
-    def ratio(self) -> float:
-        """How many times faster the package is."""
-        return self.compared / self.seconds
 
 
 def bench_device(
@@ -54,7 +37,7 @@ def bench_device(
     wide: int = 2048,
     out: Path | None = None,
     store: str | None = None,
-) -> list[Row]:
+) -> list[Ratio]:
     """Time noise, sums and the layer on a CUDA device against `torch.randn`, its memory and matrix products.
 
     Args:
@@ -81,9 +64,7 @@ def bench_device(
         for name, proposal in _PROPOSALS.items()
         for row in _noise(dtype, repeats, n, samples, device, name, proposal)
     ]
-    for one, reference in ((hessian(wide, repeats, device), "matrix product"), (redrawn(n, repeats, device), "noise")):
-        rows.append(Row(one.operation, reference, one.n, one.samples, one.seconds, one.compared))
-    rows.append(_layer(repeats, device))
+    rows += [hessian(wide, repeats, device), redrawn(n, repeats, device), _layer(repeats, device)]
     where = torch.cuda.get_device_name() if device == "cuda" else device
     headers = [
         "device",
@@ -118,20 +99,21 @@ def bench_device(
 
 def _noise(
     dtype: torch.dtype, repeats: int, n: int, samples: int, device: str, name: str, proposal: int
-) -> tuple[Row, Row]:
+) -> tuple[Ratio, Ratio]:
     against_randn = noise(dtype, repeats, n, samples, device, proposal)
     x, sigma = torch.zeros(1, n, dtype=dtype, device=device), torch.ones(n, dtype=torch.float64, device=device)
     empty = torch.empty(samples, n, dtype=dtype, device=device)
     seconds, compared = in_turn(
         sampler(x, sigma, samples, proposal), finished(lambda: empty.fill_(1.0), device), repeats
     )
+    points = f"points, {str(dtype).removeprefix('torch.')}, {name}"
     return (
-        Row(f"{against_randn.operation}, {name}", "randn", n, samples, against_randn.seconds, against_randn.compared),
-        Row(f"points, {str(dtype).removeprefix('torch.')}, {name}", "fill", n, samples, seconds, compared),
+        replace(against_randn, operation=f"{against_randn.operation}, {name}"),
+        Ratio(points, n, samples, seconds, compared, compared_with="fill"),
     )
 
 
-def _layer(repeats: int, device: str) -> Row:
+def _layer(repeats: int, device: str) -> Ratio:
     samples = 8
 
     def on(where: str) -> Callable[[], object]:
@@ -140,4 +122,4 @@ def _layer(repeats: int, device: str) -> Row:
         return finished(lambda: torch.autograd.grad(layer(x), x), where)
 
     seconds, compared = in_turn(on(device), on("cpu"), repeats)
-    return Row("layer: forward + backward", "cpu", 2, samples, seconds, compared)
+    return Ratio("layer: forward + backward", 2, samples, seconds, compared, compared_with="cpu")

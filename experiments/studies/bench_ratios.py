@@ -24,14 +24,15 @@ from torch_zerohess.sampling import kernels, proposals
 
 @dataclass(frozen=True)
 class Ratio:
-    """Median seconds of a measured operation and of its reference."""
+    """Median seconds of a measured operation and of what it is compared with, and the goal for the ratio, if any."""
 
     operation: str
     n: int
     samples: int
     seconds: float
     compared: float
-    goal: float
+    goal: float | None = None
+    compared_with: str = ""
 
     @property
     def ratio(self) -> float:
@@ -66,7 +67,7 @@ def noise(
     x, sigma = torch.zeros(1, n, dtype=dtype, device=device), torch.ones(n, dtype=torch.float64, device=device)
     plain = finished(lambda: torch.randn(samples, n, dtype=dtype, device=device), device)
     seconds, compared = in_turn(sampler(x, sigma, samples, proposal), plain, repeats)
-    return Ratio(f"noise, {str(dtype).removeprefix('torch.')}", n, samples, seconds, compared, 2.0)
+    return Ratio(f"noise, {str(dtype).removeprefix('torch.')}", n, samples, seconds, compared, 2.0, "randn")
 
 
 def hessian(n: int, repeats: int, device: str = "cpu") -> Ratio:
@@ -78,7 +79,7 @@ def hessian(n: int, repeats: int, device: str = "cpu") -> Ratio:
     u, a = (torch.randn(2 * samples, columns, dtype=torch.float64, device=device) for columns in (n, 1))
     product = finished(lambda: u.mT @ (a * u), device)
     seconds, compared = in_turn(finished(estimate.hessian, device), product, repeats)
-    return Ratio("Hessian", n, samples, seconds, compared, 0.85)
+    return Ratio("Hessian", n, samples, seconds, compared, 0.85, "matrix product")
 
 
 def redrawn(n: int, repeats: int, device: str = "cpu") -> Ratio:
@@ -93,7 +94,7 @@ def redrawn(n: int, repeats: int, device: str = "cpu") -> Ratio:
         return stein.gradient(a), stein.hvp(a, v)
 
     seconds, compared = in_turn(finished(derivatives, device), sampler(x, sigma, samples), repeats)
-    return Ratio("gradient + HVP, drawn again", n, samples, seconds, 3 * compared, 0.6)
+    return Ratio("gradient + HVP, drawn again", n, samples, seconds, 3 * compared, 0.6, "noise")
 
 
 def _threads(repeats: int) -> Ratio:

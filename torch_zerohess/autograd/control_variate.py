@@ -16,7 +16,10 @@ Part = Callable[[Tensor], Tensor]
 
 
 def _pathwise_in_transforms(memory: Memory, center: Tensor) -> bool:
-    """Choose the derivatives where a transform hides the values at center [B, n], which would tell their variances."""
+    """Whether to choose pathwise derivatives where a transform hides the values at center [B, n].
+
+    The variances cannot be compared there. The points of the memory tell whether the surrogate jumps.
+    """
     if center.shape[1] <= MOST_STEIN:
         return False
     if not (transforms.transform_active() or transforms.forward_mode_active()):

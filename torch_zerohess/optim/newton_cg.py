@@ -51,9 +51,9 @@ class NewtonCG(NewtonStep):
         damping: added to the diagonal of H.
         adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`.
         max_radius: the radius never grows beyond it.
-        noise: how far residual and curvature must differ from zero, if there are several losses: the number of standard
-            deviations in `steihaug.noise_level`, with 2 some two standard errors of one number. 0 takes the mean of the
-            losses for exact, and so does solver "dual".
+        noise: how far residual and curvature must differ from zero, if there are several losses. It is the number of
+            standard deviations in `steihaug.noise_level`. 0 takes the mean of the losses for exact, and so does solver
+            "dual".
         output_radius: longest move of the input y [n] of a black box, for every element of the batch, in units of y;
             None: any. Sampled derivatives describe a black box within about sigma of y. Steps of the weights that are
             short can still move y far beyond it. Needs curvature "gauss_newton".

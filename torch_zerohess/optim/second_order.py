@@ -132,13 +132,13 @@ class Model:
 
 
 _ROUNDING = 1e-9
-"""Of a learning rate."""
+"""By how much a learning rate may exceed 1."""
 
 
 def checked_lr(group: dict[str, Any]) -> float:
     """Return the learning rate of a group, which a scheduler may have set; ValueError if it is not in [0, 1].
 
-    What a scheduler multiplies up to 1 may be rounded to a little more.
+    Schedulers that end at 1 may end a little above it, by rounding. That counts as 1.
     """
     lr = group["lr"]
     return 1.0 if isinstance(lr, float) and 1.0 < lr < 1.0 + _ROUNDING else checked_number("lr", lr, 0.0, most=1.0)

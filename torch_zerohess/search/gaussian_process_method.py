@@ -155,6 +155,11 @@ class ProcessMethod(Method[Q]):
             "solved": torch.full_like(start, math.inf),
         }
 
+    def tells_noise(self, known: Q) -> bool:
+        """Whether there are enough outputs to tell noise from fast variation."""
+        enough = min(_TELLING * (self.settings.n + 1), self.capacity)
+        return self.settings.loss is not None and len(known.pool) >= enough
+
     # What was evaluated.
 
     def remembered(self, known: Q, new: Evaluated) -> Q:
@@ -290,13 +295,12 @@ class ProcessMethod(Method[Q]):
         An output that is not finite is replaced by the output with the highest loss. A loss alone is too little
         evidence to tell noise from ripples: it counts as noisy only if `noise` is given.
         """
-        pool, n = known.pool, self.settings.n
+        pool = known.pool
         worst = outputs[int(pool.values.argmax())]
         points = torch.cat([pool.points, known.holes])
         outputs = torch.cat([outputs, worst.expand(len(known.holes), -1)])
         declared = self.settings.noise > 0.0
-        detects = self.settings.loss is not None and len(pool) >= min(_TELLING * (n + 1), self.capacity)
-        noises = NOISES + HIGH_NOISES if declared or detects else NOISES
+        noises = NOISES + HIGH_NOISES if declared or self.tells_noise(known) else NOISES
         process = GaussianProcess.fit(points, outputs, noises, deviation or None)
         noisy = declared or process.noise >= HIGH_NOISES[0]
         best = known.record if known.noisy and not noisy else known.best

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
+import torch
 from torch import Tensor
 
 from torch_zerohess.search.state import Best, Progress, agreeing, arriving
@@ -58,11 +59,20 @@ class ProcessProgress(Progress):
             self = arriving(self, self.best)
         if not self.is_minimum(tolerance):
             return self
-        looked, least = self.evaluations - self.counted, _LOOKING * (len(self.center) + 1)
         known = agreeing(self, end or self.best, tolerance, self.pool.values)
-        if known.agreed > 1 and looked < max(self.counted, least):
+        if known.agreed > 1 and not self.has_looked:
             return self
         return replace(known, counted=self.evaluations)
+
+    @property
+    def has_looked(self) -> bool:
+        """Whether a further arrival would count as a round that agrees."""
+        return self.evaluations - self.counted >= max(self.counted, _LOOKING * (len(self.center) + 1))
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether the best point is a minimum that is known to the last digit."""
+        return torch.equal(self.solved, self.best.point)
 
     def is_minimum(self, tolerance: float) -> bool:
         """Whether neither noise nor a plateau has chosen the best point."""

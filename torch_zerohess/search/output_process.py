@@ -42,6 +42,12 @@ class OutputProcessProgress(FinishedProgress):
     """Whether it looks where it knows least, because nothing much better was found."""
     due: str = ""
     """Why the process has arrived; empty if it has not."""
+    since: int = 0
+    """Evaluations of the process since the promise of Gauss-Newton was looked at."""
+    from_loss: float = math.inf
+    """Lowest loss at that time."""
+    tries: int = 0
+    """Times that Gauss-Newton has ended beside the best point; the process then works twice as long."""
 
 
 class OutputProcess(FinishedProcess[OutputProcessProgress]):
@@ -83,10 +89,15 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             waited=0 if now < before else known.waited + count,
             stuck=0 if better else known.stuck + count,
             looks=0 if better else known.looks,
+            since=known.since + count,
         )
         turn = bool(known.due) or known.waited >= PATIENCE * (self.settings.n + 1)
-        if turn and self.is_new(known) and not known.noisy and not known.done:
-            known, points = self._begun_newton(known, generator)
+        if not known.noisy and not known.done:
+            if turn and self.is_new(known):
+                known = replace(known, finished=known.best.point)
+                known, points = self._begun_newton(known, _WORTH * abs(now), generator)
+            elif self.tells_noise(known) and self._is_due(known):
+                known, points = self._begun_newton(known, max(known.from_loss - now, 0.0), generator)
             if known.finishing:
                 return known, points
         return self._went_on(known), evaluated.points[:0]
@@ -102,29 +113,40 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             return known, points
         best = known.best.point
         solved = best if now.done else torch.full_like(best, math.inf)
-        known = replace(known, finishing=False, waited=0, finished=best, solved=solved)
+        tries = 0 if self.is_new(known) else known.tries + 1
+        known = replace(known, finishing=False, waited=0, finished=best, solved=solved, tries=tries)
         if not known.due and not now.done:
             return known, points
         return super().arrived(known, known.due or "steps of Gauss-Newton have arrived"), points
 
+    def _is_due(self, known: OutputProcessProgress) -> bool:
+        """Whether the process has had its time since Gauss-Newton has ended at the best point, or was not begun."""
+        return not known.is_solved and known.since >= (PATIENCE * (self.settings.n + 1)) << known.tries
+
     def _begun_newton(
-        self, known: OutputProcessProgress, generator: torch.Generator
+        self, known: OutputProcessProgress, least: float, generator: torch.Generator
     ) -> tuple[OutputProcessProgress, Tensor]:
-        """Let Gauss-Newton begin at the best point, if its first step promises enough."""
+        """Let Gauss-Newton begin at the best point, if its first step promises more than `least`."""
         n, best = self.settings.n, known.best
+        known = replace(known, since=0, from_loss=best.loss)
         if len(known.pool) <= n:
             return known, best.point[None][:0]
-        distance = (known.pool.points - best.point).norm(dim=1).sort().values[n]
-        sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)
-        newton, points = self.local.plan(self.local.taking_over(known, best, sigma), generator)
-        if len(points) and newton.promised > _WORTH * abs(best.loss):
+        before = known.local
+        if before is not None and torch.equal(before.lowest.point, best.point):
+            begun = replace(before.taking(known, "evaluations", "iterations"), rejected=0, lost=0, failed=False)
+        else:
+            distance = (known.pool.points - best.point).norm(dim=1).sort().values[n]
+            sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)
+            begun = self.local.taking_over(known, best, sigma)
+        newton, points = self.local.plan(begun, generator)
+        if len(points) and newton.promised > least:
             return replace(known, local=newton, finishing=True, waited=0), points
-        return replace(known, finished=best.point), points[:0]
+        return known, points[:0]
 
     def _went_on(self, known: OutputProcessProgress) -> OutputProcessProgress:
         """Arrive, or look elsewhere if that is due."""
-        if known.due:
-            return super().arrived(known, known.due)
+        if known.due or (known.is_solved and known.has_looked):
+            return super().arrived(known, known.due or "nothing lower was found than a minimum of Gauss-Newton")
         if known.stuck == 0 or known.exploring == 0:
             known = replace(known, looking=False)
         n = self.settings.n

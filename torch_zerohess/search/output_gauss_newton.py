@@ -45,6 +45,8 @@ class OutputProgress(RegionProgress):
     """Whether the quadratic has it."""
     curved_part: float = 0.0
     """Its part of the loss that is predicted at the end of the step."""
+    kept: bool = False
+    """Whether a step has kept its promise."""
     failed: bool = False
     """Whether the model does not hold here."""
 
@@ -112,7 +114,8 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         error = (ratio - 1.0) * known.promised  # predicted loss minus the loss at the end of the step
         other = error + (-known.curved_part if known.curved else known.curved_part)
         known = replace(known, curved=known.curved != (abs(other) < abs(error)))
-        return replace(known, failed=ratio < BAD and known.rejected >= self._patience), bad
+        kept = known.kept or ratio >= BAD
+        return replace(known, kept=kept, failed=known.rejected >= (_PATIENCE if kept else self._patience)), bad
 
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
         assert self.settings.loss is not None

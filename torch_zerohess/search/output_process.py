@@ -1,8 +1,9 @@
 """A Gaussian process of the output that Gauss-Newton finishes: `GaussianProcessSearch` where there is a loss.
 
 Gauss-Newton interpolates outputs next to the minimum (`OutputGaussNewton`). If its steps do not keep their promise, as
-where outputs jump, the process goes on alone. On a plateau with ripples each step of the process finds something a
-little better. Where nothing much better comes, the process looks where it knows least.
+where outputs jump, the process goes on alone. Gauss-Newton begins again once it promises more than the process has
+achieved in the meantime. On a plateau with ripples each step of the process finds something a little better. Where
+nothing much better comes, the process looks where it knows least.
 """
 
 import math
@@ -42,12 +43,12 @@ class OutputProcessProgress(FinishedProgress):
     """Whether it looks where it knows least, because nothing much better was found."""
     due: str = ""
     """Why the process has arrived; empty if it has not."""
-    since: int = 0
-    """Evaluations of the process since the promise of Gauss-Newton was looked at."""
-    from_loss: float = math.inf
-    """Lowest loss at that time."""
-    tries: int = 0
-    """Times that Gauss-Newton has ended beside the best point; the process then works twice as long."""
+    alone: int = 0
+    """Evaluations of the process since Gauss-Newton might last have begun."""
+    alone_from: float = math.inf
+    """Lowest loss before them."""
+    failures: int = 0
+    """Turns of Gauss-Newton in a row that have ended beside their start; after each the process works twice as long."""
 
 
 class OutputProcess(FinishedProcess[OutputProcessProgress]):
@@ -89,7 +90,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             waited=0 if now < before else known.waited + count,
             stuck=0 if better else known.stuck + count,
             looks=0 if better else known.looks,
-            since=known.since + count,
+            alone=known.alone + count,
         )
         turn = bool(known.due) or known.waited >= PATIENCE * (self.settings.n + 1)
         if not known.noisy and not known.done:
@@ -97,7 +98,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
                 known = replace(known, finished=known.best.point)
                 known, points = self._begun_newton(known, _WORTH * abs(now), generator)
             elif self.tells_noise(known) and self._is_due(known):
-                known, points = self._begun_newton(known, max(known.from_loss - now, 0.0), generator)
+                known, points = self._begun_newton(known, max(known.alone_from - now, 0.0), generator)
             if known.finishing:
                 return known, points
         return self._went_on(known), evaluated.points[:0]
@@ -113,27 +114,27 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             return known, points
         best = known.best.point
         solved = best if now.done else torch.full_like(best, math.inf)
-        tries = 0 if self.is_new(known) else known.tries + 1
-        known = replace(known, finishing=False, waited=0, finished=best, solved=solved, tries=tries)
+        failures = 0 if self.is_new(known) else known.failures + 1
+        known = replace(known, finishing=False, waited=0, finished=best, solved=solved, failures=failures)
         if not known.due and not now.done:
             return known, points
         return super().arrived(known, known.due or "steps of Gauss-Newton have arrived"), points
 
     def _is_due(self, known: OutputProcessProgress) -> bool:
-        """Whether the process has had its time since Gauss-Newton has ended at the best point, or was not begun."""
-        return not known.is_solved and known.since >= (PATIENCE * (self.settings.n + 1)) << known.tries
+        """Whether the process has worked alone for long enough, and the best point is not a minimum already."""
+        return not known.is_solved and known.alone >= (PATIENCE * (self.settings.n + 1)) << known.failures
 
     def _begun_newton(
         self, known: OutputProcessProgress, least: float, generator: torch.Generator
     ) -> tuple[OutputProcessProgress, Tensor]:
         """Let Gauss-Newton begin at the best point, if its first step promises more than `least`."""
         n, best = self.settings.n, known.best
-        known = replace(known, since=0, from_loss=best.loss)
+        known = replace(known, alone=0, alone_from=best.loss)
         if len(known.pool) <= n:
             return known, best.point[None][:0]
         before = known.local
         if before is not None and torch.equal(before.lowest.point, best.point):
-            begun = replace(before.taking(known, "evaluations", "iterations"), rejected=0, lost=0, failed=False)
+            begun = replace(before.taking(known, "evaluations", "iterations"), rejected=0, lost=0, kept=False, failed=False)
         else:
             distance = (known.pool.points - best.point).norm(dim=1).sort().values[n]
             sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)

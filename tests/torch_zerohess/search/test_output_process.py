@@ -1,5 +1,7 @@
 """A Gaussian process of the output that Gauss-Newton finishes: when it begins, when it ends, what is told to whom."""
 
+import itertools
+
 import pytest
 import torch
 from searches import misfit, waves
@@ -71,17 +73,74 @@ def steps(x):
     return torch.round(16.0 * swing(x)) / 16.0
 
 
+def turns(found, fn, evaluations):
+    """The last progress of each turn of Gauss-Newton, and where it began: the evaluations, the point and the region."""
+    ends, begins = [], []
+    while found.evaluations < evaluations and not found.done:
+        before = finishing(found)
+        found.tell(fn(found.ask()))
+        local = found.state_dict()["progress"]["local"]
+        if finishing(found) and not before:
+            begins.append((found.evaluations, *found.x.tolist(), local["sigma"]))
+        elif before and not finishing(found):
+            ends.append(local)
+    return ends, begins
+
+
 def test_where_the_output_jumps_the_process_goes_on_after_two_rejected_steps():
-    found, lengths, begun = search(restarts=100), [0], []
-    while found.evaluations < 150:
-        found.tell(steps(found.ask()))
-        if finishing(found):
-            begun += [found.x] * (lengths[-1] == 0)
-            lengths[-1] += 1
-        elif lengths[-1]:
-            lengths.append(0)
-    assert set(lengths[:-1]) == {2}
-    assert len({tuple(one.tolist()) for one in begun}) == len(begun)  # it does not begin twice at one point
+    ends, begins = turns(search(restarts=100), steps, 150)
+    assert ends
+    assert {one["rejected"] for one in ends} == {2}
+    assert len({one[1:] for one in begins}) == len(begins)  # it does not begin twice at one point with one region
+
+
+def test_gauss_newton_begins_again_where_its_first_turn_failed():
+    """The process works twice as long before each further turn: 15 evaluations are three per coefficient of a line."""
+    _, begins = turns(search(restarts=100), steps, 200)
+    later = [one for one, next_ in itertools.pairwise(begins) if one[1:-1] == next_[1:-1]]
+    assert later
+    for one, next_ in itertools.pairwise(begins):
+        if one[1:-1] == next_[1:-1]:
+            assert next_[-1] < one[-1]  # the region is what the turn before has left
+            assert next_[0] - one[0] >= 15
+
+
+def decay(x):
+    """A decay [K, 40] of amplitude, rate and offset."""
+    return x[:, :1] * torch.exp(-x[:, 1:2] * torch.linspace(0.0, 4.0, 40, dtype=torch.float64)) + x[:, 2:]
+
+
+def fitted(robust, seed, evaluations):
+    """The fit of a decay to noisy data with outliers, and its loss."""
+    generator = torch.Generator().manual_seed(0)
+    data = decay(vector(2.5, 1.3, 0.5)[None])[0] + 0.05 * torch.randn(40, generator=generator, dtype=torch.float64)
+    data[::7] += 3.0 * torch.rand(6, generator=generator, dtype=torch.float64)
+
+    def loss(y):
+        away = (y - data) / 0.1
+        if robust == "cauchy":
+            return torch.log1p(away.square()).mean()
+        return torch.nn.functional.huber_loss(away, 0 * away) if robust == "huber" else away.square().mean()
+
+    lower, upper = vector(0.0, 0.0, -1.0), vector(10.0, 10.0, 5.0)
+    start = lower + (upper - lower) * torch.rand(3, generator=generator.manual_seed(seed), dtype=torch.float64)
+    settings = {"bounds": (lower, upper), "max_evaluations": evaluations, "seed": seed}
+    return zh.minimize(decay, start, sigma=2.0, loss=loss, **settings), lambda x: loss(decay(x[None])[0])
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("robust", ["cauchy", "huber", "squares"])
+def test_a_fit_with_outliers_ends_at_its_minimum(robust, seed):
+    """What remains is most of the loss, so no step near the minimum promises a tenth of the loss."""
+    fit, loss = fitted(robust, seed, 300)
+    assert fit.engine == "gaussian_process"
+    gradient, hessian = torch.func.grad(loss)(fit.x), torch.func.hessian(loss)(fit.x)
+    assert float(torch.linalg.eigvalsh(hessian).min()) > 0.0
+    assert float(gradient @ torch.linalg.solve(hessian, gradient)) < 1e-8 * fit.value
+
+
+def test_a_minimum_with_a_residual_is_solved():
+    assert all(fitted("squares", seed, 400)[0].success for seed in range(2))
 
 
 def test_values_that_are_not_finite_count_in_both():
@@ -149,12 +208,16 @@ def test_it_leaves_a_plateau_with_ripples(seed):
 
 
 def test_it_looks_elsewhere_more_and_more_rarely():
-    """At a minimum where nothing is left to gain: after four evaluations per coefficient of a line, then eight."""
-    found, looks, at = search(shift=1.0, restarts=100), 0, []
+    """At a minimum where nothing is left to gain: after four evaluations per coefficient of a line, then eight.
+
+    The evaluations of Gauss-Newton do not count.
+    """
+    found, looks, at, counted = search(shift=1.0, restarts=100), 0, [], 0
     while len(at) < 3 and found.evaluations < 300:
+        counted += 0 if finishing(found) else len(found.ask())
         found.tell(swing(found.ask()))
         now = found.state_dict()["progress"]["looks"]
-        at += [found.evaluations] * (now > looks)
+        at += [counted] * (now > looks)
         looks = now
     assert at[1] - at[0] == 40
     assert at[2] - at[1] == 80

@@ -46,7 +46,7 @@ class OutputProgress(RegionProgress):
     curved_part: float = 0.0
     """Its part of the loss that is predicted at the end of the step."""
     kept: bool = False
-    """Whether a step has kept its promise."""
+    """Whether a step has kept its promise since the method began, or began again."""
     failed: bool = False
     """Whether the model does not hold here."""
 
@@ -74,7 +74,8 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     Args:
         settings: of the search.
         capacity: evaluations that are kept.
-        patience: rejected steps in a row after which it has failed; `_PATIENCE` if None.
+        patience: rejected steps in a row after which it has failed if no step has kept its promise yet; `_PATIENCE`
+            if None, and after a step that has.
     """
 
     progress = OutputProgress

@@ -23,7 +23,7 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 _STUCK, _BETTER = 4, 0.1
 """Evaluations over n + 1 after which it looks elsewhere, if none of them took away this part of the loss."""
 _PATIENCE = 2
-"""Rejected steps in a row of Gauss-Newton after which the process goes on."""
+"""Rejected steps in a row of Gauss-Newton after which the process goes on, if none before them was good."""
 _WORTH = 0.1
 """Part of the loss that the first step of Gauss-Newton must promise to take away."""
 _WIDEST = 0.3
@@ -134,7 +134,9 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             return known, best.point[None][:0]
         before = known.local
         if before is not None and torch.equal(before.lowest.point, best.point):
-            begun = replace(before.taking(known, "evaluations", "iterations"), rejected=0, lost=0, kept=False, failed=False)
+            begun = replace(
+                before.taking(known, "evaluations", "iterations"), rejected=0, lost=0, kept=False, failed=False
+            )
         else:
             distance = (known.pool.points - best.point).norm(dim=1).sort().values[n]
             sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)

@@ -156,9 +156,9 @@ class ProcessMethod(Method[Q]):
         }
 
     def tells_noise(self, known: Q) -> bool:
-        """Whether there are enough outputs to tell noise from fast variation."""
+        """Whether noise is declared, or there are enough outputs to tell noise from fast variation."""
         enough = min(_TELLING * (self.settings.n + 1), self.capacity)
-        return self.settings.loss is not None and len(known.pool) >= enough
+        return self.settings.noise > 0.0 or (self.settings.loss is not None and len(known.pool) >= enough)
 
     # What was evaluated.
 
@@ -295,14 +295,12 @@ class ProcessMethod(Method[Q]):
         An output that is not finite is replaced by the output with the highest loss. A loss alone is too little
         evidence to tell noise from ripples: it counts as noisy only if `noise` is given.
         """
-        pool = known.pool
-        worst = outputs[int(pool.values.argmax())]
-        points = torch.cat([pool.points, known.holes])
+        worst = outputs[int(known.pool.values.argmax())]
+        points = torch.cat([known.pool.points, known.holes])
         outputs = torch.cat([outputs, worst.expand(len(known.holes), -1)])
-        declared = self.settings.noise > 0.0
-        noises = NOISES + HIGH_NOISES if declared or self.tells_noise(known) else NOISES
+        noises = NOISES + HIGH_NOISES if self.tells_noise(known) else NOISES
         process = GaussianProcess.fit(points, outputs, noises, deviation or None)
-        noisy = declared or process.noise >= HIGH_NOISES[0]
+        noisy = self.settings.noise > 0.0 or process.noise >= HIGH_NOISES[0]
         best = known.record if known.noisy and not noisy else known.best
         return replace(known, noisy=noisy, best=best), process
 

@@ -2,6 +2,7 @@
 
 | method | engine of `zh.optim.TrustRegion` | from |
 |---|---|---|
+| auto | the choice of the package | image and white-box loss, or the loss alone where there is no image |
 | gaussian_process | a Gaussian process in a box | image and white-box loss |
 | gaussian_process_loss | the same | loss alone |
 | descent | local quadratic models | image and white-box loss, or the loss alone where there is no image |
@@ -79,6 +80,12 @@ def _in_box(task: Task) -> str | None:
 
 
 METHODS = (
+    Method(
+        "auto",
+        "ours: the engine that the package chooses, as `zh.minimize` does",
+        with_settings(search, engine="auto"),
+        uses="image",
+    ),
     Method(
         "gaussian_process",
         "ours: a Gaussian process of the image, under the known loss",

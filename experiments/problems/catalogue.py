@@ -14,7 +14,7 @@ from experiments.problems.task import Preset, Task
 FITTING = {
     name: f"experiments.problems.tasks.{name}"
     for name in (
-        *("quad", "box2", "box10", "texture", "texture100", "texture317", "brdf", "nonpsd", "throw"),
+        *("quad", "box2", "box10", "texture", "texture100", "texture317", "dense", "brdf", "nonpsd", "throw"),
         *("caustic", "caustic64", "discs", "hexagon"),
         *("meshfit", "meshfit_color", "suzanne", "banana"),
     )

@@ -52,12 +52,12 @@ class LocalQuadratics(Method[DescentProgress]):
         self.capacity = settings.pool or _capacity(n, loss_alone=settings.loss is None)
 
     def first(self, generator: torch.Generator) -> tuple[DescentProgress, Tensor]:
-        known = self._begun(Best(self.settings.start))
+        known = self.begun(Best(self.settings.start))
         return known, self.points(known, generator)
 
     def go_on(self, pool: Pool, best: Best, sigma: float) -> DescentProgress:
         """Return a round that begins at the best point of another search, with the evaluations of that search."""
-        known = self._begun(best)
+        known = self.begun(best)
         pool = known.pool.add(pool.points, pool.values, None, best.point, 1.0).latest(self.capacity)
         return self._planned(replace(known, pool=pool, value=best.loss, sigma=sigma).trying())
 
@@ -118,7 +118,8 @@ class LocalQuadratics(Method[DescentProgress]):
         """Return sigma for every parameter, and infinity before a step."""
         return super().width(known) if known.iterations else torch.full_like(known.center, math.inf)
 
-    def _begun(self, best: Best) -> DescentProgress:
+    def begun(self, best: Best) -> DescentProgress:
+        """Return a round that begins at a point."""
         start, pool = best.point, Pool.empty(self._n, best.point.device)
         return DescentProgress(best=best, lowest=best, center=start, first=start, step=start, pool=pool)
 

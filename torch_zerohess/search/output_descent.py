@@ -18,7 +18,7 @@ from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_descent import MOST
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
 from torch_zerohess.search.relay import Relay
-from torch_zerohess.search.state import Evaluated, Progress
+from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -57,6 +57,12 @@ class OutputDescent(Relay[OutputDescentProgress]):
             return known, points
         smooth, points = self._smooth.first(generator)
         return replace(known, smooth=smooth), points
+
+    def taking_over(self, evaluated: Evaluated, generator: torch.Generator) -> tuple[OutputDescentProgress, Tensor]:
+        """Begin with the evaluations of another search, the best one first; return the next points, too."""
+        descent = self._follow.begun(Best(evaluated.points[0]))
+        known = OutputDescentProgress(best=descent.best, center=descent.center, descent=descent)
+        return self.next(known, evaluated, generator)
 
     def next(
         self, known: OutputDescentProgress, evaluated: Evaluated, generator: torch.Generator

@@ -4,6 +4,11 @@ The first batch has the points of the first batch of `Descent`, in two parts. Th
 if the sparse Jacobian predicts more of the change of held-out samples than the dense Jacobian of least norm does, by
 `_MORE`. After the first part it must also predict more than `_MOST` of it. Otherwise it goes on as `Descent` with all
 evaluations, and asks for the points that `Descent` alone would ask for.
+
+A few dozen samples may not tell: a support that is large, or a weak dense part beside a sparse one. So both Jacobians
+are fitted again to all evaluations each time that these have doubled, until they are twice the parameters. The search
+changes if the Jacobian of the other one predicts more, by `_MORE`. A sparse Jacobian must then also predict more than
+`_MOST`.
 """
 
 from dataclasses import dataclass, replace
@@ -25,22 +30,24 @@ FEWEST = 20
 _FIRST = 32
 """Samples of the first part, at most."""
 _MOST = 0.5
-"""Share of the held-out change that decides at once."""
+"""Share of the held-out change that decides at once, and for good."""
 _MORE = 0.1
-"""Share by which the sparse Jacobian must predict more than the dense one."""
+"""Share by which one Jacobian must predict more than the other one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SparseOrDenseProgress(Progress):
-    """The evaluations before the choice; after the choice, the progress of the chosen search."""
+    """All evaluations while the choice may change, and the progress of the chosen search."""
 
     chosen: Literal["", "descent", "local"] = ""
-    """Empty before the choice."""
+    """Empty before the first choice."""
     reason: str
+    due: int = 0
+    """Evaluations at which the choice is made again; 0 if it is final."""
     rest: Tensor
     """Points of the first batch that were not asked for yet [r, n]."""
     points: Tensor
-    """Evaluated before the choice [K, n]."""
+    """Evaluated while the choice may change [K, n]."""
     losses: Tensor
     """[K]"""
     outputs: Tensor
@@ -79,31 +86,72 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
     def next(
         self, known: SparseOrDenseProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[SparseOrDenseProgress, Tensor]:
-        if known.chosen == "local":
-            assert known.local is not None
+        if not known.chosen:
+            return self._begun(_gathered(known, evaluated), generator)
+        after, points = self._went_on(known, evaluated, generator)
+        if not known.due or after.done:
+            return after, points
+        after = _gathered(after, evaluated)
+        return (after, points) if len(after.losses) < known.due else self._chosen_again(after, points, generator)
+
+    def _went_on(
+        self, known: SparseOrDenseProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[SparseOrDenseProgress, Tensor]:
+        """Let the chosen search go on."""
+        if known.local is not None:
             local, points = self.local.next(known.local, evaluated, generator)
             return replace(known, local=local).taking(local), points
-        if known.chosen == "descent":
-            assert known.descent is not None
-            descent, points = self.descent.next(known.descent, evaluated, generator)
-            return replace(known, descent=descent).taking(descent), points
-        known = _gathered(known, evaluated)
+        assert known.descent is not None
+        descent, points = self.descent.next(known.descent, evaluated, generator)
+        return replace(known, descent=descent).taking(descent), points
+
+    def _begun(self, known: SparseOrDenseProgress, generator: torch.Generator) -> tuple[SparseOrDenseProgress, Tensor]:
+        """Choose by the first batch, or ask for the rest of it."""
         every = Evaluated(known.points, known.losses, known.outputs, known.shape)
+        k = int(torch.where(torch.isfinite(known.losses), known.losses, torch.inf).argmin())
+        known = replace(known, evaluations=len(every), best=Best(known.points[k], float(known.losses[k])))
         start = self.local.started(every)
-        told = "nothing: the output is one number, or too few outputs are finite"
-        if start is not None and start.jacobian is not None:
-            sparse, dense = start.jacobian.explained, max(start.jacobian.explained_dense, 0.0)
-            told = f"{max(sparse, 0.0):.0%} of the change of held-out outputs, a dense one {dense:.0%}"
-            if sparse > dense + _MORE and (sparse > _MOST or not len(known.rest)):
-                local, points = self.local.asked(start, generator)
-                known = replace(_emptied(known), chosen="local", reason=f"a sparse Jacobian predicts {told}")
-                return replace(known, local=local, descent=None).taking(local), points
+        sparse, dense, reason = _predicted(start)
+        if start is not None and sparse > dense + _MORE and (sparse > _MOST or not len(known.rest)):
+            return self._to_local(known, start, reason, generator)
         if len(known.rest):
             return replace(known, rest=known.rest[:0]), known.rest
-        known = replace(_emptied(known), chosen="descent", reason=f"a sparse Jacobian predicts {told}")
         assert known.descent is not None
         descent, points = self.descent.next(known.descent, every, generator)
-        return replace(known, descent=descent).taking(descent), points
+        known = replace(known, chosen="descent", reason=reason, descent=descent).taking(descent)
+        return self._decided(known, final=start is None), points
+
+    def _chosen_again(
+        self, known: SparseOrDenseProgress, points: Tensor, generator: torch.Generator
+    ) -> tuple[SparseOrDenseProgress, Tensor]:
+        """Choose by all evaluations around the best of them."""
+        order = torch.where(torch.isfinite(known.losses), known.losses, torch.inf).argsort(stable=True)
+        every = Evaluated(known.points[order], known.losses[order], known.outputs[order], known.shape)
+        start = self.local.started(every)
+        sparse, dense, reason = _predicted(start)
+        if known.local is None and start is not None and sparse > max(dense + _MORE, _MOST):
+            return self._to_local(known, start, reason, generator)
+        jacobian = None if known.local is None else known.local.jacobian
+        if jacobian is not None and dense > max(jacobian.explained, sparse) + _MORE:
+            descent, points = self.descent.taking_over(every, generator)
+            known = replace(known, chosen="descent", reason=reason, descent=descent, local=None).taking(descent)
+        return self._decided(known), points
+
+    def _to_local(
+        self, known: SparseOrDenseProgress, start: LocalProgress, reason: str, generator: torch.Generator
+    ) -> tuple[SparseOrDenseProgress, Tensor]:
+        """Go on by the sparse Jacobian."""
+        local, points = self.local.asked(start, generator)
+        known = replace(known, chosen="local", reason=reason, descent=None, local=local).taking(local)
+        assert start.jacobian is not None
+        return self._decided(known, final=start.jacobian.explained > _MOST), points
+
+    def _decided(self, known: SparseOrDenseProgress, *, final: bool = False) -> SparseOrDenseProgress:
+        """Say when the choice is made again, or forget the evaluations: the chosen search has them."""
+        count = len(known.losses)
+        if final or count >= 2 * self.settings.n:
+            return replace(known, due=0, points=known.points[:0], losses=known.losses[:0], outputs=known.outputs[:0])
+        return replace(known, due=2 * count)
 
     def more(self, known: SparseOrDenseProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         return super().more(known, points, count, generator) if known.chosen else points[:0]
@@ -112,24 +160,21 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         return (self.descent, known.descent) if known.local is None else (self.local, known.local)
 
 
+def _predicted(start: LocalProgress | None) -> tuple[float, float, str]:
+    """Return the shares of the held-out change that a sparse and a dense Jacobian predict, and both in words."""
+    if start is None or start.jacobian is None:
+        return 0.0, 0.0, "a sparse Jacobian predicts nothing: the output is one number, or too few outputs are finite"
+    sparse, dense = start.jacobian.explained, max(start.jacobian.explained_dense, 0.0)
+    told = (
+        f"a sparse Jacobian predicts {max(sparse, 0.0):.0%} of the change of held-out outputs, a dense one {dense:.0%}"
+    )
+    return sparse, dense, told
+
+
 def _gathered(known: SparseOrDenseProgress, evaluated: Evaluated) -> SparseOrDenseProgress:
     """Add what was evaluated."""
     assert evaluated.outputs is not None
     outputs = torch.cat([known.outputs, evaluated.outputs]) if len(known.outputs) else evaluated.outputs
     losses = torch.cat([known.losses, evaluated.losses])
-    k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
     points = torch.cat([known.points, evaluated.points])
-    return replace(
-        known,
-        points=points,
-        losses=losses,
-        outputs=outputs,
-        shape=evaluated.shape,
-        evaluations=len(losses),
-        best=Best(points[k], float(losses[k])),
-    )
-
-
-def _emptied(known: SparseOrDenseProgress) -> SparseOrDenseProgress:
-    """Forget the batch that the search has been given."""
-    return replace(known, points=known.points[:0], losses=known.losses[:0], outputs=known.outputs[:0])
+    return replace(known, points=points, losses=losses, outputs=outputs, shape=evaluated.shape)

@@ -13,7 +13,7 @@ from experiments.problems.task import Task
 from experiments.problems.tasks import brdf, nonpsd
 from experiments.studies.nonpsd import READINGS, nonpsd_error
 
-NAMES = ("quad", "box2", "box10", "texture", "texture100", "texture317", "brdf", "nonpsd", "discs", "hexagon")
+NAMES = ("quad", "box2", "box10", "texture", "texture100", "texture317", "dense", "brdf", "nonpsd", "discs", "hexagon")
 TASKS = {name: catalogue.load(name) for name in NAMES}
 IMAGES = ("box2", "box10", "texture", "texture100", "texture317", "brdf", "discs", "hexagon")
 TEXTURE = data.camera().reshape(32, 16, 32, 16).mean((1, 3)).ravel() / 255
@@ -25,6 +25,7 @@ SOLUTIONS = {
     "texture": TEXTURE,
     "texture100": data.camera()[6:506, 6:506].reshape(100, 5, 100, 5).mean((1, 3)).ravel() / 255,
     "texture317": data.camera()[97:414, 97:414].ravel() / 255,
+    "dense": [k / 149.5 - 1 for k in range(300)],
     "brdf": [0.6, 0.25, 0.15, 0.5, 0.5, 0.4, 0.7],
     "nonpsd": [0.0, 0.0],
     "discs": [
@@ -43,6 +44,7 @@ STARTS = {
     "texture": ([0] * 1024, [1] * 1024),
     "texture100": ([0] * 10_000, [1] * 10_000),
     "texture317": ([0] * 317**2, [1] * 317**2),
+    "dense": ([-2] * 300, [2] * 300),
     "brdf": ([0] * 7, [0.5] * 6 + [0.3]),
     "nonpsd": ([-3] * 2, [3] * 2),
     "discs": ([0.1, 0.1, 0.08] * 6, [0.9, 0.9, 0.14] * 6),

@@ -8,7 +8,7 @@ import torch
 from searches import run
 
 import torch_zerohess as zh
-from torch_zerohess.optim import Descent, LocalGaussNewton, TrustRegion
+from torch_zerohess.optim import LocalGaussNewton
 from torch_zerohess.search.gauss_newton import LENGTHS
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -364,52 +364,6 @@ def test_an_output_of_one_number_is_refused():
     search = LocalGaussNewton(torch.zeros(N).double(), sigma=1.0, loss=torch.sum, seed=0)
     with pytest.raises(ValueError, match="got an output of one number: use engine='descent'"):
         search.tell(search.ask().sum(1, keepdim=True))
-
-
-def door(n, loss, **settings):
-    return TrustRegion(torch.zeros(n).double(), sigma=1.0, loss=loss, seed=3, **settings)
-
-
-def test_a_sparse_jacobian_is_chosen_by_evidence():
-    search = door(N, square(image(normal(1, N))[0]))
-    assert search.engine == "descent"
-    assert "are to tell" in search.reason
-    run(search, image, 39)
-    assert search.engine == "local"
-    assert "100% of the change of held-out outputs, a dense one" in search.reason
-    assert search.value < 1e-4
-    again = door(N, square(image(normal(1, N))[0]))
-    again.load_state_dict(search.state_dict())
-    assert again.engine == "local"
-    assert torch.equal(again.ask(), search.ask())
-
-
-@pytest.mark.parametrize(("noise", "asked"), [(0.5, 6), (1.0, 32)])
-def test_where_the_first_samples_predict_less_than_half_the_rest_is_asked_for(noise, asked):
-    """Otherwise the next points are steps. A perfect fit would predict 1 / (1 + noise^2) of the change."""
-    search, generator = door(N, square(0.0)), torch.Generator().manual_seed(0)
-    points = search.ask()
-    search.tell(image(points) + noise * torch.randn(33, SIDE, SIDE, generator=generator, dtype=torch.float64))
-    assert len(search.ask()) == asked
-
-
-@pytest.mark.parametrize("n", [20, 100])
-def test_a_dense_jacobian_costs_no_evaluation_more_than_before(n):
-    """The points equal the points of `Descent`, to the last bit."""
-    A, b = normal(150, n), normal(150, seed=1)
-    search, descent = (
-        door(n, square(b)),
-        Descent(torch.zeros(n).double(), sigma=1.0, loss=square(b), seed=3),
-    )
-    points = [[], []]
-    for one, seen in zip((search, descent), points, strict=True):
-        while one.evaluations < n + 20 and not one.done:
-            z = one.ask(limit=n + 20 - one.evaluations)
-            seen.append(z)
-            one.tell((z[:, None] * A).sum(2))  # the same bits in every batch
-    assert search.engine == "descent"
-    assert "a sparse Jacobian predicts" in search.reason
-    assert torch.equal(torch.cat(points[0]), torch.cat(points[1]))
 
 
 def test_minimize_takes_it():

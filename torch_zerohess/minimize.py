@@ -82,7 +82,7 @@ def minimize(
             `scipy.optimize.Bounds`. ValueError for two rows of two numbers that can be read either way.
         max_evaluations: points that fn may be called with.
         engine: "gaussian_process", "descent", "local", or "auto" to choose by the number of parameters, their bounds,
-            and, with `loss` and at least 20 parameters, by the first evaluations.
+            and, with `loss` and at least 20 parameters, by the evaluations.
         batch: points that fn gets at once, where the search can use so many: fewer batches, more evaluations. Give the
             number of `workers`, or how many points fn takes at once. See `TrustRegion.ask`.
         vectorized: False for an fn of one point, [n] -> scalar or [*out].

@@ -17,9 +17,21 @@ TWO_WAYS = (
 REFUSED = [
     ({"engine": "newton"}, ValueError, "engine must be one of .*, got 'newton'"),
     ({"x0": ["a", 0.0]}, ValueError, r"x0 must be a tensor, an array or a list of n numbers, got \['a', 0.0\]"),
-    ({"x0": zeros(2) + 1j}, ValueError, r"x0 must be a tensor \[n\], float32 or float64, got tensor.*complex128"),
-    ({"x0": np.zeros(2) + 1j}, ValueError, r"x0 must be a tensor \[n\], float32 or float64, got tensor.*complex128"),
-    ({"x0": torch.zeros(2, 2)}, ValueError, r"x0 must be a tensor \[n\]"),
+    (
+        {"x0": zeros(2) + 1j},
+        ValueError,
+        r"x0 must be a tensor \[n\], float32 or float64, got one of shape \[2\], torch.complex128",
+    ),
+    (
+        {"x0": np.zeros(2) + 1j},
+        ValueError,
+        r"x0 must be a tensor \[n\], float32 or float64, got one of shape \[2\], torch.complex128",
+    ),
+    (
+        {"x0": torch.zeros(2, 2)},
+        ValueError,
+        r"x0 must be a tensor \[n\], float32 or float64, got one of shape \[2, 2\]",
+    ),
     ({"maxiter": 5}, TypeError, "no argument maxiter; did you mean max_evaluations"),
     ({"restart": 5}, TypeError, "no argument restart; did you mean restarts"),
     ({"qqq": 5}, TypeError, "no argument qqq; there are"),

@@ -1,6 +1,7 @@
 """The parameters of a search: their bounds and type, and the units of sigma in which every search works."""
 
 import math
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -71,9 +72,9 @@ def checked_start(x0: Any) -> Tensor:
     elif not x0.is_floating_point() and not x0.is_complex():
         x0 = x0.double()
     if x0.dtype not in (torch.float32, torch.float64) or x0.ndim != 1 or not len(x0):
-        raise ValueError(f"x0 must be a tensor [n], float32 or float64, got {x0!r}")
+        raise ValueError(f"x0 must be a tensor [n], float32 or float64, got one of shape {[*x0.shape]}, {x0.dtype}")
     if not bool(torch.isfinite(x0).all()):
-        raise ValueError(f"x0 must be finite, got {x0}")
+        raise ValueError(f"x0 must be finite, got {reprlib.repr(x0.tolist())}")
     return x0
 
 

@@ -27,8 +27,9 @@ class TrustRegion(AskTell[Any]):
     """A search that counts evaluations: `GaussianProcessSearch`, `Descent` or `LocalGaussNewton`. The caller evaluates.
 
     - Up to four parameters in a finite box: a Gaussian process, which escapes plateaus and local minima.
-    - 20 parameters or more, an output of many numbers and a `loss`: the first batch tells whether these numbers depend
-      on few parameters each. If they do: Gauss-Newton on a sparse Jacobian.
+    - 20 parameters or more, an output of many numbers and a `loss`: the evaluations tell whether these numbers depend
+      on few parameters each. If they do: Gauss-Newton on a sparse Jacobian. The search asks this after its first batch
+      and, where the answer is not clear, each time that its evaluations have doubled.
     - Otherwise: descent by quadratic models in a trust region tied to sigma.
 
     `engine` says what was chosen, `reason` why. See the three classes for what they do.

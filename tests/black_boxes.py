@@ -70,6 +70,17 @@ def leaving(z):
     raise SystemExit("done")
 
 
+class Odd(Exception):
+    """An error that can be pickled, but not made again from what was pickled."""
+
+    def __init__(self, what, why):
+        super().__init__(what)
+
+
+def odd(z):
+    raise Odd("a", "b")
+
+
 def ragged(z):
     """A shape that depends on the point."""
     return torch.zeros(len(z), 2 if bool((z[:, 0] > 0.5).any()) else 3)
@@ -92,7 +103,7 @@ def hungry(z):
 
 
 class Disturbed:
-    """Waves, but each file of a folder makes one evaluation kill its process or hang."""
+    """Waves, but each file of a folder makes one evaluation kill or terminate its process, or hang."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -105,7 +116,7 @@ class Disturbed:
                 continue
             if file.name.startswith("hang"):
                 time.sleep(600)
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGTERM if file.name.startswith("term") else signal.SIGKILL)
         return waves(z)
 
 

@@ -71,11 +71,14 @@ class RemoteTraceback(Exception):
         return f'\n"""\n{self.text}"""'
 
 
-def dumped_error(error: BaseException, text: str) -> bytes:
-    """Return an error and its traceback as bytes; a RuntimeError that names it, if it cannot be sent itself."""
+def dumped_error(error: BaseException, text: str, dumps: Callable[[Any], bytes] = pickle.dumps) -> bytes:
+    """Return an error and its traceback as bytes; a RuntimeError that names it, if it cannot be sent itself.
+
+    dumps: writes what `pickle.loads` reads.
+    """
     text = text[-30_000:]
     with contextlib.suppress(Exception):  # whatever the pickling of a foreign error does
-        data = pickle.dumps((error, text))
+        data = dumps((error, text))
         pickle.loads(data)
         if len(data) < 60_000:
             return data

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.executor import values_of
+from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker
 
 _LOOK = 0.05
@@ -24,7 +26,8 @@ class Ray(Ahead):
 
     An actor holds the black box from call to call. An actor that ends, with its process or its machine, is restarted by
     Ray, which makes the black box again, and its points are tried again, by it or by another. What becomes of points
-    that failed too often: see `ProcessPool`. An exception of the black box is raised here.
+    that failed too often: see `ProcessPool`. An exception of the black box is raised here,
+    also SystemExit.
 
     A program that has called `ray.init(...)` has chosen its cluster. Otherwise the address in the environment variable
     RAY_ADDRESS is used, and without one a Ray of this machine alone, which ends with `close()`.
@@ -134,7 +137,11 @@ class Ray(Ahead):
         """Treat what became of a chunk; False if its actor has ended."""
         errors = self._ray.exceptions
         try:
-            batch.came(chunk, transfer.unpacked(self._ray.get(one))[0])
+            good, data = self._ray.get(one)
+            if good:
+                batch.came(chunk, transfer.unpacked(data)[0])
+            else:
+                batch.raised(chunk, loaded_error(data))
         except errors.RayTaskError as error:
             batch.raised(chunk, error)
         except errors.RayError as error:
@@ -170,11 +177,19 @@ class Actor:
     def ready(self) -> None:
         """Do nothing, once the actor has started."""
 
-    def evaluate(self, held: list[Any], data: bytes) -> bytes:
-        """Return the values of a chunk. A reference inside a list is not fetched with every call."""
-        if held[0] != self._held:
-            import ray
+    def evaluate(self, held: list[Any], data: bytes) -> tuple[bool, bytes]:
+        """Return True and the values of a chunk, or False and the error of the black box.
 
-            self._fn = None
-            self._fn, self._held = ray.get(held[0]), held[0]
-        return values_of(self._fn, data)
+        A reference inside a list is not fetched with every call.
+        """
+        import ray
+
+        try:
+            if held[0] != self._held:
+                self._fn = None
+                self._fn, self._held = ray.get(held[0]), held[0]
+            return True, values_of(self._fn, data)
+        except BaseException as error:  # SystemExit too: Ray would end the actor
+            if hasattr(error, "ray_terminate_msg"):  # Ray itself ends the actor
+                raise
+            return False, dumped_error(error, traceback.format_exc(), ray.cloudpickle.dumps)

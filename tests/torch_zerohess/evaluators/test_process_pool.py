@@ -145,6 +145,8 @@ def test_an_error_comes_with_the_traceback_of_the_worker(pool):
     numbers, values = finished_values(raised.value, z)
     assert numbers[:2] == [0, 1]
     assert torch.equal(values, z[numbers, 0])
+    with pytest.raises(RuntimeError, match=r"^Odd: a$"):
+        pool(black_boxes.odd, z)
     with pytest.raises(SystemExit, match="done"):
         pool(black_boxes.leaving, z)
     with pytest.raises(OSError, match="the scene is not there"):

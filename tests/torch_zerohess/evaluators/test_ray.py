@@ -22,8 +22,9 @@ def actors():
 @pytest.mark.filterwarnings("ignore")
 def test_an_actor_that_ends_costs_no_bit(actors, tmp_path):
     assert torch.equal(actors(black_boxes.waves, Z), black_boxes.waves(Z))
-    (tmp_path / "kill-0").touch()
-    assert torch.equal(actors(black_boxes.Disturbed(tmp_path), Z), black_boxes.waves(Z))
+    for name in ("kill-0", "term-0"):  # SIGKILL, and SIGTERM, for which Ray has a handler
+        (tmp_path / name).touch()
+        assert torch.equal(actors(black_boxes.Disturbed(tmp_path), Z), black_boxes.waves(Z))
     assert not list(tmp_path.iterdir())
     assert actors.lost == {}
 
@@ -52,6 +53,16 @@ def test_calls_that_do_not_wait_share_the_actors(actors, tmp_path):
 def test_actors_have_random_numbers_of_their_own(actors):
     count = torch.arange(8.0, dtype=torch.float64)[:, None]
     assert not bool((actors(black_boxes.numbered, count) == count[:, 0]).any())
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_errors_that_ray_cannot_send_are_raised_as_by_a_pool_of_processes(actors):
+    with pytest.raises(RuntimeError, match=r"^Odd: a$") as raised:
+        actors(black_boxes.odd, Z)
+    assert "in odd" in str(raised.value.__cause__)
+    with pytest.raises(SystemExit, match="done"):
+        actors(black_boxes.leaving, Z)
+    assert actors.lost == {}
 
 
 @pytest.mark.filterwarnings("ignore")

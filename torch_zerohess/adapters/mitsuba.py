@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_zerohess.adapters.mitsuba_film import resize
 from torch_zerohess.adapters.mitsuba_parameters import Parameter, Transform, Value
 from torch_zerohess.adapters.mitsuba_variants import select_variant
 from torch_zerohess.arguments import checked_integer
@@ -60,7 +61,10 @@ class MitsubaScene:
             loaded before and is in the mappings of both: what one changes in it, the other renders too. A function
             that loads the object anew gives each scene its own.
         parameters: what the columns of x change, in this order.
-        film: width and height in pixels; None keeps the film of the scene.
+        film: width and height in pixels; None keeps the film of the scene, and its crop window. The field of view stays
+            the same along the `fov_axis` of the sensor: along x if there is none, along the diagonal for a
+            `focal_length`. The axis is not known, and taken to be x, for a sensor that was loaded before, and for an
+            XML file with a Mitsuba before 3.7.
         spp: samples per pixel, at least 1; None keeps the number of the scene.
         depth: longest path, with the integrator `path` in place of the scene's integrator: 2 is direct light.
         integrator: dictionary for `load_dict`, in place of the scene's integrator.
@@ -77,8 +81,8 @@ class MitsubaScene:
         threads: render threads of this process; None for all cores.
 
     Raises:
-        ValueError: an argument out of its range, bounds outside what the scene accepts, or a name that the scene does
-            not have; the message has those that are near.
+        ValueError: an argument out of its range, bounds outside what the scene accepts, a film for a scene with a crop
+            window, or a name that the scene does not have; the message has those that are near.
         FileNotFoundError: the XML file or a texture does not exist.
         RuntimeError: the variant does not work here, or Mitsuba refuses the scene.
         ModuleNotFoundError: Mitsuba is not installed.
@@ -106,11 +110,12 @@ class MitsubaScene:
         self.mi: Any = select_variant(variant, threads)
         self.variant: str = self.mi.variant()
         self.spp, self.seed, self.noise, self.loss, self.nan = spp, seed, noise, loss, nan
-        self.scene: Any = _load(self.mi, description)
+        described = _described(self.mi, description)
+        self.scene: Any = _load(self.mi, described)
         self.values: Any = self.mi.traverse(self.scene)
         """Of `mitsuba.traverse`."""
         if film is not None:
-            self._resize(film)
+            resize(self.mi, self.values, film, described)
         if depth is not None:
             integrator = {"type": "path", "max_depth": depth, "rr_depth": depth}
         self.integrator: Any = None if integrator is None else self.mi.load_dict(dict(integrator))
@@ -223,24 +228,23 @@ class MitsubaScene:
             )
         return torch.from_numpy(image)
 
-    def _resize(self, film: tuple[int, int]) -> None:
-        for name in [key for key in self.values.keys() if key.endswith((".film.size", ".film.crop_size"))]:  # noqa: SIM118
-            self.values[name] = list(film)
-        self.values.update()
+
+def _described(mi: Any, description: Description) -> dict[str, Any] | Path:
+    """Return what `load_dict` takes, or the path of a file that exists."""
+    if not isinstance(description, (str, os.PathLike)):
+        return dict(description(mi) if callable(description) else description)
+    path = Path(description)
+    if not path.is_file():
+        raise FileNotFoundError(f"description: there is no file {path}")
+    return path
 
 
-def _load(mi: Any, description: Description) -> Any:
+def _load(mi: Any, description: dict[str, Any] | Path) -> Any:
     """`optimize=False` keeps the names of the parameters."""
-    if isinstance(description, (str, os.PathLike)):
-        path = Path(description)
-        if not path.is_file():
-            raise FileNotFoundError(f"description: there is no file {path}")
-        load: Callable[[], Any] = lambda: mi.load_file(str(path), optimize=False)  # noqa: E731
-    else:
-        scene = dict(description(mi) if callable(description) else description)
-        load = lambda: mi.load_dict(scene, optimize=False)  # noqa: E731
     try:
-        return load()
+        if isinstance(description, Path):
+            return mi.load_file(str(description), optimize=False)
+        return mi.load_dict(description, optimize=False)
     except RuntimeError as error:
         if "No such file" in str(error) or "does not exist" in str(error):
             raise FileNotFoundError(f"description: {error}") from error

@@ -174,7 +174,7 @@ class _Mesh:
 
 @dataclass(frozen=True)
 class Value:
-    """A number, a colour, a texture or vertices: anything `mitsuba.traverse` lists that is made of numbers.
+    """A number, a colour, a texture or vertices: anything `mitsuba.traverse` lists that is made of real numbers.
 
     Args:
         name: of a value, or several that share it.
@@ -202,6 +202,8 @@ class Value:
         for name in self.names:
             if "Transform" in type(values[name]).__name__:
                 raise ValueError(f"Value is for numbers, but {name} is a transform: take Transform")
+            if np.array(values[name]).dtype.kind != "f":
+                raise ValueError(f"Value is for real numbers, but {name} is a {type(values[name]).__name__}")
         shapes = {name: np.array(values[name]).size for name in self.names}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"names that share a value must have the same size, got {shapes}")

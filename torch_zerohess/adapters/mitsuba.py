@@ -165,10 +165,7 @@ class MitsubaScene:
         if x.ndim != 2 or x.shape[1] != self.n:
             columns = ", ".join(self.labels)
             raise ValueError(f"x must have shape [K, {self.n}] for {columns}, got {list(x.shape)}")
-        if not bool(torch.isfinite(x).all()):
-            k, i = (int(one) for one in (~torch.isfinite(x)).nonzero()[0])
-            raise ValueError(f"x must be finite, got {float(x[k, i])} for {self.labels[i]} in point {k}")
-        points = x.detach().cpu().double().clamp(*self.bounds)
+        points = self._within(x)
         with self._lock:
             self._calls += self.noise == "call"
             seed = self._fresh()
@@ -187,9 +184,13 @@ class MitsubaScene:
         return out.to(x.device)
 
     def set(self, x: Tensor) -> None:
-        """Give the scene the parameters x [n], for renders of one's own."""
+        """Give the scene the parameters x [n], clamped to the bounds, for renders of one's own.
+
+        Raises ValueError if x has another shape, or is not finite.
+        """
         if x.shape != (self.n,):
             raise ValueError(f"x must have shape [{self.n}] for {', '.join(self.labels)}, got {list(x.shape)}")
+        x = self._within(x[None])[0]
         with self._lock:
             self._select()
             for parameter, part in zip(self.parameters, x.split([one.n for one in self.parameters]), strict=True):
@@ -200,6 +201,13 @@ class MitsubaScene:
         """Let fresh noise go on as after so many calls with so many points in all."""
         with self._lock:
             self._calls += {"fixed": 0, "call": calls, "point": points}[self.noise]
+
+    def _within(self, x: Tensor) -> Tensor:
+        """Return points [K, n] clamped to the bounds; ValueError if they are not finite."""
+        if not bool(torch.isfinite(x).all()):
+            k, i = (int(one) for one in (~torch.isfinite(x)).nonzero()[0])
+            raise ValueError(f"x must be finite, got {float(x[k, i])} for {self.labels[i]} in point {k}")
+        return x.detach().cpu().double().clamp(*self.bounds)
 
     def _select(self) -> None:
         """Make the variant of this scene the current one of the process: another scene may have another."""

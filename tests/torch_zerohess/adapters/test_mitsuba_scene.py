@@ -165,6 +165,8 @@ def test_points_beyond_the_bounds_are_rendered_at_the_bounds() -> None:
     scene = scalar(plane, [Value(REFLECTANCE, bounds=(0.2, 0.7))], integrator=WITHOUT_NOISE)
     beyond, at = torch.tensor([[-3.0, 0.5, 9.0]]), torch.tensor([[0.2, 0.5, 0.7]])
     assert torch.equal(scene(beyond), scene(at))
+    scene.set(beyond[0])
+    np.testing.assert_allclose(np.array(scene.values[REFLECTANCE]).ravel(), at[0], rtol=1e-6)
 
 
 def test_unit_scales_a_value() -> None:
@@ -512,6 +514,8 @@ def test_wrong_points() -> None:
         scalar(lamp, [Value(RADIANCE)], loss=lambda image: 1.0)(torch.zeros(1, 3))
     with pytest.raises(ValueError, match=r"must be finite, got nan for .*\[1\] in point 0"):
         scene(torch.tensor([[0.0, math.nan, 0.0]]))
+    with pytest.raises(ValueError, match=r"must be finite, got inf for .*\[2\]"):
+        scene.set(torch.tensor([0.0, 0.0, math.inf]))
 
 
 def test_missing_files(tmp_path: Path) -> None:

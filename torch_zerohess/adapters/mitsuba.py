@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.adapters.mitsuba_film import resize
-from torch_zerohess.adapters.mitsuba_parameters import Parameter, Transform, Value
+from torch_zerohess.adapters.mitsuba_parameters import Parameter, Transform, Value, plain
 from torch_zerohess.adapters.mitsuba_variants import select_variant
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators.process_identity import own_seed
@@ -115,7 +115,8 @@ class MitsubaScene:
         self.values: Any = self.mi.traverse(self.scene)
         """Of `mitsuba.traverse`."""
         if film is not None:
-            resize(self.mi, self.values, film, described)
+            width, height = plain(film)
+            resize(self.mi, self.values, (width, height), described)
         if depth is not None:
             integrator = {"type": "path", "max_depth": depth, "rr_depth": depth}
         self.integrator: Any = None if integrator is None else self.mi.load_dict(dict(integrator))
@@ -274,9 +275,9 @@ def _check(
     noise: str,
     nan: str,
 ) -> None:
-    pair = tuple(film) if isinstance(film, Sequence) else ()
+    pair = plain(film) if isinstance(plain(film), (list, tuple)) else ()
     if film is not None and (len(pair) != 2 or not all(isinstance(side, int) and side >= 1 for side in pair)):
-        raise ValueError(f"film must be a pair (width, height) of pixels >= 1, got {film!r}")
+        raise ValueError(f"film must be a pair (width, height) of integers >= 1, got {film!r}")
     for name, value, least in (("spp", spp, 1), ("depth", depth, 1), ("seed", seed, 0)):
         if value is not None and not least <= checked_integer(name, value) < _MOST:
             raise ValueError(f"{name} must be from {least} to {_MOST - 1}, got {value!r}")

@@ -66,6 +66,14 @@ def test_the_field_of_view_along_y_in_closed_form() -> None:
     assert x_fov(40.0, "x", (400, 400), (96, 48)) == pytest.approx(40.0, rel=1e-12)
 
 
+@pytest.mark.parametrize("film", [(np.int64(8), np.int32(6)), np.array([8, 6]), torch.tensor([8, 6]), [8, 6]], ids=repr)
+def test_a_film_is_any_two_integers(film) -> None:
+    scene = MitsubaScene(
+        lamp, [Value("lamp.emitter.radiance.value")], film=film, spp=1, variant="scalar_rgb", threads=1
+    )
+    assert scene(torch.ones(1, 3)).shape == (1, 6, 8, 3)
+
+
 XML = """<scene version="3.0.0">
 <default name="axis" value="y"/>
 <sensor type="perspective" {name}><float name="fov" value="40"/><string name="fov_axis" value="$axis"/>

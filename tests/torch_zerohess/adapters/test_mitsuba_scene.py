@@ -487,8 +487,9 @@ def test_wrong_parameters(parameters, message) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"film": (0, 4)}, r"film must be a pair \(width, height\) of pixels >= 1, got \(0, 4\)"),
-        ({"film": 8}, r"film must be a pair \(width, height\) of pixels >= 1, got 8"),
+        ({"film": (0, 4)}, r"film must be a pair \(width, height\) of integers >= 1, got \(0, 4\)"),
+        ({"film": (8.0, 6.0)}, r"film must be a pair \(width, height\) of integers >= 1, got \(8.0, 6.0\)"),
+        ({"film": 8}, r"film must be a pair \(width, height\) of integers >= 1, got 8"),
         ({"spp": 0}, "spp must be from 1 to 2147483647, got 0"),
         ({"depth": 0}, "depth must be from 1 to 2147483647, got 0"),
         ({"seed": -1}, "seed must be from 0 to 2147483647, got -1"),

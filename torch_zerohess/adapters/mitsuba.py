@@ -2,7 +2,8 @@
 
 Each parameter says which part of the scene it changes and in which unit; all other parts stay as they are. The scene is
 loaded once and rendered again for every point. Renders have the same noise unless asked otherwise: with fresh noise
-at few samples per pixel the loss varies as much from render to render as from start to solution.
+at few samples per pixel the loss varies as much from render to render as from start to solution. Renders of one point
+have the same bits with `threads=1`.
 
 Example: where is the ball, and how bright is it? The points are [K, 3]: two lengths and a reflectance.
 
@@ -78,7 +79,9 @@ class MitsubaScene:
         nan: "raise" refuses pixels that are not finite; "keep" leaves them to what receives them, see `on_nonfinite`
             of `BlackBox`.
         variant: "auto" (`llvm_ad_rgb` where it is known to be safe, else `scalar_rgb`) or the name of one.
-        threads: render threads of this process; None for all cores.
+        threads: render threads of this process; None for all cores. With 1, renders of one point with fixed noise have
+            the same bits. With more, a just-in-time variant adds up samples in an order that changes from render to
+            render, and the last bits of pixels change with it.
 
     Raises:
         ValueError: an argument out of its range, bounds outside what the scene accepts, a film for a scene with a crop

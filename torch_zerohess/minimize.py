@@ -118,10 +118,10 @@ def minimize(
             measures how well a surrogate of the evaluations predicts, and later ones use the surrogate.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
-    Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. An exception of fn,
-    loss or callback passes, with the `Minimum` so far as its attribute `minimum`. Either keeps, also in the checkpoint,
-    the points of an interrupted batch whose values are known: with `vectorized=False`, or from an evaluator. Where all
-    values are equal the message says so.
+    Ctrl-C ends the search and returns the best point so far, also while the checkpoint is written or workers end at its
+    end; so does the last of `max_evaluations`. An exception of fn, loss or callback passes, with the `Minimum` so far
+    as its attribute `minimum`. Either keeps, also in the checkpoint, the points of an interrupted batch whose values
+    are known: with `vectorized=False`, or from an evaluator. Where all values are equal the message says so.
 
     Example:
         >>> import torch
@@ -218,9 +218,11 @@ def minimize(
                 error.minimum = running.minimum("failed", f"{blamed(error, caller)} raised {error!r}")  # type: ignore[attr-defined]
         raise
     finally:
-        running.write()
-        if own is not None:
-            own.close()
+        try:
+            _despite_ctrl_c(running.write)
+        finally:
+            if own is not None:
+                _despite_ctrl_c(own.close)
     return running.minimum(*end)
 
 
@@ -233,6 +235,14 @@ def _check_names(settings: dict[str, Any]) -> None:
             meant = _OTHER_NAMES.get(name.lower()) or " or ".join(near)
             guess = f"; did you mean {meant}?" if meant else f"; there are {', '.join(sorted(known))}"
             raise TypeError(f"minimize has no argument {name}{guess}")
+
+
+def _despite_ctrl_c(finish: Callable[[], None]) -> None:
+    """Call `finish`, and once more if Ctrl-C comes in it: the search is over, and its result is not to be lost."""
+    try:
+        finish()
+    except KeyboardInterrupt:
+        finish()
 
 
 def _is_true(answer: object) -> bool:

@@ -1,6 +1,7 @@
 """What an interruption inside a batch of `minimize` keeps: every value that is known, in the result and in the file."""
 
 import concurrent.futures
+import importlib
 import math
 from dataclasses import dataclass
 
@@ -10,11 +11,13 @@ from black_boxes import part
 from searches import raising, tilted, zeros
 
 import torch_zerohess as zh
-from torch_zerohess.evaluators import Executor
+from torch_zerohess.evaluators import Executor, Inline
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.finished import finished_values, keep_finished
+from torch_zerohess.minimization import running
 from torch_zerohess.minimization.noise import reserved
+from torch_zerohess.minimization.running import Running
 from torch_zerohess.search.protocol import AskTell
 from truths import vector
 
@@ -69,6 +72,40 @@ def test_an_exception_keeps_them_too(tmp_path):
     assert found.gradient is None
     zh.minimize(f, zeros(2), checkpoint=tmp_path / "search.pt", **SETTINGS)
     assert f.calls == 1 + 20
+
+
+class Pool(Inline):
+    """A pool of workers in this process."""
+
+    def __init__(self, workers):
+        pass
+
+
+@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize(("owner", "what"), [(Pool, "close"), (Running, "write")], ids=["workers", "file"])
+def test_ctrl_c_after_the_search_does_not_take_its_result(owner, what, fails, tmp_path, monkeypatch):
+    """Nor the error that ended it, and what was interrupted is done again."""
+    calls, finish, path = [], getattr(owner, what), tmp_path / "search.pt"
+
+    def interrupted(self):
+        calls.append(self)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        finish(self)
+
+    monkeypatch.setattr(importlib.import_module("torch_zerohess.minimize"), "ProcessPool", Pool)
+    monkeypatch.setattr(owner, what, interrupted)
+    settings = {**SETTINGS, "max_evaluations": 8, "checkpoint": path, "workers": 1}
+    monkeypatch.setattr(running, "_PAUSE", math.inf)  # no file is written before the end
+    try:
+        fit = zh.minimize(Point(5 if fails else -1, ZeroDivisionError), zeros(2), **settings)
+    except ZeroDivisionError as error:
+        fit = error.minimum
+    except KeyboardInterrupt:
+        pytest.fail("the result is lost")
+    assert (fit.status, fit.evaluations) == (("failed", 5) if fails else ("budget", 8))
+    assert len(calls) == 2
+    assert path.exists()
 
 
 def tilted_at(x):

@@ -97,6 +97,18 @@ def never(z):
     os.abort()
 
 
+class Dying:
+    """End the process at every point, after a line in a file."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __call__(self, z):
+        with self.file.open("a") as lines:
+            lines.write("called\n")
+        os._exit(3)
+
+
 def hungry(z):
     """Take 300 MB for a moment."""
     return torch.ones(75_000_000).sum() * 0 + z[:, 0]

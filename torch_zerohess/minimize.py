@@ -89,7 +89,7 @@ def minimize(
         evaluator: where evaluations run; in this process if None.
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
             does not depend on their number. Most steps are single points: give a `batch`, too, so that all workers
-            have work. A point that no process survives has the value NaN.
+            have work. A point that no process survives has the value NaN. LostEvaluationError if there is no value.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.

@@ -70,7 +70,8 @@ class Job:
     def over(self) -> bool:
         """Whether nothing more is to be done."""
         gone = self._cancelled if self._begun else self.future.cancelled()
-        return gone or self.error is not None or self.batch.finished
+        hopeless = self.batch.hopeless and self.function.known is None
+        return gone or self.error is not None or self.batch.finished or hopeless
 
     def settle(self) -> None:
         """Give the future its values or its error."""
@@ -80,6 +81,8 @@ class Job:
     def _values(self) -> Tensor:
         if self.error is not None:
             raise self.error
+        if not self.batch.finished:  # it is hopeless
+            raise self.batch.loss()
         values = self.batch.result(self.function.known)
         self.function.known = values.dtype, values.shape[1:]
         return values.to(self.device)

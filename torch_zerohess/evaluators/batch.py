@@ -8,6 +8,9 @@ as in one call with all points.
 A chunk that fails is tried again. A chunk that failed too often is cut into its points, and each of them is tried as
 often: a point that shares a chunk with one that ends the process is not lost. The value of a point that failed too
 often is NaN, and `on_nonfinite` says what becomes of it.
+
+Before the first value of a call, a point that failed is tried again after all others. A black box that fails at many
+different points, and has never had a value, fails everywhere: the call is `hopeless`, and ends.
 """
 
 from collections import deque
@@ -21,6 +24,8 @@ from torch_zerohess.evaluators.transfer import Part, joined
 
 MOST = 256
 """Chunks of a call."""
+_FAILURES = 5
+"""Evaluations of single points that may fail before the first value; as many as the retries, if these are more."""
 
 
 class LostEvaluationError(RuntimeError, ValueError):
@@ -60,6 +65,10 @@ class Batch:
     """Where the chunks start that are being evaluated."""
     lost: dict[int, str] = field(default_factory=dict)
     """Points without a value, and why."""
+    _failures: list[str] = field(default_factory=list)
+    """Why evaluations of single points failed."""
+    _first: set[int] | None = None
+    """Where the chunks start that were being evaluated at the first failure, and have not failed since."""
     _values: dict[int, Part] = field(default_factory=dict)
     _error: tuple[int, BaseException] | None = None
 
@@ -70,6 +79,15 @@ class Batch:
     def finished(self) -> bool:
         """Whether nothing remains to be done: all points are known, or the first error is."""
         return not self.waiting and not (self.busy if self._error is None else self._before_error)
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether evaluations of single points failed, without a value, more often than they may.
+
+        Those that were under way at the first failure are waited for: they may take longer than those that fail.
+        """
+        many = len(self._failures) > max(_FAILURES, self.retries)
+        return many and not self._first and not self._values and self._error is None
 
     @property
     def _before_error(self) -> list[int]:
@@ -98,8 +116,12 @@ class Batch:
         if self._error is not None and chunk.start > self._error[0]:
             return
         chunk.tries += 1
+        self._first = (set(self.busy) if self._first is None else self._first) - {chunk.start}
+        if len(chunk) == 1:
+            self._failures.append(reason)
         if chunk.tries <= self.retries:
-            self.waiting.appendleft(chunk)
+            other = len(chunk) == 1 and not self._values  # what another point does tells more
+            (self.waiting.append if other else self.waiting.appendleft)(chunk)
         elif len(chunk) > 1:
             self.waiting.extendleft(Chunk(k, k + 1) for k in reversed(range(chunk.start, chunk.stop)))
         else:
@@ -142,17 +164,30 @@ class Batch:
         return some.new_full((len(self.points), *some.shape[1:]), torch.nan).index_copy_(0, rows, some)
 
     def loss(self) -> LostEvaluationError:
-        """Return the error that names the first lost point."""
-        return loss_error(self.lost, self.points)
+        """Return the error for a call without any value."""
+        if self.hopeless:
+            return LostEvaluationError(
+                f"fn has no value in any of {len(self._failures)} evaluations of these {len(self.points)} points: "
+                f"{self._failures[0]}. To see why, call it in a program of its own, at [{numbers(self.points[0])}]. "
+                f"{_MORE}"
+            )
+        return LostEvaluationError(f"{_first_lost(self.lost, self.points)}; no point has a value. {_MORE}")
+
+
+_MORE = "An evaluator with more retries, such as evaluator=ProcessPool(retries=9), tries each point more often"
 
 
 def loss_error(lost: dict[int, str], points: Tensor) -> LostEvaluationError:
-    """Return the error for points [K, n], of which those with the numbers `lost` have no value."""
-    first = min(lost)
+    """Return the error for points [K, n], of which those with the numbers `lost` have no value, but others have."""
     return LostEvaluationError(
-        f"{lost[first]}, at the point [{numbers(points[first])}], number {first} of {len(points)}; "
-        f"{len(lost)} without a value. on_nonfinite='drop' or a number goes on without them, more retries try again"
+        f"{_first_lost(lost, points)}; {len(lost)} without a value. on_nonfinite='drop' or a number goes on without "
+        f"them. {_MORE}"
     )
+
+
+def _first_lost(lost: dict[int, str], points: Tensor) -> str:
+    first = min(lost)
+    return f"{lost[first]}, at the point [{numbers(points[first])}], number {first} of {len(points)}"
 
 
 def numbers(point: Tensor | Sequence[float]) -> str:

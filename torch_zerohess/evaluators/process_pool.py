@@ -51,8 +51,9 @@ class ProcessPool(Ahead):
 
     A worker that ends, takes too long or takes too much memory is replaced, and its points are tried again, see
     `evaluators.batch`. Points that failed too often have the value NaN: `on_nonfinite` of `BlackBox` and `estimate`
-    says what becomes of them, "raise" names the point and how the worker ended. An exception of the black box is not
-    tried again. It is raised here, with the worker's traceback as its cause.
+    says what becomes of them, "raise" names the point and how the worker ended. A black box whose first 6 evaluations
+    (`retries` + 1 if that is more) end so is given up: `LostEvaluationError`. An exception of the black box is raised
+    here, with the worker's traceback as its cause, and not tried again.
 
     Values have the same bits as with `Inline` for every number of workers, if the black box is deterministic and
     its value of a point does not depend on which points share its call. (Matrix products, and some functions of torch

@@ -246,6 +246,43 @@ def test_chunks_are_tried_again_and_then_cut():
     torch.testing.assert_close(batch.result(), torch.tensor([0.5, math.nan, 2.5]), equal_nan=True)
 
 
+@pytest.mark.parametrize("retries", [0, 2, 8])
+def test_before_the_first_value_every_point_is_tried_before_one_is_tried_again(retries):
+    """After more than 5 failures, and more than there are retries, a call without a value is hopeless."""
+    most = max(5, retries)
+    batch, tried = Batch(torch.zeros(4 if retries else 20, 1), retries), []
+    while not batch.hopeless:
+        chunk = batch.take()
+        tried.append(chunk.start)
+        batch.failed(chunk, "why")
+    assert tried == [k % len(batch.points) for k in range(most + 1)]
+    with pytest.raises(
+        LostEvaluationError, match=rf"no value in any of {most + 1} .*: why.*\[0\].*ProcessPool\(retries="
+    ):
+        batch.result()
+    batch.came(batch.take(), part(torch.zeros(1)))
+    assert not batch.hopeless
+
+
+def test_a_slow_point_is_waited_for_before_a_call_is_hopeless():
+    batch = Batch(torch.zeros(20, 1), retries=2)
+    slow = batch.take()
+    for _ in range(15):
+        batch.failed(batch.take(), "why")
+        assert not batch.hopeless
+    batch.failed(slow, "why")
+    assert batch.hopeless
+
+
+def test_a_black_box_that_always_ends_its_process_is_given_up_early(tmp_path):
+    """The search needs 4 values at first, with 3 tries each: 12 evaluations."""
+    fn = black_boxes.Dying(tmp_path / "calls")
+    message = r"no value in any of [67] .* these 4 .*\(exit code 3\)\. To see why, .*, at \[0, 0\]\. An evaluator with"
+    with pytest.raises(LostEvaluationError, match=message):
+        zh.minimize(fn, torch.zeros(2), sigma=0.5, workers=2, batch=4)
+    assert len(fn.file.read_text().splitlines()) <= 7  # the seventh may be under way
+
+
 def test_the_first_error_is_raised_whichever_comes_first():
     batch = Batch(torch.zeros(4, 1), retries=0)
     first, second, third, fourth = (batch.take() for _ in range(4))

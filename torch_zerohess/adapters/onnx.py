@@ -1,5 +1,6 @@
 """An ONNX model in onnxruntime as a black box."""
 
+import copy
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -34,6 +35,7 @@ class OnnxFunction:
     layout allow it.
 
     An `OnnxFunction` can be pickled, for `evaluators.ProcessPool`, if its model is a path, bytes or a ModelProto.
+    A copy or deep copy, as of a model with such a layer, shares the session.
 
     Args:
         model: path, bytes, `onnx.ModelProto`, or an `onnxruntime.InferenceSession`.
@@ -92,6 +94,16 @@ class OnnxFunction:
     def __repr__(self) -> str:
         parameters = ", ".join(f"{name} {list(shape)}" for name, shape in self.shapes.items())
         return f"OnnxFunction(n={self.n}, parameters=[{parameters}], output={self.output!r})"
+
+    def __copy__(self) -> "OnnxFunction":
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        return other
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OnnxFunction":
+        memo[id(self)] = other = copy.copy(self)
+        other._constants = copy.deepcopy(self._constants, memo)
+        return other
 
     def __reduce__(self) -> tuple[Any, ...]:
         if not isinstance(self._arguments[0], (str, os.PathLike, bytes)):

@@ -1,5 +1,6 @@
 """ONNX models: the same numbers as the torch module that they come from, and what they cannot be asked for."""
 
+import copy
 import math
 import pickle
 
@@ -93,6 +94,19 @@ def test_a_copy_for_another_process(tmp_path):
     assert torch.equal(pickle.loads(pickle.dumps(f))(Z), f(Z))
     with pytest.raises(TypeError, match="must be a path or bytes"):
         pickle.dumps(OnnxFunction(f.session, constants={"c": C[0]}, output="y"))
+
+
+def test_copies_of_a_layer_share_the_session():
+    f = OnnxFunction(OnnxFunction(model(), constants={"c": C[0]}, output="y").session, ["x"], aux=("c",), output="y")
+    layer = zh.BlackBox(f, zh.Smoothing(sigma=0.1))
+    for one in (copy.copy(f), copy.deepcopy(f), copy.deepcopy(layer).fn):
+        assert one is not f
+        assert one.session is f.session
+        torch.testing.assert_close(one(Z, C), truth(Z, C))
+    f = OnnxFunction(f.session, constants={"c": C[0]}, output="y")
+    other = copy.deepcopy(f)
+    f._constants["c"].zero_()
+    torch.testing.assert_close(other(Z), truth(Z, C[0]))
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ class Program(Closing):
         timeout: seconds per point, after which the program ends, with the programs that it started; None for no
             limit.
         folder: where the program runs; here if None.
-        environment: variables added to the environment of this process.
+        environment: variables added to the environment of this process. A PATH among them finds the program, too.
         on_failure: "raise", or "nan" to go on without the values of a run that fails.
 
     Raises:
@@ -102,7 +102,7 @@ class Program(Closing):
         if folder is not None and not os.path.isdir(folder):
             raise FileNotFoundError(f"folder must be a folder that exists, got {folder!r}")
         if not callable(command):
-            _found(command, folder)
+            _found(command, folder, self.environment)
         self._server: Server | None = None
         self._end: weakref.finalize[Any, Any] | None = None
         """Ends the server: called by `close`, when nobody refers to this object any more, or when Python ends."""
@@ -137,7 +137,7 @@ class Program(Closing):
             found: dict[int, Tensor | None] = {}
             try:
                 for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
-                    run = functools.partial(self._run, _found(self.command(one), self.folder), b"", 1)
+                    run = functools.partial(self._run, _found(self.command(one), self.folder, self.environment), b"", 1)
                     found[k] = self._unless_failed(run, one)
             except BaseException as error:  # Ctrl-C, too
                 keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
@@ -272,10 +272,10 @@ def _checked_environment(environment: Any) -> dict[str, str] | None:
     return dict(environment)
 
 
-def _found(command: Sequence[str], folder: str | None) -> Sequence[str]:
+def _found(command: Sequence[str], folder: str | None, environment: Mapping[str, str] | None) -> Sequence[str]:
     """Return a command whose program exists; TypeError if it is text, which a function may return by mistake.
 
-    A path of the program is relative to the folder where it runs, a name alone is looked for in PATH.
+    A path of the program is relative to the folder where it runs, a name alone is looked for in the PATH that it gets.
     """
     if isinstance(command, str) or not isinstance(command, Sequence) or not command:
         raise TypeError(f"command must return a list, the program and its arguments, got {command!r}")
@@ -284,7 +284,7 @@ def _found(command: Sequence[str], folder: str | None) -> Sequence[str]:
         raise TypeError(f"command must be a list of texts and paths, got {wrong[0]!r} in it: write str({wrong[0]!r})")
     name = os.fsdecode(command[0])
     place = os.path.join(folder or "", name) if os.path.dirname(name) else name
-    if shutil.which(place) is None:
+    if shutil.which(place, path=(environment or {}).get("PATH")) is None:
         raise FileNotFoundError(
             f"command: there is no program {name!r} that could be run, see "
             + ("PATH" if place == name else f"folder {os.fspath(folder or '')!r}")

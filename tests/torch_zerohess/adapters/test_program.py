@@ -320,6 +320,19 @@ def test_a_program_in_the_folder_where_it_runs(tmp_path):
         Program(["./other.sh"], folder=str(tmp_path))
 
 
+def test_a_program_in_the_path_that_it_gets(tmp_path):
+    script = tmp_path / "only-there"
+    script.write_text("#!/bin/sh\necho 3.5\n")
+    script.chmod(0o755)
+    environment = {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
+    for command in (["only-there"], lambda point: ["only-there"]):
+        program = Program(command, environment=environment, format=lambda out: [float(out)])
+        assert program(Z[:1]).flatten().tolist() == [3.5]
+    with pytest.raises(FileNotFoundError, match="there is no program 'awk' that could be run, see PATH"):
+        Program(["awk"], environment={"PATH": str(tmp_path)})
+    Program(["awk"], environment={"OTHER": "1"})
+
+
 def test_no_points_have_no_values():
     program = Program(lambda point: ["echo", "[1, 2]"])
     assert program(Z[:0]).shape == (0,)

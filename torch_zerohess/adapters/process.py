@@ -142,7 +142,9 @@ class Program(Closing):
             except BaseException as error:  # Ctrl-C, too
                 keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
                 raise
-            self._shape = next((one.shape for one in found.values() if one is not None), self._shape)
+            shapes = {k: one.shape for k, one in found.items() if one is not None}
+            _check_shapes(shapes, x)
+            self._shape = next(iter(shapes.values()), self._shape)
             return torch.stack([_missing(self._shape) if one is None else one for one in found.values()])
         request = self._request(x, aux)
         answer = self._serve if self.server else functools.partial(self._run, self.command)
@@ -259,6 +261,17 @@ class Program(Closing):
 
 def _missing(shape: Sequence[int]) -> Tensor:
     return torch.full(tuple(shape), torch.nan, dtype=torch.float64, device="cpu")
+
+
+def _check_shapes(shapes: Mapping[int, torch.Size], x: Tensor) -> None:
+    """Raise ValueError for values of two shapes, by the number of their points x [K, n]."""
+    first = next(iter(shapes), 0)
+    for k, shape in shapes.items():
+        if shape != shapes[first]:
+            raise ValueError(
+                f"the program must write values of one shape, got {list(shapes[first])} at the point "
+                f"[{numbers(x[first])}] and {list(shape)} at the point [{numbers(x[k])}]"
+            )
 
 
 def _checked_environment(environment: Any) -> dict[str, str] | None:

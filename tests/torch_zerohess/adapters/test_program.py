@@ -275,6 +275,13 @@ def test_a_command_is_made_when_its_run_begins(tmp_path):
     assert (numbers, values.tolist()) == ([0, 1], [3.0, 7.0])
 
 
+def test_values_of_two_shapes_are_named_with_their_points():
+    program = Program(lambda point: ["echo", "[1, 2]" if point[0] < 0.2 else "[1, 2, 3]"])
+    message = r"one shape, got \[2\] at the point \[0\.1, 0\.2\] and \[3\] at the point \[0\.333333, 0\.4\]"
+    with pytest.raises(ValueError, match=message):
+        program(Z)
+
+
 def test_a_search_goes_on_after_a_run_that_failed():
     def command(point: torch.Tensor) -> list[str]:
         x = float(point[0])

@@ -243,7 +243,11 @@ class Program(Closing):
             if self.format == "npy":
                 import numpy as np
 
-                return as_tensor(np.load(io.BytesIO(output), allow_pickle=False))
+                file = io.BytesIO(output)
+                values = as_tensor(np.load(file, allow_pickle=False))
+                if more := file.read():
+                    raise ValueError(f"it wrote {len(more)} bytes after the array")
+                return values
             found = json.loads(output)
             if b"null" in output:
                 raise ValueError("it printed null where a number was expected")

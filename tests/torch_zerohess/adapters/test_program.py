@@ -96,6 +96,14 @@ def test_arrays(server):
             assert torch.equal(program(Z), torch.stack([Z, 2 * Z], 1).float())
 
 
+@pytest.mark.parametrize("more", ["b'done'", "one.getvalue()"], ids=["text", "array"])
+def test_one_array_and_nothing_after_it(more):
+    code = "import io, sys, numpy as np\none = io.BytesIO(); np.save(one, np.ones(2))\n"
+    program = Program([sys.executable, "-c", f"{code}sys.stdout.buffer.write(one.getvalue() + {more})"], format="npy")
+    with pytest.raises(ValueError, match=r"values as npy and nothing else (.|\n)*it wrote \d+ bytes after the array"):
+        program(Z)
+
+
 def test_a_server_that_prints_is_named_and_started_again():
     with python(SERVE + "print('Loading scene')\n    " + ANSWER, server=True) as program:
         with pytest.raises(ValueError, match="nothing else to its standard output, got 'Loading scene"):

@@ -24,7 +24,7 @@ from torch_zerohess.evaluators.transfer import Part, joined
 
 MOST = 256
 """Chunks of a call."""
-_FAILURES = 5
+_FAILURES = 9
 """Evaluations of single points that may fail before the first value; as many as the retries, if these are more."""
 
 

@@ -51,7 +51,7 @@ class ProcessPool(Ahead):
 
     A worker that ends, takes too long or takes too much memory is replaced, and its points are tried again, see
     `evaluators.batch`. Points that failed too often have the value NaN: `on_nonfinite` of `BlackBox` and `estimate`
-    says what becomes of them, "raise" names the point and how the worker ended. A black box whose first 6 evaluations
+    says what becomes of them, "raise" names the point and how the worker ended. A black box whose first 10 evaluations
     (`retries` + 1 if that is more) end so is given up: `LostEvaluationError`. An exception of the black box is raised
     here, with the worker's traceback as its cause, and not tried again.
 

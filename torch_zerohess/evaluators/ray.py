@@ -26,8 +26,7 @@ class Ray(Ahead):
 
     An actor holds the black box from call to call. An actor that ends, with its process or its machine, is restarted by
     Ray, which makes the black box again, and its points are tried again, by it or by another. What becomes of points
-    that failed too often: see `ProcessPool`. An exception of the black box is raised here,
-    also SystemExit.
+    that failed too often: see `ProcessPool`. An exception of the black box is raised here, also SystemExit.
 
     A program that has called `ray.init(...)` has chosen its cluster. Otherwise the address in the environment variable
     RAY_ADDRESS is used, and without one a Ray of this machine alone, which ends with `close()`.

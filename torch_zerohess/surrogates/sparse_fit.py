@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.sparse_regression import predicted, significant, slopes
+from torch_zerohess.surrogates.sparse_regression import predicted, significant, slopes, slopes_by_ridges
 from torch_zerohess.surrogates.sparse_selection import Grids, candidates, largest, spaced, thresholds
 from torch_zerohess.surrogates.surrogate import scaled
 
@@ -150,8 +150,7 @@ def _validated(
             root = weights[held].sqrt()[:, None]
             v, e = v * root, e * root
         index, used = _support(*train, inner, settings, before)
-        for k, ridges in enumerate(choices):
-            values, _ = slopes(*train, index, used, before, ridges)
+        for k, values in enumerate(slopes_by_ridges(*train, index, used, before, choices)):
             rests[k] += float((e - predicted(index, values, v)).square().sum())
         total += float(e.square().sum())
         if first:

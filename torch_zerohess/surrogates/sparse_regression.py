@@ -11,6 +11,8 @@ prior is added: (M P (J - J'))^2, and the diagonal of s^2 M P M, where s^2 is th
 """
 
 import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -19,6 +21,70 @@ from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _BLOCK = 1 << 22
 """Elements of A held at a time."""
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The regressions of some rows."""
+
+    which: slice
+    live: Tensor
+    """Which entries are used [b, s]."""
+    A: Tensor
+    """[b, s, K], transposed; 0 where an entry is not used."""
+    old: Tensor
+    """The previous slopes of these entries [b, s]."""
+    target: Tensor
+    """Changes that the previous slopes do not predict [b, K]."""
+    gram: Tensor
+    """A^T A [b, s, s]."""
+    weight: Tensor
+    """Prior of a ridge of 1 [b, s]."""
+
+    def prior(self, ridges: tuple[float, float]) -> Tensor:
+        """Return the diagonal of P [b, s], for the squares of the ridges of old and of new entries."""
+        return (
+            torch.where(self.old != 0, self.weight.new_tensor(ridges[0]), self.weight.new_tensor(ridges[1]))
+            * self.weight
+        )
+
+    def factor(self, prior: Tensor) -> Tensor:
+        """Return the Cholesky factor of A^T A + P [b, s, s]."""
+        return torch.linalg.cholesky(self.gram + torch.diag_embed(prior))
+
+
+def _regressions(u: Tensor, d: Tensor, index: Tensor, used: Tensor, previous: SparseJacobian) -> Iterator[_Rows]:
+    """Yield the regressions of all rows, some at a time."""
+    K, m, rows = len(u), len(index), u.mT.contiguous()
+    # Rows with few used entries have small systems: the used ones come first.
+    width = max(1, int(used.sum(1).max()))
+    size = max(1, _BLOCK // (K * width))
+    for first in range(0, m, size):
+        some = slice(first, first + size)
+        own, live = index[some, :width], used[some, :width]
+        same = (own[:, :, None] == previous.index[some][:, None]) & (previous.values[some] != 0)[:, None]
+        old = (same * previous.values[some][:, None]).sum(2) * live
+        A = rows[own] * live[:, :, None]
+        target = d[:, some].mT - (A * old[:, :, None]).sum(1)
+        yield _Rows(some, live, A, old, target, A @ A.mT, K * _scale(u, own))
+
+
+def slopes_by_ridges(
+    u: Tensor,
+    d: Tensor,
+    index: Tensor,
+    used: Tensor,
+    previous: SparseJacobian,
+    choices: Sequence[tuple[float, float]],
+) -> list[Tensor]:
+    """Return the slopes [m, keep] of `slopes` for each of several ridges."""
+    values = [torch.zeros_like(index, dtype=u.dtype) for _ in choices]
+    for rows in _regressions(u, d, index, used, previous):
+        change = rows.A @ rows.target[:, :, None]
+        for one, ridges in zip(values, choices, strict=True):
+            solved = torch.cholesky_solve(change, rows.factor(rows.prior(ridges)))[..., 0]
+            one[rows.which, : rows.live.shape[1]] = (rows.old + solved) * rows.live
+    return values
 
 
 def slopes(
@@ -37,26 +103,13 @@ def slopes(
     constant: leverage of the constant on each sample [K]. If it is None, all samples have the same variance.
     shortened: whether errors include that the ridge shortens new slopes; it shortens none that is 0.
     """
-    K, m = len(u), len(index)
-    rows, values = u.mT.contiguous(), torch.zeros_like(index, dtype=u.dtype)
+    K, values = len(u), torch.zeros_like(index, dtype=u.dtype)
     errors = torch.zeros_like(values)
-    # Rows with few used entries have small systems: the used ones come first.
-    width = max(1, int(used.sum(1).max()))
-    size = max(1, _BLOCK // (K * width))
-    for first in range(0, m, size):
-        some = slice(first, first + size)
-        own, live = index[some, :width], used[some, :width]
-        same = (own[:, :, None] == previous.index[some][:, None]) & (previous.values[some] != 0)[:, None]
-        old = (same * previous.values[some][:, None]).sum(2) * live
-        A = rows[own] * live[:, :, None]  # [b, width, K]
-        prior = torch.where(old != 0, u.new_tensor(ridges[0]), u.new_tensor(ridges[1])) * K * _scale(u, own)
-        gram = A @ A.mT
-        gram.diagonal(dim1=1, dim2=2).add_(prior)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(gram))
-        target = d[:, some].mT - (A * old[:, :, None]).sum(1)
-        change = (inverse @ (A @ target[:, :, None]))[..., 0]
-        values[some, :width] = (old + change) * live
-        left = target - (A * change[:, :, None]).sum(1)
+    for rows in _regressions(u, d, index, used, previous):
+        A, old, live, prior = rows.A, rows.old, rows.live, rows.prior(ridges)
+        inverse = torch.cholesky_inverse(rows.factor(prior))
+        change = (inverse @ (A @ rows.target[:, :, None]))[..., 0]
+        left = rows.target - (A * change[:, :, None]).sum(1)
         own_part = inverse.diagonal(dim1=1, dim2=2)
         spent = ((1.0 - own_part * prior) * live).sum(1).clamp_min(0.0)
         variance = left.square().sum(1) / (K - 1 - spent).clamp_min(1.0)
@@ -67,7 +120,8 @@ def slopes(
         else:
             square = _of_samples(A, inverse, left, constant)
             square += variance[:, None] * (inverse.square() * prior[:, None]).sum(2)  # of the prior
-        errors[some, :width] = (square + bias.square()).sqrt() * live
+        values[rows.which, : live.shape[1]] = (old + change) * live
+        errors[rows.which, : live.shape[1]] = (square + bias.square()).sqrt() * live
     return values, errors
 
 

@@ -5,7 +5,7 @@ import torch
 
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.sparse_regression import slopes
+from torch_zerohess.surrogates.sparse_regression import slopes, slopes_by_ridges
 from truths import normal
 
 K, M, N = 30, 5, 3
@@ -46,6 +46,24 @@ def test_variances_are_those_of_fits_without_one_sample(weighted, old):
     expected += (left / (K - 1 - spent))[:, None] * (inverse @ torch.diag(penalty) @ inverse).diagonal()
     expected += ((whole - prior) @ torch.diag(penalty) @ inverse).square()
     torch.testing.assert_close(errors.square(), expected)
+
+
+def test_slopes_by_several_ridges_are_those_of_weighted_least_squares():
+    """Some entries are old, some new, and some are not used."""
+    u, d, some = normal(K, N), normal(K, M, seed=1), torch.arange(M * N).view(M, N) % 4
+    index, used = torch.arange(N).expand(M, N), some != 3
+    prior = torch.where(used & (some == 0), normal(M, N, seed=4), 0.0)
+    before = SparseJacobian(index, prior, torch.zeros(M, N), N, torch.Size([M]))
+    choices = [(1e-4, 1e-4), (0.3, 0.1)]
+    for ridges, values in zip(choices, slopes_by_ridges(u, d, index, used, before, choices), strict=True):
+        expected = torch.zeros(M, N).double()
+        for row in range(M):
+            A, old = u[:, used[row]], prior[row, used[row]]
+            penalty = torch.where(old != 0, *torch.tensor(ridges).double()) * A.square().sum(0)
+            expected[row, used[row]] = torch.linalg.solve(
+                A.mT @ A + torch.diag(penalty), A.mT @ d[:, row] + penalty * old
+            )
+        torch.testing.assert_close(values, expected)
 
 
 def test_a_fit_with_as_many_samples_as_it_takes_has_finite_errors():

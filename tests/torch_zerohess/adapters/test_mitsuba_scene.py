@@ -452,7 +452,7 @@ def test_bounds_of_names_that_share_a_value_are_those_that_all_accept() -> None:
         ([Transform("plane.to_world", move=(1, 0, 0))], "vectors of 3 numbers, not all 0, got 1"),
         ([Transform("plane.to_world", move=((1, 0, 0),), unit=(1.0, 2.0))], "unit must be a number or 1"),
         ([Value((REFLECTANCE, "sensor.x_fov"))], "must have the same size"),
-        ([Value("sensor.film.size")], "Value is for real numbers, but sensor.film.size is a Vector2u"),
+        ([Value("sensor.film.size")], "Value is for real numbers, but sensor.film.size is a (Scalar)?Vector2u"),
         ([Value("allow_thread_reordering")], "Value is for real numbers, but allow_thread_reordering is a bool"),
         (
             [Transform("plane.to_world", move=np.array(1.0))],

@@ -95,12 +95,12 @@ class Record:
         if self.requested is not None:
             self.note(*self._interrupted)
 
-    def keeping(self, untouched: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return `told`, with the loss NaN wherever an untouched parameter, bools [n], differs from the start."""
+    def keeping(self, untouched: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `told`, with the loss NaN wherever an untouched parameter, bools [n], differs from x [n]."""
         points, losses = self.told
         if untouched is None:
             return points, losses
-        return points, torch.where((points == points[:1])[:, untouched].all(1), losses, torch.nan)
+        return points, torch.where((points == x)[:, untouched].all(1), losses, torch.nan)
 
     @property
     def flat(self) -> bool:

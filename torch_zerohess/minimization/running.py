@@ -189,7 +189,7 @@ class Running:
             return
         self._deciding = before, allowed
         search, believed = self.search, self._believed(before).x
-        points, losses = self.record.keeping(search.untouched)
+        points, losses = self.record.keeping(search.untouched, search.x)
         likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
         found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise, trusted=search.averages)
         if found is not None:
@@ -259,14 +259,14 @@ class Running:
         search = self.search
         if not self.noise and search.evaluations and self.record.requested is None:
             return Belief(search.x, search.value, 0.0)
-        points, losses = self.record.keeping(search.untouched)  # with what was not told to the search
+        points, losses = self.record.keeping(search.untouched, search.x)  # with what was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):
             return self._believed(self.evaluations)
         return lowest(points, losses, search.x)
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
-        points, losses = self.record.keeping(self.search.untouched)
+        points, losses = self.record.keeping(self.search.untouched, self.search.x)
         return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
 
     def _first(self, points: Tensor) -> None:

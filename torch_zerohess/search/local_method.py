@@ -115,11 +115,11 @@ class LocalMethod(GaussNewton[LocalProgress]):
         )
 
     def started(self, evaluated: Evaluated) -> LocalProgress | None:
-        """Return the progress after the start and samples around it at sigma; None if they give no Jacobian."""
+        """Return the progress after a center, the first one, and samples around it; None if they give no Jacobian."""
         if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
             return None
-        known = replace(self.begun(), shape=evaluated.shape, evaluations=len(evaluated)).recorded(evaluated)
-        known = self.sampled(known, evaluated)
+        known = replace(self.begun(), center=evaluated.points[0], shape=evaluated.shape, evaluations=len(evaluated))
+        known = self.sampled(known.recorded(evaluated), evaluated)
         return None if known.jacobian is None else known
 
     def samples(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:

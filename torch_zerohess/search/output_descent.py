@@ -58,9 +58,11 @@ class OutputDescent(Relay[OutputDescentProgress]):
         smooth, points = self._smooth.first(generator)
         return replace(known, smooth=smooth), points
 
-    def taking_over(self, evaluated: Evaluated, generator: torch.Generator) -> tuple[OutputDescentProgress, Tensor]:
+    def taking_over(
+        self, other: Progress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[OutputDescentProgress, Tensor]:
         """Begin with the evaluations of another search, the best one first; return the next points, too."""
-        descent = self._follow.begun(Best(evaluated.points[0]))
+        descent = self._follow.begun(Best(evaluated.points[0])).taking(other, "iterations", "rounds")
         known = OutputDescentProgress(best=descent.best, center=descent.center, descent=descent)
         return self.next(known, evaluated, generator)
 

@@ -134,9 +134,8 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             return known, best.point[None][:0]
         before = known.local
         if before is not None and torch.equal(before.lowest.point, best.point):
-            begun = replace(
-                before.taking(known, "evaluations", "iterations"), rejected=0, lost=0, kept=False, failed=False
-            )
+            begun = before.taking(known, "evaluations", "iterations")
+            begun = replace(begun, rejected=0, tied=0, lost=0, good=False, kept=False, failed=False, done=False)
         else:
             distance = (known.pool.points - best.point).norm(dim=1).sort().values[n]
             sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)
@@ -148,7 +147,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
 
     def _went_on(self, known: OutputProcessProgress) -> OutputProcessProgress:
         """Arrive, or look elsewhere if that is due."""
-        if known.due or (known.is_solved and known.has_looked):
+        if known.due or (known.is_solved and known.has_looked and known.is_minimum(self.settings.tolerance)):
             return super().arrived(known, known.due or "nothing lower was found than a minimum of Gauss-Newton")
         if known.stuck == 0 or known.exploring == 0:
             known = replace(known, looking=False)

@@ -6,7 +6,8 @@ if the sparse Jacobian predicts more of the change of held-out samples than the 
 evaluations, and asks for the points that `Descent` alone would ask for.
 
 A few dozen samples may not tell: a support that is large, or a weak dense part beside a sparse one. So both Jacobians
-are fitted again to all evaluations each time that these have doubled, until they are twice the parameters. The search
+are fitted again to all evaluations each time that these have doubled, until they are twice the parameters or too many
+to be kept. The search
 changes if the Jacobian of the other one predicts more, by `_MORE`. A sparse Jacobian must then also predict more than
 `_MOST`.
 """
@@ -30,9 +31,11 @@ FEWEST = 20
 _FIRST = 32
 """Samples of the first part, at most."""
 _MOST = 0.5
-"""Share of the held-out change that decides at once, and for good."""
+"""Share of the held-out change from which on a sparse Jacobian is chosen for good: early, or in place of descent."""
 _MORE = 0.1
 """Share by which one Jacobian must predict more than the other one."""
+_HELD = 1 << 25
+"""Numbers of points and outputs that are kept for another choice, at most."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,15 +128,15 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         self, known: SparseOrDenseProgress, points: Tensor, generator: torch.Generator
     ) -> tuple[SparseOrDenseProgress, Tensor]:
         """Choose by all evaluations around the best of them."""
-        order = torch.where(torch.isfinite(known.losses), known.losses, torch.inf).argsort(stable=True)
-        every = Evaluated(known.points[order], known.losses[order], known.outputs[order], known.shape)
-        start = self.local.started(every)
+        every = Evaluated(known.points, known.losses, known.outputs, known.shape)
+        every = every.those(torch.where(every.finite, known.losses, torch.inf).argsort(stable=True))
+        start = self.local.started(every) if bool(every.finite[0]) else None
         sparse, dense, reason = _predicted(start)
         if known.local is None and start is not None and sparse > max(dense + _MORE, _MOST):
             return self._to_local(known, start, reason, generator)
         jacobian = None if known.local is None else known.local.jacobian
         if jacobian is not None and dense > max(jacobian.explained, sparse) + _MORE:
-            descent, points = self.descent.taking_over(every, generator)
+            descent, points = self.descent.taking_over(known, every, generator)
             known = replace(known, chosen="descent", reason=reason, descent=descent, local=None).taking(descent)
         return self._decided(known), points
 
@@ -141,7 +144,7 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         self, known: SparseOrDenseProgress, start: LocalProgress, reason: str, generator: torch.Generator
     ) -> tuple[SparseOrDenseProgress, Tensor]:
         """Go on by the sparse Jacobian."""
-        local, points = self.local.asked(start, generator)
+        local, points = self.local.asked(start.taking(known, "iterations", "rounds"), generator)
         known = replace(known, chosen="local", reason=reason, descent=None, local=local).taking(local)
         assert start.jacobian is not None
         return self._decided(known, final=start.jacobian.explained > _MOST), points
@@ -149,7 +152,7 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
     def _decided(self, known: SparseOrDenseProgress, *, final: bool = False) -> SparseOrDenseProgress:
         """Say when the choice is made again, or forget the evaluations: the chosen search has them."""
         count = len(known.losses)
-        if final or count >= 2 * self.settings.n:
+        if final or count >= 2 * self.settings.n or known.points.numel() + known.outputs.numel() > _HELD:
             return replace(known, due=0, points=known.points[:0], losses=known.losses[:0], outputs=known.outputs[:0])
         return replace(known, due=2 * count)
 

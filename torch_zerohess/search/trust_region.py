@@ -1,4 +1,4 @@
-"""The choice of a search by the number of parameters, their bounds, and the first evaluations."""
+"""The choice of a search by the number of parameters, their bounds, and the evaluations."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -146,6 +146,18 @@ def test_a_minimum_with_a_residual_is_solved():
         assert fit.evaluations < 400
 
 
+def test_a_minimum_with_ties_does_not_end_a_round_with_every_evaluation():
+    """Rounded outputs tie at the minimum, so that no arrival counts there."""
+    for seed in range(4):
+        found = search(lambda x: torch.round(4.0 * swing(x)) / 4.0, restarts=100, seed=seed)
+        rounds = [0]
+        while not found.done and found.evaluations < 150:
+            found.tell(torch.round(4.0 * swing(found.ask())) / 4.0)
+            rounds.append(found.state_dict()["progress"]["rounds"])
+        several = [k for k in range(len(rounds) - 3) if rounds[k] < rounds[k + 1] < rounds[k + 2] < rounds[k + 3]]
+        assert not several
+
+
 def test_values_that_are_not_finite_count_in_both():
     """Three of them end Gauss-Newton, and seven more the search."""
     found = search(restarts=100)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from searches import run
 
+import torch_zerohess as zh
 from torch_zerohess.optim import Descent, TrustRegion
 from truths import normal
 
@@ -105,6 +106,38 @@ def test_a_support_that_the_first_samples_do_not_tell_is_found_by_more():
     assert seen[2] == "descent"
     assert search.engine == "local"
     assert search.evaluations < n // 2
+
+
+@pytest.mark.parametrize("dead", [0, 20])
+def test_the_value_is_one_of_the_best_point_also_after_a_change(dead):
+    """The start is not the best point when the search changes; the last parameters have no effect."""
+    n = 3 * 16**2
+
+    def some(x):
+        return blurred(x[:, :n])
+
+    loss = square(some(1.0 + normal(1, n))[0])
+    search = door(n + dead, loss)
+    engines_seen = set()
+    while search.evaluations < 300 and not search.done:
+        search.tell(some(search.ask()))
+        engines_seen.add(search.engine)
+        assert search.value == pytest.approx(float(loss(some(search.x[None])[0])), rel=1e-9)
+    assert engines_seen == {"descent", "local"}
+
+
+def test_the_best_point_counts_after_a_change_where_parameters_have_no_effect():
+    """They lie where the descent has left them, not at the start."""
+    n = 3 * 16**2
+
+    def some(x):
+        return blurred(x[:, :n])
+
+    loss = square(some(1.0 + normal(1, n))[0])
+    fit = zh.minimize(some, torch.zeros(n + 20).double(), sigma=1.0, loss=loss, max_evaluations=300, seed=3)
+    assert fit.engine == "local"
+    assert fit.value == pytest.approx(float(loss(some(fit.x[None])[0])), rel=1e-9)
+    assert fit.value < 0.1 * float(loss(some(torch.zeros(1, n).double())[0]))
 
 
 def test_a_state_before_the_second_choice_goes_on_as_before():

@@ -9,7 +9,7 @@ from searches import misfit, waves
 import torch_zerohess as zh
 from torch_zerohess.optim import GaussianProcessSearch
 from torch_zerohess.search.output_process import OutputProcess
-from truths import vector
+from truths import normal, vector
 
 TIMES = torch.linspace(0.0, 6.0, 25, dtype=torch.float64)
 SOLUTION = vector(1.0, 0.4, 2.0, 0.3)
@@ -146,16 +146,24 @@ def test_a_minimum_with_a_residual_is_solved():
         assert fit.evaluations < 400
 
 
-def test_a_minimum_with_ties_does_not_end_a_round_with_every_evaluation():
+@pytest.mark.parametrize(("n", "levels", "floor", "seed"), [(1, 20.0, 1.0, 56), (2, 5.0, 1.0, 58), (3, 5.0, 0.3, 19)])
+def test_a_minimum_with_ties_does_not_end_a_round_with_every_evaluation(n, levels, floor, seed):
     """Rounded outputs tie at the minimum, so that no arrival counts there."""
-    for seed in range(4):
-        found = search(lambda x: torch.round(4.0 * swing(x)) / 4.0, restarts=100, seed=seed)
-        rounds = [0]
-        while not found.done and found.evaluations < 150:
-            found.tell(torch.round(4.0 * swing(found.ask())) / 4.0)
-            rounds.append(found.state_dict()["progress"]["rounds"])
-        several = [k for k in range(len(rounds) - 3) if rounds[k] < rounds[k + 1] < rounds[k + 2] < rounds[k + 3]]
-        assert not several
+    A, B, c = normal(n, 4, seed=seed), normal(n, 4, seed=seed + 1), normal(4, seed=seed + 2)
+
+    def rounded(x):
+        return torch.round(levels * (x @ A + 0.5 * torch.sin(3.0 * x) @ B + c)) / levels
+
+    settings = {"sigma": 0.5, "bounds": (-1.0, 1.0), "seed": seed}
+    found = GaussianProcessSearch(
+        torch.full((n,), 0.6).double(), loss=lambda y: y.square().sum().clamp(min=floor), **settings
+    )
+    ends = []
+    while not found.done and found.evaluations < 200:
+        before = found.rounds
+        found.tell(rounded(found.ask()))
+        ends += [found.evaluations] * (found.rounds > before)
+    assert not any(later - first == 2 for first, later in zip(ends, ends[2:], strict=False))
 
 
 def test_values_that_are_not_finite_count_in_both():

@@ -114,6 +114,20 @@ def raising(fn, call, error=ZeroDivisionError):
     return counting
 
 
+SIDE = 12
+N = SIDE**2
+
+
+def square(target):
+    """The mean square of the difference from a target."""
+    return lambda y: (y - target).square().mean()
+
+
+def texels(x):
+    """Pixels [K, 12, 12] of one texel each."""
+    return x.view(-1, SIDE, SIDE)
+
+
 def cosine_bowl(z):
     """A wide bowl with its minimum beside 0 and a local minimum in every turn of a cosine."""
     return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)

@@ -89,7 +89,7 @@ def minimize(
         evaluator: where evaluations run; in this process if None.
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
             does not depend on their number. Most steps are single points: give a `batch`, too, so that all workers
-            have work. A point that no process survives has the value NaN. LostEvaluationError if there is no value.
+            have work. A point that no process survives has the value NaN. LostEvaluationError if no point has a value.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second.
         seed: of the samples; from torch's global generator if None.
@@ -118,10 +118,11 @@ def minimize(
             measures how well a surrogate of the evaluations predicts, and later ones use the surrogate.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
-    Ctrl-C ends the search and returns the best point so far, also while the checkpoint is written or workers end at its
-    end; so does the last of `max_evaluations`. An exception of fn, loss or callback passes, with the `Minimum` so far
-    as its attribute `minimum`. Either keeps, also in the checkpoint, the points of an interrupted batch whose values
-    are known: with `vectorized=False`, or from an evaluator. Where all values are equal the message says so.
+    Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. Ctrl-C while the
+    last checkpoint is written, or while workers end, returns it, too. An exception of fn, loss or callback passes, with
+    the `Minimum` so far as its attribute `minimum`. Ctrl-C and exceptions keep, also in the checkpoint, the points of
+    an interrupted batch whose values are known: with `vectorized=False`, or from an evaluator. Where all values are
+    equal the message says so.
 
     Example:
         >>> import torch

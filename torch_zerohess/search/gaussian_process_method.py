@@ -316,5 +316,4 @@ class ProcessMethod(Method[Q]):
         """Return the point [n] where the model is lowest; near a minimum that is solved, the minimum itself."""
         best = known.best.point
         x = lowest(model, best, self.settings.lower, self.settings.upper, generator)
-        solved = torch.equal(known.solved, best) and float((x - best).norm()) < APART
-        return best if solved else x
+        return best if known.is_solved and float((x - best).norm()) < APART else x

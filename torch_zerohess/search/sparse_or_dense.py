@@ -7,9 +7,8 @@ evaluations, and asks for the points that `Descent` alone would ask for.
 
 A few dozen samples may not tell: a support that is large, or a weak dense part beside a sparse one. So both Jacobians
 are fitted again to all evaluations each time that these have doubled, until they are twice the parameters or too many
-to be kept. The search
-changes if the Jacobian of the other one predicts more, by `_MORE`. A sparse Jacobian must then also predict more than
-`_MOST`.
+to be kept. The search changes if the Jacobian of the other one predicts more, by `_MORE`. To change to a sparse
+Jacobian, this must also predict more than `_MOST`.
 """
 
 from dataclasses import dataclass, replace

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from searches import run
+from searches import SIDE, N, run, square
+from searches import texels as image
 
 import torch_zerohess as zh
 from torch_zerohess.optim import LocalGaussNewton
@@ -13,18 +14,6 @@ from torch_zerohess.search.gauss_newton import LENGTHS
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from truths import normal, vector
-
-SIDE = 12
-N = SIDE**2
-
-
-def square(target):
-    return lambda y: (y - target).square().mean()
-
-
-def image(x):
-    """Pixels [12, 12] of one texel each."""
-    return x.view(-1, SIDE, SIDE)
 
 
 def blur(x):

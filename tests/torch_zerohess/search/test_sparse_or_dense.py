@@ -2,22 +2,12 @@
 
 import pytest
 import torch
-from searches import run
+from searches import SIDE, N, run, square
+from searches import texels as image
 
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent, TrustRegion
 from truths import normal
-
-SIDE = 12
-N = SIDE**2
-
-
-def square(target):
-    return lambda y: (y - target).square().mean()
-
-
-def image(x):
-    return x.view(-1, SIDE, SIDE)
 
 
 def door(n, loss, **settings):
@@ -156,6 +146,16 @@ def test_a_state_before_the_second_choice_goes_on_as_before():
         one.tell(points @ A.mT)
         other.tell(points @ A.mT)
     assert one.engine == other.engine == "descent"
+
+
+def test_the_choice_is_final_where_too_much_would_be_kept(monkeypatch):
+    """After the first batch these are 33 to 65 points of 100 parameters and 200 outputs."""
+    monkeypatch.setattr("torch_zerohess.search.sparse_or_dense._HELD", 33 * 300 - 1)
+    A = mixed(100)
+    search = door(100, square(A @ normal(100)))
+    engines(search, lambda x: x @ A.mT, 0.0, 100)
+    known = search.state_dict()["progress"]
+    assert (known["chosen"], known["due"], len(known["points"])) == ("local", 0, 0)
 
 
 def test_the_evaluations_are_forgotten_once_the_choice_is_final():

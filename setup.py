@@ -69,7 +69,7 @@ def extension(torch: Path) -> Extension:
     return Extension(
         "torch_zerohess._C",
         sources=["csrc/ops.cpp"],
-        depends=[f"csrc/{name}.h" for name in ("dispatch", "philox", "quantiles", "single", "perturb", "reduce")],
+        depends=[str(path) for path in sorted(Path("csrc").glob("*.h"))],
         include_dirs=[str(torch / "include")],
         library_dirs=[str(torch / "lib")],
         libraries=["torch", "torch_cpu", "c10"],

@@ -9,11 +9,13 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <atomic>
 #include <optional>
 #include <tuple>
 #include <vector>
 
 #include "reduce.h"
+#include "regress.h"
 
 PyMODINIT_FUNC PyInit__C(void) {
   // An empty module: importing it runs the registrations below.
@@ -384,6 +386,60 @@ void mirror(const Tensor& matrices) {
   }
 }
 
+template <class T>
+std::tuple<Tensor, Tensor, int64_t> regressed(
+    const Tensor& directions, const Tensor& scale, const Tensor& changes, const Tensor& index, const Tensor& used,
+    const Tensor& known_index, const Tensor& known_values, const Tensor& ridges,
+    const std::optional<Tensor>& constant, bool errors, bool shortened, ScalarType type) {
+  const int64_t m = index.size(0), keep = index.size(1), K = directions.size(1), R = ridges.size(0);
+  Tensor values = torch::stable::new_zeros(changes, {R, m, keep});
+  Tensor deviations = torch::stable::new_zeros(changes, {errors ? m : 0, keep});
+  const Regression<T> of{
+      directions.const_data_ptr<T>(), scale.const_data_ptr<T>(), changes.const_data_ptr<T>(),
+      index.const_data_ptr<int64_t>(), known_index.const_data_ptr<int64_t>(), used.const_data_ptr<bool>(),
+      known_values.const_data_ptr<T>(), ridges.const_data_ptr<T>(), constant ? constant->const_data_ptr<T>() : nullptr,
+      m, K, keep, known_index.size(1), R, shortened,
+      values.mutable_data_ptr<T>(), errors ? deviations.mutable_data_ptr<T>() : nullptr};
+  std::atomic<int64_t> failed{0};
+  torch::stable::parallel_for(0, m, grain(keep * keep * K), [&](int64_t begin, int64_t end) {
+    failed += regress_rows(of, begin, end);
+  });
+  return {values, deviations, failed.load()};
+}
+
+// The slopes [R, m, keep] of m regressions for R pairs of ridges, standard errors [m, keep] of the first of them or
+// [0, keep], and how many regressions have no solution. See `Regression` for the arguments.
+std::tuple<Tensor, Tensor, int64_t> regress(
+    const Tensor& directions, const Tensor& scale, const Tensor& changes, const Tensor& index, const Tensor& used,
+    const Tensor& known_index, const Tensor& known_values, const Tensor& ridges,
+    const std::optional<Tensor>& constant, bool errors, bool shortened) {
+  const bool single = changes.scalar_type() == ScalarType::Float;
+  const ScalarType type = single ? ScalarType::Float : ScalarType::Double;
+  check(directions, "directions", 2, type);
+  check(scale, "scale", 1, type);
+  check(changes, "changes", 2, type);
+  check(index, "index", 2, ScalarType::Long);
+  check(used, "used", 2, ScalarType::Bool);
+  check(known_index, "known_index", 2, ScalarType::Long);
+  check(known_values, "known_values", 2, type);
+  check(ridges, "ridges", 2, type);
+  if (constant) check(*constant, "constant", 1, type);
+  const int64_t n = directions.size(0), K = directions.size(1), m = index.size(0), keep = index.size(1);
+  STD_TORCH_CHECK(scale.size(0) == n && changes.size(1) == K && (!constant || constant->size(0) == K),
+                  "directions, scale, changes and constant do not fit");
+  STD_TORCH_CHECK(changes.size(0) == m && used.size(0) == m && used.size(1) == keep && known_index.size(0) == m &&
+                      known_values.size(0) == m && known_values.size(1) == known_index.size(1),
+                  "changes, index, used, known_index and known_values do not fit");
+  STD_TORCH_CHECK(ridges.size(1) == 2 && (!errors || ridges.size(0) > 0), "ridges are no pairs");
+  const int64_t* parameters = index.const_data_ptr<int64_t>();
+  STD_TORCH_CHECK(std::all_of(parameters, parameters + m * keep, [n](int64_t d) { return 0 <= d && d < n; }),
+                  "index has numbers beyond the parameters");
+  return single ? regressed<float>(directions, scale, changes, index, used, known_index, known_values, ridges, constant,
+                                   errors, shortened, type)
+                : regressed<double>(directions, scale, changes, index, used, known_index, known_values, ridges,
+                                    constant, errors, shortened, type);
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY(torch_zerohess, m) {
@@ -405,6 +461,9 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("weighted_gradient(Tensor u, Tensor weight, Tensor a) -> Tensor");
   m.def("weighted_hvp(Tensor u, Tensor weight, Tensor a, Tensor v) -> Tensor");
   m.def("mirror(Tensor(a!) matrices) -> ()");
+  m.def(
+      "regress(Tensor directions, Tensor scale, Tensor changes, Tensor index, Tensor used, Tensor known_index, "
+      "Tensor known_values, Tensor ridges, Tensor? constant, bool errors, bool shortened) -> (Tensor, Tensor, int)");
   m.def(
       "project_drawn(Tensor rows, Tensor x, Tensor sigma, bool antithetic, bool single, Tensor t) "
       "-> Tensor");
@@ -431,6 +490,7 @@ STABLE_TORCH_LIBRARY_IMPL(torch_zerohess, CPU, m) {
   m.impl("weighted_gradient", TORCH_BOX(&weighted_gradient));
   m.impl("weighted_hvp", TORCH_BOX(&weighted_hvp));
   m.impl("mirror", TORCH_BOX(&mirror));
+  m.impl("regress", TORCH_BOX(&regress));
   m.impl("project_drawn", TORCH_BOX(&project_drawn));
   m.impl("accumulate_drawn", TORCH_BOX(&accumulate_drawn));
 }

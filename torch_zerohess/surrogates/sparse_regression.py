@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.sampling import extension
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _BLOCK = 1 << 22
@@ -78,6 +79,8 @@ def slopes_by_ridges(
     choices: Sequence[tuple[float, float]],
 ) -> list[Tensor]:
     """Return the slopes [m, keep] of `slopes` for each of several ridges."""
+    if extension.available and u.is_cpu:
+        return list(_compiled(u, d, index, used, previous, choices)[0])
     values = [torch.zeros_like(index, dtype=u.dtype) for _ in choices]
     for rows in _regressions(u, d, index, used, previous):
         change = rows.A @ rows.target[:, :, None]
@@ -103,6 +106,9 @@ def slopes(
     constant: leverage of the constant on each sample [K]. If it is None, all samples have the same variance.
     shortened: whether errors include that the ridge shortens new slopes; it shortens none that is 0.
     """
+    if extension.available and u.is_cpu:
+        (found,), deviations = _compiled(u, d, index, used, previous, [ridges], constant, errors=True, shortened=shortened)
+        return found, deviations
     K, values = len(u), torch.zeros_like(index, dtype=u.dtype)
     errors = torch.zeros_like(values)
     for rows in _regressions(u, d, index, used, previous):
@@ -123,6 +129,34 @@ def slopes(
         values[rows.which, : live.shape[1]] = (old + change) * live
         errors[rows.which, : live.shape[1]] = (square + bias.square()).sqrt() * live
     return values, errors
+
+
+def _compiled(
+    u: Tensor,
+    d: Tensor,
+    index: Tensor,
+    used: Tensor,
+    previous: SparseJacobian,
+    choices: Sequence[tuple[float, float]],
+    constant: Tensor | None = None,
+    *,
+    errors: bool = False,
+    shortened: bool = True,
+) -> tuple[Tensor, Tensor]:
+    """Return slopes [choices, m, keep] and errors of the first of them [m, keep], by the C++ extension."""
+    scale = len(u) * u.square().mean(0).clamp_min(torch.finfo(u.dtype).tiny)
+    values, deviations, failed = torch.ops.torch_zerohess.regress(
+        *(one.contiguous() for one in (u.mT, scale, d.mT, index, used, previous.index, previous.values)),
+        u.new_tensor(choices),
+        constant,
+        errors,
+        shortened,
+    )
+    if failed:
+        raise torch.linalg.LinAlgError(  # type: ignore[attr-defined]
+            f"the normal equations of {failed} outputs are not positive definite"
+        )
+    return values, deviations
 
 
 def _of_samples(A: Tensor, inverse: Tensor, left: Tensor, constant: Tensor) -> Tensor:

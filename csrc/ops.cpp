@@ -15,7 +15,7 @@
 #include <vector>
 
 #include "reduce.h"
-#include "regress.h"
+#include "sparse.h"
 
 PyMODINIT_FUNC PyInit__C(void) {
   // An empty module: importing it runs the registrations below.
@@ -386,6 +386,50 @@ void mirror(const Tensor& matrices) {
   }
 }
 
+template <class V, class T>
+Tensor sparse_times_as(
+    const Tensor& column, const Tensor& first, const Tensor& values, const Tensor& vector, ScalarType type) {
+  const int64_t rows = first.size(0), entries = column.size(0);
+  Tensor result = torch::stable::empty({rows}, type);
+  const int64_t *columns = column.const_data_ptr<int64_t>(), *begins = first.const_data_ptr<int64_t>();
+  const V* numbers = values.const_data_ptr<V>();
+  const T* source = vector.const_data_ptr<T>();
+  T* out = result.mutable_data_ptr<T>();
+  torch::stable::parallel_for(0, rows, grain(entries / std::max<int64_t>(1, rows)), [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      const int64_t at = begins[row], last = row + 1 < rows ? begins[row + 1] : entries;
+      out[row] = sparse_dot(columns + at, numbers + at, last - at, source);
+    }
+  });
+  return result;
+}
+
+ScalarType real_type(const Tensor& tensor) {
+  return tensor.scalar_type() == ScalarType::Float ? ScalarType::Float : ScalarType::Double;
+}
+
+// The product [rows] of a sparse matrix and a vector [columns]: the columns of its entries and their values [entries],
+// row after row, and where each row begins [rows]. Values and vector are float32 or float64; the result is as the latter.
+Tensor sparse_times(const Tensor& column, const Tensor& first, const Tensor& values, const Tensor& vector) {
+  const ScalarType own = real_type(values), type = real_type(vector);
+  check(column, "column", 1, ScalarType::Long);
+  check(first, "first", 1, ScalarType::Long);
+  check(values, "values", 1, own);
+  check(vector, "vector", 1, type);
+  const int64_t entries = column.size(0), rows = first.size(0), n = vector.size(0);
+  const int64_t *columns = column.const_data_ptr<int64_t>(), *begins = first.const_data_ptr<int64_t>();
+  STD_TORCH_CHECK(values.size(0) == entries, "column and values do not fit");
+  STD_TORCH_CHECK(std::all_of(columns, columns + entries, [n](int64_t c) { return 0 <= c && c < n; }),
+                  "column has numbers beyond the vector");
+  STD_TORCH_CHECK(std::is_sorted(begins, begins + rows) && (rows ? begins[0] == 0 && begins[rows - 1] <= entries : !entries),
+                  "first does not say where rows begin");
+  if (own == ScalarType::Float)
+    return type == own ? sparse_times_as<float, float>(column, first, values, vector, type)
+                       : sparse_times_as<float, double>(column, first, values, vector, type);
+  return type == own ? sparse_times_as<double, double>(column, first, values, vector, type)
+                     : sparse_times_as<double, float>(column, first, values, vector, type);
+}
+
 template <class T>
 std::tuple<Tensor, Tensor, int64_t> regressed(
     const Tensor& directions, const Tensor& scale, const Tensor& changes, const Tensor& index, const Tensor& used,
@@ -413,8 +457,7 @@ std::tuple<Tensor, Tensor, int64_t> regress(
     const Tensor& directions, const Tensor& scale, const Tensor& changes, const Tensor& index, const Tensor& used,
     const Tensor& known_index, const Tensor& known_values, const Tensor& ridges,
     const std::optional<Tensor>& constant, bool errors, bool shortened) {
-  const bool single = changes.scalar_type() == ScalarType::Float;
-  const ScalarType type = single ? ScalarType::Float : ScalarType::Double;
+  const ScalarType type = real_type(changes);
   check(directions, "directions", 2, type);
   check(scale, "scale", 1, type);
   check(changes, "changes", 2, type);
@@ -434,7 +477,7 @@ std::tuple<Tensor, Tensor, int64_t> regress(
   const int64_t* parameters = index.const_data_ptr<int64_t>();
   STD_TORCH_CHECK(std::all_of(parameters, parameters + m * keep, [n](int64_t d) { return 0 <= d && d < n; }),
                   "index has numbers beyond the parameters");
-  return single ? regressed<float>(directions, scale, changes, index, used, known_index, known_values, ridges, constant,
+  return type == ScalarType::Float ? regressed<float>(directions, scale, changes, index, used, known_index, known_values, ridges, constant,
                                    errors, shortened, type)
                 : regressed<double>(directions, scale, changes, index, used, known_index, known_values, ridges,
                                     constant, errors, shortened, type);
@@ -461,6 +504,7 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("weighted_gradient(Tensor u, Tensor weight, Tensor a) -> Tensor");
   m.def("weighted_hvp(Tensor u, Tensor weight, Tensor a, Tensor v) -> Tensor");
   m.def("mirror(Tensor(a!) matrices) -> ()");
+  m.def("sparse_times(Tensor column, Tensor first, Tensor values, Tensor vector) -> Tensor");
   m.def(
       "regress(Tensor directions, Tensor scale, Tensor changes, Tensor index, Tensor used, Tensor known_index, "
       "Tensor known_values, Tensor ridges, Tensor? constant, bool errors, bool shortened) -> (Tensor, Tensor, int)");
@@ -490,6 +534,7 @@ STABLE_TORCH_LIBRARY_IMPL(torch_zerohess, CPU, m) {
   m.impl("weighted_gradient", TORCH_BOX(&weighted_gradient));
   m.impl("weighted_hvp", TORCH_BOX(&weighted_hvp));
   m.impl("mirror", TORCH_BOX(&mirror));
+  m.impl("sparse_times", TORCH_BOX(&sparse_times));
   m.impl("regress", TORCH_BOX(&regress));
   m.impl("project_drawn", TORCH_BOX(&project_drawn));
   m.impl("accumulate_drawn", TORCH_BOX(&accumulate_drawn));

@@ -32,6 +32,8 @@ FEWEST_SAMPLES = 8
 """That a fit needs."""
 _FOLDS = 4
 """Parts of the samples that are held out in turn."""
+_HELD = 2
+"""Of them, that are held out where previous slopes are known."""
 _ROUNDS = 3
 """In which entries are found where no old ones are known."""
 _RIDGES = ((1e-4, 1e-4), (0.03, 0.03), (0.3, 0.1), (0.3, 0.3), (1.0, 0.3))
@@ -140,7 +142,7 @@ def _validated(
     fold = torch.arange(len(u), device=u.device) % _FOLDS
     choices = _RIDGES[:3] if first else _RIDGES
     rests, total, dense = [0.0] * len(choices), 0.0, 0.0
-    for number in range(_FOLDS):
+    for number in range(_FOLDS if first else _HELD):
         kept, held = fold != number, fold == number
         w = None if weights is None else weights[kept]
         center, middle = _means(u[kept], w), _means(d[kept], w)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from torch_zerohess.sampling import extension
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -174,17 +175,12 @@ def _scale(u: Tensor, own: Tensor) -> Tensor:
 
 def predicted(index: Tensor, values: Tensor, u: Tensor) -> Tensor:
     """Return the changes [K, m] along u [K, n] that slopes predict."""
-    K, m, rows = len(u), len(index), u.mT.contiguous()
-    live = values != 0
-    if not bool(live.any()):
-        return u.new_zeros(K, m)
-    width = int(live.any(0).nonzero()[-1]) + 1
-    size = max(1, _BLOCK // (K * width))
-    parts = [
-        (rows[index[first : first + size, :width]] * values[first : first + size, :width, None]).sum(1)
-        for first in range(0, m, size)
-    ]
-    return torch.cat(parts).mT.contiguous()
+    live = (values != 0).any(0).nonzero()
+    if not len(live):
+        return u.new_zeros(len(u), len(index))
+    width = int(live[-1]) + 1
+    sums = embedding_bag(index[:, :width], u.mT.contiguous(), mode="sum", per_sample_weights=values[:, :width])
+    return sums.mT.contiguous()
 
 
 def significant(values: Tensor, errors: Tensor, used: Tensor, K: float, rate: float) -> Tensor:

@@ -1,5 +1,6 @@
-// Regressions of the rows of a sparse Jacobian: slopes on known supports, with the previous slopes as the prior, and
-// their standard errors. Literal reference, with the formulas: torch_zerohess/surrogates/sparse_regression.py.
+// Sparse Jacobians: their products with vectors, and regressions of their rows: slopes on known supports, with the
+// previous slopes as the prior, and their standard errors. Literal references, with the formulas: `sparse_product.py`
+// and `sparse_regression.py` in torch_zerohess/surrogates.
 #pragma once
 
 #include <algorithm>
@@ -11,6 +12,14 @@
 #include "dispatch.h"
 
 namespace zerohess {
+
+// sum_e values[e] vector[column[e]] over the entries of a row, as four sums, which do not wait for each other.
+template <class V, class T>
+inline T sparse_dot(const int64_t* column, const V* values, int64_t entries, const T* vector) {
+  T sums[4] = {};
+  for (int64_t e = 0; e < entries; ++e) sums[e % 4] += T(values[e]) * vector[column[e]];
+  return (sums[0] + sums[2]) + (sums[1] + sums[3]);
+}
 
 // What all rows have in common: n parameters, K samples, `keep` entries of a row, `known` entries of a previous row.
 template <class T>

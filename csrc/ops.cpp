@@ -431,7 +431,7 @@ Tensor sparse_times(const Tensor& column, const Tensor& first, const Tensor& val
 }
 
 template <class T>
-std::tuple<Tensor, Tensor, int64_t> regressed(
+std::tuple<Tensor, Tensor, Tensor> regressed(
     const Tensor& directions, const Tensor& scale, const Tensor& changes, const Tensor& index, const Tensor& used,
     const Tensor& known_index, const Tensor& known_values, const Tensor& ridges,
     const std::optional<Tensor>& constant, bool errors, bool shortened, ScalarType type) {
@@ -444,16 +444,18 @@ std::tuple<Tensor, Tensor, int64_t> regressed(
       known_values.const_data_ptr<T>(), ridges.const_data_ptr<T>(), constant ? constant->const_data_ptr<T>() : nullptr,
       m, K, keep, known_index.size(1), R, shortened,
       values.mutable_data_ptr<T>(), errors ? deviations.mutable_data_ptr<T>() : nullptr};
+  Tensor count = torch::stable::empty({}, ScalarType::Long);
   std::atomic<int64_t> failed{0};
   torch::stable::parallel_for(0, m, grain(keep * keep * K), [&](int64_t begin, int64_t end) {
     failed += regress_rows(of, begin, end);
   });
-  return {values, deviations, failed.load()};
+  *count.mutable_data_ptr<int64_t>() = failed;
+  return {values, deviations, count};
 }
 
-// The slopes [R, m, keep] of m regressions for R pairs of ridges, standard errors [m, keep] of the first of them or
-// [0, keep], and how many regressions have no solution. See `Regression` for the arguments.
-std::tuple<Tensor, Tensor, int64_t> regress(
+// The slopes [R, m, keep] of m regressions for R pairs of ridges, standard errors [m, keep] for the first pair or
+// [0, keep], and of how many regressions the matrix is not positive definite. See `Regression` for the arguments.
+std::tuple<Tensor, Tensor, Tensor> regress(
     const Tensor& directions, const Tensor& scale, const Tensor& changes, const Tensor& index, const Tensor& used,
     const Tensor& known_index, const Tensor& known_values, const Tensor& ridges,
     const std::optional<Tensor>& constant, bool errors, bool shortened) {
@@ -507,7 +509,7 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("sparse_times(Tensor column, Tensor first, Tensor values, Tensor vector) -> Tensor");
   m.def(
       "regress(Tensor directions, Tensor scale, Tensor changes, Tensor index, Tensor used, Tensor known_index, "
-      "Tensor known_values, Tensor ridges, Tensor? constant, bool errors, bool shortened) -> (Tensor, Tensor, int)");
+      "Tensor known_values, Tensor ridges, Tensor? constant, bool errors, bool shortened) -> (Tensor, Tensor, Tensor)");
   m.def(
       "project_drawn(Tensor rows, Tensor x, Tensor sigma, bool antithetic, bool single, Tensor t) "
       "-> Tensor");

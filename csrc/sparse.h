@@ -158,7 +158,7 @@ ZH_INLINE void read_row(const Regression<T>& of, int64_t row, Scratch<T>& to) {
   for (int64_t e = 0; e < of.keep; ++e)
     if (of.used[row * of.keep + e]) to.place[to.s++] = e;
   to.width = padded<T>(to.s);
-  std::copy_n(of.changes + row * of.K, of.K, to.target.data());
+  std::fill(std::copy_n(of.changes + row * of.K, of.K, to.target.begin()), to.target.end(), T(0));
   for (int64_t i = 0; i < to.s; ++i) {
     const int64_t parameter = index[to.place[i]];
     std::copy_n(of.directions + parameter * of.K, of.K, to.A.data() + i * to.samples);

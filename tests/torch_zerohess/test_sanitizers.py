@@ -21,8 +21,9 @@ def compiled(folder: Path, source: str, *flags: str) -> Path:
     return program
 
 
-def test_kernels_under_sanitizers(tmp_path: Path) -> None:
-    done = subprocess.run([compiled(tmp_path, "core_test.cpp", "-O1")], capture_output=True, text=True)
+@pytest.mark.parametrize("source", ["core_test.cpp", "sparse_test.cpp"])
+def test_kernels_under_sanitizers(source: str, tmp_path: Path) -> None:
+    done = subprocess.run([compiled(tmp_path, source, "-O1")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-4000:]
 
 

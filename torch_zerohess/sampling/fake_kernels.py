@@ -1,6 +1,6 @@
 """Shapes and types of what the C++ operators return, for tensors without numbers: fake tensors, tracers, compilers.
 
-Shapes: B batch, S samples, K = S or 2 S evaluations per x, n parameters, M vectors; see `csrc/ops.cpp`.
+Shapes: B batch, S samples, K = S or 2 S evaluations per x, n parameters, M vectors, m outputs; see `csrc/ops.cpp`.
 """
 
 import torch
@@ -84,10 +84,33 @@ def mirror(matrices: Tensor) -> None:
     return None
 
 
+def sparse_times(column: Tensor, first: Tensor, values: Tensor, vector: Tensor) -> Tensor:
+    return vector.new_empty(first.shape[0])
+
+
+def regress(
+    directions: Tensor,
+    scale: Tensor,
+    changes: Tensor,
+    index: Tensor,
+    used: Tensor,
+    known_index: Tensor,
+    known_values: Tensor,
+    ridges: Tensor,
+    constant: Tensor | None,
+    errors: bool,
+    shortened: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    m, keep = index.shape
+    values = changes.new_empty(ridges.shape[0], m, keep)
+    return values, changes.new_empty(m if errors else 0, keep), index.new_empty(())
+
+
 OPERATORS = (
     *(pick_rows, draw, uniforms, shape, with_lobes, sample, place),
     *(project, accumulate, hessian, mirror, project_drawn, accumulate_drawn),
     *(coefficients, weighted_gradient, weighted_hvp),
+    *(sparse_times, regress),
 )
 
 

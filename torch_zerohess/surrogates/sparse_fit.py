@@ -33,7 +33,7 @@ FEWEST_SAMPLES = 8
 _FOLDS = 4
 """Parts of the samples that are held out in turn."""
 _HELD = 2
-"""Of them, that are held out where previous slopes are known."""
+"""Of these parts, that are held out where previous slopes are known."""
 _ROUNDS = 3
 """In which entries are found where no old ones are known."""
 _RIDGES = ((1e-4, 1e-4), (0.03, 0.03), (0.3, 0.1), (0.3, 0.3), (1.0, 0.3))

@@ -108,8 +108,9 @@ def slopes(
     shortened: whether errors include that the ridge shortens new slopes; it shortens none that is 0.
     """
     if extension.available and u.is_cpu:
-        (found,), deviations = _compiled(u, d, index, used, previous, [ridges], constant, errors=True, shortened=shortened)
-        return found, deviations
+        case = u, d, index, used, previous, [ridges]
+        found, deviations = _compiled(*case, constant, errors=True, shortened=shortened)
+        return found[0], deviations
     K, values = len(u), torch.zeros_like(index, dtype=u.dtype)
     errors = torch.zeros_like(values)
     for rows in _regressions(u, d, index, used, previous):
@@ -147,16 +148,15 @@ def _compiled(
     """Return slopes [choices, m, keep] and errors of the first of them [m, keep], by the C++ extension."""
     scale = len(u) * u.square().mean(0).clamp_min(torch.finfo(u.dtype).tiny)
     values, deviations, failed = torch.ops.torch_zerohess.regress(
-        *(one.contiguous() for one in (u.mT, scale, d.mT, index, used, previous.index, previous.values)),
+        *(one.contiguous() for one in (u.mT, scale, d.mT, index, used, previous.index, previous.values.to(u))),
         u.new_tensor(choices),
         constant,
         errors,
         shortened,
     )
     if failed:
-        raise torch.linalg.LinAlgError(  # type: ignore[attr-defined]
-            f"the normal equations of {failed} outputs are not positive definite"
-        )
+        message = f"the normal equations of {int(failed)} outputs are not positive definite"
+        raise torch.linalg.LinAlgError(message)  # type: ignore[attr-defined]
     return values, deviations
 
 

@@ -120,6 +120,11 @@ def doubles(*shape: int) -> Tensor:
 
 ROWS = proposals.pick_rows(1, 0, 8, N, proposals.SECOND_ORDER)
 RECIPE = (ROWS, BATCH, doubles(N), True, False)
+INDEX = torch.arange(3).repeat(4, 1) % N
+REGRESSIONS = (
+    *(doubles(N, 6), doubles(N).abs(), doubles(4, 6), INDEX, INDEX > 0),  # 6 samples, 4 outputs, 3 entries each
+    *(INDEX[:, :2].contiguous(), doubles(4, 2), torch.full((2, 2), 0.5, dtype=torch.float64)),
+)
 OPERATORS = {
     "pick_rows": (1, 0, 8, N, 1),
     "draw": (ROWS, N),
@@ -136,6 +141,9 @@ OPERATORS = {
     "mirror": (doubles(2, N, N),),
     "project_drawn": (*RECIPE, doubles(4, 5, N)),
     "accumulate_drawn": (*RECIPE, doubles(4, 5, 4), False),
+    "sparse_times": (INDEX[0], torch.tensor([0, 1]), doubles(3).float(), doubles(N)),
+    "regress": (*REGRESSIONS, None, False, True),
+    "regress with errors": (*REGRESSIONS, doubles(6).abs(), True, False),
 }
 
 

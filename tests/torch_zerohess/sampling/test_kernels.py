@@ -169,6 +169,11 @@ made += [ops.project(u, t), ops.accumulate(u, half, False), ops.hessian(u, half)
 weight = a[:, 0, :120].exp().contiguous()
 made += [ops.coefficients(u[..., :5].contiguous(), None, 119, True), ops.weighted_gradient(u, weight, half)]
 made += [ops.weighted_hvp(u, weight, half, t)]
+for real in (torch.float32, torch.float64):
+    rows, index = u[0, :30].to(real), torch.arange(60).view(20, 3) * 7 % 30
+    parts = rows[:, :50], rows[:, 50].abs(), rows[:20, 50:100], index, index % 5 > 0, index, rows[:20, :3]
+    ridges, constant = torch.full((2, 2), 0.3, dtype=real), torch.full((50,), 0.02, dtype=real)
+    made += ops.regress(*(one.contiguous() for one in parts), ridges, constant, True, True)
 for single in (True, False):
     recipe = (every, x, sigma, True, single)
     made += [ops.project_drawn(*recipe, t), ops.accumulate_drawn(*recipe, a, False)]

@@ -6,7 +6,7 @@ Random tests have fixed seeds. Limits of shares are from binomial errors or stat
 import pytest
 import torch
 
-from torch_zerohess.surrogates import sparse_selection
+from torch_zerohess.surrogates import sparse_fit, sparse_selection
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, _subset, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, largest, spaced, thresholds
@@ -223,6 +223,18 @@ def test_pruning_keeps_the_rate_where_neighbours_share_evidence():
         found = fit_sparse(u, u @ A.mT, torch.Size([side, side]), settings).dense().view(side**2, -1) != 0
         false[prune] = float((found & (A == 0)).sum() / found.sum())
     assert false[True] < 0.1 < false[False]
+
+
+def test_fits_that_know_slopes_hold_out_fewer_parts(monkeypatch):
+    """Each part that is held out takes as long as a fit."""
+    held, count = sparse_fit.slopes_by_ridges, []
+    monkeypatch.setattr(sparse_fit, "slopes_by_ridges", lambda *given: count.append(1) or held(*given))
+    u, settings = normal(40, 20), SparseSettings(2)
+    first = fit_sparse(u, u[:, :10], torch.Size([10]), settings)
+    assert len(count) == 4
+    again = fit_sparse(u, u[:, :10], torch.Size([10]), settings, first)
+    assert len(count) == 6
+    assert again.explained > 0.99
 
 
 def test_the_mean_over_neighbours():

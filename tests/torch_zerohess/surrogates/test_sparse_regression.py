@@ -1,14 +1,25 @@
-"""Standard errors of slopes on a known support, against fits without one sample at a time."""
+"""Slopes on a known support, and their standard errors against fits without one sample at a time.
+
+All of it by the C++ extension and by torch.
+"""
 
 import pytest
 import torch
 
+from torch_zerohess.sampling import extension
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
-from torch_zerohess.surrogates.sparse_regression import slopes, slopes_by_ridges
+from torch_zerohess.surrogates.sparse_regression import predicted, slopes, slopes_by_ridges
 from truths import normal
 
 K, M, N = 30, 5, 3
+needs_extension = pytest.mark.skipif(not extension.available, reason="the operators are those of the extension")
+
+
+@pytest.fixture(autouse=True, params=[pytest.param(True, marks=needs_extension, id="extension"), "torch"])
+def backend(request, monkeypatch):
+    """By the extension, or by torch alone."""
+    monkeypatch.setattr(extension, "available", request.param is True)
 
 
 def fitted(u, d, weights, penalty, prior):
@@ -80,3 +91,56 @@ def test_a_search_may_do_without_robust_errors():
     found = [fit_sparse(u, d, torch.Size([20]), SparseSettings(1, robust=robust)) for robust in (True, False)]
     assert torch.equal(found[0].dense(), found[1].dense())
     assert bool((found[0].standard_error > 1.5 * found[1].standard_error).all())
+
+
+def random_case(samples, dtype, keep=12, m=60, n=40):
+    """Directions, changes, supports with holes, and previous slopes of which some are on the supports."""
+    u, d = normal(samples, n).to(dtype), normal(samples, m, seed=1).to(dtype)
+    index = normal(m, n, seed=2).argsort(1)[:, :keep]
+    used = normal(m, keep, seed=3) < 1.0
+    values = torch.where(normal(m, 8, seed=4) > 0.0, normal(m, 8, seed=5), 0.0).to(dtype)
+    known = normal(m, n, seed=6).argsort(1)[:, :8]
+    return u, d, index, used, SparseJacobian(known, values, torch.zeros_like(values), n, torch.Size([m]))
+
+
+@needs_extension
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("samples", [15, 32, 100])
+def test_extension_and_torch_agree(samples, dtype, monkeypatch):
+    case, bound = random_case(samples, dtype), 300 * torch.finfo(dtype).eps
+    constant, choices = torch.full((samples,), 1 / samples, dtype=dtype), [(0.03, 0.03), (0.3, 0.1)]
+    results = []
+    for available in (True, False):
+        monkeypatch.setattr(extension, "available", available)
+        made = slopes_by_ridges(*case, choices)
+        for shortened in (True, False):
+            for one in (None, constant):
+                made += slopes(*case, choices[1], one, shortened=shortened)
+        results.append(made)
+    for got, expected in zip(*results, strict=True):
+        assert got.dtype == dtype
+        torch.testing.assert_close(got, expected, rtol=bound, atol=bound * float(expected.abs().max()))
+
+
+def test_directions_without_a_solution_are_an_error():
+    u, d, *rest = random_case(20, torch.float64)
+    u[0, 0] = torch.inf
+    with pytest.raises(torch.linalg.LinAlgError, match="positive"):
+        slopes(u, d, *rest, (0.3, 0.1))
+
+
+@needs_extension
+def test_indices_beyond_the_parameters_are_refused():
+    u, d, index, *rest = random_case(20, torch.float64)
+    extension.available = True
+    for wrong in (-1, 40):
+        with pytest.raises(RuntimeError, match="index has numbers beyond the parameters"):
+            slopes(u, d, index.clone().fill_(wrong), *rest, (0.3, 0.1))
+
+
+def test_predicted_changes_are_products_with_the_rows():
+    u, _, index, _, _ = random_case(20, torch.float64)
+    values = torch.where(normal(60, 12, seed=7) > 0.0, normal(60, 12, seed=8), 0.0)
+    J = torch.zeros(60, 40).double().scatter_(1, index, values)
+    torch.testing.assert_close(predicted(index, values, u), u @ J.mT)
+    assert bool((predicted(index, 0.0 * values, u) == 0.0).all())

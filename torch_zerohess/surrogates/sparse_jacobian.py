@@ -50,7 +50,8 @@ class SparseJacobian:
         with outside_inference():
             found = self.found
             row, column, values = found.nonzero()[:, 0], self.index[found], self.values[found]
-            by_rows = SparseRows.of(row, column, values, len(found))
+            counts = found.sum(1)
+            by_rows = SparseRows(column, counts.cumsum(0) - counts, values)
             object.__setattr__(self, "_entries", (by_rows, SparseRows.of(column, row, values, self.n)))
 
     @classmethod

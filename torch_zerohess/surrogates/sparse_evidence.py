@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_regression import chances, normal_from_t, threshold
+from torch_zerohess.surrogates.sparse_selection import lengths
 
 _RATE = 5e-3
 """Expected share of parameters that no output depends on, among those that are found in a batch, at most."""
@@ -76,8 +77,8 @@ def confirmed(jacobian: SparseJacobian, u: Tensor, d: Tensor) -> Tensor:
     u, d = u - u.mean(0), d - d.mean(0)
     left, own = d - jacobian.matvec(u).flatten(1), jacobian.squared_lengths.double() * u
     sums = jacobian.rmatvec(left.view(-1, *jacobian.shape)) + own
-    length = sums.norm(dim=0)
-    r = (u * sums).sum(0) / (u.norm(dim=0) * length).clamp_min(torch.finfo(u.dtype).tiny)
-    r = torch.where(length > _ROUNDING * own.norm(dim=0), r, 0.0)
+    length = lengths(sums)
+    r = (u * sums).sum(0) / (lengths(u) * length).clamp_min(torch.finfo(u.dtype).tiny)
+    r = torch.where(length > _ROUNDING * lengths(own), r, 0.0)
     nu = len(u) - 2.0
     return normal_from_t(r * (nu / (1.0 - r.square()).clamp_min(torch.finfo(u.dtype).eps)).sqrt(), nu)

@@ -5,6 +5,7 @@
 | noise | picks, perturbations, points and density ratios of proposal "aggregate" | `torch.randn` of the same count |
 | Hessian | `Estimate.hessian` | the bare matrix product of its samples |
 | gradient + HVP | one gradient and one product from perturbations that are drawn again | three passes of noise |
+| sparse regressions | slopes of 4 096 outputs, of 40 parameters each, for five priors | the same in torch |
 | threads | the noise with one thread | with two |
 
 A ratio above 1 says that the package is faster, or that two threads are.
@@ -19,7 +20,9 @@ import torch
 
 import torch_zerohess as zh
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
-from torch_zerohess.sampling import kernels, proposals
+from torch_zerohess.sampling import extension, kernels, proposals
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+from torch_zerohess.surrogates.sparse_regression import slopes_by_ridges
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,7 @@ def ratios(repeats: int, wide: tuple[int, ...] = (512, 2048), large: int = 1_000
     rows = [noise(dtype, repeats) for dtype in (torch.float32, torch.float64)]
     rows += [hessian(n, repeats) for n in wide]
     rows.append(redrawn(large, max(1, repeats // 5)))
+    rows.append(_regressions(max(1, repeats // 5)))
     rows.append(_threads(repeats))
     return rows
 
@@ -95,6 +99,26 @@ def redrawn(n: int, repeats: int, device: str = "cpu") -> Ratio:
 
     seconds, compared = in_turn(finished(derivatives, device), sampler(x, sigma, samples), repeats)
     return Ratio("gradient + HVP, drawn again", n, samples, seconds, 3 * compared, 0.6, "noise")
+
+
+def _regressions(repeats: int) -> Ratio:
+    n, samples, m, keep = 1024, 64, 4096, 40
+    generator = torch.Generator().manual_seed(0)
+    u, d = torch.randn(samples, n, generator=generator), torch.randn(samples, m, generator=generator)
+    index = torch.rand(m, n, generator=generator).topk(keep).indices
+    previous = SparseJacobian(index, torch.ones(m, keep), torch.zeros(m, keep), n, torch.Size([m]))
+    choices = [(0.1 * k, 0.1 * k) for k in range(1, 6)]
+
+    def fit(compiled: bool) -> Callable[[], object]:
+        def run() -> object:
+            extension.available = compiled
+            return slopes_by_ridges(u, d, index, index >= 0, previous, choices)
+
+        return run
+
+    seconds, compared = in_turn(fit(True), fit(False), repeats)
+    extension.available = True
+    return Ratio("sparse regressions", n, samples, seconds, compared, compared_with="torch")
 
 
 def _threads(repeats: int) -> Ratio:

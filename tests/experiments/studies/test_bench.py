@@ -80,6 +80,7 @@ def test_ratios_against_the_machine(costs) -> None:
         "noise, float64",
         "Hessian",
         "gradient + HVP, drawn again",
+        "sparse regressions",
         "noise, two threads against one",
         *(
             f"{memory}: a {what}"

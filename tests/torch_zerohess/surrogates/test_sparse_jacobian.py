@@ -5,7 +5,10 @@ Random tests have fixed seeds. Limits of shares are from binomial errors or stat
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
+from torch_zerohess.sampling import extension
 from torch_zerohess.surrogates import sparse_fit, sparse_selection
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, _subset, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -235,6 +238,32 @@ def test_fits_that_know_slopes_hold_out_fewer_parts(monkeypatch):
     again = fit_sparse(u, u[:, :10], torch.Size([10]), settings, first)
     assert len(count) == 6
     assert again.explained > 0.99
+
+
+class Largest(TorchDispatchMode):
+    """Keeps the most elements that a tensor has had."""
+
+    elements = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        for one in tree_leaves(result):
+            if isinstance(one, torch.Tensor):
+                self.elements = max(self.elements, one.untyped_storage().nbytes() // one.element_size())
+        return result
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_no_tensor_of_a_fit_has_as_many_elements_as_the_jacobian(compiled, monkeypatch):
+    """The memory of a fit is a constant times the entries that it keeps, here 4 of 6 400 per pixel."""
+    monkeypatch.setattr(extension, "available", compiled and extension.available)
+    side, settings = 80, SparseSettings(4, grid=(80, 80, 1))
+    u = normal(32, side**2).float()
+    with Largest() as largest:
+        J = fit_sparse(u, u, torch.Size([side, side]), settings)
+        fit_sparse(u, u, torch.Size([side, side]), settings, J)
+    assert J.explained > 0.9
+    assert largest.elements <= side**4 / 16
 
 
 def test_the_mean_over_neighbours():

@@ -12,9 +12,8 @@ _ROUNDING = 1e-6
 """Difference of two values, relative to them, that is rounding: renders of one seed differ by 3e-8."""
 _SHARE, _MOST, _LEAST = 8, 48, 4
 """The part of all evaluations that the decision at the end gets: one in so many, at most and at least so many."""
-
 _SIGNIFICANT = 2.0
-"""Standard errors by which a mean must be lower than the mean of a point that is trusted."""
+"""Standard errors by which a mean must be lower than the mean of a point that is trusted, and a deviation than noise."""
 
 
 def differs(one: Tensor, other: Tensor) -> bool:
@@ -61,7 +60,8 @@ def lowest_mean(
         evaluate: points [K, n] -> losses [K].
         points: to choose from.
         evaluations: how many may be made.
-        noise: standard deviation of a loss; a larger measured deviation takes its place.
+        noise: standard deviation of a loss. What is measured at the chosen point takes its place if that is larger, or
+            significantly smaller: a loss of noisy outputs has less noise where it is lower.
         trusted: whether a model of many evaluations has chosen the first point. Another point then takes its place only
             if the mean is lower by two standard errors of the difference.
     """
@@ -80,10 +80,23 @@ def lowest_mean(
             better = means.argsort()[: math.ceil(len(left) / 2)]
             left, losses = left[better], losses[better]
     told = evaluate(points[left[:1]].repeat(evaluations, 1))
-    told = told[torch.isfinite(told)]
+    told, earlier = (one[torch.isfinite(one)] for one in (told, losses[0]))
     if not len(told):
-        told = losses[0][torch.isfinite(losses[0])]
+        told, earlier = earlier, told
     if not len(told):
         return None
-    spread = max(noise, deviation(told)) if len(told) > 1 else noise
-    return int(left[0]), float(told.mean()), spread / math.sqrt(len(told))
+    return int(left[0]), float(told.mean()), _spread([told, earlier], noise) / math.sqrt(len(told))
+
+
+def _spread(groups: Sequence[Tensor], noise: float) -> float:
+    """Return the standard deviation of groups [K] of values with different means, if it was expected to be `noise`.
+
+    The logarithm of a measured deviation has the variance 1 / (2 degrees of freedom), and `noise` was measured as well.
+    """
+    freedom = sum(len(one) - 1 for one in groups if len(one))
+    if freedom == 0:
+        return noise
+    measured = math.sqrt(sum(float((one - one.mean()).square().sum()) for one in groups if len(one)) / freedom)
+    error = math.sqrt(0.5 / freedom + 0.5 / (REPEATED - 1))
+    smaller = 0.0 < measured < noise * math.exp(-_SIGNIFICANT * error)
+    return measured if smaller else max(noise, measured)

@@ -13,7 +13,7 @@ _ROUNDING = 1e-6
 _SHARE, _MOST, _LEAST = 8, 48, 4
 """The part of all evaluations that the decision at the end gets: one in so many, at most and at least so many."""
 _SIGNIFICANT = 2.0
-"""Standard errors by which a mean must be lower than the mean of a point that is trusted, and a deviation than noise."""
+"""Standard errors by which a mean must be below the mean of a point that is trusted, and a deviation below noise."""
 
 
 def differs(one: Tensor, other: Tensor) -> bool:

@@ -40,9 +40,8 @@ from experiments.runs.trial import LIMIT, Trial
 METHOD = "gaussian_process"
 OWN = {
     **dict.fromkeys(("quad", "box10", "dense", "brdf", "discs", "hexagon"), "descent"),
-    **dict.fromkeys(("texture", "texture100", "texture317", "poster", "caustic64"), "local"),
+    **dict.fromkeys(("texture", "texture100", "texture317", "poster", "caustic", "caustic64"), "local"),
     **dict.fromkeys(("meshfit", "meshfit_color", "suzanne", "banana"), "handles_newton"),
-    "caustic": "block_gauss_newton",
 }
 """Tasks for which another method is recommended."""
 OTHER = "cma_es_bounded"

@@ -1,9 +1,11 @@
 """What runs in a worker process: it gets a black box once, then points, until its pipe is closed."""
 
 import contextlib
+import multiprocessing
+import os
 import pickle
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -66,6 +68,7 @@ def main(connection: "Connection[Any, Any]") -> None:
     """Serve until the pipe is closed."""
     end_with_parent()
     become_worker()
+    multiprocessing.current_process().daemon = False  # the black box may have processes: they end with the group
     _leave_no_core()
     torch.set_num_threads(1)
     messages = Messages(connection)
@@ -83,14 +86,29 @@ def main(connection: "Connection[Any, Any]") -> None:
                 if kind == FUNCTION:
                     fn = None  # what it holds is given back before the next one is made
                     fn = pickle.loads(parts[0].data)
-                    built(fn)
+                    _in_this_process(built, fn)
                 else:
                     tensors = [one.tensor() for one in parts]
-                    values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+                    values = checked_values(_in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's
                 messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:
                 _answer(messages, values)
+
+
+def _in_this_process(fn: Callable[..., Any], *args: Any) -> Any:
+    """Return fn(*args). A process that fn forks, and that comes back from it too, ends: two would answer."""
+    process = os.getpid()
+    try:
+        result = fn(*args)
+    except BaseException:
+        if os.getpid() != process:
+            traceback.print_exc()
+            os._exit(1)
+        raise
+    if os.getpid() != process:
+        os._exit(0)
+    return result
 
 
 def _answer(messages: Messages, values: Tensor | None) -> None:

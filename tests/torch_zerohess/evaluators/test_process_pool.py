@@ -154,6 +154,17 @@ def test_an_error_comes_with_the_traceback_of_the_worker(pool):
     assert torch.equal(pool(black_boxes.waves, z), black_boxes.waves(z))  # the other worker's same error is no news
 
 
+def test_a_process_that_the_black_box_forks_does_not_answer(pool):
+    z = torch.tensor([[0.1], [0.7], [0.2], [0.9]])
+    for _ in range(2):
+        assert torch.equal(pool(black_boxes.forking, z), z[:, 0])
+
+
+def test_the_black_box_may_have_processes_of_its_own(pool):
+    z = points(3)
+    assert torch.equal(pool(black_boxes.with_processes, z), z.sum(1))
+
+
 def test_values_of_different_shapes_are_refused(pool):
     with pytest.raises(ValueError, match=r"one shape, got \[3\] for point 0 and \[2\] for point 1, \[0.7\]"):
         pool(black_boxes.ragged, torch.tensor([[0.1], [0.7]]))

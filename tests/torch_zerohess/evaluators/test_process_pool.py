@@ -321,6 +321,17 @@ class Losing:
         return values
 
 
+def test_a_point_that_is_lost_is_not_said_to_be_nan():
+    lost = {"evaluator": Losing(lambda z: z[:, 0] < 9.0), "on_nonfinite": "drop"}
+    with pytest.raises(ValueError, match=r"left 0 of 8 draws.*; it crashed, at the point \["):
+        zh.estimate(black_boxes.waves, vector(0.1, 0.2), S, **lost)
+    with torch.no_grad(), pytest.raises(ValueError, match=r"it crashed, at the point \[0\.1, 0\.2\], which is x"):
+        zh.smooth(black_boxes.waves, S, **lost)(vector(0.1, 0.2))
+    second = {"evaluator": Losing(lambda z: torch.arange(len(z)) == 17 + 16), "on_nonfinite": "drop"}
+    with pytest.raises(ValueError, match=r"it crashed, at the point \[0\.3, 0\.4\], which is x"):
+        zh.estimate(black_boxes.waves, torch.stack([vector(0.1, 0.2), vector(0.3, 0.4)]), S, **second)
+
+
 def test_a_head_cannot_hide_a_lost_point():
     smoothing = S.replace(samples=4, baseline="mean")
     second = Losing(lambda z: torch.arange(len(z)) == 1)

@@ -62,8 +62,8 @@ def finite_values(
         center = int(bad[:, K].nonzero()[0]), K
         raise ValueError(
             f"{_wrong(values[center], outputs[center], points()[center], why(*center))}, which is x itself. "
-            "on_nonfinite='drop' drops perturbed points alone: choose baseline='mean' and value='smoothed', which do not need f(x), or "
-            "on_nonfinite=<a number>"
+            "on_nonfinite='drop' drops perturbed points alone: choose baseline='mean' and value='smoothed', which do "
+            "not need f(x), or on_nonfinite=<a number>"
         )
     if not stein.droppable:
         raise ValueError(

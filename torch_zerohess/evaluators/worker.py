@@ -2,10 +2,9 @@
 
 import contextlib
 import multiprocessing
-import os
 import pickle
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -16,7 +15,7 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.factory import Each, built
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
-from torch_zerohess.evaluators.process_identity import become_worker
+from torch_zerohess.evaluators.process_identity import become_worker, in_this_process
 from torch_zerohess.evaluators.values import checked_values
 
 READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
@@ -86,29 +85,14 @@ def main(connection: "Connection[Any, Any]") -> None:
                 if kind == FUNCTION:
                     fn = None  # what it holds is given back before the next one is made
                     fn = pickle.loads(parts[0].data)
-                    _in_this_process(built, fn)
+                    in_this_process(built, fn)
                 else:
                     tensors = [one.tensor() for one in parts]
-                    values = checked_values(_in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
+                    values = checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's
                 messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:
                 _answer(messages, values)
-
-
-def _in_this_process(fn: Callable[..., Any], *args: Any) -> Any:
-    """Return fn(*args). A process that fn forks, and that comes back from it too, ends: two would answer."""
-    process = os.getpid()
-    try:
-        result = fn(*args)
-    except BaseException:
-        if os.getpid() != process:
-            traceback.print_exc()
-            os._exit(1)
-        raise
-    if os.getpid() != process:
-        os._exit(0)
-    return result
 
 
 def _answer(messages: Messages, values: Tensor | None) -> None:

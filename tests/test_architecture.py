@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {
     "torch_zerohess": [
         *(
+            "version",
             "arguments",
             "precision",
             "choice",

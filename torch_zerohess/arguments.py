@@ -9,6 +9,8 @@ from typing import Any
 
 from torch import Tensor
 
+from torch_zerohess.version import written_by
+
 
 def check_callable(**arguments: Any) -> None:
     """Raise TypeError for an argument that is neither None nor callable."""
@@ -42,11 +44,15 @@ def check_evaluator(value: Any) -> None:
 
 
 def check_state(state: Any, like: Mapping[str, Any], what: str) -> None:
-    """Raise TypeError for a state that is no dictionary, KeyError for one that lacks what `like` has."""
+    """Raise TypeError for a state that is no dictionary, KeyError for one that lacks what `like` has.
+
+    Where `like` is a version of such states, the message names the version of the state.
+    """
     if not isinstance(state, Mapping):
         raise TypeError(f"state must be a state_dict of {what}, got {type(state).__name__}")
     if missing := [name for name in like if name not in state]:
-        raise KeyError(f"state must be a state_dict of {what}, this one lacks {', '.join(missing)}")
+        of = f" ({written_by(state)})" if "version" in like else ""
+        raise KeyError(f"state must be a state_dict of {what}, this one lacks {', '.join(missing)}{of}")
 
 
 def checked_seed(value: Any) -> int:

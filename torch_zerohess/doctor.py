@@ -10,6 +10,7 @@ import torch
 
 from torch_zerohess.adapters import mitsuba_variants
 from torch_zerohess.sampling import extension
+from torch_zerohess.version import installed_version
 
 _OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "numpy")
 _NAME = "torch_zerohess"
@@ -59,14 +60,6 @@ def doctor() -> Report:
         advice.append(f"for fast renders with derivatives, {mitsuba_variants.LLVM}")
     advice += [f"for {', '.join(names)}: pip install '{_NAME}[{extra}]'" for extra, names in _missing()]
     return Report(extension.available, extension.status, devices, variants, versions, advice)
-
-
-def installed_version(package: str) -> str | None:
-    """Return the version of an installed package, by its name on PyPI; None if it is not installed."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _missing() -> Iterator[tuple[str, list[str]]]:

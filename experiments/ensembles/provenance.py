@@ -14,7 +14,7 @@ from typing import Any
 
 from experiments.problems.task import Preset
 from experiments.runs.records import write
-from torch_zerohess.doctor import installed_version
+from torch_zerohess.version import installed_version
 
 _ROOT = Path(__file__).parents[2]
 _CODE = ("experiments", "torch_zerohess", "csrc", "setup.py", "pyproject.toml", ":(exclude)experiments/results")

@@ -11,7 +11,7 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Task
 from experiments.runs.network_trial import NetworkTrial
 from experiments.runs.trial import Trial
-from torch_zerohess.doctor import installed_version
+from torch_zerohess.version import installed_version
 
 
 def everywhere(task: object) -> str | None:

@@ -124,11 +124,11 @@ def test_a_checkpoint_that_is_none(tmp_path):
     for name, content in (("corrupt", b"example"), ("empty", b""), ("cut", good.read_bytes()[:500])):
         path = tmp_path / name
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=f"checkpoint must be a new file, or one that minimize.*{name}"):
+        with pytest.raises(ValueError, match=f"checkpoint must be a new file, or.*{name}: torch.load cannot"):
             zh.minimize(tilted, zeros(2), checkpoint=path, **settings)
         assert path.read_bytes() == content
     torch.save({"noise": 0.0}, tmp_path / "other.pt")
-    with pytest.raises(ValueError, match=r"checkpoint must be .*other\.pt: KeyError"):
+    with pytest.raises(ValueError, match=r"checkpoint must be .*other\.pt: .*this one lacks sure, .*without a version"):
         zh.minimize(tilted, zeros(2), checkpoint=tmp_path / "other.pt", **settings)
     with pytest.raises(ValueError, match=r"good\.pt: x0 must be torch\.float64 as there, got torch\.float32"):
         zh.minimize(tilted, zeros(2, dtype=torch.float32), checkpoint=good, **settings)

@@ -54,6 +54,7 @@ def test_derivatives_of_auxiliary_inputs_are_refused(transform):
         calls[transform]()
 
 
+@pytest.mark.filterwarnings("ignore:on_nonfinite='drop' drops most draws")
 def test_standard_error_after_dropping_counts_what_is_left():
     """A constant has no spread, and half of the draws of a sum have the spread of half as many draws."""
     settings = S.replace(samples=4000, proposal="gaussian", baseline="none")

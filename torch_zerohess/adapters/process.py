@@ -36,7 +36,10 @@ class Program(Closing):
 
     - "json": a request is the line `{"x": [[...], ...]}`, with `"aux": [...]` where there is aux. The answer is one
       line, the list of K values. Numbers are written so that float64 is read back exactly.
-    - "npy": a request is the array x, then each aux, as `numpy.save` writes them. The answer is one array.
+    - "npy": a request is the array x, then each aux, as `numpy.save` writes them, in the types of the tensors. The
+      answer is one array of numbers, as `numpy.save(sys.stdout.buffer, values)` writes it. `numpy.load` cannot read
+      from a pipe. A Python program reads one array by
+      `numpy.lib.format.read_array(types.SimpleNamespace(read=sys.stdin.buffer.read))`.
     - a function of bytes: turns the output of the program into the value. Requests are written as for "json".
 
     A server writes one answer per request and flushes it, and writes messages to the standard error alone. More answers
@@ -59,6 +62,7 @@ class Program(Closing):
             limit.
         folder: where the program runs; here if None.
         environment: variables added to the environment of this process. A PATH among them finds the program, too.
+            Relative folders in it are relative to `folder`.
         on_failure: "raise", or "nan" to go on without the values of a run that fails.
 
     Raises:
@@ -293,6 +297,7 @@ def _found(command: Sequence[str], folder: str | None, environment: Mapping[str,
     """Return a command whose program exists; TypeError if it is text, which a function may return by mistake.
 
     A path of the program is relative to the folder where it runs, a name alone is looked for in the PATH that it gets.
+    So are the folders in this PATH, because the program starts from there.
     """
     if isinstance(command, str) or not isinstance(command, Sequence) or not command:
         raise TypeError(f"command must return a list, the program and its arguments, got {command!r}")
@@ -301,7 +306,8 @@ def _found(command: Sequence[str], folder: str | None, environment: Mapping[str,
         raise TypeError(f"command must be a list of texts and paths, got {wrong[0]!r} in it: write str({wrong[0]!r})")
     name = os.fsdecode(command[0])
     place = os.path.join(folder or "", name) if os.path.dirname(name) else name
-    if shutil.which(place, path=(environment or {}).get("PATH")) is None:
+    folders = (os.environ | (environment or {})).get("PATH", os.defpath).split(os.pathsep)
+    if shutil.which(place, path=os.pathsep.join(os.path.join(folder or "", one) for one in folders)) is None:
         raise FileNotFoundError(
             f"command: there is no program {name!r} that could be run, see "
             + ("PATH" if place == name else f"folder {os.fspath(folder or '')!r}")

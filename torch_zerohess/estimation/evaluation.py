@@ -145,6 +145,11 @@ class BlackBoxCall:
             raise loss_error(lost, points)
         return sorted(lost)
 
+    def why_lost(self, E: int) -> Callable[[int, int], str | None]:
+        """Return a function that says why the evaluator has no value of point e of element b, in the last call."""
+        lost: dict[int, str] = getattr(self.evaluator, "lost", None) or {}
+        return lambda b, e: lost.get(e if self.joint else b * E + e)
+
 
 def evaluate(
     call: BlackBoxCall,
@@ -185,7 +190,9 @@ def evaluate(
     if control is None and outer.linear and smoothing.baseline == "center":
         _, coefficients = coefficients_of(values, None, K, smoothing, n)
     if coefficients is None or not all_finite(coefficients):  # differences to f(x) are finite only if all values are
-        values, kept = finite_values(values, outputs, points, call.on_nonfinite, K, smoothing, stein)
+        values, kept = finite_values(
+            values, outputs, points, call.on_nonfinite, K, smoothing, stein, call.why_lost(K + with_center)
+        )
         share = share_of(kept, B, K, x.device)
 
         def added(all_values: Tensor) -> list[Tensor]:
@@ -229,7 +236,7 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     values, outputs = (one[:, 0] for one in call.values(x[:, None], list(aux)))
     bad = ~torch.isfinite(values.reshape(len(x), -1)).all(1)
     if bool(bad.any()):
-        values = replaced(values, outputs, bad.nonzero()[0], x, call.on_nonfinite)
+        values = replaced(values, outputs, bad.nonzero()[0], x, call.on_nonfinite, call.why_lost(1))
     return values
 
 

@@ -121,7 +121,8 @@ def _sampled(call: BlackBoxCall, x: Tensor, smoothing: Smoothing) -> tuple[Tenso
             f"fn must return an output of many numbers, each of few parameters, got shape {list(shape)}: for one "
             "number use estimate"
         )
-    values, kept = finite_values(values, values, lambda: points, call.on_nonfinite, len(u), smoothing, stein)
+    why = call.why_lost(points.shape[1])
+    values, kept = finite_values(values, values, lambda: points, call.on_nonfinite, len(u), smoothing, stein, why)
     flat = values[0].reshape(len(u), -1).double()
     if smoothing.antithetic:
         S = len(u) // 2

@@ -16,7 +16,7 @@ from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
-from torch_zerohess.evaluators.process_identity import become_worker, identity
+from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
 from torch_zerohess.evaluators.values import checked_values
 
 _HELD = 4
@@ -176,5 +176,5 @@ def values_of(fn: Callable[..., Any], data: bytes) -> bytes:
     """Return the values of points and auxiliary inputs, all as bytes."""
     tensors = [one.tensor() for one in transfer.unpacked(data)]
     with torch.no_grad():
-        values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+        values = checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
     return transfer.packed([values])

@@ -1,4 +1,4 @@
-"""Which process this is, for black boxes that draw random numbers of their own.
+"""Which process this is, for black boxes that draw random numbers of their own, or that fork.
 
 A black box that is made in every worker counts its calls from the same seed in each of them. Its random numbers must
 differ between workers, because estimates of noise compare repeated values.
@@ -6,7 +6,10 @@ differ between workers, because estimates of noise compare repeated values.
 
 import hashlib
 import os
+import traceback
 import uuid
+from collections.abc import Callable
+from typing import Any
 
 _START = uuid.uuid4().hex
 """Of this process and of those that it forks; other processes, also on other machines, have others."""
@@ -33,3 +36,18 @@ def own_seed(seed: int, below: int) -> int:
         return seed
     digest = hashlib.blake2b(f"{identity()} {seed}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") % below
+
+
+def in_this_process(fn: Callable[..., Any], *args: Any) -> Any:
+    """Return fn(*args). A process that fn forks, and that comes back from it too, ends: two would answer."""
+    process = os.getpid()
+    try:
+        result = fn(*args)
+    except BaseException:
+        if os.getpid() != process:
+            traceback.print_exc()
+            os._exit(1)
+        raise
+    if os.getpid() != process:
+        os._exit(0)
+    return result

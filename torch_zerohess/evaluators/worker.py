@@ -1,6 +1,7 @@
 """What runs in a worker process: it gets a black box once, then points, until its pipe is closed."""
 
 import contextlib
+import multiprocessing
 import pickle
 import traceback
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.factory import Each, built
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
-from torch_zerohess.evaluators.process_identity import become_worker
+from torch_zerohess.evaluators.process_identity import become_worker, in_this_process
 from torch_zerohess.evaluators.values import checked_values
 
 READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
@@ -66,6 +67,7 @@ def main(connection: "Connection[Any, Any]") -> None:
     """Serve until the pipe is closed."""
     end_with_parent()
     become_worker()
+    multiprocessing.current_process().daemon = False  # the black box may have processes: they end with the group
     _leave_no_core()
     torch.set_num_threads(1)
     messages = Messages(connection)
@@ -83,10 +85,10 @@ def main(connection: "Connection[Any, Any]") -> None:
                 if kind == FUNCTION:
                     fn = None  # what it holds is given back before the next one is made
                     fn = pickle.loads(parts[0].data)
-                    built(fn)
+                    in_this_process(built, fn)
                 else:
                     tensors = [one.tensor() for one in parts]
-                    values = checked_values(fn(*tensors), tensors[0], not isinstance(fn, Each))
+                    values = checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's
                 messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import check_state
 from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.decision import Decision, decide
 from torch_zerohess.minimization.derivatives import quadratic_at
@@ -18,6 +19,7 @@ from torch_zerohess.minimization.noise import REPEATED, are_counts, deviation, d
 from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.minimization.wording import budget, worded
 from torch_zerohess.search.trust_region import TrustRegion
+from torch_zerohess.version import VERSION
 
 _PAUSE = 1.0
 """Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
@@ -67,10 +69,13 @@ class Running:
         self.record = Record(call, lambda values: self.search.losses(values), self.search.x)
         if path is None or not path.exists():
             return
+        saved = None
         try:
-            self._resume(torch.load(path, map_location="cpu", weights_only=True))
-        except Exception as error:
-            why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {str(error)[:100]}"
+            saved = torch.load(path, map_location="cpu", weights_only=True)
+            self._resume(saved)
+        except Exception as error:  # of torch.load, which raises any for a file of another kind, or of the state
+            read = f"torch.load cannot read it, {type(error).__name__}: {str(error)[:100]}"
+            why = read if saved is None else str(*error.args[:1])
             wanted = "a new file, or one that minimize wrote with the same settings"
             raise ValueError(f"checkpoint must be {wanted}, got {path}: {why}") from error
 
@@ -203,14 +208,8 @@ class Running:
         self._written = time.monotonic()
         draft = self._path.with_name(f"{self._path.name}.part")
         decided = None if self._decided is None else vars(self._decided)
-        saved = {
-            "noise": self.noise,
-            "sure": self._sure,
-            "decided": decided,
-            "deciding": self._deciding,
-            "search": self.search.state_dict(),
-        }
-        torch.save(saved | self.record.state_dict(), draft)
+        own = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
+        torch.save({**own, "search": self.search.state_dict(), "version": VERSION, **self.record.state_dict()}, draft)
         draft.replace(self._path)
 
     def minimum(self, status: Status, message: str) -> Minimum:
@@ -238,6 +237,8 @@ class Running:
 
     def _resume(self, saved: dict[str, Any]) -> None:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
+        names = "noise", "sure", "decided", "deciding", "search", *self.record.state_dict(), "version"
+        check_state(saved, dict.fromkeys(names), "minimize")
         self.noise = saved["noise"]
         self.search = self._make(self.noise or 0.0)
         self.record.load_state_dict(saved, x := self.search.x)

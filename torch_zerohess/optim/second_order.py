@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from torch_zerohess.arguments import checked_number
+from torch_zerohess.arguments import check_state, checked_number
 from torch_zerohess.autograd.blocks import jacobian as white_box_jacobian
 from torch_zerohess.autograd.blocks import output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
@@ -168,6 +168,13 @@ class SecondOrder(Optimizer):
                 f"{type(self).__name__}"
             )
         super().add_param_group(param_group)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a `state_dict`, with its settings. KeyError if it lacks one: it is of another optimizer."""
+        check_state(state_dict, dict.fromkeys(("state", "param_groups")), name := type(self).__name__)
+        for group in state_dict["param_groups"]:
+            check_state(group, self.defaults, name)
+        super().load_state_dict(state_dict)
 
     @property
     def _output_modification(self) -> str | None:

@@ -20,9 +20,10 @@ from torch_zerohess.arguments import check_callable, check_state, checked_intege
 from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
-from torch_zerohess.search.state import Evaluated, P, State, plain, restored
+from torch_zerohess.search.state import Evaluated, P, State, plain, restored_progress
 from torch_zerohess.search.told import as_evaluated, check_start, converted, joined
 from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.version import VERSION
 
 
 class AskTell(ABC, Generic[P]):
@@ -268,7 +269,7 @@ class AskTell(ABC, Generic[P]):
         Tensors, numbers, strings, lists and dicts: `torch.save`, and `torch.load` with weights_only=True.
         """
         alone = len(self._given) in (0, len(self._state.asked))  # nothing is out, or what the search itself asked for
-        out = {"early": dict(self._early), "out": None if alone else self._given}
+        out = {"early": dict(self._early), "out": None if alone else self._given, "version": VERSION}
         bounds = {"lower": self._space.lower, "upper": self._space.upper}
         return {"search": self._kind, "unit": self.unit, **bounds, **out, **plain(self._state)}
 
@@ -282,7 +283,7 @@ class AskTell(ABC, Generic[P]):
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         self._space.check_state(state)
         device = self.unit.device
-        progress = restored(self._method.progress, state["progress"], device)
+        progress = restored_progress(self._method.progress, state, device)
         early = {k: value.to(device) for k, value in state["early"].items()}
         out = None if state["out"] is None else state["out"].to(device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())

@@ -2,11 +2,14 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
 import torch
 from torch import Tensor
+
+from torch_zerohess.version import written_by
 
 T = TypeVar("T")
 _SCALAR = torch.Size()
@@ -194,10 +197,24 @@ def plain(value: Any) -> Any:
 
 
 def restored(kind: type[T], data: dict[str, Any], device: torch.device) -> T:
-    """Return the dataclass of which `plain` made `data`, with its tensors on the device."""
+    """Return the dataclass of which `plain` made `data`, with its tensors on the device.
+
+    ValueError if it has other fields.
+    """
     hints = get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind) if field.init]  # type: ignore[arg-type]
+    for wrong, verb in ((set(names) - data.keys(), "lacks"), (data.keys() - set(names), "has")):
+        if wrong:
+            raise ValueError(f"its {kind.__name__} {verb} {', '.join(sorted(wrong))}")
     return kind(**{name: _restored(hints[name], data[name], device) for name in names})
+
+
+def restored_progress(kind: type[P], state: Mapping[str, Any], device: torch.device) -> P:
+    """Return the progress in a `state_dict`. ValueError if it has other fields: another version wrote it."""
+    try:
+        return restored(kind, state["progress"], device)
+    except ValueError as error:
+        raise ValueError(f"state must be one that this version can read: {error} ({written_by(state)})") from error
 
 
 def _restored(hint: Any, value: Any, device: torch.device) -> Any:

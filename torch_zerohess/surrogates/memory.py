@@ -11,6 +11,7 @@ from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.coefficient import Coefficient
 from torch_zerohess.surrogates.surrogate import Surrogate, outside_inference
+from torch_zerohess.version import VERSION
 
 _GROWTH = 1.3
 """The surrogate is fitted again when there are this times as many evaluations as at the last fit."""
@@ -219,6 +220,7 @@ class Memory:
             "pathwise": self.pathwise,
             "moments": [list(one) for one in self.regression.moments],
             "surrogate": model,
+            "version": VERSION,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

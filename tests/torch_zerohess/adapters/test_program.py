@@ -80,16 +80,11 @@ def test_a_layer_around_a_server(server):
 @pytest.mark.parametrize("server", [False, True])
 def test_arrays(server):
     code = (
-        "import io, sys, numpy as np\n"
-        "from numpy.lib import format as f\n"
-        "def read(i=sys.stdin.buffer):\n"
-        "    v = f.read_magic(i); s, _, d = f.read_array_header_1_0(i)\n"
-        "    return np.frombuffer(i.read(int(np.prod(s)) * d.itemsize), d).reshape(s)\n"
+        "import sys, types, numpy as np\n"
         "while True:\n"
-        "    try: x = read()\n"
+        "    try: x = np.lib.format.read_array(types.SimpleNamespace(read=sys.stdin.buffer.read))\n"
         "    except ValueError: break\n"
-        "    o = io.BytesIO(); np.save(o, np.stack([x, x * 2], 1).astype('f4'))\n"
-        "    sys.stdout.buffer.write(o.getvalue()); sys.stdout.flush()\n"
+        "    np.save(sys.stdout.buffer, np.stack([x, x * 2], 1).astype('f4')); sys.stdout.flush()\n"
     )
     with Program([sys.executable, "-c", code], server=server, format="npy") as program:
         for _ in range(2 if server else 1):
@@ -346,6 +341,22 @@ def test_a_program_in_the_path_that_it_gets(tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no program 'awk' that could be run, see PATH"):
         Program(["awk"], environment={"PATH": str(tmp_path)})
     Program(["awk"], environment={"OTHER": "1"})
+
+
+def test_a_relative_path_variable_is_relative_to_the_folder(tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    script = tmp_path / "bin" / "only-there"
+    script.write_text("#!/bin/sh\necho 3.5\n")
+    script.chmod(0o755)
+    mine = f"bin{os.pathsep}{os.environ['PATH']}"
+    for environment in ({"PATH": mine}, None):
+        for command in (["only-there"], lambda point: ["only-there"]):
+            program = Program(command, folder=str(tmp_path), environment=environment, format=lambda out: [float(out)])
+            assert program(Z[:1]).flatten().tolist() == [3.5]
+        monkeypatch.setenv("PATH", mine)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match="there is no program 'only-there'"):
+        Program(["only-there"], folder="bin")
 
 
 def test_no_points_have_no_values():

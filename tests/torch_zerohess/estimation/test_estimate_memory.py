@@ -289,6 +289,7 @@ def test_a_surrogate_of_another_shape_says_so(head: Callable[[Tensor, Tensor], T
         estimate(image, X, SMOOTHING, *aux, head=head, memory=memory)
 
 
+@pytest.mark.filterwarnings("ignore:on_nonfinite='drop' drops most draws")
 def test_points_that_are_dropped_leave_the_coefficient() -> None:
     """Half of the plane has no value; the surrogate is exact where there is one."""
 

@@ -56,7 +56,8 @@ def test_the_other_one_of_a_dropped_pair_goes_with_it() -> None:
 
 def test_too_few_draws_left_is_an_error() -> None:
     everything_but_one = holes(*range(1, 8))
-    assert estimate(everything_but_one, X, S, on_nonfinite="drop").dropped == 14
+    with pytest.warns(UserWarning, match="drops most draws around a point.*For a region give a number"):
+        assert estimate(everything_but_one, X, S, on_nonfinite="drop").dropped == 14
     with pytest.raises(ValueError, match="left 1 of 8 draws, 2 are needed"):
         estimate(everything_but_one, X, S.replace(baseline="mean"), on_nonfinite="drop")
     with pytest.raises(ValueError, match="left 0 of 8 draws, 1 are needed"):
@@ -65,6 +66,27 @@ def test_too_few_draws_left_is_an_error() -> None:
     sobol = S.replace(samples=16, sampler="sobol", baseline="mean")
     with pytest.raises(ValueError, match="left one independent draw, baseline 'mean' needs two"):
         estimate(holes(*range(8)), X, sobol, on_nonfinite="drop", value="smoothed")
+
+
+def test_an_element_in_a_region_without_values_is_noticed_in_a_batch() -> None:
+    """One of 40 elements lies where fn fails. Chance takes as much from some of them, and that is no warning."""
+    x = torch.zeros(40, 2, dtype=torch.float64)
+    x[7, 0] = 1.3
+    generator, left = torch.Generator().manual_seed(0), []
+
+    def fails_above_one(z: Tensor) -> Tensor:
+        return torch.where(z[:, 0] > 1.0, math.nan, f(z))
+
+    def fails_at_random(z: Tensor) -> Tensor:
+        lost = torch.rand(len(z), generator=generator) < 0.4
+        left.append(float((~lost).reshape(40, 32).double().mean(1).min()))
+        return torch.where(lost, math.nan, f(z))
+
+    single = S.replace(samples=32, antithetic=False, baseline="mean")
+    with pytest.warns(UserWarning, match="drops most draws around a point"):
+        estimate(fails_above_one, x, single, value="smoothed", on_nonfinite="drop")
+    estimate(fails_at_random, x, single, value="smoothed", on_nonfinite="drop")
+    assert left[0] < 0.5
 
 
 def test_where_nothing_is_finite_the_error_says_so() -> None:
@@ -97,7 +119,8 @@ def test_a_head_that_is_not_finite_is_named() -> None:
         estimate(lambda z: z[:, :1] - 0.2, X, S, head=log)
     with pytest.raises(ValueError, match="fn returned nan at the point"):
         estimate(lambda z: z / 0.0 - z / 0.0, X, S, head=log)
-    got = estimate(lambda z: z, X, S, head=log, on_nonfinite="drop")
+    with pytest.warns(UserWarning, match="drops most draws"):
+        got = estimate(lambda z: z, X, S, head=log, on_nonfinite="drop")
     assert 0 < got.dropped < 16
     with pytest.raises(ValueError, match=r"left 0 of 8 draws.*17 of 17 values are not finite; head returned nan"):
         estimate(lambda z: z - 9.0, X, S, head=log, on_nonfinite="drop")

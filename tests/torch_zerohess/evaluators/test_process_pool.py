@@ -154,6 +154,17 @@ def test_an_error_comes_with_the_traceback_of_the_worker(pool):
     assert torch.equal(pool(black_boxes.waves, z), black_boxes.waves(z))  # the other worker's same error is no news
 
 
+def test_a_process_that_the_black_box_forks_does_not_answer(pool):
+    z = torch.tensor([[0.1], [0.7], [0.2], [0.9]])
+    for _ in range(2):
+        assert torch.equal(pool(black_boxes.forking, z), z[:, 0])
+
+
+def test_the_black_box_may_have_processes_of_its_own(pool):
+    z = points(3)
+    assert torch.equal(pool(black_boxes.with_processes, z), z.sum(1))
+
+
 def test_values_of_different_shapes_are_refused(pool):
     with pytest.raises(ValueError, match=r"one shape, got \[3\] for point 0 and \[2\] for point 1, \[0.7\]"):
         pool(black_boxes.ragged, torch.tensor([[0.1], [0.7]]))
@@ -308,6 +319,17 @@ class Losing:
         values[gone] = torch.nan
         self.lost = dict.fromkeys(gone.nonzero()[:, 0].tolist(), "it crashed")
         return values
+
+
+def test_a_point_that_is_lost_is_not_said_to_be_nan():
+    lost = {"evaluator": Losing(lambda z: z[:, 0] < 9.0), "on_nonfinite": "drop"}
+    with pytest.raises(ValueError, match=r"left 0 of 8 draws.*; it crashed, at the point \["):
+        zh.estimate(black_boxes.waves, vector(0.1, 0.2), S, **lost)
+    with torch.no_grad(), pytest.raises(ValueError, match=r"it crashed, at the point \[0\.1, 0\.2\], which is x"):
+        zh.smooth(black_boxes.waves, S, **lost)(vector(0.1, 0.2))
+    second = {"evaluator": Losing(lambda z: torch.arange(len(z)) == 17 + 16), "on_nonfinite": "drop"}
+    with pytest.raises(ValueError, match=r"it crashed, at the point \[0\.3, 0\.4\], which is x"):
+        zh.estimate(black_boxes.waves, torch.stack([vector(0.1, 0.2), vector(0.3, 0.4)]), S, **second)
 
 
 def test_a_head_cannot_hide_a_lost_point():

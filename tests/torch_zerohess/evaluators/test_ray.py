@@ -50,6 +50,11 @@ def test_calls_that_do_not_wait_share_the_actors(actors, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
+def test_a_fork_in_an_actor_does_not_answer(actors):
+    assert torch.equal(actors(black_boxes.forking, Z), Z.sum(1))
+
+
+@pytest.mark.filterwarnings("ignore")
 def test_actors_have_random_numbers_of_their_own(actors):
     count = torch.arange(8.0, dtype=torch.float64)[:, None]
     assert not bool((actors(black_boxes.numbered, count) == count[:, 0]).any())

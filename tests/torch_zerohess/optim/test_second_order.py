@@ -60,6 +60,19 @@ def test_a_closure_that_calls_backward_is_told_not_to(kind: type) -> None:
     assert dict(optimizer.state) == {}
 
 
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
+def test_the_state_of_another_optimizer_is_refused(kind: type) -> None:
+    p = torch.nn.Parameter(vector(1.0, 2.0))
+    optimizer = kind([p])
+    before = optimizer.state_dict()
+    with pytest.raises(KeyError, match=rf"a state_dict of {kind.__name__}, this one lacks .*curvature"):
+        optimizer.load_state_dict(torch.optim.Adam([p]).state_dict())
+    with pytest.raises(KeyError, match=rf"a state_dict of {kind.__name__}, this one lacks state, param_groups"):
+        optimizer.load_state_dict({})
+    assert optimizer.state_dict() == before
+    optimizer.step(lambda: (p**4).sum())
+
+
 SCHEDULED = {
     "NewtonCG": (zh.optim.NewtonCG, {}),
     "NewtonCG without a test": (zh.optim.NewtonCG, {"adapt": False}),

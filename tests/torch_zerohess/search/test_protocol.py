@@ -1,5 +1,6 @@
 """Ask and tell, the same for every search: points asked for, refused values, and resumed searches."""
 
+import importlib.metadata
 import math
 import warnings
 
@@ -459,6 +460,26 @@ def test_a_start_that_is_not_finite_can_be_told_again():
     search.tell(values[:1], which=[0])
     search.tell(values[1:])
     assert search.evaluations == len(values)
+
+
+@pytest.mark.parametrize("written", ["0.0.9", None])
+@pytest.mark.parametrize(("change", "wrong"), [("agreed", "lacks agreed"), (None, "has later")])
+def test_a_state_of_another_version_is_named_and_changes_nothing(written, change, wrong):
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    search.tell(bowl(search.ask()))
+    state = search.state_dict()
+    assert state["version"] == importlib.metadata.version("torch_zerohess")
+    progress = {name: one for name, one in state["progress"].items() if name != change}
+    other = state | {"progress": progress if change else progress | {"later": 1}, "version": written}
+    before = search.ask()
+    with pytest.raises(
+        ValueError, match=rf"Progress {wrong} \(written by version {written}, this is torch_zerohess \d"
+    ):
+        search.load_state_dict(other)
+    assert torch.equal(search.ask(), before)
+    del other["version"]
+    with pytest.raises(KeyError, match=r"this one lacks version \(without a version, this is torch_zerohess \d"):
+        search.load_state_dict(other)
 
 
 def test_wrong_states_seeds_and_numbers_are_named():

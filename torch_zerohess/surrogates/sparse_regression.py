@@ -8,6 +8,8 @@ grows with |u_k| if the black box is curved. So the variances of the slopes are
 
 in which e_k / (1 - h_k) is what the fit without sample k leaves of it (HC3: MacKinnon and White 1985). The error of the
 prior is added: (M P (J - J'))^2, and the diagonal of s^2 M P M, where s^2 is the mean of e^2.
+
+CPU tensors go to the C++ extension if it was built. What follows is the literal reference of `csrc/sparse.h`.
 """
 
 import math

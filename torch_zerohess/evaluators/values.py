@@ -80,6 +80,13 @@ def as_tensor(result: Any) -> Tensor:
 
 def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tensor:
     """Return values [K, *out] of points [K, n], or raise TypeError or ValueError if they cannot be that."""
+    if vectorized and isinstance(result, tuple) and len(result) > 1:
+        lengths = [getattr(one, "shape", ())[:1] for one in result]
+        if all(tuple(one) == (len(points),) for one in lengths):  # two outputs of two points are no two values
+            raise ValueError(
+                f"fn must return one tensor, got a tuple of {len(result)} with {len(points)} values each: return one, "
+                "or torch.stack(outputs, 1); values of single points go into a list"
+            )
     values = as_tensor(result)
     if values.requires_grad:
         raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")

@@ -362,6 +362,7 @@ def test_every_third_point_ends_its_process_and_the_others_make_the_estimate(poo
         assert torch.equal(one, other)
 
 
+@pytest.mark.filterwarnings("ignore:on_nonfinite='drop' drops most draws")
 def test_an_estimate_without_every_third_point_is_unbiased():
     """3 numbers within 5 standard errors: a false alarm in 2e-6 of the seeds."""
     x, smoothing = vector(0.2, -0.3), zh.Smoothing(sigma=0.7, samples=48, baseline="mean")

@@ -24,6 +24,8 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 
 _PREDICTED = 0.25
 """Misfit of a predicted output below which the output counts as smooth."""
+_LEAST = 0.1
+"""First region of Gauss-Newton after a shorter step, over the reach of the descent."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,9 +77,8 @@ class OutputDescent(Relay[OutputDescentProgress]):
         descent = self._follow.take(before, evaluated, generator)
         known = replace(known, descent=descent)
         if self._is_smooth(before, descent, evaluated):
-            smooth = self._smooth.taking_over(
-                descent, descent.lowest, float((evaluated.points[0] - before.center).norm())
-            )
+            step = float((evaluated.points[0] - before.center).norm())
+            smooth = self._smooth.taking_over(descent, descent.lowest, max(step, _LEAST * _reach(descent)))
             return self._went_on(known, *self._smooth.plan(smooth, generator), generator)
         return known.taking(descent), self._follow.points(descent, generator)
 
@@ -121,3 +122,9 @@ class OutputDescent(Relay[OutputDescentProgress]):
         pool = pool.add(smooth.points, smooth.values, outputs, smooth.lowest.point, 1.0)
         descent = replace(descent, pool=pool)
         return descent.taking(smooth, "best", "lowest", "evaluations", "iterations", "shape")
+
+
+def _reach(descent: DescentProgress) -> float:
+    """Return how far the n + 1 evaluations lie that are nearest to the best point, at most sigma."""
+    distance = (descent.pool.points - descent.lowest.point).norm(dim=1)
+    return min(float(distance.sort().values[descent.n]), descent.sigma)

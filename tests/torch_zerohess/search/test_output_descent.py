@@ -7,6 +7,7 @@ from searches import plateau, rays, rays_loss, run, zeros
 
 from torch_zerohess.optim import Descent
 from torch_zerohess.search import output_descent, output_gauss_newton
+from torch_zerohess.search.output_gauss_newton import OutputGaussNewton
 from truths import vector
 
 
@@ -98,6 +99,23 @@ def test_after_five_rejected_steps_gauss_newton_has_failed(monkeypatch):
 
     usual = count()
     assert count(2) < usual < count(20)
+
+
+def test_gauss_newton_begins_with_a_region_as_wide_as_its_evaluations_lie(monkeypatch):
+    scales = vector(1.0, 100.0, 100.0, 100.0)
+
+    def first_region():
+        found, begin = [], OutputGaussNewton.taking_over
+        with monkeypatch.context() as patch:
+            patch.setattr(OutputGaussNewton, "taking_over", lambda *given: found.append(given[3]) or begin(*given))
+            search = Descent(torch.full((4,), 1e-3, dtype=torch.float64), sigma=1.0, loss=squares, seed=2)
+            while not found:
+                search.tell(search.ask() * scales)  # the minimum is next to the start: the first step is short
+        return found[0]
+
+    assert first_region() > 0.05
+    monkeypatch.setattr(output_descent, "_LEAST", 0.0)
+    assert first_region() < 0.01
 
 
 def test_on_a_plateau_it_never_begins():

@@ -246,5 +246,6 @@ class Estimate:
             raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")
         if not all_finite(v):
             raise ValueError(f"v must be finite, got {short(v)}")
-        t = (v.detach().to(self._sigma) / self._sigma).reshape(-1, 1, n)
+        t = v.detach().to(self._sigma) / self._sigma
+        t = t if t.dim() == 1 else t.reshape(-1, 1, n)
         return t.expand(self._batch.numel(), self._out.numel(), n).contiguous()

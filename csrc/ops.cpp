@@ -309,19 +309,41 @@ std::vector<double> weighted(const Tensor& u, const Tensor& weight, const Tensor
   return result;
 }
 
-Tensor weighted_gradient(const Tensor& u, const Tensor& weight, const Tensor& a) {
-  const std::vector<double> numbers = weighted(u, weight, a);
-  return accumulate_numbers(stored(u), a.size(0), a.size(1), a.size(2), u.size(2), false, numbers.data());
+// The numbers of sigma [n], or null where it is absent.
+const double* sigma_data(const std::optional<Tensor>& sigma, int64_t n) {
+  if (!sigma) return nullptr;
+  check(*sigma, "sigma", 1);
+  STD_TORCH_CHECK(sigma->size(0) == n, "sigma has ", sigma->size(0), " elements instead of ", n);
+  return sigma->const_data_ptr<double>();
 }
 
-// sum_k a_k w_k ((u_k . v) u_k - v)
-Tensor weighted_hvp(const Tensor& u, const Tensor& weight, const Tensor& a, const Tensor& v) {
+// sum_k a_k w_k u_k, divided by sigma where it is given.
+Tensor weighted_gradient(
+    const Tensor& u, const Tensor& weight, const Tensor& a, const std::optional<Tensor>& sigma) {
+  const std::vector<double> numbers = weighted(u, weight, a);
+  const double* const unit = sigma_data(sigma, u.size(2));
+  const int64_t B = a.size(0), M = a.size(1), n = u.size(2);
+  Tensor result = accumulate_numbers(stored(u), B, M, a.size(2), n, false, numbers.data());
+  if (unit) divide_rows(result.mutable_data_ptr<double>(), unit, B * M, n);
+  return result;
+}
+
+// sum_k a_k w_k ((u_k . v) u_k - v); with v / sigma in place of v and divided by sigma where it is given.
+Tensor weighted_hvp(
+    const Tensor& u, const Tensor& weight, const Tensor& a, const Tensor& v, const std::optional<Tensor>& sigma) {
   std::vector<double> numbers = weighted(u, weight, a);
   check(v, "v", 3);
+  const double* const unit = sigma_data(sigma, u.size(2));
   const int64_t B = a.size(0), M = a.size(1), K = a.size(2), n = u.size(2);
   STD_TORCH_CHECK(v.size(0) == B && v.size(1) == M && v.size(2) == n, "u, a and v do not fit");
   const auto rows_of = stored(u);
   const double* vectors = v.const_data_ptr<double>();
+  std::vector<double> divided;
+  if (unit) {
+    divided.assign(vectors, vectors + B * M * n);
+    divide_rows(divided.data(), unit, B * M, n);
+    vectors = divided.data();
+  }
   std::vector<double> totals(size_t(B * M)), along(size_t(B * M * K));
   for (int64_t row = 0; row < B * M; ++row) totals[size_t(row)] = total(numbers.data() + row * K, K);
   torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
@@ -335,6 +357,7 @@ Tensor weighted_hvp(const Tensor& u, const Tensor& weight, const Tensor& a, cons
   double* out = result.mutable_data_ptr<double>();
   for (int64_t row = 0; row < B * M; ++row)
     for (int64_t d = 0; d < n; ++d) out[row * n + d] -= totals[size_t(row)] * vectors[row * n + d];
+  if (unit) divide_rows(out, unit, B * M, n);
   return result;
 }
 
@@ -416,8 +439,8 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("accumulate(Tensor u, Tensor a, bool squares) -> Tensor");
   m.def("hessian(Tensor u, Tensor a) -> Tensor");
   m.def("coefficients(Tensor values, Tensor? share, int K, bool center) -> Tensor");
-  m.def("weighted_gradient(Tensor u, Tensor weight, Tensor a) -> Tensor");
-  m.def("weighted_hvp(Tensor u, Tensor weight, Tensor a, Tensor v) -> Tensor");
+  m.def("weighted_gradient(Tensor u, Tensor weight, Tensor a, Tensor? sigma=None) -> Tensor");
+  m.def("weighted_hvp(Tensor u, Tensor weight, Tensor a, Tensor v, Tensor? sigma=None) -> Tensor");
   m.def("mirror(Tensor(a!) matrices) -> ()");
   m.def(
       "project_drawn(Tensor rows, Tensor x, Tensor sigma, bool antithetic, bool single, Tensor t) "

@@ -56,10 +56,11 @@ class BlackBoxCall:
     def __post_init__(self) -> None:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
-        check_evaluator(self.evaluator)
-        check_bool(vectorized=self.vectorized)
         if self.evaluator is None:
             object.__setattr__(self, "evaluator", Inline())
+        else:
+            check_evaluator(self.evaluator)
+        check_bool(vectorized=self.vectorized)
         object.__setattr__(self, "outer", outer_of(self.head))
         checked_head(self.outer.head)
         if self.value not in ("center", "smoothed"):

@@ -39,18 +39,26 @@ def _compiled(u: Tensor, a: Tensor) -> bool:
     return extension.available and u.is_cpu and a.shape[1] <= kernels.MANY_VECTORS
 
 
-def gradient(u: Samples, weight: Tensor, a: Tensor) -> Tensor:
-    """Return sum_k a_k w_k u_k, [B, M, n], for u [B, K, n] or its recipe, weight w [B, K] and a [B, M, K]."""
+def gradient(u: Samples, weight: Tensor, a: Tensor, sigma: Tensor | None = None) -> Tensor:
+    """Return sum_k a_k w_k u_k, [B, M, n], for u [B, K, n] or its recipe, weight w [B, K] and a [B, M, K].
+
+    sigma: divide by it, float64 [n].
+    """
     if isinstance(u, Tensor) and _compiled(u, a):
-        return torch.ops.torch_zerohess.weighted_gradient(u.contiguous(), weight.contiguous(), a.contiguous())
-    return kernels.accumulate(u, a * weight[:, None])
+        return torch.ops.torch_zerohess.weighted_gradient(u.contiguous(), weight.contiguous(), a.contiguous(), sigma)
+    sums = kernels.accumulate(u, a * weight[:, None])
+    return sums if sigma is None else sums / sigma
 
 
-def hvp(u: Samples, weight: Tensor, a: Tensor, v: Tensor) -> Tensor:
-    """Return sum_k a_k w_k ((u_k . v) u_k - v), [B, M, n], for v [B, M, n]; the others as in `gradient`."""
+def hvp(u: Samples, weight: Tensor, a: Tensor, v: Tensor, sigma: Tensor | None = None) -> Tensor:
+    """Return sum_k a_k w_k ((u_k . v) u_k - v), [B, M, n], for v [B, M, n]; the others as in `gradient`.
+
+    sigma: divide v by it, and the result.
+    """
     if isinstance(u, Tensor) and _compiled(u, a):
         return torch.ops.torch_zerohess.weighted_hvp(
-            u.contiguous(), weight.contiguous(), a.contiguous(), v.contiguous()
+            u.contiguous(), weight.contiguous(), a.contiguous(), v.contiguous(), sigma
         )
-    a = a * weight[:, None]
-    return kernels.accumulate(u, a * kernels.project(u, v)).addcmul_(total(a.mT).mT, v, value=-1.0)
+    a, v = a * weight[:, None], v if sigma is None else v / sigma
+    sums = kernels.accumulate(u, a * kernels.project(u, v)).addcmul_(total(a.mT).mT, v, value=-1.0)
+    return sums if sigma is None else sums / sigma

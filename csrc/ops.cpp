@@ -277,12 +277,14 @@ Tensor coefficients_of(const T* values, const double* share, int64_t B, int64_t 
   return result;
 }
 
-// (f - baseline) * share [B, K, P] for values [B, E, P] in single or double precision: the baseline is value K where
-// `center`, else zero; share is [B, K, 1], or 1 / K where it is absent.
+// (f - baseline) * share [B, K, P] for values [B, E, *out] of P numbers each, in single or double precision: the
+// baseline is value K where `center`, else zero; share is [B, K, 1], or 1 / K where it is absent.
 Tensor coefficients(const Tensor& values, const std::optional<Tensor>& share, int64_t K, bool center) {
   const bool single = values.scalar_type() == ScalarType::Float;
-  check(values, "values", 3, single ? ScalarType::Float : ScalarType::Double);
-  const int64_t B = values.size(0), E = values.size(1), P = values.size(2);
+  check(values, "values", std::max<int64_t>(2, values.dim()), single ? ScalarType::Float : ScalarType::Double);
+  const int64_t B = values.size(0), E = values.size(1);
+  int64_t P = 1;
+  for (int64_t d = 2; d < values.dim(); ++d) P *= values.size(d);
   STD_TORCH_CHECK(K > 0 && K + center <= E, "values do not have K rows, and one more for the center");
   if (share) {
     check(*share, "share", 3);

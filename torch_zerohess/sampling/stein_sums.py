@@ -23,14 +23,14 @@ def total(a: Tensor) -> Tensor:
 
 
 def coefficients(values: Tensor, share: Tensor | None, K: int, center: bool) -> Tensor:
-    """Return (f - baseline) * share, float64 [B, K, P], for values [B, E, P].
+    """Return (f - baseline) * share, float64 [B, K, P], for values [B, E, *out] of P numbers each.
 
     The baseline is value K, f(x), where `center`, else zero. share: float64 [B, K, 1], or 1/K where it is None.
     """
     if extension.available and values.is_cpu:
         values = values if values.dtype == torch.float32 else values.double()
         return torch.ops.torch_zerohess.coefficients(values.contiguous(), share, K, center)
-    values = values.double()
+    values = values.double().reshape(*values.shape[:2], -1)
     f = values[:, :K] - values[:, K : K + 1] if center else values[:, :K]
     return f * (1.0 / K if share is None else share)
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 
-
 _AS_IT_IS: AbstractContextManager[Any] = contextlib.nullcontext()
 
 

@@ -66,8 +66,7 @@ class BlackBoxCall:
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
         rule = self.on_nonfinite
-        number = isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
-        if not number and rule not in ("raise", "drop"):
+        if rule not in ("raise", "drop") and not _finite_number(rule):
             raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -232,6 +231,10 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     if bool(bad.any()):
         values = replaced(values, outputs, bad.nonzero()[0], x, call.on_nonfinite)
     return values
+
+
+def _finite_number(rule: Any) -> bool:
+    return isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
 
 
 def _copied(tensor: Tensor) -> Tensor:

@@ -216,7 +216,7 @@ class Estimate:
         if quantity == "value":
             return sums
         if quantity == "hessian":
-            one = self._batches[0].smoothing.sigma
+            one = self._batches[0].evaluations.smoothing.sigma
             if isinstance(one, float):  # in place: a Hessian is large, and the sums are of no other use
                 return sums.div_(one).div_(one)
             i, j = self._sigma[:, None], self._sigma  # the larger sigma first, for symmetry to the last bit
@@ -225,7 +225,7 @@ class Estimate:
 
     def _shaped(self, flat: Tensor, what: str) -> Tensor:
         """Return [B, P, ...] as [*batch, *out, ...] in the dtype of x; ValueError if it is not finite there."""
-        result = flat.reshape((*self._batch, *self._out, *flat.shape[2:]))
+        result = flat.reshape(self._batch + self._out + flat.shape[2:])
         result = result if result.dtype == self._x.dtype else result.to(self._x.dtype)
         if not all_finite(result):
             largest = max(float(one.evaluations.values.abs().max()) for one in self._batches)

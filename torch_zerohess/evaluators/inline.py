@@ -5,7 +5,6 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
-import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.values import checked_values

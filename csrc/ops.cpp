@@ -3,12 +3,14 @@
 // n parameters, M vectors. Everything is contiguous float64 unless it says int64 or "type of x".
 #include <Python.h>
 
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <initializer_list>
 #include <optional>
 #include <tuple>
 #include <vector>

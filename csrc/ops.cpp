@@ -3,6 +3,7 @@
 // n parameters, M vectors. Everything is contiguous float64 unless it says int64 or "type of x".
 #include <Python.h>
 
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
@@ -42,6 +43,20 @@ void check(const Tensor& tensor, const char* name, int64_t dim, ScalarType type 
   STD_TORCH_CHECK(tensor.is_contiguous(), name, " is not contiguous");
 }
 
+// A new contiguous tensor of the CPU, [*sizes]. Not torch::stable::empty: it finds its operator by name at every call,
+// which takes longer than the sums of a small estimate.
+Tensor empty(std::initializer_list<int64_t> sizes, ScalarType type) {
+  std::vector<int64_t> strides(sizes.size(), 1);
+  for (size_t d = sizes.size(); d-- > 1;) strides[d - 1] = strides[d] * std::max<int64_t>(1, sizes.begin()[d]);
+  const int32_t dtype = type == ScalarType::Double  ? aoti_torch_dtype_float64()
+                        : type == ScalarType::Float ? aoti_torch_dtype_float32()
+                                                    : aoti_torch_dtype_int64();
+  AtenTensorHandle made;
+  STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(
+      int64_t(sizes.size()), sizes.begin(), strides.data(), dtype, aoti_torch_device_type_cpu(), 0, &made));
+  return Tensor(made);
+}
+
 int64_t grain(int64_t work_per_item) { return std::max<int64_t>(1, kGrain / std::max<int64_t>(1, work_per_item)); }
 
 const Row* row_data(const Tensor& rows) {
@@ -53,7 +68,7 @@ const Row* row_data(const Tensor& rows) {
 Tensor pick_rows(int64_t seed, int64_t first, int64_t count, int64_t n, int64_t proposal) {
   check_size(count, "count", 0);
   check_size(n, "n", 1);
-  Tensor rows = torch::stable::empty({count, 5}, ScalarType::Long);
+  Tensor rows = empty({count, 5}, ScalarType::Long);
   Row* out = reinterpret_cast<Row*>(rows.mutable_data_ptr<int64_t>());
   for (int64_t r = 0; r < count; ++r) out[r] = pick(seed, first + r, n, proposal);
   return rows;
@@ -63,7 +78,7 @@ template <typename T>
 Tensor draw_as(const Tensor& rows, int64_t n, ScalarType type) {
   check_size(n, "n", 0);
   const Row* row = row_data(rows);
-  Tensor u = torch::stable::empty({rows.size(0), n}, type);
+  Tensor u = empty({rows.size(0), n}, type);
   T* out = u.mutable_data_ptr<T>();
   torch::stable::parallel_for(0, rows.size(0), grain(8 * n), [&](int64_t begin, int64_t end) {
     for (int64_t r = begin; r < end; ++r)
@@ -85,7 +100,7 @@ Tensor uniforms_of(const Tensor& seed, const Tensor& row, int64_t first, int64_t
   check_size(first, "first", 0);
   STD_TORCH_CHECK(seed.size(0) == row.size(0) && first % 2 == 0, "seed and row do not fit, or first is odd");
   const int64_t R = row.size(0);
-  Tensor result = torch::stable::empty({R, count}, ScalarType::Double);
+  Tensor result = empty({R, count}, ScalarType::Double);
   const int64_t *seeds = seed.const_data_ptr<int64_t>(), *rows = row.const_data_ptr<int64_t>();
   double* out = result.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, R, grain(2 * count), [&](int64_t begin, int64_t end) {
@@ -107,7 +122,7 @@ Tensor shape(const Tensor& rows, const Tensor& p) {
   check(p, "p", 2);
   STD_TORCH_CHECK(rows.size(0) == p.size(0), "rows and p do not fit");
   const int64_t n = p.size(1);
-  Tensor u = torch::stable::empty({p.size(0), n}, ScalarType::Double);
+  Tensor u = empty({p.size(0), n}, ScalarType::Double);
   const double* source = p.const_data_ptr<double>();
   double* out = u.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, p.size(0), grain(8 * n), [&](int64_t begin, int64_t end) {
@@ -124,7 +139,7 @@ Tensor with_lobes(const Tensor& rows, const Tensor& u, const Tensor& p_i, const 
   check(p_j, "p_j", 1);
   const int64_t R = u.size(0), n = u.size(1);
   STD_TORCH_CHECK(rows.size(0) == R && p_i.size(0) == R && p_j.size(0) == R, "rows, u, p_i and p_j do not fit");
-  Tensor result = torch::stable::empty({R, n}, ScalarType::Double);
+  Tensor result = empty({R, n}, ScalarType::Double);
   const double *first = p_i.const_data_ptr<double>(), *second = p_j.const_data_ptr<double>();
   double* out = result.mutable_data_ptr<double>();
   std::copy_n(u.const_data_ptr<double>(), R * n, out);
@@ -139,9 +154,9 @@ std::tuple<Tensor, Tensor, Tensor> placed(
     const Tensor& x, const Tensor& sigma, int64_t S, bool antithetic, int64_t proposal, bool center, bool keep,
     ScalarType type, const Columns& columns) {
   const int64_t B = x.size(0), n = x.size(1), K = antithetic ? 2 * S : S, E = K + center;
-  Tensor points = torch::stable::empty({B, E, n}, type);
-  Tensor u = torch::stable::empty({keep ? B : 0, K, n}, ScalarType::Double);
-  Tensor weights = torch::stable::empty({B, K}, ScalarType::Double);
+  Tensor points = empty({B, E, n}, type);
+  Tensor u = empty({keep ? B : 0, K, n}, ScalarType::Double);
+  Tensor weights = empty({B, K}, ScalarType::Double);
   const Batch<X, T> batch{
       x.const_data_ptr<X>(), sigma.const_data_ptr<double>(), S, E, n, proposal, antithetic,
       points.mutable_data_ptr<T>(), keep ? u.mutable_data_ptr<double>() : nullptr, weights.mutable_data_ptr<double>()};
@@ -193,7 +208,7 @@ template <class RowsOf>
 Tensor accumulate_numbers(
     const RowsOf& rows_of, int64_t B, int64_t M, int64_t K, int64_t n, bool squares, const double* a) {
   const int64_t blocks = (n + kBlock - 1) / kBlock;
-  Tensor result = torch::stable::empty({B, M, n}, ScalarType::Double);
+  Tensor result = empty({B, M, n}, ScalarType::Double);
   double* out = result.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, B * blocks, grain(M * K * std::min(n, kBlock)), [&](int64_t begin, int64_t end) {
     for (int64_t task = begin; task < end; ++task) {
@@ -232,7 +247,7 @@ Tensor project(const Tensor& u, const Tensor& t) {
   check(t, "t", 3);
   STD_TORCH_CHECK(u.size(0) == t.size(0) && u.size(2) == t.size(2), "u and t do not fit");
   const int64_t B = t.size(0), M = t.size(1), n = t.size(2), K = u.size(1);
-  Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
+  Tensor result = empty({B, M, K}, ScalarType::Double);
   const double* vectors = t.const_data_ptr<double>();
   double* out = result.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
@@ -253,7 +268,7 @@ Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
 
 template <class T>
 Tensor coefficients_of(const T* values, const double* share, int64_t B, int64_t E, int64_t P, int64_t K, bool center) {
-  Tensor result = torch::stable::empty({B, K, P}, ScalarType::Double);
+  Tensor result = empty({B, K, P}, ScalarType::Double);
   double* out = result.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, B * K, grain(P), [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {
@@ -265,12 +280,14 @@ Tensor coefficients_of(const T* values, const double* share, int64_t B, int64_t 
   return result;
 }
 
-// (f - baseline) * share [B, K, P] for values [B, E, P] in single or double precision: the baseline is value K where
-// `center`, else zero; share is [B, K, 1], or 1 / K where it is absent.
+// (f - baseline) * share [B, K, P] for values [B, E, *out] of P numbers each, in single or double precision: the
+// baseline is value K where `center`, else zero; share is [B, K, 1], or 1 / K where it is absent.
 Tensor coefficients(const Tensor& values, const std::optional<Tensor>& share, int64_t K, bool center) {
   const bool single = values.scalar_type() == ScalarType::Float;
-  check(values, "values", 3, single ? ScalarType::Float : ScalarType::Double);
-  const int64_t B = values.size(0), E = values.size(1), P = values.size(2);
+  check(values, "values", std::max<int64_t>(2, values.dim()), single ? ScalarType::Float : ScalarType::Double);
+  const int64_t B = values.size(0), E = values.size(1);
+  int64_t P = 1;
+  for (int64_t d = 2; d < values.dim(); ++d) P *= values.size(d);
   STD_TORCH_CHECK(K > 0 && K + center <= E, "values do not have K rows, and one more for the center");
   if (share) {
     check(*share, "share", 3);
@@ -297,19 +314,41 @@ std::vector<double> weighted(const Tensor& u, const Tensor& weight, const Tensor
   return result;
 }
 
-Tensor weighted_gradient(const Tensor& u, const Tensor& weight, const Tensor& a) {
-  const std::vector<double> numbers = weighted(u, weight, a);
-  return accumulate_numbers(stored(u), a.size(0), a.size(1), a.size(2), u.size(2), false, numbers.data());
+// The numbers of sigma [n], or null where it is absent.
+const double* sigma_data(const std::optional<Tensor>& sigma, int64_t n) {
+  if (!sigma) return nullptr;
+  check(*sigma, "sigma", 1);
+  STD_TORCH_CHECK(sigma->size(0) == n, "sigma has ", sigma->size(0), " elements instead of ", n);
+  return sigma->const_data_ptr<double>();
 }
 
-// sum_k a_k w_k ((u_k . v) u_k - v)
-Tensor weighted_hvp(const Tensor& u, const Tensor& weight, const Tensor& a, const Tensor& v) {
+// sum_k a_k w_k u_k, divided by sigma where it is given.
+Tensor weighted_gradient(
+    const Tensor& u, const Tensor& weight, const Tensor& a, const std::optional<Tensor>& sigma) {
+  const std::vector<double> numbers = weighted(u, weight, a);
+  const double* const unit = sigma_data(sigma, u.size(2));
+  const int64_t B = a.size(0), M = a.size(1), n = u.size(2);
+  Tensor result = accumulate_numbers(stored(u), B, M, a.size(2), n, false, numbers.data());
+  if (unit) divide_rows(result.mutable_data_ptr<double>(), unit, B * M, n);
+  return result;
+}
+
+// sum_k a_k w_k ((u_k . v) u_k - v); with v / sigma in place of v and divided by sigma where it is given.
+Tensor weighted_hvp(
+    const Tensor& u, const Tensor& weight, const Tensor& a, const Tensor& v, const std::optional<Tensor>& sigma) {
   std::vector<double> numbers = weighted(u, weight, a);
   check(v, "v", 3);
+  const double* const unit = sigma_data(sigma, u.size(2));
   const int64_t B = a.size(0), M = a.size(1), K = a.size(2), n = u.size(2);
   STD_TORCH_CHECK(v.size(0) == B && v.size(1) == M && v.size(2) == n, "u, a and v do not fit");
   const auto rows_of = stored(u);
   const double* vectors = v.const_data_ptr<double>();
+  std::vector<double> divided;
+  if (unit) {
+    divided.assign(vectors, vectors + B * M * n);
+    divide_rows(divided.data(), unit, B * M, n);
+    vectors = divided.data();
+  }
   std::vector<double> totals(size_t(B * M)), along(size_t(B * M * K));
   for (int64_t row = 0; row < B * M; ++row) totals[size_t(row)] = total(numbers.data() + row * K, K);
   torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
@@ -323,6 +362,7 @@ Tensor weighted_hvp(const Tensor& u, const Tensor& weight, const Tensor& a, cons
   double* out = result.mutable_data_ptr<double>();
   for (int64_t row = 0; row < B * M; ++row)
     for (int64_t d = 0; d < n; ++d) out[row * n + d] -= totals[size_t(row)] * vectors[row * n + d];
+  if (unit) divide_rows(out, unit, B * M, n);
   return result;
 }
 
@@ -332,7 +372,7 @@ Tensor project_drawn(
   check(t, "t", 3);
   STD_TORCH_CHECK(x.size(0) == t.size(0) && x.size(1) == t.size(2), "x and t do not fit");
   const int64_t B = t.size(0), M = t.size(1), n = t.size(2), S = rows.size(0) / B, K = antithetic ? 2 * S : S;
-  Tensor result = torch::stable::empty({B, M, K}, ScalarType::Double);
+  Tensor result = empty({B, M, K}, ScalarType::Double);
   const double* vectors = t.const_data_ptr<double>();
   double* out = result.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, B * S, grain((M + 8) * n), [&](int64_t begin, int64_t end) {
@@ -360,7 +400,7 @@ Tensor hessian(const Tensor& u, const Tensor& a) {
   check(a, "a", 3);
   STD_TORCH_CHECK(u.size(0) == a.size(0) && u.size(1) == a.size(2), "u and a do not fit");
   const int64_t B = a.size(0), M = a.size(1), K = a.size(2), n = u.size(2);
-  Tensor result = torch::stable::empty({B, M, n, n}, ScalarType::Double);
+  Tensor result = empty({B, M, n, n}, ScalarType::Double);
   const double *rows = u.const_data_ptr<double>(), *coefficients = a.const_data_ptr<double>();
   double* out = result.mutable_data_ptr<double>();
   torch::stable::parallel_for(0, B * M * n, grain(K * n / 2), [&](int64_t begin, int64_t end) {
@@ -503,8 +543,8 @@ STABLE_TORCH_LIBRARY(torch_zerohess, m) {
   m.def("accumulate(Tensor u, Tensor a, bool squares) -> Tensor");
   m.def("hessian(Tensor u, Tensor a) -> Tensor");
   m.def("coefficients(Tensor values, Tensor? share, int K, bool center) -> Tensor");
-  m.def("weighted_gradient(Tensor u, Tensor weight, Tensor a) -> Tensor");
-  m.def("weighted_hvp(Tensor u, Tensor weight, Tensor a, Tensor v) -> Tensor");
+  m.def("weighted_gradient(Tensor u, Tensor weight, Tensor a, Tensor? sigma=None) -> Tensor");
+  m.def("weighted_hvp(Tensor u, Tensor weight, Tensor a, Tensor v, Tensor? sigma=None) -> Tensor");
   m.def("mirror(Tensor(a!) matrices) -> ()");
   m.def("sparse_times(Tensor column, Tensor first, Tensor values, Tensor vector) -> Tensor");
   m.def(

@@ -138,6 +138,12 @@ inline void center_row(const T* f, const T* baseline, double share, int64_t P, d
     for (int64_t p = 0; p < P; ++p) out[p] = double(f[p]) * share;
 }
 
+// Divides each of `rows` rows of n numbers by sigma [n].
+inline void divide_rows(double* numbers, const double* sigma, int64_t rows, int64_t n) {
+  for (int64_t row = 0; row < rows; ++row, numbers += n)
+    for (int64_t d = 0; d < n; ++d) numbers[d] /= sigma[d];
+}
+
 // Sum of K numbers, block by block: an error of a few units in the last place of the sum of magnitudes.
 inline double total(const double* a, int64_t K) {
   double whole = 0.0;

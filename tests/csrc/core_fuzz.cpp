@@ -173,6 +173,9 @@ Numbers test_sums(Bytes in) {
   center_row(f.data(), base.data(), t[0], K, centered.data()), center_row<T>(f.data(), nullptr, t[0], K, alone.data());
   for (size_t k = 0; k < f.size(); ++k)
     EXPECT(same(centered[k], (double(f[k]) - double(base[k])) * t[0]) && same(alone[k], double(f[k]) * t[0]));
+  Numbers divided = sums;
+  divide_rows(divided.data(), t.data(), M, n);
+  for (int64_t i = 0; i < M * n; ++i) EXPECT(same(divided[size_t(i)], sums[size_t(i)] / t[size_t(i % n)]));
   if (n > 64) return sums;
   for (int64_t i = 0; i < n; ++i) hessian_row(u.data(), i, K, n, a.data(), H.data());
   H_parts = H;

@@ -296,7 +296,7 @@ def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> 
 
 def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
     """Return the expansion around `center` at x [B, n], to first order."""
-    slope = expansion.stein.gradient(expansion.coefficients.mT.contiguous()) / expansion.sigma
+    slope = expansion.stein.scaled_gradient(expansion.coefficients.mT.contiguous(), expansion.sigma)
     change = (slope @ (x.double() - center.double())[..., None])[..., 0]
     return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
 

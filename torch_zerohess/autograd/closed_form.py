@@ -43,4 +43,4 @@ class ClosedForm(torch.autograd.Function):
             return result, None, None
         c = ctx.expansion.coefficients
         a = torch.bmm(c, gradient.double().reshape(len(c), -1, 1)).mT
-        return (ctx.expansion.stein.gradient(a) / ctx.expansion.sigma).reshape(x.shape).to(x.dtype), None, None
+        return ctx.expansion.stein.scaled_gradient(a, ctx.expansion.sigma).reshape(x.shape).to(x.dtype), None, None

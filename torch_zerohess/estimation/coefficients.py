@@ -24,10 +24,9 @@ def coefficients_of(
     The value at the center is the last one, if there is one. share: [B, K, 1]; None: 1/K. The baseline is None where it
     is the value at the center, or zero.
     """
-    values = values.reshape(*values.shape[:2], -1)
     if smoothing.baseline != "mean":
         return None, stein_sums.coefficients(values, share, K, smoothing.baseline == "center")
-    f = values[:, :K].double()
+    f = values[:, :K].double().reshape(len(values), K, -1)
     share = share_of(None, len(f), K, f.device) if share is None else share
     baseline = mean_of_others(f, share, draws(smoothing, n))
     return total(baseline * share), (f - baseline) * share

@@ -103,7 +103,7 @@ def estimate(
     control, term = None, None
 
     def draw(own: Smoothing) -> Sums:
-        return Sums(evaluate(call, flat, aux_rows, own, stored(own, B, n), control), own)
+        return Sums.of(evaluate(call, flat, aux_rows, own, stored(own, B, n), control))
 
     def made(batches: list[Sums], reason: str) -> Estimate:
         return Estimate(batches, batch, x, reason=reason, value=value, term=term, chosen=chosen, joint=joint)

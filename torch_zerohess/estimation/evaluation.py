@@ -56,17 +56,17 @@ class BlackBoxCall:
     def __post_init__(self) -> None:
         if not callable(self.fn):
             raise TypeError(f"fn must be callable, got {self.fn!r}")
-        check_evaluator(self.evaluator)
-        check_bool(vectorized=self.vectorized)
         if self.evaluator is None:
             object.__setattr__(self, "evaluator", Inline())
+        else:
+            check_evaluator(self.evaluator)
+        check_bool(vectorized=self.vectorized)
         object.__setattr__(self, "outer", outer_of(self.head))
         checked_head(self.outer.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
         rule = self.on_nonfinite
-        number = isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
-        if not number and rule not in ("raise", "drop"):
+        if rule not in ("raise", "drop") and not _finite_number(rule):
             raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -238,6 +238,10 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     if bool(bad.any()):
         values = replaced(values, outputs, bad.nonzero()[0], x, call.on_nonfinite, call.why_lost(1))
     return values
+
+
+def _finite_number(rule: Any) -> bool:
+    return isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
 
 
 def _copied(tensor: Tensor) -> Tensor:

@@ -1,7 +1,6 @@
 """What one call of the black box told: points, values, and the expansion made of them."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -11,8 +10,7 @@ from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.smoothing import Smoothing
 
 
-@dataclass(frozen=True)
-class Evaluations:
+class Evaluations(NamedTuple):
     """One call of the black box: its points and values, and the expansion made of them.
 
     Shapes: B batch, K perturbations, n parameters.
@@ -34,7 +32,7 @@ class Evaluations:
     smoothing: Smoothing
     expansion: Expansion
 
-    @cached_property
+    @property
     def share(self) -> Tensor:
         """Weight of each row in a mean, [B, K, 1]: 1/K; where rows were dropped, zero for them and more for others."""
         return share_of(self.kept, len(self.x), self.K, self.x.device)

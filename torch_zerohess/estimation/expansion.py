@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -11,8 +11,7 @@ from torch_zerohess.estimation.stein import Layout, Stein
 from torch_zerohess.smoothing import Smoothing
 
 
-@dataclass(frozen=True)
-class Expansion:
+class Expansion(NamedTuple):
     """F(x + sigma d) = base + sum_k (ratio_k(d) - ratio_k(0)) c_k.
 
     The derivatives at d = 0 are the Stein sums of the coefficients c. `Estimate` computes these sums, and the layer

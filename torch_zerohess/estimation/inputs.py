@@ -51,7 +51,7 @@ def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
 
 def all_finite(tensor: Tensor) -> bool:
     """Whether all numbers are finite: their sum is finite only then, and a sum of finite numbers may overflow."""
-    whole = sum(tensor.reshape(-1).tolist()) if tensor.numel() <= _FEW else tensor.sum().item()
+    whole = sum(tensor.flatten().tolist()) if tensor.numel() <= _FEW else tensor.sum().item()
     return math.isfinite(whole) or bool(torch.isfinite(tensor).all())
 
 

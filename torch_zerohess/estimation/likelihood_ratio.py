@@ -81,6 +81,12 @@ class LikelihoodRatio(Divisible):
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
         return stein_sums.hvp(self.u, self.weight, a, v)
 
+    def scaled_gradient(self, a: Tensor, sigma: Tensor) -> Tensor:
+        return stein_sums.gradient(self.u, self.weight, a, sigma)
+
+    def scaled_hvp(self, a: Tensor, v: Tensor, sigma: Tensor) -> Tensor:
+        return stein_sums.hvp(self.u, self.weight, a, v, sigma)
+
     def hessian_diagonal(self, a: Tensor) -> Tensor:
         a = a * self.weight[:, None]
         return kernels.accumulate_squares(self.u, a).sub_(total(a.mT).mT)

@@ -66,14 +66,14 @@ class Estimate:
     @cached_property
     def gradient(self) -> Tensor:
         """dF/dx_i: [*batch, *out, n]."""
-        sums = combined(self._batches, lambda one: one.stein.gradient(one.a))
-        return self._shaped(self._completed(sums / self._sigma, "gradient"), "gradient")
+        mean = combined(self._batches, lambda one: one.stein.scaled_gradient(one.a, self._sigma))
+        return self._shaped(self._completed(mean, "gradient"), "gradient")
 
     def hvp(self, v: Tensor) -> Tensor:
         """Hessian of F times v [*batch, n] or [n]: [*batch, *out, n], O(K n) without the Hessian."""
-        t = self._vector(v)
-        sums = combined(self._batches, lambda one: one.stein.hvp(one.a, t))
-        return self._shaped(self._completed(sums / self._sigma, "hvp", t), "hvp")
+        v = self._vector(v)
+        mean = combined(self._batches, lambda one: one.stein.scaled_hvp(one.a, v, self._sigma))
+        return self._shaped(self._completed(mean, "hvp", v), "hvp")
 
     def hessian_diagonal(self) -> Tensor:
         """d2F/dx_i2: [*batch, *out, n], O(K n) without the Hessian."""
@@ -146,14 +146,15 @@ class Estimate:
             ValueError: as `standard_error`, or a level out of its range.
         """
         level = checked_number("level", level, above=0.0, most=_MOST_LEVEL)
-        t = self._checked(quantity, v)
-        error, degrees = self._spread(quantity, t)
+        v = self._checked(quantity, v)
+        error, degrees = self._spread(quantity, v)
         half = error * student_factor(level, degrees)
         if quantity == "value":
             middle = combined(self._batches, lambda one: one.evaluations.smoothed.reshape(half.shape))
         else:
+            t = self._in_sigma(v)
             middle = self._in_units(combined(self._batches, lambda one: one.stein.sums(quantity, one.a, t)), quantity)
-        middle = self._completed(middle, quantity, t)
+        middle = self._completed(middle, quantity, v)
         ends = (self._shaped(middle + sign * half, f"interval of the {quantity}") for sign in (-1, 1))
         return ConfidenceInterval(*ends)
 
@@ -192,26 +193,30 @@ class Estimate:
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
 
-    def _spread(self, quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the standard error in units of x, and its degrees of freedom."""
-        error, degrees = combined_spread(self._batches, quantity, t)
+    def _spread(self, quantity: Quantity, v: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the standard error in units of x, and its degrees of freedom; v as from `_vector`."""
+        error, degrees = combined_spread(self._batches, quantity, self._in_sigma(v))
         error = self._in_units(error, quantity)
         if self._term is None:
             return error, degrees
-        return self._term.spread(error, degrees, quantity, None if t is None else t[:, 0] * self._sigma)
+        return self._term.spread(error, degrees, quantity, None if v is None else v[:, 0])
 
-    def _completed(self, rest: Tensor, quantity: Quantity, t: Tensor | None = None) -> Tensor:
-        """Add what the surrogate of a memory explains; t as from `_vector`."""
+    def _completed(self, rest: Tensor, quantity: Quantity, v: Tensor | None = None) -> Tensor:
+        """Add what the surrogate of a memory explains; v as from `_vector`."""
         if self._term is None:
             return rest
-        return rest + self._term.mean(quantity, None if t is None else t[:, 0] * self._sigma)
+        return rest + self._term.mean(quantity, None if v is None else v[:, 0])
+
+    def _in_sigma(self, v: Tensor | None) -> Tensor | None:
+        """Return the vector of an hvp in units of sigma."""
+        return None if v is None else v / self._sigma
 
     def _in_units(self, sums: Tensor, quantity: Quantity) -> Tensor:
         """Sums in units of x; one division after another, because the square of a small sigma is zero."""
         if quantity == "value":
             return sums
         if quantity == "hessian":
-            one = self._batches[0].smoothing.sigma
+            one = self._batches[0].evaluations.smoothing.sigma
             if isinstance(one, float):  # in place: a Hessian is large, and the sums are of no other use
                 return sums.div_(one).div_(one)
             i, j = self._sigma[:, None], self._sigma  # the larger sigma first, for symmetry to the last bit
@@ -220,7 +225,7 @@ class Estimate:
 
     def _shaped(self, flat: Tensor, what: str) -> Tensor:
         """Return [B, P, ...] as [*batch, *out, ...] in the dtype of x; ValueError if it is not finite there."""
-        result = flat.reshape((*self._batch, *self._out, *flat.shape[2:]))
+        result = flat.reshape(self._batch + self._out + flat.shape[2:])
         result = result if result.dtype == self._x.dtype else result.to(self._x.dtype)
         if not all_finite(result):
             largest = max(float(one.evaluations.values.abs().max()) for one in self._batches)
@@ -240,11 +245,13 @@ class Estimate:
         return None if v is None else self._vector(v)
 
     def _vector(self, v: Tensor) -> Tensor:
+        """Return v as float64 [B, P, n]; ValueError if it has another shape or is not finite."""
         (n,) = self._sigma.shape
         if not isinstance(v, Tensor) or v.shape not in ((n,), (*self._batch, n)):
             given = list(v.shape) if isinstance(v, Tensor) else type(v).__name__
             raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")
         if not all_finite(v):
             raise ValueError(f"v must be finite, got {short(v)}")
-        t = (v.detach().to(self._sigma) / self._sigma).reshape(-1, 1, n)
-        return t.expand(self._batch.numel(), self._out.numel(), n).contiguous()
+        v = v.detach().to(self._sigma)
+        v = v if v.dim() == 1 else v.reshape(-1, 1, n)
+        return v.expand(self._batch.numel(), self._out.numel(), n).contiguous()

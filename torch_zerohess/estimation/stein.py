@@ -15,7 +15,7 @@ is N(z; x) / p(z) = w exp(u.d - d.d/2), so derivatives of every order are estima
 To add a family: write one subclass of `Stein` in a file of its own and name it in `perturbations.FAMILIES`.
 
 Shapes: B batch, K samples, M vectors, n parameters, P outputs. Coefficients a are [B, M, K]. Everything is float64 and
-in units of sigma: the caller divides by sigma.
+in units of sigma, but for `scaled_gradient` and `scaled_hvp`: the caller divides by sigma.
 """
 
 from abc import ABC, abstractmethod
@@ -117,6 +117,14 @@ class Stein(ABC):
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
         """Return the sums of the Hessian times v [B, M, n], [B, M, n]."""
         raise ValueError(FIRST_ORDER_ERROR)
+
+    def scaled_gradient(self, a: Tensor, sigma: Tensor) -> Tensor:
+        """Return the gradient in units of x, [B, M, n]."""
+        return self.gradient(a) / sigma
+
+    def scaled_hvp(self, a: Tensor, v: Tensor, sigma: Tensor) -> Tensor:
+        """Return the Hessian times v [B, M, n], both in units of x, [B, M, n]."""
+        return self.hvp(a, v / sigma) / sigma
 
     def hessian_diagonal(self, a: Tensor) -> Tensor:
         """Return the sums of the Hessian's diagonal, [B, M, n]."""

@@ -1,8 +1,7 @@
 """One batch of evaluations inside an estimate: its sums, their standard errors, and their share of the whole."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,20 +9,19 @@ from torch import Tensor
 from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.perturbations import draws
 from torch_zerohess.estimation.stein import Quantity, Stein
-from torch_zerohess.smoothing import Smoothing
 
 
-@dataclass(frozen=True)
-class Sums:
-    """Evaluations, and the settings that they were drawn with. All results are float64 and in units of sigma."""
+class Sums(NamedTuple):
+    """Evaluations, and what their sums are made of. All results are float64 and in units of sigma."""
 
     evaluations: Evaluations
-    smoothing: Smoothing
+    a: Tensor
+    """Coefficients [B, P, K], P outputs."""
 
-    @cached_property
-    def a(self) -> Tensor:
-        """Coefficients [B, P, K], P outputs."""
-        return self.evaluations.expansion.coefficients.mT.contiguous()
+    @classmethod
+    def of(cls, evaluations: Evaluations) -> "Sums":
+        """Return the sums of evaluations."""
+        return cls(evaluations, evaluations.expansion.coefficients.mT.contiguous())
 
     @property
     def stein(self) -> Stein:
@@ -36,7 +34,7 @@ class Sums:
         t: vector of the hvp [B, P, n], in units of sigma. The squares of values from 1e-300 to 1e300 exist only
         relative to the largest of them, a power of two so that nothing is rounded.
         """
-        index = draws(self.smoothing, len(self.evaluations.expansion.sigma))
+        index = draws(self.evaluations.smoothing, len(self.evaluations.expansion.sigma))
         unit = _power_of_two(self.a.abs().amax(2, keepdim=True))
         pooled = self._pooled / unit if self._coupled(quantity) else None
         length = torch.ones_like(unit) if t is None else _power_of_two(t.abs().amax(2, keepdim=True))
@@ -52,7 +50,8 @@ class Sums:
 
         It does not in the gradient of antithetic draws: their kernel is odd, so that every baseline cancels.
         """
-        return self.smoothing.baseline == "mean" and not (quantity == "gradient" and self.smoothing.antithetic)
+        smoothing = self.evaluations.smoothing
+        return smoothing.baseline == "mean" and not (quantity == "gradient" and smoothing.antithetic)
 
     @property
     def _pooled(self) -> Tensor:

@@ -5,11 +5,10 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
-import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.values import checked_values
-from torch_zerohess.precision import without_autocast
+from torch_zerohess.precision import without_autocast, without_graph
 
 E = TypeVar("E", bound="Closing")
 
@@ -78,7 +77,7 @@ class Inline(Closing):
     """
 
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Any:
-        with torch.no_grad(), without_autocast(points.device):
+        with without_graph(), without_autocast(points.device):
             return fn(points, *aux)
 
     def submit(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Evaluation:

@@ -12,10 +12,12 @@ def stacked(rows: Any) -> Any:
 
     Raises ValueError for rows of different shapes.
     """
+    if not isinstance(rows, (list, tuple)):
+        return rows
     kind = type(leaf(rows))
     numpy: Any = sys.modules.get("numpy")
     arrays = numpy is not None and issubclass(kind, numpy.ndarray)
-    if not isinstance(rows, (list, tuple)) or not (arrays or issubclass(kind, Tensor)):
+    if not (arrays or issubclass(kind, Tensor)):
         return rows
     parts = [stacked(one) for one in rows]
     if not all(isinstance(one, numpy.ndarray if arrays else Tensor) for one in parts):

@@ -3,6 +3,8 @@
 Shapes: B batch, S samples, K = S or 2 S evaluations per x, n parameters, M vectors, m outputs; see `csrc/ops.cpp`.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -69,14 +71,14 @@ def accumulate_drawn(
 
 
 def coefficients(values: Tensor, share: Tensor | None, K: int, center: bool) -> Tensor:
-    return values.new_empty(values.shape[0], K, values.shape[2], dtype=torch.float64)
+    return values.new_empty(values.shape[0], K, math.prod(values.shape[2:]), dtype=torch.float64)
 
 
-def weighted_gradient(u: Tensor, weight: Tensor, a: Tensor) -> Tensor:
+def weighted_gradient(u: Tensor, weight: Tensor, a: Tensor, sigma: Tensor | None = None) -> Tensor:
     return a.new_empty(a.shape[0], a.shape[1], u.shape[2])
 
 
-def weighted_hvp(u: Tensor, weight: Tensor, a: Tensor, v: Tensor) -> Tensor:
+def weighted_hvp(u: Tensor, weight: Tensor, a: Tensor, v: Tensor, sigma: Tensor | None = None) -> Tensor:
     return torch.empty_like(v)
 
 

@@ -274,7 +274,7 @@ def test_the_limit_of_evaluations_ends_the_drawing() -> None:
     assert 500 < got.evaluations <= 1000
     assert got.points.shape[:2] == (3, got.evaluations // 3)
     # Batches are combined by their rows: the same as one sum over all of them.
-    parts = [estimate(SLOPE, x, one.smoothing).gradient for one in got._batches]
+    parts = [estimate(SLOPE, x, one.evaluations.smoothing).gradient for one in got._batches]
     rows = torch.tensor([one.evaluations.points.shape[1] for one in got._batches]).double()
     expected = (torch.stack(parts) * (rows / rows.sum())[:, None, None]).sum(0)
     torch.testing.assert_close(got.gradient, expected)

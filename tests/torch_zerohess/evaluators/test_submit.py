@@ -52,6 +52,22 @@ def expected_with(aux):
     return black_boxes.waves(points(len(aux)), aux)
 
 
+def test_an_evaluator_in_this_process_records_nothing():
+    recording = []
+
+    def fn(z):
+        recording.append(torch.is_grad_enabled())
+        return z.sum(1)
+
+    z = points(2).requires_grad_()
+    assert not Inline()(fn, z).requires_grad
+    with torch.no_grad():
+        Inline()(fn, z)
+        assert not torch.is_grad_enabled()
+    assert torch.is_grad_enabled()
+    assert recording == [False, False]
+
+
 @pytest.mark.parametrize("name", ["pool", "one_thread", "inline"])
 def test_a_black_box_may_use_its_arrays_again(name, request):
     """One that returns the same buffer every time, and writes to its points."""

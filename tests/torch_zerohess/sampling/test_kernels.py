@@ -386,6 +386,17 @@ def test_wrong_shapes_raise(call, capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr().err == "", "LibTorch was asked about an argument that was not checked"
 
 
+@pytest.mark.parametrize("shape", [(4, 3), (0, 3), (4, 0), (0, 0)])
+def test_results_lie_in_memory_as_those_of_torch(shape: tuple[int, int]) -> None:
+    R, n = shape
+    rows = proposals.pick_rows(0, 0, R, max(n, 1), proposals.GAUSSIAN)
+    for single in (True, False):
+        got = ops.draw(rows, n, single)
+        expected = torch.empty(shape, dtype=torch.float32 if single else torch.float64)
+        assert (got.dtype, got.stride(), got.device) == (expected.dtype, expected.stride(), expected.device)
+    assert ops.pick_rows(0, 0, R, 1, 0).stride() == torch.empty(R, 5).stride()
+
+
 def test_no_batch_at_all_raises_and_does_not_end_the_process() -> None:
     script = (
         "import torch, torch_zerohess\n"

@@ -1,5 +1,7 @@
 """Coefficients, gradient and Hessian times vector in one operator each, against their references in torch."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -45,6 +47,17 @@ def test_coefficients_have_the_bits_of_the_reference(
             torch.testing.assert_close(got, by_hand, rtol=1e-14, atol=0.0, equal_nan=True)
 
 
+@pytest.mark.parametrize("available", [True, False])
+@pytest.mark.parametrize("out", [(), (1,), (2, 3), (0,)])
+def test_coefficients_take_outputs_of_any_shape(
+    out: tuple[int, ...], available: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extension, "available", available)
+    flat = spread(2 * 5 * 6, -1.0, 3.0).view(2, 5, 6)[:, :, : math.prod(out)]
+    got = stein_sums.coefficients(flat.reshape(2, 5, *out), None, 4, True)
+    assert torch.equal(got, stein_sums.coefficients(flat, None, 4, True))
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_gradient_is_the_sum_of_weighted_rows(size: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     u, weight, a, _ = made(*size)
@@ -66,6 +79,20 @@ def test_hvp_is_the_hessian_times_the_vector(size: tuple[int, int, int, int], mo
     assert bool(((got - (hessian @ v[..., None])[..., 0]).abs() <= bound).all())
     monkeypatch.setattr(extension, "available", False)
     assert bool(((stein_sums.hvp(u, weight, a, v) - got).abs() <= bound).all())
+
+
+@pytest.mark.parametrize("available", [True, False])
+@pytest.mark.parametrize("size", SIZES)
+def test_sums_in_units_of_x_are_divided_by_sigma(
+    size: tuple[int, int, int, int], available: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extension, "available", available)
+    u, weight, a, v = made(*size)
+    sigma = spread(size[3], 0.1, 3.0)
+    gradient, hvp = stein_sums.gradient(u, weight, a), stein_sums.hvp(u, weight, a, v / sigma)
+    assert torch.equal(stein_sums.gradient(u, weight, a, sigma), gradient / sigma)
+    assert torch.equal(stein_sums.hvp(u, weight, a, v, sigma), hvp / sigma)
+    assert torch.equal(v, made(*size)[3])
 
 
 def test_perturbations_that_are_drawn_again_have_the_same_sums() -> None:
@@ -94,8 +121,11 @@ def test_inputs_in_any_layout() -> None:
 OPCHECKED = {
     "coefficients": lambda u, weight, a, v: (a.mT.contiguous(), None, 5, True),
     "coefficients with shares": lambda u, weight, a, v: (a.mT.contiguous().float(), share(2, 6, 2), 6, False),
+    "coefficients of images": lambda u, weight, a, v: (a.view(2, 3, 2, 3, 1), None, 3, False),
     "weighted_gradient": lambda u, weight, a, v: (u, weight, a),
+    "weighted_gradient in units of x": lambda u, weight, a, v: (u, weight, a, weight[0, :5].contiguous()),
     "weighted_hvp": lambda u, weight, a, v: (u, weight, a, v),
+    "weighted_hvp in units of x": lambda u, weight, a, v: (u, weight, a, v, weight[0, :5].contiguous()),
 }
 
 
@@ -107,11 +137,12 @@ def test_operators_pass_the_checks_of_torch(name: str) -> None:
 
 def test_any_number_of_threads_gives_the_same_bits() -> None:
     u, weight, a, v = made(2, 3, 150, 300)
-    values = spread(2 * 200 * 300, -1.0, 1.0).view(2, 200, 300)
+    values, sigma = spread(2 * 200 * 300, -1.0, 1.0).view(2, 200, 300), spread(300, 0.1, 1.0)
 
     def everything() -> list[Tensor]:
         c = stein_sums.coefficients(values, None, 199, True)
-        return [c, stein_sums.gradient(u, weight, a), stein_sums.hvp(u, weight, a, v)]
+        scaled = [stein_sums.gradient(u, weight, a, sigma), stein_sums.hvp(u, weight, a, v, sigma)]
+        return [c, stein_sums.gradient(u, weight, a), stein_sums.hvp(u, weight, a, v), *scaled]
 
     before = torch.get_num_threads()
     try:
@@ -129,7 +160,7 @@ def doubles(*shape: int) -> Tensor:
 
 
 WRONG = {
-    "coefficients: dimensions": lambda: ops.coefficients(doubles(2, 3), None, 2, True),
+    "coefficients: dimensions": lambda: ops.coefficients(doubles(3), None, 2, True),
     "coefficients: type": lambda: ops.coefficients(doubles(2, 3, 1).half(), None, 2, True),
     "coefficients: no center": lambda: ops.coefficients(doubles(2, 3, 1), None, 3, True),
     "coefficients: no rows": lambda: ops.coefficients(doubles(2, 3, 1), None, 0, False),
@@ -139,6 +170,16 @@ WRONG = {
     "gradient: weight": lambda: ops.weighted_gradient(doubles(2, 4, 3), doubles(2, 3), doubles(2, 1, 4)),
     "gradient: batch": lambda: ops.weighted_gradient(doubles(1, 4, 3), doubles(2, 4), doubles(2, 1, 4)),
     "gradient: type": lambda: ops.weighted_gradient(doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4).float()),
+    "gradient: sigma": lambda: ops.weighted_gradient(doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4), doubles(2)),
+    "gradient: dimensions of sigma": lambda: ops.weighted_gradient(
+        doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4), doubles(3, 1)
+    ),
+    "hvp: sigma": lambda: ops.weighted_hvp(
+        doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4), doubles(2, 1, 3), doubles(4)
+    ),
+    "hvp: type of sigma": lambda: ops.weighted_hvp(
+        doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4), doubles(2, 1, 3), doubles(3).float()
+    ),
     "hvp: n": lambda: ops.weighted_hvp(doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4), doubles(2, 1, 4)),
     "hvp: M": lambda: ops.weighted_hvp(doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4), doubles(2, 2, 3)),
     "hvp: dimensions": lambda: ops.weighted_hvp(doubles(2, 4, 3), doubles(2, 4), doubles(2, 1, 4), doubles(2, 3)),

@@ -430,7 +430,7 @@ template <class V, class T>
 Tensor sparse_times_as(
     const Tensor& column, const Tensor& first, const Tensor& values, const Tensor& vector, ScalarType type) {
   const int64_t rows = first.size(0), entries = column.size(0);
-  Tensor result = torch::stable::empty({rows}, type);
+  Tensor result = empty({rows}, type);
   const int64_t *columns = column.const_data_ptr<int64_t>(), *begins = first.const_data_ptr<int64_t>();
   const V* numbers = values.const_data_ptr<V>();
   const T* source = vector.const_data_ptr<T>();
@@ -484,7 +484,7 @@ std::tuple<Tensor, Tensor, Tensor> regressed(
       known_values.const_data_ptr<T>(), ridges.const_data_ptr<T>(), constant ? constant->const_data_ptr<T>() : nullptr,
       m, K, keep, known_index.size(1), R, shortened,
       values.mutable_data_ptr<T>(), errors ? deviations.mutable_data_ptr<T>() : nullptr};
-  Tensor count = torch::stable::empty({}, ScalarType::Long);
+  Tensor count = empty({}, ScalarType::Long);
   std::atomic<int64_t> failed{0};
   torch::stable::parallel_for(0, m, grain(keep * keep * K), [&](int64_t begin, int64_t end) {
     failed += regress_rows(of, begin, end);

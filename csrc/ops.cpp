@@ -461,8 +461,8 @@ Tensor sparse_times(const Tensor& column, const Tensor& first, const Tensor& val
   STD_TORCH_CHECK(values.size(0) == entries, "column and values do not fit");
   STD_TORCH_CHECK(std::all_of(columns, columns + entries, [n](int64_t c) { return 0 <= c && c < n; }),
                   "column has numbers beyond the vector");
-  STD_TORCH_CHECK(std::is_sorted(begins, begins + rows) && (rows ? begins[0] == 0 && begins[rows - 1] <= entries : !entries),
-                  "first does not say where rows begin");
+  const bool whole = rows ? begins[0] == 0 && begins[rows - 1] <= entries : entries == 0;
+  STD_TORCH_CHECK(whole && std::is_sorted(begins, begins + rows), "first does not say where rows begin");
   if (own == ScalarType::Float)
     return type == own ? sparse_times_as<float, float>(column, first, values, vector, type)
                        : sparse_times_as<float, double>(column, first, values, vector, type);
@@ -474,7 +474,7 @@ template <class T>
 std::tuple<Tensor, Tensor, Tensor> regressed(
     const Tensor& directions, const Tensor& scale, const Tensor& changes, const Tensor& index, const Tensor& used,
     const Tensor& known_index, const Tensor& known_values, const Tensor& ridges,
-    const std::optional<Tensor>& constant, bool errors, bool shortened, ScalarType type) {
+    const std::optional<Tensor>& constant, bool errors, bool shortened) {
   const int64_t m = index.size(0), keep = index.size(1), K = directions.size(1), R = ridges.size(0);
   Tensor values = torch::stable::new_zeros(changes, {R, m, keep});
   Tensor deviations = torch::stable::new_zeros(changes, {errors ? m : 0, keep});
@@ -519,10 +519,8 @@ std::tuple<Tensor, Tensor, Tensor> regress(
   const int64_t* parameters = index.const_data_ptr<int64_t>();
   STD_TORCH_CHECK(std::all_of(parameters, parameters + m * keep, [n](int64_t d) { return 0 <= d && d < n; }),
                   "index has numbers beyond the parameters");
-  return type == ScalarType::Float ? regressed<float>(directions, scale, changes, index, used, known_index, known_values, ridges, constant,
-                                   errors, shortened, type)
-                : regressed<double>(directions, scale, changes, index, used, known_index, known_values, ridges,
-                                    constant, errors, shortened, type);
+  const auto with = type == ScalarType::Float ? regressed<float> : regressed<double>;
+  return with(directions, scale, changes, index, used, known_index, known_values, ridges, constant, errors, shortened);
 }
 
 }  // namespace

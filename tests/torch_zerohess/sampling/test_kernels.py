@@ -285,6 +285,11 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
             ops.uniforms(rows[:, 0].contiguous(), rows[:, 1].contiguous(), 0, n, 2),
             ops.shape(rows, drawn.sigmoid()),
         ]
+        index, numbers = torch.arange(6000).view(2000, 3) % n, spread(6000, -1.0, 1.0)
+        entries, few = (index.flatten(), torch.arange(0, 6000, 3), numbers), numbers.view(2000, 3)
+        parts.append(ops.sparse_times(*entries, t[0, 0]))
+        regressions = (t[0].mT.contiguous(), t[0, 0].abs(), few, index, index > 4, index, few, few[:5, :2].contiguous())
+        parts += ops.regress(*regressions, None, True, True)
         whole = [drawn, points, u, weights, mirrored, *parts]
         return [*whole, *sampled, *sums, ops.accumulate_drawn(*recipe, a, True)]
 

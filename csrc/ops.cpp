@@ -476,13 +476,17 @@ std::tuple<Tensor, Tensor, Tensor> regressed(
     const Tensor& known_index, const Tensor& known_values, const Tensor& ridges,
     const std::optional<Tensor>& constant, bool errors, bool shortened) {
   const int64_t m = index.size(0), keep = index.size(1), K = directions.size(1), R = ridges.size(0);
+  const bool* flags = used.const_data_ptr<bool>();
+  int64_t most = 0;
+  for (int64_t row = 0; row < m; ++row)
+    most = std::max<int64_t>(most, std::count(flags + row * keep, flags + (row + 1) * keep, true));
   Tensor values = torch::stable::new_zeros(changes, {R, m, keep});
   Tensor deviations = torch::stable::new_zeros(changes, {errors ? m : 0, keep});
   const Regression<T> of{
       directions.const_data_ptr<T>(), scale.const_data_ptr<T>(), changes.const_data_ptr<T>(),
-      index.const_data_ptr<int64_t>(), known_index.const_data_ptr<int64_t>(), used.const_data_ptr<bool>(),
+      index.const_data_ptr<int64_t>(), known_index.const_data_ptr<int64_t>(), flags,
       known_values.const_data_ptr<T>(), ridges.const_data_ptr<T>(), constant ? constant->const_data_ptr<T>() : nullptr,
-      m, K, keep, known_index.size(1), R, shortened,
+      m, K, keep, known_index.size(1), R, most, shortened,
       values.mutable_data_ptr<T>(), errors ? deviations.mutable_data_ptr<T>() : nullptr};
   Tensor count = empty({}, ScalarType::Long);
   std::atomic<int64_t> failed{0};

@@ -28,7 +28,7 @@ struct Regression {
   const int64_t *index, *known_index;                         // [m, keep], [m, known]
   const bool* used;                                           // [m, keep]
   const T *known_values, *ridges, *constant;                  // [m, known], [R, 2], [K] or null
-  int64_t m, K, keep, known, R;
+  int64_t m, K, keep, known, R, most;                         // most: used entries of a row, at most
   bool shortened;
   T *values, *errors;  // [R, m, keep] and, of the first ridges, [m, keep] or null; zeros before
 };
@@ -71,9 +71,9 @@ ZH_INLINE void add_padded(T scale, const T* a, int64_t count, T* out) {
 template <class T>
 struct Cholesky {
   int64_t s = 0, width = 0;
-  std::vector<T> factor, reciprocal, rest;  // [keep, width], of the diagonal, scratch [width]
+  std::vector<T> factor, reciprocal, rest;  // [most, width]; of the diagonal [most]; scratch [width]
 
-  explicit Cholesky(int64_t keep) : factor(size_t(keep * padded<T>(keep))), reciprocal(keep), rest(padded<T>(keep)) {}
+  explicit Cholesky(int64_t most) : factor(size_t(most * padded<T>(most))), reciprocal(most), rest(padded<T>(most)) {}
 
   T* row(int64_t i) { return factor.data() + i * width; }
   static int64_t aligned(int64_t i) { return i / kLanes<T> * kLanes<T>; }
@@ -130,21 +130,21 @@ ZH_INLINE void solve_upper(Cholesky<T>& with, const T* y, T* x) {
   }
 }
 
-// The numbers of one row; s entries of it are used.
+// The numbers of one row; s entries of it are used, at most `most`.
 template <class T>
 struct Scratch {
   int64_t s = 0, width = 0, samples;
   std::vector<int64_t> place;              // of the used entries
-  std::vector<T> A, target, gram;          // [keep, samples], transposed; [samples]; [keep, width]
+  std::vector<T> A, target, gram;          // [most, samples], transposed; [samples]; [most, width]
   std::vector<T> product, old, prior, change, half;
   std::vector<T> roots, own, weighted, influence, rest;  // for errors
   Cholesky<T> system;
 
   explicit Scratch(const Regression<T>& of)
-      : samples(padded<T>(of.K)), place(of.keep), A(size_t(of.keep * samples)), target(samples),
-        gram(size_t(of.keep * padded<T>(of.keep))), product(padded<T>(of.keep)), old(of.keep), prior(of.keep),
-        change(padded<T>(of.keep)), half(padded<T>(of.keep)), system(of.keep) {
-    if (of.errors) roots.resize(gram.size()), own.resize(of.keep), weighted.resize(padded<T>(of.keep));
+      : samples(padded<T>(of.K)), place(of.keep), A(size_t(of.most * samples)), target(samples),
+        gram(size_t(of.most * padded<T>(of.most))), product(padded<T>(of.most)), old(of.most), prior(of.most),
+        change(padded<T>(of.most)), half(padded<T>(of.most)), system(of.most) {
+    if (of.errors) roots.resize(gram.size()), own.resize(of.most), weighted.resize(padded<T>(of.most));
     if (of.errors && of.constant) influence.resize(A.size()), rest.resize(samples);
   }
 };
@@ -253,7 +253,9 @@ ZH_INLINE int64_t regress_rows_generic(const Regression<T>& of, int64_t begin, i
   int64_t failed = 0;
   for (int64_t row = begin; row < end; ++row) {
     read_row(of, row, scratch);
-    for (int64_t r = of.R - 1; r >= 0; --r) failed += !solve_row(of, row, r, scratch);
+    bool solved = true;
+    for (int64_t r = of.R - 1; r >= 0; --r) solved &= solve_row(of, row, r, scratch);
+    failed += !solved;
     if (of.errors) errors_of_row(of, row, scratch);
   }
   return failed;

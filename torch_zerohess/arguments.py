@@ -46,11 +46,11 @@ def check_evaluator(value: Any) -> None:
 def check_state(state: Any, like: Mapping[str, Any], what: str) -> None:
     """Raise TypeError for a state that is no dictionary, KeyError for one that lacks what `like` has.
 
-    Where `like` is a version of such states, the message names the version of the state.
+    A state may lack a version. If `like` has one, the message names the version of the state.
     """
     if not isinstance(state, Mapping):
         raise TypeError(f"state must be a state_dict of {what}, got {type(state).__name__}")
-    if missing := [name for name in like if name not in state]:
+    if missing := [name for name in like if name not in state and name != "version"]:
         of = f" ({written_by(state)})" if "version" in like else ""
         raise KeyError(f"state must be a state_dict of {what}, this one lacks {', '.join(missing)}{of}")
 

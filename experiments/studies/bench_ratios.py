@@ -116,8 +116,11 @@ def _regressions(repeats: int) -> Ratio:
 
         return run
 
-    seconds, compared = in_turn(fit(True), fit(False), repeats)
-    extension.available = True
+    available = extension.available
+    try:
+        seconds, compared = in_turn(fit(available), fit(False), repeats)
+    finally:
+        extension.available = available
     return Ratio("sparse regressions", n, samples, seconds, compared, compared_with="torch")
 
 

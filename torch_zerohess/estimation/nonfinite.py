@@ -15,8 +15,8 @@ from torch_zerohess.smoothing import Smoothing
 _CHANCE = 1e-3
 """Probability at which an element of a batch loses more draws than the others by chance."""
 _REGION = (
-    "on_nonfinite='drop' drops most draws around a point, where fn fails or is not finite. It is for failures at "
-    "random: derivatives near a region where fn always fails are wrong. For a region give a number"
+    "on_nonfinite='drop' drops most draws around a point, where fn fails or is not finite. If fn fails at random, more "
+    "samples help. If it fails in a region, derivatives near it are wrong: give a number"
 )
 
 

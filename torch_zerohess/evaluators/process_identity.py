@@ -43,8 +43,10 @@ def in_this_process(fn: Callable[..., Any], *args: Any) -> Any:
     process = os.getpid()
     try:
         result = fn(*args)
-    except BaseException:
+    except BaseException as error:
         if os.getpid() != process:
+            if isinstance(error, SystemExit) and isinstance(error.code, int | None):
+                os._exit(error.code or 0)
             traceback.print_exc()
             os._exit(1)
         raise

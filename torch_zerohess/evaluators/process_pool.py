@@ -46,7 +46,8 @@ class ProcessPool(Ahead):
     take more cores than there are. They start with the first call, and stay. The black box is sent to a worker once;
     what it holds stays there. Pass `Factory(make, *args)` for one that cannot be pickled, or that takes long to make.
     What the caller changes in a black box afterwards does not reach the workers.
-    A black box may have processes of its own, such as those of a DataLoader. They end with the worker.
+    A black box may have processes of its own, such as those of a DataLoader. They end with the worker on Linux and
+    macOS.
 
     A script that makes a pool has its main part under `if __name__ == "__main__":`, because workers import the script.
 

@@ -91,12 +91,15 @@ def lowest_mean(
 def _spread(groups: Sequence[Tensor], noise: float) -> float:
     """Return the standard deviation of groups [K] of values with different means, if it was expected to be `noise`.
 
-    The logarithm of a measured deviation has the variance 1 / (2 degrees of freedom), and `noise` was measured as well.
+    Paulson (1942) gives a normal number with the probability of a ratio of two variances that are equal in truth. The
+    variance `noise`^2 is taken for a measured one.
     """
     freedom = sum(len(one) - 1 for one in groups if len(one))
     if freedom == 0:
         return noise
     measured = math.sqrt(sum(float((one - one.mean()).square().sum()) for one in groups if len(one)) / freedom)
-    error = math.sqrt(0.5 / freedom + 0.5 / (REPEATED - 1))
-    smaller = 0.0 < measured < noise * math.exp(-_SIGNIFICANT * error)
-    return measured if smaller else max(noise, measured)
+    if measured == 0.0 or measured >= noise:
+        return max(noise, measured)
+    ratio, own, other = (measured / noise) ** (2 / 3), 2 / (9 * freedom), 2 / (9 * (REPEATED - 1))
+    smaller = (1 - other) * ratio - (1 - own) < -_SIGNIFICANT * math.sqrt(own + other * ratio**2)
+    return measured if smaller else noise

@@ -69,15 +69,16 @@ class Running:
         self.record = Record(call, lambda values: self.search.losses(values), self.search.x)
         if path is None or not path.exists():
             return
-        saved = None
+        wrong = f"checkpoint must be a new file, or one that minimize wrote with the same settings, got {path}: "
         try:
             saved = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # it raises any, for a file of another kind
+            raise ValueError(f"{wrong}torch.load says {type(error).__name__}: {str(error)[:100]}") from error
+        try:
             self._resume(saved)
-        except Exception as error:  # of torch.load, which raises any for a file of another kind, or of the state
-            read = f"torch.load cannot read it, {type(error).__name__}: {str(error)[:100]}"
-            why = read if saved is None else str(*error.args[:1])
-            wanted = "a new file, or one that minimize wrote with the same settings"
-            raise ValueError(f"checkpoint must be {wanted}, got {path}: {why}") from error
+        except Exception as error:
+            name = "" if isinstance(error, ValueError | KeyError) else f"{type(error).__name__}: "
+            raise ValueError(f"{wrong}{name}{str(*error.args[:1])[:300]}") from error
 
     @property
     def seconds(self) -> float:

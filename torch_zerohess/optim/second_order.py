@@ -169,12 +169,11 @@ class SecondOrder(Optimizer):
             )
         super().add_param_group(param_group)
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from a `state_dict`, with its settings. KeyError if it lacks one: it is of another optimizer."""
-        check_state(state_dict, dict.fromkeys(("state", "param_groups")), name := type(self).__name__)
-        for group in state_dict["param_groups"]:
-            check_state(group, self.defaults, name)
-        super().load_state_dict(state_dict)
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a loaded state, after all hooks. KeyError if it lacks a setting: it is of another optimizer."""
+        for group in state["param_groups"]:
+            check_state(group, getattr(self, "defaults", {}), type(self).__name__)
+        super().__setstate__(state)
 
     @property
     def _output_modification(self) -> str | None:

@@ -25,7 +25,7 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 _PREDICTED = 0.25
 """Misfit of a predicted output below which the output counts as smooth."""
 _LEAST = 0.1
-"""First region of Gauss-Newton after a shorter step, over the reach of the descent."""
+"""Least first radius of Gauss-Newton, over the distance of the nearest evaluations."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from torch_zerohess.sampling import extension
 
-_COMPILED = torch.float32, torch.float64
-"""Types of the C++ operator."""
+_COMPILED = {torch.float32, torch.float64}
+"""Types of the C++ operator, which is for one vector: embedding_bag would take three times as long."""
 
 
 class SparseRows(NamedTuple):
@@ -30,10 +30,10 @@ class SparseRows(NamedTuple):
 
     def times(self, vectors: Tensor) -> Tensor:
         """Return the products [K, rows] with vectors [K, columns], without a graph."""
-        if len(vectors) == 1 and extension.available and vectors.is_cpu and vectors.dtype in _COMPILED:
+        compiled = extension.available and vectors.is_cpu and {vectors.dtype, self.values.dtype} <= _COMPILED
+        if compiled and len(vectors) == 1:
             product = torch.ops.torch_zerohess.sparse_times(*self, vectors[0].contiguous())
             return product[None]
-        # For one vector this takes three times as long; for many float32 vectors it is fast.
         sums = nn.functional.embedding_bag(
             self.column, vectors.mT.contiguous(), self.first, mode="sum", per_sample_weights=self.values.to(vectors)
         )

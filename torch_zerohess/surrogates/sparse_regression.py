@@ -60,8 +60,9 @@ class _Rows:
 def _regressions(u: Tensor, d: Tensor, index: Tensor, used: Tensor, previous: SparseJacobian) -> Iterator[_Rows]:
     """Yield the regressions of all rows, some at a time."""
     K, m, rows = len(u), len(index), u.mT.contiguous()
-    # Rows with few used entries have small systems: the used ones come first.
-    width = max(1, int(used.sum(1).max()))
+    # Systems are small if the used entries come first, and few are used.
+    in_use = used.any(0).nonzero()
+    width = int(in_use[-1]) + 1 if len(in_use) else 1
     size = max(1, _BLOCK // (K * width))
     for first in range(0, m, size):
         some = slice(first, first + size)

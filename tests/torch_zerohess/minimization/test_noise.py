@@ -50,6 +50,16 @@ def test_the_mean_of_the_point_that_is_chosen_is_unbiased_and_its_error_true(dec
     assert float(scores.square().mean().sqrt()) == pytest.approx(1.0, abs=5 / math.sqrt(2 * 400))
 
 
+@pytest.mark.parametrize("evaluations", [4, 6, 10])
+def test_few_values_do_not_shrink_the_error(evaluations):
+    """What is expected by chance of few values is no evidence of less noise: 2 standard errors cover 95 %."""
+    points, covered = torch.stack([TARGET, -TARGET]), 0  # of one loss
+    for seed in range(400):
+        _, value, error = lowest_mean(noisy(seed, fn=lambda z: z.square().sum(1)), points, evaluations, 0.3)
+        covered += abs(value - 10.0) <= 2 * error
+    assert covered / 400 > 0.954 - 4 * math.sqrt(0.954 * 0.046 / 400)
+
+
 def test_the_value_is_unbiased_and_its_error_true():
     """Over 6 runs the mean of (value - truth) / error is 0 within 5 standard errors; the luckiest draw is at -3."""
     scores = []

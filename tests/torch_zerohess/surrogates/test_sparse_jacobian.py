@@ -13,7 +13,7 @@ from torch_zerohess.surrogates import sparse_fit, sparse_selection
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, _subset, check_samples, fit_sparse
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from torch_zerohess.surrogates.sparse_selection import Grids, largest, spaced, thresholds
-from truths import normal
+from truths import normal, vector
 
 
 def sparse_map(m, n, s, seed=0):
@@ -238,6 +238,17 @@ def test_fits_that_know_slopes_hold_out_fewer_parts(monkeypatch):
     again = fit_sparse(u, u[:, :10], torch.Size([10]), settings, first)
     assert len(count) == 6
     assert again.explained > 0.99
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_products_of_values_and_vectors_of_two_types(dtype):
+    J = SparseJacobian(
+        torch.tensor([[0, 3], [2, 0]]), vector(1.0, 2.0, 5.0, 0.0).view(2, 2), torch.zeros(2, 2), 4, torch.Size([2])
+    )
+    half = J.to(torch.zeros(1, dtype=dtype))
+    for like in (torch.float32, torch.float64):
+        assert half.matvec(torch.ones(4, dtype=like)).tolist() == [3.0, 5.0]
+        assert half.rmatvec(torch.ones(2, dtype=like)).tolist() == [1.0, 0.0, 5.0, 2.0]
 
 
 class Largest(TorchDispatchMode):

@@ -98,6 +98,7 @@ def random_case(samples, dtype, keep=12, m=60, n=40):
     u, d = normal(samples, n).to(dtype), normal(samples, m, seed=1).to(dtype)
     index = normal(m, n, seed=2).argsort(1)[:, :keep]
     used = normal(m, keep, seed=3) < 1.0
+    used[:, 3] = False
     values = torch.where(normal(m, 8, seed=4) > 0.0, normal(m, 8, seed=5), 0.0).to(dtype)
     known = normal(m, n, seed=6).argsort(1)[:, :8]
     return u, d, index, used, SparseJacobian(known, values, torch.zeros_like(values), n, torch.Size([m]))

@@ -71,6 +71,7 @@ class Inline(Closing):
     """Calls the black box in this process, all points at once, without autograd.
 
     Example:
+        >>> import torch
         >>> with Inline() as evaluator:
         ...     evaluator(lambda z: z.sum(1), torch.ones(2, 3))
         tensor([3., 3.])

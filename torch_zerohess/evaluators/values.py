@@ -82,14 +82,6 @@ def as_tensor(result: Any) -> Tensor:
 
 def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tensor:
     """Return values [K, *out] of points [K, n], or raise TypeError or ValueError if they cannot be that."""
-    if vectorized and isinstance(result, tuple) and len(result) > 1:
-        numpy: Any = sys.modules.get("numpy")
-        arrays = (Tensor,) if numpy is None else (Tensor, numpy.ndarray)
-        if any(isinstance(one, arrays) and one.ndim for one in result):  # of two points it would pass for two values
-            raise ValueError(
-                f"fn must return one tensor, got a tuple of {len(result)}: return one of them, or "
-                "torch.stack(outputs, 1); values of single points go into a list"
-            )
     values = as_tensor(result)
     if values.requires_grad:
         raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")

@@ -56,7 +56,7 @@ def test_the_other_one_of_a_dropped_pair_goes_with_it() -> None:
 
 def test_too_few_draws_left_is_an_error() -> None:
     everything_but_one = holes(*range(1, 8))
-    with pytest.warns(UserWarning, match="drops most draws around a point.*For a region give a number"):
+    with pytest.warns(UserWarning, match="drops most draws around a point.*in a region.*give a number"):
         assert estimate(everything_but_one, X, S, on_nonfinite="drop").dropped == 14
     with pytest.raises(ValueError, match="left 1 of 8 draws, 2 are needed"):
         estimate(everything_but_one, X, S.replace(baseline="mean"), on_nonfinite="drop")

@@ -138,7 +138,6 @@ FUNCTIONS = [
     (lambda z: z.sum(), ValueError, r"fn must return one value per point, \[K, \*out\].*got \[\].*vectorized=False"),
     (lambda z: z.sum(0), ValueError, r"fn must return one value per point, \[K, \*out\].*got \[2\]"),
     (lambda z: f(z)[:-1], ValueError, r"\[K, \*out\] for points \[K, 2\], got \[[06]\]"),
-    (lambda z: (f(z), f(z)), ValueError, r"fn must return one tensor, got a tuple of 2: return one of them, or"),
     (lambda z: f(z) * 1j, TypeError, r"fn must return real numbers, got torch\.complex128"),
     (lambda z: (f(z) * 1j).numpy(), TypeError, r"fn must return real numbers, got torch\.complex128"),
     (lambda z: None, TypeError, "fn must return a tensor or a NumPy array of numbers, got NoneType"),
@@ -163,15 +162,6 @@ def test_what_the_function_returns_where_only_the_value_is_asked_for() -> None:
     for fn, error, message in FUNCTIONS:
         with torch.no_grad(), pytest.raises(error, match=message.replace("K", "1")):
             BlackBox(fn, S)(X)
-
-
-def test_two_outputs_of_two_points_are_no_two_values() -> None:
-    """A black box that returns an image and its edges, at two points."""
-    two = Smoothing(sigma=0.1, samples=1, antithetic=False)  # and x itself
-    with pytest.raises(ValueError, match="got a tuple of 2: return one"):
-        estimate(lambda z: (z, z * z), X, two)
-    assert estimate(lambda z: (z[0, 0], z[1, 0]), X, two).gradient.shape == (2,)
-    assert estimate(lambda z: [z[0], z[1]], X, two).gradient.shape == (2, 2)
 
 
 def test_errors_of_the_function_itself_arrive_as_they_are() -> None:

@@ -135,7 +135,7 @@ def test_loading_takes_no_loss_and_fails_as_a_whole(name):
 
     resumed = make(name, loss=loss if SEARCHES[name][3] else None)
     fresh = resumed.ask()
-    for key in state:
+    for key in state.keys() - {"version"}:
         with pytest.raises(KeyError):
             resumed.load_state_dict({one: value for one, value in state.items() if one != key})
         assert torch.equal(resumed.ask(), fresh)

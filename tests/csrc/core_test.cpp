@@ -2,23 +2,13 @@
 // g++ -std=c++20 -fsanitize=address,undefined core_test.cpp && ./a.out
 #include "../../csrc/reduce.h"
 
-#include <cstdio>
-#include <cstdlib>
 #include <limits>
+
+#include "expect.h"
 
 using namespace zerohess;
 
 namespace {
-
-int failures = 0;
-
-#define EXPECT(condition)                                                        \
-  do {                                                                           \
-    if (!(condition)) {                                                          \
-      std::fprintf(stderr, "%s:%d: not %s\n", __FILE__, __LINE__, #condition);   \
-      ++failures;                                                                \
-    }                                                                            \
-  } while (false)
 
 constexpr int64_t kSizes[] = {1, 2, 3, 7, 127, 128, 129, 255, 256, 257, 1000};
 constexpr int64_t kSeeds[] = {0, 1, int64_t(1) << 32, std::numeric_limits<int64_t>::max()};
@@ -317,6 +307,5 @@ int main() {
     test_sums();
     test_small_sums();
   }
-  if (failures) std::fprintf(stderr, "%d failures\n", failures);
-  return failures ? EXIT_FAILURE : EXIT_SUCCESS;
+  return verdict();
 }

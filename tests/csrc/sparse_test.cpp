@@ -2,23 +2,13 @@
 // Slopes are compared with Gaussian elimination in long double. Their errors are tested in test_sparse_regression.py.
 #include "../../csrc/sparse.h"
 
-#include <cstdio>
-#include <cstdlib>
 #include <random>
+
+#include "expect.h"
 
 using namespace zerohess;
 
 namespace {
-
-int failures = 0;
-
-#define EXPECT(condition)                                                        \
-  do {                                                                           \
-    if (!(condition)) {                                                          \
-      std::fprintf(stderr, "%s:%d: not %s\n", __FILE__, __LINE__, #condition);   \
-      ++failures;                                                                \
-    }                                                                            \
-  } while (false)
 
 constexpr int64_t kRidges = 2, kRows = 3;
 
@@ -148,6 +138,5 @@ int main() {
     test_matrices_that_are_not_positive_definite();
     test_products();
   }
-  if (failures) std::fprintf(stderr, "%d failures\n", failures);
-  return failures ? EXIT_FAILURE : EXIT_SUCCESS;
+  return verdict();
 }

@@ -76,7 +76,10 @@ def finite_values(
 
 
 def _lost_by_place(left: Tensor, draws: int) -> bool:
-    """Whether most draws are lost of all elements, or of one that chance does not single out; left: shares [B]."""
+    """Whether most draws are lost: of all elements together, or of one element by more than chance.
+
+    left: share of the draws that an element keeps [B].
+    """
     mean, least = float(left.mean()), float(left.min())
     chance = len(left) * math.exp(-2 * draws * (mean - least) ** 2)  # Hoeffding (1963)
     return mean < 0.5 or (least < 0.5 and chance < _CHANCE)

@@ -23,6 +23,8 @@ from torch.nn.functional import embedding_bag
 from torch_zerohess.sampling import extension
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
+_Case = tuple[Tensor, Tensor, Tensor, Tensor, SparseJacobian]
+"""Directions u [K, n], changes d [K, m], parameters [m, keep], which of them are used, and the previous slopes."""
 _BLOCK = 1 << 22
 """Elements of A held at a time."""
 
@@ -84,7 +86,7 @@ def slopes_by_ridges(
 ) -> list[Tensor]:
     """Return the slopes [m, keep] of `slopes` for each of several ridges."""
     if extension.available and u.is_cpu:
-        return list(_compiled(u, d, index, used, previous, choices)[0])
+        return list(_compiled((u, d, index, used, previous), choices)[0])
     values = [torch.zeros_like(index, dtype=u.dtype) for _ in choices]
     for rows in _regressions(u, d, index, used, previous):
         change = rows.A @ rows.target[:, :, None]
@@ -111,8 +113,8 @@ def slopes(
     shortened: whether errors include that the ridge shortens new slopes; it shortens none that is 0.
     """
     if extension.available and u.is_cpu:
-        case = u, d, index, used, previous, [ridges]
-        found, deviations = _compiled(*case, constant, errors=True, shortened=shortened)
+        case = u, d, index, used, previous
+        found, deviations = _compiled(case, [ridges], constant, errors=True, shortened=shortened)
         return found[0], deviations
     K, values = len(u), torch.zeros_like(index, dtype=u.dtype)
     errors = torch.zeros_like(values)
@@ -137,11 +139,7 @@ def slopes(
 
 
 def _compiled(
-    u: Tensor,
-    d: Tensor,
-    index: Tensor,
-    used: Tensor,
-    previous: SparseJacobian,
+    case: _Case,
     choices: Sequence[tuple[float, float]],
     constant: Tensor | None = None,
     *,
@@ -149,6 +147,7 @@ def _compiled(
     shortened: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Return slopes [choices, m, keep] and errors of the first of them [m, keep], by the C++ extension."""
+    u, d, index, used, previous = case
     scale = len(u) * u.square().mean(0).clamp_min(torch.finfo(u.dtype).tiny)
     values, deviations, failed = torch.ops.torch_zerohess.regress(
         *(one.contiguous() for one in (u.mT, scale, d.mT, index, used, previous.index, previous.values.to(u))),

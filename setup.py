@@ -68,7 +68,7 @@ def extension(torch: Path) -> Extension:
     windows = sys.platform == "win32"
     return Extension(
         "torch_zerohess._C",
-        sources=["csrc/ops.cpp"],
+        sources=["csrc/ops.cpp", "csrc/sparse_ops.cpp"],
         depends=[str(path) for path in sorted(Path("csrc").glob("*.h"))],
         include_dirs=[str(torch / "include")],
         library_dirs=[str(torch / "lib")],

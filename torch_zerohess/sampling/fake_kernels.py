@@ -1,6 +1,6 @@
 """Shapes and types of what the C++ operators return, for tensors without numbers: fake tensors, tracers, compilers.
 
-Shapes: B batch, S samples, K = S or 2 S evaluations per x, n parameters, M vectors, m outputs; see `csrc/ops.cpp`.
+Shapes: B batch, S samples, K = S or 2 S evaluations per x, n parameters, M vectors, m outputs; see `csrc/*.cpp`.
 """
 
 import math

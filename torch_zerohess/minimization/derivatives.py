@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.surrogates.local_fit import quadratic_around
+from torch_zerohess.surrogates.noisy_derivatives import noisy_derivatives
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 _FITTED = 40
@@ -39,15 +40,16 @@ def quadratic_at(x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor,
 def _model(
     x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor, noise: float
 ) -> tuple[LocalModel, float] | None:
-    """Return the search's quadratic model around x and its sigma; or the regression on all evaluations, if better.
+    """Return the search's quadratic model around x and its sigma; or what all evaluations tell, if that is better.
 
-    In noise the regression is better if there is one: its standard errors come from the noise.
+    In noise it is better if there are enough of them: its standard errors contain what is not quadratic.
     """
     found, unit = search.model_at_best(x), search.unit
     if len(x) > _FITTED:
         return found
-    around = quadratic_around(x.to(unit) / unit, points.to(unit) / unit, losses.to(unit), noise)
+    x, points, losses = x.to(unit) / unit, points.to(unit) / unit, losses.to(unit)
+    if noise:
+        return noisy_derivatives(x, points, losses, noise) or found
+    around = quadratic_around(x, points, losses)
     most = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
-    if around is None or (found is not None and not noise and around[2] > most):
-        return found
-    return around[:2]
+    return found if around is None or (found is not None and around[2] > most) else around[:2]

@@ -47,7 +47,7 @@ class InducedProcess:
         """Condition on outputs [P, m] at points [P, n], in units of the length; noise in units of the variance."""
         mean = outputs.mean(0)
         change = outputs - mean
-        features, chosen = _decomposed(points, kernel, max(_LEFT * noise, _LEAST))
+        features, chosen = decomposed(points, kernel, max(_LEFT * noise, _LEAST), MOST)
         lower = features[chosen].tril()
         square = features.mT @ features
         square.diagonal().add_(noise)
@@ -71,10 +71,20 @@ class InducedProcess:
         return self.variance * (unexplained + self.noise * known)
 
 
-def _decomposed(points: Tensor, kernel: Kernel, left: float) -> tuple[Tensor, Tensor]:
-    """Return L [P, M] with covariance ~ L L^T, and the pivots [M]: L[pivots] is lower triangular."""
+def decomposed(points: Tensor, kernel: Kernel, left: float, most: int) -> tuple[Tensor, Tensor]:
+    """Decompose the covariance of points [P, n], without the noise.
+
+    Args:
+        points: in units of the length.
+        kernel: of distances.
+        left: variance of a point that may be left unexplained, in units of the variance of the process.
+        most: M at most.
+
+    Returns:
+        L [P, M] with covariance ~ L L^T, and the pivots [M]: L[pivots] is lower triangular.
+    """
     P = len(points)
-    most = min(MOST, P)
+    most = min(most, P)
     rows = points.new_zeros(most, P)
     rest = points.new_full((P,), 1.0 + CONSTANT)
     pivots: list[int] = []

@@ -5,7 +5,6 @@ import math
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.gaussian_process import DEVIATION_DEGREES
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms, symmetric
 
 _SPARE = 5
@@ -13,32 +12,23 @@ _SPARE = 5
 _WIDER = 1.3
 """Factor between the numbers of evaluations that are tried."""
 _MOST = 3
-"""Evaluations without noise that are tried at most, over the coefficients."""
-_CHANCE = 2.0
-"""Standard deviations by which the residuals may exceed the noise before the rest is no quadratic."""
-_APART = 3.0
-"""Standard errors by which a wider quadratic in noise may differ from a narrower one."""
+"""Evaluations that are tried at most, over the coefficients."""
 _REACH = 2.0
 """Distance of the farthest evaluation, in units of the width."""
 _RANK = 1e-9
 """Smallest pivot of the design, relative to the largest, with which the evaluations tell all coefficients."""
 
 
-def quadratic_around(
-    x: Tensor, points: Tensor, values: Tensor, noise: float = 0.0
-) -> tuple[LocalModel, float, float] | None:
+def quadratic_around(x: Tensor, points: Tensor, values: Tensor) -> tuple[LocalModel, float, float] | None:
     """Return the least-squares quadratic around x [n], its width, and the relative standard error of its Hessian.
 
     Args:
         x: its centre.
         points: evaluations [P, n], float64.
         values: their losses [P]; points whose loss is not finite are left out.
-        noise: standard deviation of repeated losses at one point.
 
-    The number of nearest evaluations is chosen for the least of this error. A quadratic function is found exactly, but
-    for the noise. None if the evaluations do not determine a quadratic. In noise a wider quadratic has smaller standard
-    errors, but may not describe the function at x: the widening ends where a quadratic contradicts a narrower one
-    (Lepski 1991).
+    The number of nearest evaluations is chosen for the least of this error. A quadratic function is found exactly. None
+    if the evaluations do not determine a quadratic.
     """
     finite = torch.isfinite(values)
     points, values = points[finite], values[finite]
@@ -46,33 +36,19 @@ def quadratic_around(
     determined = coefficients(n)
     distance, order = (points - x).norm(dim=1).sort()
     best, least = None, math.inf
-    narrower: list[tuple[Tensor, Tensor]] = []
     count = determined + max(_SPARE, n)
-    most = len(order) if noise else min(len(order), _MOST * determined + _SPARE + n)
+    most = min(len(order), _MOST * determined + _SPARE + n)
     while count <= most:
         sigma = float(distance[count - 1]) / _REACH
         near = order[:count]
-        fitted = _least_squares((points[near] - x) / sigma, values[near], noise) if sigma > 0.0 else None
-        if fitted is not None and noise:
-            found, error = _derivatives(fitted[0], sigma)
-            if any(bool(((found - one).abs() > _APART * width).any()) for one, width in narrower):
-                break
-            narrower.append((found, error))
+        fitted = _least_squares((points[near] - x) / sigma, values[near]) if sigma > 0.0 else None
         if fitted is not None and fitted[1] < least:
             best, least = (fitted[0], sigma, fitted[1]), fitted[1]
-        wider = math.ceil(_WIDER * count)
-        count = most if noise and count < most < wider else wider
+        count = math.ceil(_WIDER * count)
     return best
 
 
-def _derivatives(model: LocalModel, sigma: float) -> tuple[Tensor, Tensor]:
-    """Return gradient and Hessian diagonal [2n] in units of the points, and their standard errors."""
-    scale = torch.cat([torch.full_like(model.gradient, sigma), torch.full_like(model.gradient, sigma**2)])
-    found = torch.cat([model.gradient, model.hessian.diagonal()])
-    return found / scale, torch.cat([model.gradient_error, model.curvature_error]) / scale
-
-
-def _least_squares(u: Tensor, values: Tensor, noise: float) -> tuple[LocalModel, float] | None:
+def _least_squares(u: Tensor, values: Tensor) -> tuple[LocalModel, float] | None:
     """Return a quadratic fitted to values [P] at u [P, n], and the relative standard error of its Hessian."""
     P, n = u.shape
     base = values.min()
@@ -89,14 +65,9 @@ def _least_squares(u: Tensor, values: Tensor, noise: float) -> tuple[LocalModel,
     solution = inverse @ (q.mT @ target)
     spare = P - design.shape[1]
     missed = float((target - design @ solution).norm()) * math.sqrt(P / spare)
-    averaged = 0.0
-    if noise:
-        variance = missed**2 / P
-        averaged = (DEVIATION_DEGREES * (noise / size) ** 2 + spare * variance) / (DEVIATION_DEGREES + spare)
-        missed = math.sqrt(P * max(variance - averaged * (1.0 + _CHANCE * math.sqrt(2.0 / spare)), 0.0))
     rounding = torch.finfo(values.dtype).eps * float(values.abs().max()) / size
-    # What is not quadratic is no noise: it does not average out over the evaluations (Cauchy and Schwarz).
-    error = math.hypot(missed, math.sqrt(averaged), rounding) * inverse.norm(dim=1)
+    # What is not quadratic does not average out over the evaluations (Cauchy and Schwarz).
+    error = math.hypot(missed, rounding) * inverse.norm(dim=1)
     hessian = symmetric(solution[n + 1 :], n)
     scale = float(hessian.norm())
     row, column = torch.triu_indices(n, n, device=u.device)

@@ -1,0 +1,191 @@
+"""Derivatives from noisy values against dense formulas of universal kriging, and against functions that are known."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from torch_zerohess.surrogates import noisy_derivatives as module
+from torch_zerohess.surrogates.noisy_derivatives import noisy_derivatives
+from torch_zerohess.surrogates.quadratic import quadratic_terms
+from truths import normal
+
+NOISE = 0.1
+
+
+def matern(square):
+    root = (5 * square).sqrt()
+    return (1 + root + root.square() / 3) * torch.exp(-root)
+
+
+KERNELS = (lambda square: torch.exp(-0.5 * square), matern)
+AT_ZERO = ((-1 / 2, 1 / 4), (-5 / 6, 25 / 12))
+"""First and second derivative of each kernel by the squared distance at 0: the series of exp and of Matern."""
+
+
+def choose(monkeypatch, kernel, length, ratio):
+    """Leave one choice to the module."""
+    monkeypatch.setattr(module, "_KERNELS", module._KERNELS[kernel : kernel + 1])
+    monkeypatch.setattr(module, "_LENGTHS", (length,))
+    monkeypatch.setattr(module, "_RATIOS", (ratio,))
+
+
+def dense(u, change, number, length, ratio, noise):
+    """Evidence, means and variances [q] by matrices of all points; derivatives of the kernel by automatic ones."""
+    n, kernel = u.shape[1], KERNELS[number]
+    row, column = torch.triu_indices(n, n)
+
+    def between(a, b):
+        return ratio * kernel((a - b).square().sum() / length**2 + 1e-30)
+
+    def derivatives(function, x):
+        """Value, gradient and upper triangle of the Hessian."""
+        hessian = torch.func.hessian(function)(x)
+        return torch.cat([function(x)[None], torch.func.grad(function)(x), hessian[row, column]])
+
+    x = torch.zeros(n, dtype=u.dtype)
+    with_points = torch.stack([derivatives(lambda z, one=one: between(z, one), x) for one in u], 1)  # [q, P]
+    covariance = torch.stack([torch.stack([between(a, b) for b in u]) for a in u]) + torch.eye(len(u))
+    terms, inverse = quadratic_terms(u), torch.linalg.inv(covariance)
+    normal_matrix = terms.mT @ inverse @ terms
+    trend = torch.linalg.solve(normal_matrix, terms.mT @ inverse)
+    projected = inverse @ (torch.eye(len(u)) - terms @ trend)
+    degrees = len(u) - terms.shape[1] + 7
+    variance = float(change @ projected @ change + 7 * noise**2) / degrees
+    logs = torch.logdet(covariance) + torch.logdet(normal_matrix) - torch.logdet(terms.mT @ terms)
+    evidence = -0.5 * float(degrees * math.log(variance) + logs)
+    means = trend @ change + with_points @ (projected @ change)
+    first, second = AT_ZERO[number]
+    same = (row == column).to(u)
+    prior = ratio * torch.cat(
+        [u.new_ones(1), u.new_full((n,), -2 * first / length**2), 4 * second * (1 + 2 * same) / length**4]
+    )
+    open_terms = torch.eye(terms.shape[1], dtype=u.dtype) - with_points @ inverse @ terms
+    variances = prior - (with_points @ inverse * with_points).sum(1)
+    variances += (open_terms @ torch.linalg.inv(normal_matrix) * open_terms).sum(1)
+    return evidence, means, variance * variances
+
+
+@pytest.mark.parametrize("kernel", [0, 1])
+@pytest.mark.parametrize(("n", "length", "ratio"), [(1, 0.5, 10.0), (2, 1.0, 100.0), (3, 2.0, 1.0)])
+def test_one_choice_is_universal_kriging(monkeypatch, kernel, n, length, ratio):
+    choose(monkeypatch, kernel, length, ratio)
+    u = normal(30, n)
+    change = torch.sin(2 * u).sum(1) + 0.05 * normal(30, seed=1)
+    choices = module._choices(u, change, NOISE)
+    _, means, variances = dense(u, change, kernel, length, ratio, NOISE)
+    torch.testing.assert_close(choices.means[0], means, rtol=0, atol=1e-4 * float(means.abs().max()))
+    torch.testing.assert_close(choices.variances[0].sqrt(), variances.sqrt(), rtol=1e-3, atol=0)
+
+
+def test_choices_have_the_evidence_of_universal_kriging(monkeypatch):
+    """Up to a constant, and the prior of a short length."""
+    u = normal(25, 2)
+    change, found, truth = torch.sin(2 * u).sum(1) + 0.05 * normal(25, seed=1), [], []
+    for kernel, length, ratio in itertools.product((0, 1), (0.5, 2.0), (1.0, 100.0)):
+        with monkeypatch.context() as patch:
+            choose(patch, kernel, length, ratio)
+            found.append(float(module._choices(u, change, NOISE).evidence) - 6 * math.log(min(length, 1.0)))
+        truth.append(dense(u, change, kernel, length, ratio, NOISE)[0])
+    assert [one - found[0] for one in found] == pytest.approx([one - truth[0] for one in truth], abs=1e-3)
+
+
+def test_the_choices_are_averaged(monkeypatch):
+    """Two choices of equal evidence that differ: the variance of a mixture."""
+    means, variances = normal(2, 6), normal(2, 6, seed=1).square()
+    two = module._Choices(torch.zeros(2, dtype=torch.float64), means, variances)
+    monkeypatch.setattr(module, "_choices", lambda u, change, noise: two)
+    points = normal(12, 2)
+    model, _ = noisy_derivatives(points.new_zeros(2), points, 2.0 * torch.eye(12, dtype=torch.float64)[0], NOISE)
+    size = 2.0 - 2.0 / 12
+    mixture = (means.square() + variances).mean(0) - means.mean(0).square()
+    slope, bend = model.full_errors()
+    torch.testing.assert_close(model.full_gradient(), size * means.mean(0)[1:3])
+    torch.testing.assert_close(torch.cat([slope, bend]), size * mixture.sqrt()[[1, 2, 3, 5]])
+
+
+def scores(function, hessian, n=2, runs=40, count=80):
+    """Errors of gradient and Hessian diagonal at 0 over their standard errors [runs, 2n], and the latter [runs, 2n].
+
+    Args:
+        function: its gradient at 0 is 0.
+        hessian: its diagonal at 0.
+    """
+    generator, found, sizes = torch.Generator().manual_seed(0), [], []
+    for _ in range(runs):
+        lengths = torch.rand(count, 1, generator=generator, dtype=torch.float64)
+        points = lengths * torch.randn(count, n, generator=generator, dtype=torch.float64)
+        values = function(points) + NOISE * torch.randn(count, generator=generator, dtype=torch.float64)
+        model, width = noisy_derivatives(points.new_zeros(n), points, values, NOISE)
+        slope, bend = (error / width**k for k, error in enumerate(model.full_errors(), 1))
+        off = model.full_hessian().diagonal() / width**2 - hessian
+        found.append(torch.cat([model.full_gradient() / width / slope, off / bend]))
+        sizes.append(torch.cat([slope, bend]))
+    return torch.stack(found), torch.stack(sizes)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda z: z.square().sum(1),
+        lambda z: z.square().sum(1) + 0.5 * z.pow(3).sum(1),
+        lambda z: z.square().sum(1) + z.pow(4).sum(1),
+        lambda z: 2 * z.cosh().sum(1) - z.square().prod(1),
+        lambda z: 0.5 * (2 * z).sin().square().sum(1) - z.square().sum(1),
+    ],
+    ids=["quadratic", "cubic", "quartic", "cosh", "sine"],
+)
+def test_twice_the_standard_error_covers_the_derivatives(function):
+    """Also of functions that are no quadratic: a least-squares quadratic is off by many of its errors there."""
+    zero = torch.zeros(2, dtype=torch.float64)
+    hessian = torch.func.hessian(lambda z: function(z[None])[0])(zero).diagonal()
+    found, _ = scores(function, hessian)
+    assert float((found.abs() < 2).double().mean()) > 0.88
+    assert float((found.abs() < 4).double().mean()) > 0.98
+
+
+def test_errors_are_near_those_of_least_squares_where_the_function_is_a_quadratic():
+    found, sizes = scores(lambda z: z.square().sum(1), 2.0)
+    least = found * sizes  # its own scatter
+    assert float(sizes[:, 2:].median()) < 3.0 * float(least[:, 2:].square().mean().sqrt())
+
+
+def test_values_far_away_do_not_spoil_the_derivatives():
+    """Values up to 1e6 where the noise is 0.1."""
+    found, sizes = scores(lambda z: (6 * z).cosh().sum(1) / 18, 2.0, count=160)
+    assert float((found.abs() < 2).double().mean()) > 0.85
+    assert float(sizes[:, 2:].median()) < 2.0
+
+
+def test_what_few_features_miss_is_in_the_errors(monkeypatch):
+    u = normal(60, 2)
+    change = torch.sin(3 * u).sum(1)
+    choose(monkeypatch, 1, 0.5, 100.0)
+    exact = module._choices(u, change, NOISE).variances
+    monkeypatch.setattr(module, "_FEATURES", 10)
+    few = module._choices(u, change, NOISE).variances
+    assert bool((few[0, 1:] > 0.9 * exact[0, 1:]).all())
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_too_few_values_tell_nothing(n):
+    q = (n + 1) * (n + 2) // 2
+    points = normal(q + 5, n)
+    values = points.square().sum(1)
+    x = points.new_zeros(n)
+    assert noisy_derivatives(x, points, values, NOISE) is not None
+    assert noisy_derivatives(x, points[1:], values[1:], NOISE) is None
+    lost = values.clone()
+    lost[0] = math.nan
+    assert noisy_derivatives(x, points, lost, NOISE) is None
+    assert noisy_derivatives(x, points[:0], values[:0], NOISE) is None
+
+
+def test_points_that_do_not_determine_a_quadratic_tell_nothing():
+    x = normal(3)
+    plane = normal(40, 3)
+    plane[:, 2] = x[2]
+    assert noisy_derivatives(x, plane, normal(40), NOISE) is None
+    assert noisy_derivatives(x, x.repeat(40, 1), normal(40), NOISE) is None
+    assert noisy_derivatives(x, normal(40, 3), torch.full((40,), 3.0).double(), NOISE) is None

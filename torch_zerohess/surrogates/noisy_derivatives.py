@@ -1,0 +1,182 @@
+"""Gradient and Hessian at a point from noisy values around it, and how certain they are.
+
+The function is a quadratic, with a flat prior, plus a Gaussian process. The process is what is not quadratic, so the
+values tell how far the quadratic holds, and the standard errors contain what it leaves out. (O'Hagan 1978; Rasmussen
+and Williams 2006, section 2.7. Derivatives of a Gaussian process: Solak et al. 2003.)
+
+All kernels, lengths and sizes of the lists are averaged with their probabilities: with the likeliest one alone the
+standard errors are too small.
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.surrogates.gaussian_process import CONSTANT, DEVIATION_DEGREES
+from torch_zerohess.surrogates.inducing import decomposed
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms, symmetric
+
+_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Lengths of the process, in units of the width of the values' points."""
+_RATIOS = tuple(10.0**exponent for exponent in range(-3, 7))
+"""Variances of the process, in units of the variance of the noise."""
+_SPARE = 5
+"""Values beyond the coefficients of a quadratic, at least."""
+_MOST = 4000
+"""Values that are used, the nearest ones."""
+_FEATURES = 200
+"""Points that explain the others, at most."""
+_UNEXPLAINED = 1e-7
+"""Variance that they may leave, in units of the variance of the process."""
+_SHORT = 6.0
+"""Power of a length below 1 in the prior: with a short length even a process below the noise has large derivatives."""
+_RANK = 1e-9
+"""Smallest pivot of the quadratic, relative to the largest, with which the points tell all its coefficients."""
+
+
+class _Kernel(NamedTuple):
+    """A kernel as a function of the squared distance, and its two derivatives."""
+
+    value: Callable[[Tensor], Tensor]
+    first: Callable[[Tensor], Tensor]
+    second: Callable[[Tensor], Tensor]
+
+
+def _length(square: Tensor) -> Tensor:
+    return (5.0 * square).sqrt()
+
+
+_KERNELS = (
+    _Kernel(
+        lambda s: torch.exp(-0.5 * s),
+        lambda s: -0.5 * torch.exp(-0.5 * s),
+        lambda s: 0.25 * torch.exp(-0.5 * s),
+    ),
+    _Kernel(  # Matern, twice differentiable
+        lambda s: (1.0 + _length(s) + 5.0 / 3.0 * s) * torch.exp(-_length(s)),
+        lambda s: -5.0 / 6.0 * (1.0 + _length(s)) * torch.exp(-_length(s)),
+        lambda s: 25.0 / 12.0 * torch.exp(-_length(s)),
+    ),
+)
+
+
+class _Choices(NamedTuple):
+    """What C choices of kernel, length and size tell of value, gradient and upper triangle of the Hessian [q]."""
+
+    evidence: Tensor
+    """Log probability [C], up to a constant."""
+    means: Tensor
+    """[C, q]"""
+    variances: Tensor
+    """[C, q]"""
+
+
+def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -> tuple[LocalModel, float] | None:
+    """Return value, gradient and Hessian at x with their standard errors, and the width of the points that tell them.
+
+    Args:
+        x: [n].
+        points: evaluations [P, n], float64.
+        values: their losses [P]; points whose loss is not finite are left out.
+        noise: standard deviation of repeated losses at one point.
+
+    Of all values, the nearest half, the nearest quarter and so on, those with the least error of the Hessian are used:
+    one size of the process does not suit values that grow fast.
+
+    Returns:
+        The quadratic around x in units of the width, the root mean square distance of a coordinate; None if the points
+        do not determine a quadratic.
+    """
+    finite = torch.isfinite(values)
+    points, values, least = points[finite], values[finite], coefficients(len(x)) + _SPARE
+    distance, order = (points - x).norm(dim=1).sort(stable=True)
+    found, count = [], min(len(order), _MOST)
+    while count >= least:
+        near = order[:count]
+        width = float(distance[:count].square().mean().sqrt()) / math.sqrt(len(x))
+        model = _model((points[near] - x) / width, values[near], noise) if width > 0.0 else None
+        if model is not None:
+            found.append((model, width))
+        count //= 2
+    return min(found, key=lambda one: float((one[0].curvature_error / one[1] ** 2).norm()), default=None)
+
+
+def _model(u: Tensor, values: Tensor, noise: float) -> LocalModel | None:
+    """Return the quadratic around 0 given values [P] at u [P, n]; None if they do not determine one."""
+    base, n = float(values.mean()), u.shape[1]
+    size = float((values - base).abs().max())
+    choices = _choices(u, (values - base) / size, noise / size) if size > 0.0 else None
+    if choices is None:
+        return None
+    weights = choices.evidence.softmax(0)
+    mean = weights @ choices.means
+    error = (weights @ (choices.variances + (choices.means - mean).square())).sqrt()
+    mean, error = size * mean, size * error
+    row, column = torch.triu_indices(n, n, device=u.device)
+    slope, bend = error[1 : n + 1], error[n + 1 :][row == column]
+    return LocalModel(base + float(mean[0]), mean[1 : n + 1], symmetric(mean[n + 1 :], n), None, slope, bend)
+
+
+def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
+    """Return what all choices tell at u = 0, given change [P] at u [P, n]; None if u does not determine a quadratic.
+
+    For each kernel and length the process is a sum of features with independent normal weights. The flat prior of the
+    quadratic takes its part out of features and values (restricted likelihood). The eigenvectors of what is left serve
+    all sizes of the process.
+    """
+    terms = quadratic_terms(u)
+    orthonormal, triangle = torch.linalg.qr(terms)
+    pivots = triangle.diagonal().abs()
+    if float(pivots.min()) < _RANK * float(pivots.max()):
+        return None
+    one = torch.eye(len(triangle), dtype=u.dtype, device=u.device)
+    inverse = torch.linalg.solve_triangular(triangle, one, upper=True)
+    quadratic = inverse @ (orthonormal.mT @ change)
+    rest = change - terms @ quadratic
+    known = DEVIATION_DEGREES * noise**2
+    degrees = len(u) - len(triangle) + DEVIATION_DEGREES
+    ratios = u.new_tensor(_RATIOS)[:, None]
+    found = []
+    for kernel, length in itertools.product(_KERNELS, _LENGTHS):
+        features, derivatives, missed = _features(u, kernel, length)
+        part = inverse @ (orthonormal.mT @ features)
+        spread, axes = torch.linalg.eigh((features - terms @ part).mT @ features)
+        pulled = axes.mT @ (features.mT @ rest)
+        widened = 1.0 + ratios * spread.clamp_min(0.0)  # [ratios, M]
+        shrunk = ratios / widened
+        squares = (rest.square().sum() - shrunk @ pulled.square()).clamp_min(math.ulp(0.0))
+        variances = (squares + known) / degrees
+        evidence = -0.5 * (degrees * variances.log() + widened.log().sum(1)) + _SHORT * math.log(min(length, 1.0))
+        tilt = (derivatives - part) @ axes  # [q, M]
+        means = quadratic + (shrunk * pulled) @ tilt.mT
+        certain = inverse.square().sum(1) + shrunk @ tilt.square().mT + ratios * missed
+        found.append(_Choices(evidence, means, variances[:, None] * certain))
+    return _Choices(*(torch.cat(one) for one in zip(*found, strict=True)))
+
+
+def _features(u: Tensor, kernel: _Kernel, length: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Decompose a process of variance 1 (plus a constant) into features, at most as many as there are points.
+
+    Returns:
+        The features at u [P, M]; their value, gradient and upper triangle of the Hessian at 0 [q, M]; and the variances
+        of these [q] that the features miss.
+    """
+    n = u.shape[1]
+    features, chosen = decomposed(u / length, lambda d: kernel.value(d.square()), _UNEXPLAINED, _FEATURES)
+    to = u[chosen] / length
+    square = to.square().sum(1)
+    first, second = kernel.first(square), kernel.second(square)
+    row, column = torch.triu_indices(n, n, device=u.device)
+    same = (row == column).to(u)
+    bends = 4.0 * second * (to[:, row] * to[:, column]).mT + 2.0 * first * same[:, None]
+    covariance = torch.cat([CONSTANT + kernel.value(square)[None], -2.0 * first * to.mT, bends])
+    first, second = kernel.first(u.new_zeros(1)), kernel.second(u.new_zeros(1))
+    prior = torch.cat([u.new_full((1,), CONSTANT + 1.0), -2.0 * first.expand(n), 4.0 * second * (1.0 + 2.0 * same)])
+    units = length ** torch.cat([u.new_zeros(1), u.new_ones(n), torch.full_like(same, 2.0)])
+    derivatives = torch.linalg.solve_triangular(features[chosen].tril(), covariance.mT, upper=False).mT
+    missed = (prior - derivatives.square().sum(1)).clamp_min(0.0)
+    return features, derivatives / units[:, None], missed / units.square()

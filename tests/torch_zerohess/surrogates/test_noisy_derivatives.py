@@ -92,20 +92,22 @@ def test_choices_have_the_evidence_of_universal_kriging(monkeypatch):
 
 
 def test_the_choices_are_averaged(monkeypatch):
-    """Two choices of equal evidence that differ: the variance of a mixture."""
+    """Two choices with probabilities 1/4 and 3/4: mean and variance of a mixture."""
     means, variances = normal(2, 6), normal(2, 6, seed=1).square()
-    two = module._Choices(torch.zeros(2, dtype=torch.float64), means, variances)
+    weights = torch.tensor([0.25, 0.75], dtype=torch.float64)
+    two = module._Choices(weights.log() + 5.0, means, variances)
     monkeypatch.setattr(module, "_choices", lambda u, change, noise: two)
     points = normal(12, 2)
     model, _ = noisy_derivatives(points.new_zeros(2), points, 2.0 * torch.eye(12, dtype=torch.float64)[0], NOISE)
     size = 2.0 - 2.0 / 12
-    mixture = (means.square() + variances).mean(0) - means.mean(0).square()
+    mean = weights @ means
+    mixture = weights @ (means.square() + variances) - mean.square()
     slope, bend = model.full_errors()
-    torch.testing.assert_close(model.full_gradient(), size * means.mean(0)[1:3])
+    torch.testing.assert_close(model.full_gradient(), size * mean[1:3])
     torch.testing.assert_close(torch.cat([slope, bend]), size * mixture.sqrt()[[1, 2, 3, 5]])
 
 
-def scores(function, hessian, n=2, runs=40, count=80):
+def scores(function, hessian, n=2, runs=16, count=60):
     """Errors of gradient and Hessian diagonal at 0 over their standard errors [runs, 2n], and the latter [runs, 2n].
 
     Args:

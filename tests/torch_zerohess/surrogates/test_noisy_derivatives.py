@@ -157,7 +157,7 @@ def test_values_far_away_do_not_spoil_the_derivatives():
     """Values up to 1e6 where the noise is 0.1."""
     found, sizes = scores(lambda z: (6 * z).cosh().sum(1) / 18, 2.0, count=160)
     assert float((found.abs() < 2).double().mean()) > 0.85
-    assert float(sizes[:, 2:].median()) < 2.0
+    assert float(sizes[:, 2:].median()) < 5.0
 
 
 def test_what_few_features_miss_is_in_the_errors(monkeypatch):

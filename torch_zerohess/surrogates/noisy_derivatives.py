@@ -46,7 +46,7 @@ class _Kernel(NamedTuple):
     second: Callable[[Tensor], Tensor]
 
 
-def _length(square: Tensor) -> Tensor:
+def _root(square: Tensor) -> Tensor:
     return (5.0 * square).sqrt()
 
 
@@ -57,9 +57,9 @@ _KERNELS = (
         lambda s: 0.25 * torch.exp(-0.5 * s),
     ),
     _Kernel(  # Matern, twice differentiable
-        lambda s: (1.0 + _length(s) + 5.0 / 3.0 * s) * torch.exp(-_length(s)),
-        lambda s: -5.0 / 6.0 * (1.0 + _length(s)) * torch.exp(-_length(s)),
-        lambda s: 25.0 / 12.0 * torch.exp(-_length(s)),
+        lambda s: (1.0 + _root(s) + 5.0 / 3.0 * s) * torch.exp(-_root(s)),
+        lambda s: -5.0 / 6.0 * (1.0 + _root(s)) * torch.exp(-_root(s)),
+        lambda s: 25.0 / 12.0 * torch.exp(-_root(s)),
     ),
 )
 
@@ -107,7 +107,7 @@ def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -
 
 def _model(u: Tensor, values: Tensor, noise: float) -> LocalModel | None:
     """Return the quadratic around 0 given values [P] at u [P, n]; None if they do not determine one."""
-    base, n = float(values.mean()), u.shape[1]
+    base, n = float(values.median()), u.shape[1]
     size = float((values - base).abs().max())
     choices = _choices(u, (values - base) / size, noise / size) if size > 0.0 else None
     if choices is None:

@@ -99,7 +99,7 @@ def test_the_choices_are_averaged(monkeypatch):
     monkeypatch.setattr(module, "_choices", lambda u, change, noise: two)
     points = normal(12, 2)
     model, _ = noisy_derivatives(points.new_zeros(2), points, 2.0 * torch.eye(12, dtype=torch.float64)[0], NOISE)
-    size = 2.0 - 2.0 / 12
+    size = 2.0  # the largest distance of a value from their median
     mean = weights @ means
     mixture = weights @ (means.square() + variances) - mean.square()
     slope, bend = model.full_errors()
@@ -191,3 +191,13 @@ def test_points_that_do_not_determine_a_quadratic_tell_nothing():
     assert noisy_derivatives(x, plane, normal(40), NOISE) is None
     assert noisy_derivatives(x, x.repeat(40, 1), normal(40), NOISE) is None
     assert noisy_derivatives(x, normal(40, 3), torch.full((40,), 3.0).double(), NOISE) is None
+
+
+def test_the_largest_losses_do_not_overflow():
+    points = normal(80, 2)
+    values = points.square().sum(1) + NOISE * normal(80, seed=1)
+    values[points.norm(dim=1) > 1.5] = 1e308
+    model, width = noisy_derivatives(points.new_zeros(2), points, values, NOISE)
+    error = model.full_hessian().diagonal() / width**2 - 2.0
+    assert bool((error.abs() < 4 * model.full_errors()[1] / width**2).all())
+    assert bool((model.full_errors()[1] / width**2 < 2.0).all())

@@ -93,7 +93,7 @@ def minima(
         result_files.may_keep(store)
     torch.set_num_threads(1)
     cases = [(name, size, count) for size in n for count in evaluations for name in problems(size)]
-    rows = [judged(*case, runs, seed) for case in progress(cases, "cases")]
+    rows = [judged(name, size, count, runs, seed) for name, size, count in progress(cases, "cases")]
     cells = [list(astuple(row)) for row in rows]
     print(table(HEADERS, cells))
     if store:
@@ -104,7 +104,10 @@ def minima(
 def judged(name: str, n: int, evaluations: int, runs: int, seed: int) -> Row:
     """Search for the minimum of one function several times, and compare what is said of it."""
     problem = problems(n)[name]
-    values, slopes, bends, errors = [], [], [], []
+    values: list[bool] = []
+    slopes: list[Tensor] = []
+    bends: list[Tensor] = []
+    errors: list[float] = []
     for run in range(seed, seed + runs):
         found = _searched(problem, n, evaluations, run)
         offset = 0.0 if problem.image is None else problem.noise**2
@@ -112,15 +115,17 @@ def judged(name: str, n: int, evaluations: int, runs: int, seed: int) -> Row:
         slope = torch.func.grad(problem.loss)(found.x)
         bend = torch.func.hessian(problem.loss)(found.x).diagonal()
         if found.gradient is None or found.hessian is None or found.standard_errors is None:  # nothing is claimed
-            slopes, bends, errors = [*slopes, 0 * slope], [*bends, 0 * slope], [*errors, math.inf]
+            slopes.append(0 * slope)
+            bends.append(0 * slope)
+            errors.append(math.inf)
             continue
         said = found.standard_errors
         off = found.hessian.diagonal() - bend
         slopes.append(((found.gradient - slope).abs() <= 2 * said["gradient"]).double())
         bends.append((off.abs() <= 2 * said["hessian_diagonal"]).double())
         errors.append(float(off.square().mean().sqrt() / bend.abs().mean()))
-    shares = [float(torch.stack(one).mean()) for one in (slopes, bends)]
-    return Row(name, n, evaluations, sum(values) / runs, *shares, statistics.median(errors), runs)
+    gradient, hessian = (float(torch.stack(one).mean()) for one in (slopes, bends))
+    return Row(name, n, evaluations, sum(values) / runs, gradient, hessian, statistics.median(errors), runs)
 
 
 def _searched(problem: Problem, n: int, evaluations: int, run: int) -> zh.Minimum:

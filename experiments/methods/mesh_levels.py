@@ -48,11 +48,11 @@ class Stage(NamedTuple):
 
 STAGES = (
     Stage(1, 150, 0.2, 8),
-    Stage(2, 700, 0.3, 4),
+    Stage(2, 550, 0.3, 4),
     Stage(None, 250, 0.3, 4, 0.7),
-    Stage(3, 450, 0.3, 4, 0.6),
-    Stage(None, 400, 0.3, 4, 0.9),
-    Stage(3, 400, 0.25, 4, 0.9),
+    Stage(3, 350, 0.3, 4, 0.6),
+    Stage(None, 550, 0.3, 4, 0.9),
+    Stage(3, 460, 0.25, 4, 0.9),
 )
 """Chosen by hand on runs 1000 to 1013, as the defaults of `levels_local`."""
 _APART = 0.2

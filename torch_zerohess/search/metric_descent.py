@@ -23,6 +23,7 @@ from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.least_change import least_change
+from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.plateau import is_plateau
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
@@ -44,6 +45,13 @@ _LATEST = 2
 _ROUNDED = 1e15
 """A Hessian of values that were larger than those of now by this factor is made of their roundings."""
 
+_CLOSE, _NEARER, _TIMES = 0.15, 0.5, 2
+"""A round comes to the minimum of an earlier one if its loss is above that minimum by what the quadratic there says, up
+to the first share, so many times, each time by at most the second share of the time before."""
+
+_SURE = 0.1
+"""Relative error of a Hessian that is better than the last one of a round."""
+
 _SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place", "apart")
 """What further rounds, and isotropic quadratics on a plateau, go on with."""
 
@@ -54,6 +62,14 @@ class MetricProgress(RegionProgress):
 
     wide: DescentProgress | None = None
     """Isotropic descent on the smoothed loss, which takes over on a plateau."""
+    slope: Tensor | None = None
+    """Gradient [n] where the rounds that agree have arrived, `place`; None before the first of them."""
+    bend: Tensor | None = None
+    """Hessian there [n, n]."""
+    above: float = math.inf
+    """Loss of this round above that minimum when it was last as the quadratic says."""
+    times: int = 0
+    """How often it was."""
 
 
 class MetricQuadratics(RegionDescent[MetricProgress]):
@@ -80,7 +96,12 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[MetricProgress, Tensor]:
         if known.wide is None:
-            return super().next(known, evaluated, generator)
+            known = self._compared(known, evaluated)
+            if known.times < _TIMES:
+                return super().next(known, evaluated, generator)
+            assert known.place is not None
+            known = known.remembered(evaluated, self._capacity)
+            return self._ended(known, known.place, "the round has come to a minimum that is known", generator)
         first = known.phase == "start" and len(known.wide.pool) == len(known.values)
         wide, points = self._wide.next(known.wide, evaluated, generator)
         if first and not wide.done and bool((known.values[:, None] != evaluated.losses).all()):
@@ -129,9 +150,29 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[MetricProgress, Tensor]:
         """End, or start another round at a random point."""
+        if known.lost >= LOST:
+            return self._ended(known, None, reason, generator, last=last)
+        if torch.equal(known.lowest.point, known.best.point):
+            known = self._with_quadratic(known)
+        return self._ended(known, known.lowest, reason, generator, last=last)
+
+    def _with_quadratic(self, known: MetricProgress) -> MetricProgress:
+        """Keep the quadratic of a round that has arrived.
+
+        The last one of the round is made of differences near rounding. One through more evaluations is better.
+        """
+        around = quadratic_around(known.lowest.point, known.points, known.values)
+        if around is None or around[2] > _SURE:
+            return replace(known, slope=known.size * known.gradient, bend=known.size * known.hessian)
+        model, sigma, _ = around
+        return replace(known, slope=model.full_gradient() / sigma, bend=model.full_hessian() / sigma**2)
+
+    def _ended(
+        self, known: MetricProgress, end: Best | None, reason: str, generator: torch.Generator, *, last: bool = False
+    ) -> tuple[MetricProgress, Tensor]:
+        """Count a round that has arrived at a point, or nowhere; end, or start another one."""
         settings = self.settings
-        if known.lost < LOST:
-            end = known.lowest
+        if end is not None:
             distance = (known.points - end.point).square().mean(1).sqrt()
             plateau = is_plateau(distance, known.values, end.loss, beyond=settings.tolerance)
             known = agreeing(known, end, settings.tolerance, None if plateau else known.values)
@@ -140,7 +181,27 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         if known.done:
             return known, known.points[:0]
         center = further_start(generator, known.first, settings.lower, settings.upper)
-        return self._started(self._begun(Best(center)).taking(known, "iterations", *_SHARED), generator)
+        begun = self._begun(Best(center)).taking(known, "iterations", "slope", "bend", *_SHARED)
+        return self._started(begun, generator)
+
+    def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
+        """Compare the lowest of the new losses with the quadratic at the minimum where an earlier round has arrived."""
+        place = known.place
+        if place is None or known.slope is None or known.bend is None:
+            return known
+        steps, above = evaluated.points - place.point, evaluated.losses - place.loss
+        expected = steps @ known.slope + 0.5 * ((steps @ known.bend) * steps).sum(1)
+        as_there = (above - expected).abs() <= _CLOSE * above
+        if known.phase == "start":
+            return replace(known, times=len(above) if bool(as_there.all()) else 0)
+        k = int(above.argmin())
+        if float(evaluated.losses[k]) >= known.lowest.loss:
+            return known
+        if not as_there[k]:
+            return replace(known, times=0, above=math.inf)
+        if float(above[k]) > _NEARER * known.above:
+            return known
+        return replace(known, times=known.times + 1, above=float(above[k]))
 
     # Plateaus.
 
@@ -161,7 +222,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Return from isotropic quadratics: parameters along whose axes nothing changes are no plateau."""
         begun = self.go_on(wide.pool.points, wide.pool.values, wide.lowest, 1.0)
-        return self.plan(begun.taking(wide, "first", "iterations", *_SHARED), generator)
+        begun = begun.taking(wide, "first", "iterations", *_SHARED).taking(known, "slope", "bend")
+        return self.plan(begun, generator)
 
     # Models.
 

@@ -94,7 +94,7 @@ def test_gauss_newton_of_an_output():
 
 
 def test_of_one_point_and_of_numpy():
-    settings = {"sigma": 2.0, "seed": 0, "max_evaluations": 25}
+    settings = {"sigma": 2.0, "seed": 0, "max_evaluations": 15}
     plain = zh.minimize(tilted, zeros(2), **settings)
 
     def numpy(z):
@@ -107,7 +107,7 @@ def test_of_one_point_and_of_numpy():
     for fn, vectorized in ((numpy, True), (one, False), (lambda z: np.float64(one(z)), False)):
         fit = zh.minimize(fn, zeros(2), vectorized=vectorized, **settings)
         torch.testing.assert_close(fit.x, plain.x, rtol=0, atol=1e-9)
-        assert fit.evaluations == 25
+        assert fit.evaluations == 15
 
 
 def test_an_output_of_one_point():
@@ -130,8 +130,8 @@ def test_the_evaluator_makes_the_calls():
         batches.append(len(points))
         return fn(points)
 
-    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, evaluator=evaluator, max_evaluations=20)
-    assert sum(batches) == fit.evaluations == 20
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, evaluator=evaluator, max_evaluations=12)
+    assert sum(batches) == fit.evaluations == 12
 
 
 def test_float32():

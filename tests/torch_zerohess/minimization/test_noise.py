@@ -72,12 +72,12 @@ def test_the_value_is_unbiased_and_its_error_true():
 
 def test_a_function_without_noise_has_no_error_and_costs_one_evaluation_more():
     f = Counted(bowl)
-    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=30)
+    fit = zh.minimize(f, zeros(2), sigma=2.0, seed=0, max_evaluations=12)
     assert (fit.noise, fit.value_error) == (0.0, 0.0)
     assert torch.equal(f.points[0][-1], f.points[0][0])
-    assert fit.evaluations == sum(len(one) for one in f.points) == 30
+    assert fit.evaluations == sum(len(one) for one in f.points) == 12
     g = Counted(bowl)
-    told = zh.minimize(g, zeros(2), sigma=2.0, seed=0, max_evaluations=29, noise=0.0)
+    told = zh.minimize(g, zeros(2), sigma=2.0, seed=0, max_evaluations=11, noise=0.0)
     assert torch.equal(torch.cat(g.points), torch.cat([f.points[0][:-1], *f.points[1:]]))
     assert told.value == fit.value
     assert "+-" not in repr(told)

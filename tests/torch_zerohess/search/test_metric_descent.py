@@ -9,7 +9,8 @@ from searches import plateau, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import metric_descent
-from torch_zerohess.search.state import Best
+from torch_zerohess.search.method import Settings
+from torch_zerohess.search.state import Best, Evaluated
 from truths import vector
 
 
@@ -105,10 +106,64 @@ def test_rounds_that_arrive_at_one_point_agree():
     assert search.done
     assert search.solved
     assert search.agreed == 6
-    two = Descent(zeros(1), sigma=2.0, seed=0, restarts=8, bounds=(-4.0, 4.0))
+    two = Descent(zeros(1), sigma=2.0, seed=1, restarts=8, bounds=(-4.0, 4.0))
     run(two, lambda z: (z[:, 0].square() - 4).square() + z[:, 0], 10_000)  # minima at -2.03 and 1.97
     assert two.agreed < 3
     assert float(two.x) == pytest.approx(-2.0305, abs=1e-3)
+
+
+@pytest.mark.parametrize("n", [2, 4, 10])
+def test_further_rounds_end_where_the_first_one_has_been(n):
+    """Of a quadratic the first values of a round are as the known quadratic says: no step follows."""
+    f = ellipsoid(100.0, n, 0)
+    once, thrice = (run(Descent(zeros(n), sigma=1.0, seed=0, restarts=more), f, 10_000) for more in (0, 2))
+    assert thrice.agreed == 3
+    assert thrice.evaluations == once.evaluations + 2 * (n + 1)
+
+
+def test_the_quadratic_of_a_round_is_made_of_more_than_rounding():
+    """The last steps of a round change this loss by 1e-16. Their Hessian is off by a third."""
+
+    def f(z):
+        return (z - 0.5).cosh().log().sum(1) + 0.1 * z.square().sum(1)
+
+    search = run(Descent(vector(0.4, 3.0), sigma=1.0, seed=2, restarts=2), f, 10_000)
+    assert search.agreed == 3
+    assert search.evaluations < 45
+
+
+def arrived_at_zero():
+    """A search, and its progress in a round after one that has arrived at 0, where the loss is |z|^2."""
+    settings = Settings(zeros(2), zeros(2) - 9, zeros(2) + 9, None, restarts=9, tolerance=1e-3, noise=0.0, pool=None)
+    method = metric_descent.MetricQuadratics(settings)
+    place = Best(zeros(2), 0.0)
+    known = replace(method._begun(place), place=place, slope=zeros(2), bend=2 * torch.eye(2, dtype=torch.float64))
+    return method, replace(known, lowest=Best(zeros(2) + 9, 162.0), phase="trial")
+
+
+def seen(method, known, place, loss):
+    """The progress after a loss at the point (place, 0)."""
+    known = method._compared(known, Evaluated(vector(place, 0.0)[None], vector(loss)))
+    return known if loss >= known.lowest.loss else replace(known, lowest=Best(vector(place, 0.0), loss))
+
+
+def test_a_minimum_is_known_where_two_losses_are_as_its_quadratic_says():
+    method, known = arrived_at_zero()
+    known = seen(method, known, 2.0, 4.5)  # 12 % above
+    assert known.times == 1
+    assert seen(method, known, 1.9, 3.61).times == 1  # hardly nearer
+    assert seen(method, known, 3.0, 9.0).times == 1  # not the lowest one
+    assert seen(method, known, 1.0, 0.9).times == 2
+    assert seen(method, known, 1.0, 0.5).times == 0
+    assert seen(method, known, 1.0, -0.5).times == 0  # lower than the minimum
+
+
+def test_all_first_losses_of_a_round_must_be_as_the_quadratic_says():
+    method, known = arrived_at_zero()
+    known = replace(known, phase="start")
+    points = vector(1.0, 0.0, 2.0, 0.0, 0.0, 3.0).view(3, 2)
+    assert method._compared(known, Evaluated(points, vector(1.0, 4.1, 9.0))).times == 3
+    assert method._compared(known, Evaluated(points, vector(1.0, 5.0, 9.0))).times == 0
 
 
 def test_a_batch_has_ends_of_shorter_and_longer_steps():

@@ -51,9 +51,9 @@ class Minimum:
         standard_errors: of these by the names "gradient" [n] and "hessian_diagonal" [n]; None likewise. They are
             infinite where the evaluations do not determine the derivative. Without noise they are an estimate, often
             too small: they tell neither third derivatives nor what J^T H J leaves out. In noise, and up to 40
-            parameters, twice the error covers the derivative in 93 to 98 % of runs. It covers the Hessian in 55 to 75 %
-            only, where the minimum is a sharp tip that few evaluations resolve. With fewer evaluations than a quadratic
-            has coefficients, and with more parameters, it covers about 85 %.
+            parameters, about 95 % of derivatives are within twice the error. Of the Hessian it is 50 to 85 % where the
+            minimum is a sharp tip that few evaluations resolve. With fewer evaluations than a quadratic has
+            coefficients, and with more parameters, it is about 85 %.
         sigma: [n], width of the quadratic along every parameter.
         evaluations: how many there were.
         points: [evaluations, n], where, in order.

@@ -6,6 +6,8 @@ evaluation is spent on its walls.
 
 On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
 grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
+
+A further round ends where its losses are as the quadratic at a minimum says at which an earlier round has arrived.
 """
 
 import math

@@ -39,7 +39,7 @@ def quadratic_at(x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor,
 
 def _model(
     x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor, noise: float
-) -> tuple[LocalModel, float] | None:
+) -> tuple[LocalModel, float | Tensor] | None:
     """Return the search's quadratic model around x and its sigma; or what all evaluations tell, if that is better.
 
     In noise it is better if there are enough of them: its standard errors contain what is not quadratic.

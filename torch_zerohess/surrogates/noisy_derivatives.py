@@ -20,20 +20,22 @@ from torch_zerohess.surrogates.gaussian_process import CONSTANT, DEVIATION_DEGRE
 from torch_zerohess.surrogates.inducing import decomposed
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms, symmetric
 
-_LENGTHS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Lengths of the process, in units of the width of the values' points."""
-_RATIOS = tuple(10.0**exponent for exponent in range(-3, 7))
+_LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""Lengths of the process, in units of the width."""
+_RATIOS = tuple(10.0**exponent for exponent in range(-6, 7))
 """Variances of the process, in units of the variance of the noise."""
 _SPARE = 5
 """Values beyond the coefficients of a quadratic, at least."""
-_MOST = 4000
-"""Values that are used, the nearest ones."""
-_FEATURES = 200
+_MOST = 1000
+"""Values that are used at a time, at most, or twice as many as a quadratic has coefficients. The rest is left out."""
+_FEATURES = 150
 """Points that explain the others, at most."""
 _UNEXPLAINED = 1e-7
 """Variance that they may leave, in units of the variance of the process."""
 _SHORT = 6.0
 """Power of a length below 1 in the prior: with a short length even a process below the noise has large derivatives."""
+_LARGE = 0.1
+"""Power of a size in the prior, with a minus: where the values do not tell, there is no process."""
 _RANK = 1e-9
 """Smallest pivot of the quadratic, relative to the largest, with which the points tell all its coefficients."""
 
@@ -75,7 +77,7 @@ class _Choices(NamedTuple):
     """[C, q]"""
 
 
-def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -> tuple[LocalModel, float] | None:
+def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -> tuple[LocalModel, Tensor] | None:
     """Return value, gradient and Hessian at x with their standard errors, and the width of the points that tell them.
 
     Args:
@@ -84,30 +86,40 @@ def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -
         values: their losses [P]; points whose loss is not finite are left out.
         noise: standard deviation of repeated losses at one point.
 
-    Of all values, the nearest half, the nearest quarter and so on, those with the least error of the Hessian are used:
-    one size of the process does not suit values that grow fast.
+    Of all values, the nearest half, the nearest quarter and so on, those with the least error of the Hessian are
+    used: one size of the process does not suit values that grow fast.
 
     Returns:
-        The quadratic around x in units of the width, the root mean square distance of a coordinate; None if the points
-        do not determine a quadratic.
+        The quadratic around x in units of the width, and the width [n], the mean distance along every parameter; None
+        if the points do not determine a quadratic.
     """
     finite = torch.isfinite(values)
-    points, values, least = points[finite], values[finite], coefficients(len(x)) + _SPARE
-    distance, order = (points - x).norm(dim=1).sort(stable=True)
-    found, count = [], min(len(order), _MOST)
+    steps, values, least = points[finite] - x, values[finite], coefficients(len(x)) + _SPARE
+    unit = _width(steps)
+    order = (steps / unit).norm(dim=1).argsort(stable=True)
+    found, count, most = [], len(order), max(_MOST, 2 * least)
     while count >= least:
-        near = order[:count]
-        width = float(distance[:count].square().mean().sqrt()) / math.sqrt(len(x))
-        model = _model((points[near] - x) / width, values[near], noise) if width > 0.0 else None
+        near = order[:count][:: math.ceil(count / most)]
+        width = _width(steps[near])
+        model = _model(steps[near] / width, values[near], noise)
         if model is not None:
-            found.append((model, width))
+            found.append((float((model.curvature_error * (unit / width).square()).norm()), model, width))
         count //= 2
-    return min(found, key=lambda one: float((one[0].curvature_error / one[1] ** 2).norm()), default=None)
+    best = min((one for one in found if math.isfinite(one[0])), key=lambda one: one[0], default=None)
+    return None if best is None else best[1:]
+
+
+def _width(steps: Tensor) -> Tensor:
+    """Return the mean length [n] of steps [P, n] along every parameter; 1 where there are none."""
+    mean = steps.abs().mean(0)
+    return torch.where(mean > 0.0, mean, torch.ones_like(mean))
 
 
 def _model(u: Tensor, values: Tensor, noise: float) -> LocalModel | None:
     """Return the quadratic around 0 given values [P] at u [P, n]; None if they do not determine one."""
-    base, n = float(values.median()), u.shape[1]
+    largest, n = float(values.abs().max()) or 1.0, u.shape[1]
+    values, noise = values / largest, noise / largest  # differences of the largest numbers overflow
+    base = values.median()
     size = float((values - base).abs().max())
     choices = _choices(u, (values - base) / size, noise / size) if size > 0.0 else None
     if choices is None:
@@ -115,10 +127,11 @@ def _model(u: Tensor, values: Tensor, noise: float) -> LocalModel | None:
     weights = choices.evidence.softmax(0)
     mean = weights @ choices.means
     error = (weights @ (choices.variances + (choices.means - mean).square())).sqrt()
-    mean, error = size * mean, size * error
+    mean, error = largest * (size * mean), largest * (size * error)
     row, column = torch.triu_indices(n, n, device=u.device)
     slope, bend = error[1 : n + 1], error[n + 1 :][row == column]
-    return LocalModel(base + float(mean[0]), mean[1 : n + 1], symmetric(mean[n + 1 :], n), None, slope, bend)
+    value = largest * float(base) + float(mean[0])
+    return LocalModel(value, mean[1 : n + 1], symmetric(mean[n + 1 :], n), None, slope, bend)
 
 
 def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
@@ -136,7 +149,7 @@ def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
     one = torch.eye(len(triangle), dtype=u.dtype, device=u.device)
     inverse = torch.linalg.solve_triangular(triangle, one, upper=True)
     quadratic = inverse @ (orthonormal.mT @ change)
-    rest = change - terms @ quadratic
+    rest = change - orthonormal @ (orthonormal.mT @ change)
     known = DEVIATION_DEGREES * noise**2
     degrees = len(u) - len(triangle) + DEVIATION_DEGREES
     ratios = u.new_tensor(_RATIOS)[:, None]
@@ -144,13 +157,14 @@ def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
     for kernel, length in itertools.product(_KERNELS, _LENGTHS):
         features, derivatives, missed = _features(u, kernel, length)
         part = inverse @ (orthonormal.mT @ features)
-        spread, axes = torch.linalg.eigh((features - terms @ part).mT @ features)
+        spread, axes = torch.linalg.eigh((features - orthonormal @ (orthonormal.mT @ features)).mT @ features)
         pulled = axes.mT @ (features.mT @ rest)
         widened = 1.0 + ratios * spread.clamp_min(0.0)  # [ratios, M]
         shrunk = ratios / widened
-        squares = (rest.square().sum() - shrunk @ pulled.square()).clamp_min(math.ulp(0.0))
-        variances = (squares + known) / degrees
-        evidence = -0.5 * (degrees * variances.log() + widened.log().sum(1)) + _SHORT * math.log(min(length, 1.0))
+        squares = rest.square().sum() - shrunk @ pulled.square() + known
+        variances = squares.clamp_min(torch.finfo(u.dtype).tiny * degrees) / degrees
+        evidence = -0.5 * (degrees * variances.log() + widened.log().sum(1))
+        evidence += _SHORT * math.log(min(length, 1.0)) - _LARGE * ratios[:, 0].log()
         tilt = (derivatives - part) @ axes  # [q, M]
         means = quadratic + (shrunk * pulled) @ tilt.mT
         certain = inverse.square().sum(1) + shrunk @ tilt.square().mT + ratios * missed

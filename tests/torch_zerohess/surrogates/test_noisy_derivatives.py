@@ -80,13 +80,14 @@ def test_one_choice_is_universal_kriging(monkeypatch, kernel, n, length, ratio):
 
 
 def test_choices_have_the_evidence_of_universal_kriging(monkeypatch):
-    """Up to a constant, and the prior of a short length."""
+    """Up to a constant, and the prior."""
     u = normal(25, 2)
     change, found, truth = torch.sin(2 * u).sum(1) + 0.05 * normal(25, seed=1), [], []
     for kernel, length, ratio in itertools.product((0, 1), (0.5, 2.0), (1.0, 100.0)):
         with monkeypatch.context() as patch:
             choose(patch, kernel, length, ratio)
-            found.append(float(module._choices(u, change, NOISE).evidence) - 6 * math.log(min(length, 1.0)))
+            prior = 6 * math.log(min(length, 1.0)) - 0.1 * math.log(ratio)
+            found.append(float(module._choices(u, change, NOISE).evidence) - prior)
         truth.append(dense(u, change, kernel, length, ratio, NOISE)[0])
     assert [one - found[0] for one in found] == pytest.approx([one - truth[0] for one in truth], abs=1e-3)
 
@@ -148,13 +149,48 @@ def test_twice_the_standard_error_covers_the_derivatives(function):
 
 
 def test_errors_are_near_those_of_least_squares_where_the_function_is_a_quadratic():
-    found, sizes = scores(lambda z: z.square().sum(1), 2.0)
-    least = found * sizes  # its own scatter
-    assert float(sizes[:, 2:].median()) < 3.0 * float(least[:, 2:].square().mean().sqrt())
+    points = normal(200, 2)
+    values = points.square().sum(1) + NOISE * normal(200, seed=1)
+    model, width = noisy_derivatives(points.new_zeros(2), points, values, NOISE)
+    terms = quadratic_terms(points)
+    least = NOISE * torch.linalg.inv(terms.mT @ terms).diagonal().sqrt()
+    assert bool((model.full_errors()[0] / width < 4.0 * least[1:3]).all())
+    assert bool((model.full_errors()[1] / width**2 < 4.0 * least[[3, 5]]).all())
+
+
+def test_parameters_have_widths_of_their_own():
+    """One changes the function over a distance of 1, the other over 1/300; so are the points."""
+    scale = torch.tensor([1.0, 300.0], dtype=torch.float64)
+    generator, inside = torch.Generator().manual_seed(0), []
+    for _ in range(12):
+        points = torch.randn(100, 2, generator=generator, dtype=torch.float64) / scale
+        values = 2 * (points * scale - 0.2).cosh().log().sum(1)
+        values += NOISE * torch.randn(100, generator=generator, dtype=torch.float64)
+        model, width = noisy_derivatives(points.new_zeros(2), points, values, NOISE)
+        truth = 2 * scale.square() / torch.cosh(torch.tensor(0.2)) ** 2
+        off = model.full_hessian().diagonal() / width.square() - truth
+        inside.append(off.abs() < 2 * model.full_errors()[1] / width.square())
+        assert float(width[0] / width[1]) == pytest.approx(300.0, rel=0.5)
+    assert float(torch.stack(inside).double().mean()) > 0.85
+
+
+@pytest.mark.parametrize("n", [2, 20])
+def test_many_values_are_thinned_and_cover_the_same_region(monkeypatch, n):
+    """Of 3 000 values as many are used as the limit says, from the nearest to the farthest."""
+    used, choices = [], module._choices
+    monkeypatch.setattr(module, "_choices", lambda u, *rest: used.append(u) or choices(u, *rest))
+    monkeypatch.setattr(module, "_MOST", 100)
+    points = torch.linspace(0.1, 1.0, 3000, dtype=torch.float64)[:, None] * normal(3000, n)
+    noisy_derivatives(points.new_zeros(n), points, points.square().sum(1) + NOISE * normal(3000, seed=1), NOISE)
+    most = max(100, 2 * ((n + 1) * (n + 2) // 2 + 5))
+    assert max(len(u) for u in used) <= most
+    far = (used[0] * used[0].new_ones(n)).norm(dim=1)
+    assert float(far.max()) > 1.5 * float(far.median())
+    assert most // 2 < len(used[0])
 
 
 def test_values_far_away_do_not_spoil_the_derivatives():
-    """Values up to 1e6 where the noise is 0.1."""
+    """Values up to 1e6 where the noise is 0.1: all together leave an error of 80, the nearest ones of 2."""
     found, sizes = scores(lambda z: (6 * z).cosh().sum(1) / 18, 2.0, count=160)
     assert float((found.abs() < 2).double().mean()) > 0.85
     assert float(sizes[:, 2:].median()) < 5.0
@@ -168,6 +204,15 @@ def test_what_few_features_miss_is_in_the_errors(monkeypatch):
     monkeypatch.setattr(module, "_FEATURES", 10)
     few = module._choices(u, change, NOISE).variances
     assert bool((few[0, 1:] > 0.9 * exact[0, 1:]).all())
+
+
+@pytest.mark.parametrize("noise", [1e-300, 1e-12])
+def test_hardly_any_noise(noise):
+    """The quadratic explains all values."""
+    points = normal(60, 2)
+    model, width = noisy_derivatives(points.new_zeros(2), points, points.square().sum(1), noise)
+    torch.testing.assert_close(model.full_hessian() / width**2, 2 * torch.eye(2, dtype=torch.float64))
+    assert all(bool(torch.isfinite(one).all()) for one in model.full_errors())
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

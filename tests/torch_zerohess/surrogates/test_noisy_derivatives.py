@@ -234,6 +234,8 @@ def test_points_that_do_not_determine_a_quadratic_tell_nothing():
     plane = normal(40, 3)
     plane[:, 2] = x[2]
     assert noisy_derivatives(x, plane, normal(40), NOISE) is None
+    plane[:, 2] = x[2] + (plane[:, :2] - x[:2]).sum(1)
+    assert noisy_derivatives(x, plane, normal(40), NOISE) is None
     assert noisy_derivatives(x, x.repeat(40, 1), normal(40), NOISE) is None
     assert noisy_derivatives(x, normal(40, 3), torch.full((40,), 3.0).double(), NOISE) is None
 

@@ -56,6 +56,8 @@ _SURE = 0.1
 
 _SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place", "apart")
 """What further rounds, and isotropic quadratics on a plateau, go on with."""
+_QUADRATIC = ("bottom", "slope", "bend")
+"""What further rounds are compared with."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,8 +66,10 @@ class MetricProgress(RegionProgress):
 
     wide: DescentProgress | None = None
     """Isotropic descent on the smoothed loss, which takes over on a plateau."""
+    bottom: Best | None = None
+    """The lowest point at which a round has arrived; None before the first one."""
     slope: Tensor | None = None
-    """Gradient [n] where the rounds that agree have arrived, `place`; None before the first of them."""
+    """Gradient there [n]."""
     bend: Tensor | None = None
     """Hessian there [n, n]."""
     above: float = math.inf
@@ -101,9 +105,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
             known = self._compared(known, evaluated)
             if known.times < _TIMES:
                 return super().next(known, evaluated, generator)
-            assert known.place is not None
             known = known.remembered(evaluated, self._capacity)
-            return self._ended(known, known.place, "the round has come to a minimum that is known", generator)
+            return self._ended(known, known.bottom, "the round has come to a minimum that is known", generator)
         first = known.phase == "start" and len(known.wide.pool) == len(known.values)
         wide, points = self._wide.next(known.wide, evaluated, generator)
         if first and not wide.done and bool((known.values[:, None] != evaluated.losses).all()):
@@ -165,9 +168,11 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """
         around = quadratic_around(known.lowest.point, known.points, known.values)
         if around is None or around[2] > _SURE:
-            return replace(known, slope=known.size * known.gradient, bend=known.size * known.hessian)
-        model, sigma, _ = around
-        return replace(known, slope=model.full_gradient() / sigma, bend=model.full_hessian() / sigma**2)
+            slope, bend = known.size * known.gradient, known.size * known.hessian
+        else:
+            model, sigma, _ = around
+            slope, bend = model.full_gradient() / sigma, model.full_hessian() / sigma**2
+        return replace(known, bottom=known.lowest, slope=slope, bend=bend)
 
     def _ended(
         self, known: MetricProgress, end: Best | None, reason: str, generator: torch.Generator, *, last: bool = False
@@ -183,15 +188,15 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         if known.done:
             return known, known.points[:0]
         center = further_start(generator, known.first, settings.lower, settings.upper)
-        begun = self._begun(Best(center)).taking(known, "iterations", "slope", "bend", *_SHARED)
+        begun = self._begun(Best(center)).taking(known, "iterations", *_QUADRATIC, *_SHARED)
         return self._started(begun, generator)
 
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the lowest of the new losses with the quadratic at the minimum where an earlier round has arrived."""
-        place = known.place
-        if place is None or known.slope is None or known.bend is None:
+        bottom, evaluated = known.bottom, evaluated.those(evaluated.finite)
+        if bottom is None or known.slope is None or known.bend is None or not len(evaluated):
             return known
-        steps, above = evaluated.points - place.point, evaluated.losses - place.loss
+        steps, above = evaluated.points - bottom.point, evaluated.losses - bottom.loss
         expected = steps @ known.slope + 0.5 * ((steps @ known.bend) * steps).sum(1)
         as_there = (above - expected).abs() <= _CLOSE * above
         if known.phase == "start":
@@ -224,7 +229,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Return from isotropic quadratics: parameters along whose axes nothing changes are no plateau."""
         begun = self.go_on(wide.pool.points, wide.pool.values, wide.lowest, 1.0)
-        begun = begun.taking(wide, "first", "iterations", *_SHARED).taking(known, "slope", "bend")
+        begun = begun.taking(wide, "first", "iterations", *_SHARED).taking(known, *_QUADRATIC)
         return self.plan(begun, generator)
 
     # Models.

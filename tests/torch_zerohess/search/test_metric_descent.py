@@ -136,8 +136,8 @@ def arrived_at_zero():
     """A search, and its progress in a round after one that has arrived at 0, where the loss is |z|^2."""
     settings = Settings(zeros(2), zeros(2) - 9, zeros(2) + 9, None, restarts=9, tolerance=1e-3, noise=0.0, pool=None)
     method = metric_descent.MetricQuadratics(settings)
-    place = Best(zeros(2), 0.0)
-    known = replace(method._begun(place), place=place, slope=zeros(2), bend=2 * torch.eye(2, dtype=torch.float64))
+    bottom = Best(zeros(2), 0.0)
+    known = replace(method._begun(bottom), bottom=bottom, slope=zeros(2), bend=2 * torch.eye(2, dtype=torch.float64))
     return method, replace(known, lowest=Best(zeros(2) + 9, 162.0), phase="trial")
 
 
@@ -164,6 +164,9 @@ def test_all_first_losses_of_a_round_must_be_as_the_quadratic_says():
     points = vector(1.0, 0.0, 2.0, 0.0, 0.0, 3.0).view(3, 2)
     assert method._compared(known, Evaluated(points, vector(1.0, 4.1, 9.0))).times == 3
     assert method._compared(known, Evaluated(points, vector(1.0, 5.0, 9.0))).times == 0
+    nothing = vector(1.0, math.nan, 9.0)
+    assert method._compared(known, Evaluated(points, nothing)).times == 2
+    assert method._compared(known, Evaluated(points, nothing * math.nan)) is known
 
 
 def test_a_batch_has_ends_of_shorter_and_longer_steps():

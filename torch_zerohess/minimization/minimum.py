@@ -52,7 +52,7 @@ class Minimum:
         standard_errors: of these by the names "gradient" [n] and "hessian_diagonal" [n]; None likewise. They are
             infinite where the evaluations do not determine the derivative. Without noise they are an estimate, often
             too small: they tell neither third derivatives nor what J^T H J leaves out. In noise, and up to 40
-            parameters, about 95 % of derivatives are within twice the error. Of the Hessian it is 50 to 85 % where the
+            parameters, about 95 % of derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the
             minimum is a sharp tip that few evaluations resolve. With fewer evaluations than a quadratic has
             coefficients, 5 more with `loss`, it is some 60 to 85 %, and with more than 40 parameters 85 %.
         sigma: [n], width of the quadratic along every parameter; in noise, the mean distance of the evaluations used.

@@ -21,7 +21,7 @@ from torch_zerohess.minimization.running import Running
 from torch_zerohess.search.protocol import AskTell
 from truths import vector
 
-SETTINGS = {"sigma": 2.0, "seed": 0, "vectorized": False, "max_evaluations": 20}
+SETTINGS = {"sigma": 2.0, "seed": 0, "vectorized": False, "max_evaluations": 16}
 
 
 class Point:
@@ -46,7 +46,7 @@ class Point:
 def test_every_value_that_is_known_is_kept_and_paid_once(noise, bounds, tmp_path):
     """Wherever it is interrupted, a search goes on to the same bits, also of the measured noise."""
     whole = zh.minimize(Point(noise=noise), zeros(2), bounds=bounds, **SETTINGS)
-    for k in range(1, 20, 2 if bounds is None else 5):
+    for k in range(1, 16, 2 if bounds is None else 5):
         path, memory = tmp_path / f"{k}.pt", zh.Memory()
         f = Point(k, noise=noise)
         part = zh.minimize(f, zeros(2), bounds=bounds, checkpoint=path, memory=memory, **SETTINGS)
@@ -71,7 +71,7 @@ def test_an_exception_keeps_them_too(tmp_path):
     assert (found.status, found.evaluations, found.value) == ("failed", 2, min(f.values))
     assert found.gradient is None
     zh.minimize(f, zeros(2), checkpoint=tmp_path / "search.pt", **SETTINGS)
-    assert f.calls == 1 + 20
+    assert f.calls == 1 + 16
 
 
 class Pool(Inline):
@@ -157,7 +157,7 @@ def test_measured_noise_is_paid_once_if_the_first_model_is_interrupted(tmp_path,
         part = zh.minimize(f, zeros(2), **settings)
     assert (part.status, part.evaluations) == ("interrupted", f.calls)
     fit = zh.minimize(f, zeros(2), **settings)
-    assert fit.evaluations == f.calls == 20
+    assert fit.evaluations == f.calls == 16
     assert fit.values.tolist() == f.values
     whole = zh.minimize(Point(noise=0.3), zeros(2), **{**settings, "checkpoint": None})
     assert torch.equal(fit.values, whole.values)

@@ -51,6 +51,8 @@ _CLOSE, _NEARER, _TIMES = 0.15, 0.5, 2
 """A round comes to the minimum of an earlier one if its loss is above that minimum by what the quadratic there says, up
 to the first share, so many times, each time by at most the second share of the time before."""
 
+_UNIQUE = 1e-4
+"""Smallest curvature of that quadratic, over the largest: along the floor of a valley a round ends elsewhere."""
 _SURE = 0.1
 """Relative error of a Hessian that is better than the last one of a round."""
 
@@ -164,7 +166,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _with_quadratic(self, known: MetricProgress) -> MetricProgress:
         """Keep the quadratic of a round that has arrived.
 
-        The last one of the round is made of differences near rounding. One through more evaluations is better.
+        The last one of the round is made of differences near rounding. One through more evaluations is better. None
+        is kept where a minimum may have others beside it.
         """
         around = quadratic_around(known.lowest.point, known.points, known.values)
         if around is None or around[2] > _SURE:
@@ -172,6 +175,9 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         else:
             model, sigma, _ = around
             slope, bend = model.full_gradient() / sigma, model.full_hessian() / sigma**2
+        curvatures = torch.linalg.eigvalsh(bend)
+        if float(curvatures[0]) < _UNIQUE * float(curvatures[-1]):
+            return replace(known, bottom=None)
         return replace(known, bottom=known.lowest, slope=slope, bend=bend)
 
     def _ended(
@@ -193,14 +199,15 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the lowest of the new losses with the quadratic at the minimum where an earlier round has arrived."""
-        bottom, evaluated = known.bottom, evaluated.those(evaluated.finite)
+        bottom, holes = known.bottom, not bool(evaluated.finite.all())
+        evaluated = evaluated.those(evaluated.finite)
         if bottom is None or known.slope is None or known.bend is None or not len(evaluated):
             return known
         steps, above = evaluated.points - bottom.point, evaluated.losses - bottom.loss
         expected = steps @ known.slope + 0.5 * ((steps @ known.bend) * steps).sum(1)
         as_there = (above - expected).abs() <= _CLOSE * above
         if known.phase == "start":
-            return replace(known, times=len(above) if bool(as_there.all()) else 0)
+            return replace(known, times=len(above) if bool(as_there.all()) and not holes else 0)
         k = int(above.argmin())
         if float(evaluated.losses[k]) >= known.lowest.loss:
             return known

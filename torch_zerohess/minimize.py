@@ -105,8 +105,8 @@ def minimize(
             from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
             file, or of another x0, sigma, bounds or engine.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
-            up, or three rounds in a row have arrived at the same point, or at points with the same loss. A round has
-            arrived, too, where its losses are as the quadratic at a minimum says that is known.
+            up, or three rounds in a row have arrived at the same point, or at points with the same loss. A later round
+            counts as arrived as soon as the quadratic at a known minimum predicts its losses.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
             evaluations, and six more if the two differ. Where losses are counts, which may be equal by chance, x is
             evaluated twice again when the search arrives or is about to end. Give the noise if fn is noisy elsewhere

@@ -53,9 +53,10 @@ class Minimum:
             infinite where the evaluations do not determine the derivative. Without noise they are an estimate, often
             too small: they tell neither third derivatives nor what J^T H J leaves out. In noise, and up to 40
             parameters, about 95 % of derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the
-            minimum is a sharp tip that few evaluations resolve. With fewer evaluations than a quadratic has
-            coefficients, 5 more with `loss`, it is some 60 to 85 %, and with more than 40 parameters 85 %.
-        sigma: [n], width of the quadratic along every parameter; in noise, the mean distance of the evaluations used.
+            minimum is a sharp tip that few evaluations resolve. With more parameters, or with fewer than (n + 1)(n +
+            2)/2 + 5 evaluations, the errors are of the search's own model, and often too small.
+        sigma: [n], width of the quadratic along every parameter; in noise, the mean distance from x of the evaluations
+            that tell the derivatives.
         evaluations: how many there were.
         points: [evaluations, n], where, in order.
         values: [evaluations], float64, the losses there.

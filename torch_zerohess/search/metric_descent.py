@@ -7,7 +7,8 @@ evaluation is spent on its walls.
 On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
 grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
 
-A further round ends where its losses are as the quadratic at a minimum says at which an earlier round has arrived.
+A round that has arrived keeps the quadratic at its minimum. A later round ends early where this quadratic predicts its
+losses: it would arrive at the same minimum.
 """
 
 import math
@@ -48,18 +49,18 @@ _ROUNDED = 1e15
 """A Hessian of values that were larger than those of now by this factor is made of their roundings."""
 
 _CLOSE, _NEARER, _TIMES = 0.15, 0.5, 2
-"""A round comes to the minimum of an earlier one if its loss is above that minimum by what the quadratic there says, up
-to the first share, so many times, each time by at most the second share of the time before."""
-
+"""A later round ends early after so many predictions with a relative error of at most the first number. The loss above
+the minimum must fall to at most the second number of what it was at the prediction before."""
 _UNIQUE = 1e-4
-"""Smallest curvature of that quadratic, over the largest: along the floor of a valley a round ends elsewhere."""
+"""Smallest curvature, over the largest, of a quadratic that is kept. On the floor of a valley rounds arrive at several
+points."""
 _SURE = 0.1
-"""Relative error of a Hessian that is better than the last one of a round."""
+"""Largest relative error of a fitted Hessian that replaces the last one of the round."""
 
 _SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place", "apart")
 """What further rounds, and isotropic quadratics on a plateau, go on with."""
 _QUADRATIC = ("bottom", "slope", "bend")
-"""What further rounds are compared with."""
+"""The quadratic that is kept, which predicts the losses of later rounds."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,15 +70,15 @@ class MetricProgress(RegionProgress):
     wide: DescentProgress | None = None
     """Isotropic descent on the smoothed loss, which takes over on a plateau."""
     bottom: Best | None = None
-    """The lowest point at which a round has arrived; None before the first one."""
+    """The lowest point at which a round has arrived; None if there is none, or if no quadratic is kept."""
     slope: Tensor | None = None
     """Gradient there [n]."""
     bend: Tensor | None = None
     """Hessian there [n, n]."""
     above: float = math.inf
-    """Loss of this round above that minimum when it was last as the quadratic says."""
+    """Loss of this round above `bottom`, where it was last predicted."""
     times: int = 0
-    """How often it was."""
+    """Predictions in a row that were right."""
 
 
 class MetricQuadratics(RegionDescent[MetricProgress]):
@@ -164,10 +165,9 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         return self._ended(known, known.lowest, reason, generator, last=last)
 
     def _with_quadratic(self, known: MetricProgress) -> MetricProgress:
-        """Keep the quadratic of a round that has arrived.
+        """Keep the quadratic of a round that has arrived, unless its minimum may be one of many.
 
-        The last one of the round is made of differences near rounding. One through more evaluations is better. None
-        is kept where a minimum may have others beside it.
+        The last quadratic of the round is made of differences near rounding. A fit to more evaluations is better.
         """
         around = quadratic_around(known.lowest.point, known.points, known.values)
         if around is None or around[2] > _SURE:
@@ -198,7 +198,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         return self._started(begun, generator)
 
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
-        """Compare the lowest of the new losses with the quadratic at the minimum where an earlier round has arrived."""
+        """Compare the lowest new loss, and all losses at the start of a round, with the quadratic that is kept."""
         bottom, holes = known.bottom, not bool(evaluated.finite.all())
         evaluated = evaluated.those(evaluated.finite)
         if bottom is None or known.slope is None or known.bend is None or not len(evaluated):

@@ -1,11 +1,11 @@
 """Gradient and Hessian at a point from noisy values around it, and how certain they are.
 
-The function is a quadratic, with a flat prior, plus a Gaussian process. The process is what is not quadratic, so the
-values tell how far the quadratic holds, and the standard errors contain what it leaves out. (O'Hagan 1978; Rasmussen
-and Williams 2006, section 2.7. Derivatives of a Gaussian process: Solak et al. 2003.)
+The model is a quadratic with a flat prior, plus a Gaussian process for what is not quadratic (O'Hagan 1978; Rasmussen
+and Williams 2006, section 2.7). So the standard errors contain what the quadratic leaves out. The derivatives of the
+process are normal, too (Solak et al. 2003).
 
-All kernels, lengths and sizes of the lists are averaged with their probabilities: with the likeliest one alone the
-standard errors are too small.
+All kernels, lengths and sizes of the lists are averaged, weighted by their probabilities. With the likeliest choice
+alone the standard errors are too small.
 """
 
 import itertools
@@ -27,15 +27,16 @@ _RATIOS = tuple(10.0**exponent for exponent in range(-6, 7))
 _SPARE = 5
 """Values beyond the coefficients of a quadratic, at least."""
 _MOST = 1000
-"""Values that are used at a time, at most, or twice as many as a quadratic has coefficients. The rest is left out."""
+"""Values that are used at a time: at most so many, or twice as many as are needed. Of more every k-th is used."""
 _FEATURES = 150
-"""Points that explain the others, at most."""
+"""Features of the process, at most."""
 _UNEXPLAINED = 1e-7
-"""Variance that they may leave, in units of the variance of the process."""
+"""Variance of a value that the features may miss, in units of the variance of the process."""
 _SHORT = 6.0
-"""Power of a length below 1 in the prior: with a short length even a process below the noise has large derivatives."""
+"""The prior of a length below 1 is its power with this exponent. A short process below the noise is never seen, but has
+large derivatives."""
 _LARGE = 0.1
-"""Power of a size in the prior, with a minus: where the values do not tell, there is no process."""
+"""The prior of a ratio is its power with minus this exponent: a process is small if the values do not tell its size."""
 _RANK = 1e-9
 """Smallest pivot of the quadratic, relative to the largest, with which the points tell all its coefficients."""
 
@@ -188,8 +189,8 @@ def _features(u: Tensor, kernel: _Kernel, length: float) -> tuple[Tensor, Tensor
     same = (row == column).to(u)
     bends = 4.0 * second * (to[:, row] * to[:, column]).mT + 2.0 * first * same[:, None]
     covariance = torch.cat([CONSTANT + kernel.value(square)[None], -2.0 * first * to.mT, bends])
-    first, second = kernel.first(u.new_zeros(1)), kernel.second(u.new_zeros(1))
-    prior = torch.cat([u.new_full((1,), CONSTANT + 1.0), -2.0 * first.expand(n), 4.0 * second * (1.0 + 2.0 * same)])
+    slope, bend = kernel.first(u.new_zeros(1)), kernel.second(u.new_zeros(1))
+    prior = torch.cat([u.new_full((1,), CONSTANT + 1.0), -2.0 * slope.expand(n), 4.0 * bend * (1.0 + 2.0 * same)])
     units = length ** torch.cat([u.new_zeros(1), u.new_ones(n), torch.full_like(same, 2.0)])
     derivatives = torch.linalg.solve_triangular(features[chosen].tril(), covariance.mT, upper=False).mT
     missed = (prior - derivatives.square().sum(1)).clamp_min(0.0)

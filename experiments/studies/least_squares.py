@@ -1,14 +1,15 @@
 """`python -m experiments least_squares`: our search and others on the least-squares problems of More and Wild.
 
-A method solves a problem to tau once a point has f <= f_L + tau (f(x0) - f_L), where f_L is the lowest value that any
-of the methods finds (More and Wild 2009). The table has the share of the 53 problems solved after 3, 10 and 100 (n + 1)
-evaluations. All methods have the same starts and no bounds. The first step of the others is a tenth of the largest
-parameter, at least 0.1, the default of DFO-LS and Py-BOBYQA. A method that ends by itself starts again from a random
-point. No method is told of noise.
+A problem has a start x0. A method solves it to tau once a point has f <= f_L + tau (f(x0) - f_L), where f_L is the
+lowest value that any of the methods finds from x0 (More and Wild 2009). The table has the share of problems solved
+after 3, 10 and 100 (n + 1) evaluations. There are 53 from the start of the authors, which is run 0, and as many from
+each further start. All methods have the same starts and no bounds. The first step of the others is a tenth of the
+largest parameter, at least 0.1, the default of DFO-LS and Py-BOBYQA. A method that ends by itself starts again from a
+random point. No method is told of noise.
 
 Noise and oscillations are not in the values that are compared: what counts is where the points are.
 
-Tables have the start of the authors, run 0. `--over` compares settings of a method; use other runs for that.
+`--over` compares settings of a method; use other runs than the tables for that.
 """
 
 import itertools
@@ -91,6 +92,7 @@ def least_squares(
     budget: int = BUDGETS[-1],
     limit: float = 600.0,
     run: int = 0,
+    runs: int = 1,
     over: tuple[str, ...] = (),
     out: Path = Path("results/least_squares"),
     store: str | None = None,
@@ -104,13 +106,16 @@ def least_squares(
         problems: names, as watson_n6 or watson_n6_far; all 53 if not given.
         budget: evaluations over n + 1 that a run may use.
         limit: seconds that a run may take.
-        run: number of the start; 0 is the start of the authors, others are random.
+        run: number of the first start; 0 is the start of the authors, others are random.
+        runs: starts of every problem.
         over: settings of the one method in `methods` to compare, each with a row: `scale=0.3,1,3`.
         out: folder; runs that the same code has made there are not made again.
         store: name under which the table is kept for the documents, as experiments/results/NAME.csv.
     """
-    if budget < 1 or run < 0 or not limit > 0:
-        raise SystemExit(f"budget must be at least 1, run 0, limit positive, got {budget}, {run} and {limit:g}")
+    if budget < 1 or run < 0 or runs < 1 or not limit > 0:
+        raise SystemExit(
+            f"budget and runs must be at least 1, run 0, limit positive, got {budget}, {runs}, {run} and {limit:g}"
+        )
     if store is not None:
         may_keep(store)
     torch.set_num_threads(1)
@@ -119,8 +124,9 @@ def least_squares(
     chosen("kinds", kinds, list(get_args(more_wild.Kind)))
     wanted = SUITE.wanted(methods, over)
     parts, done = KeptParts(out), dict[Job, Progression]()
-    for kind, name, (method, settings) in progress(list(itertools.product(kinds, names, wanted)), "runs"):
-        problem, job = there[name], Job(name, kind, method, budget, run, settings)
+    wanted_runs = list(itertools.product(range(run, run + runs), kinds, names, wanted))
+    for start, kind, name, (method, settings) in progress(wanted_runs, "runs"):
+        problem, job = there[name], Job(name, kind, method, budget, start, settings)
         task = more_wild.task(problem, budget * (problem.n + 1), kind)
         if SUITE.method(method).unusable(task) is None:
             make = partial(_run, job, task, limit)
@@ -196,21 +202,22 @@ def _grouped(done: Mapping[Job, Progression]) -> dict[tuple[str, str], list[tupl
     return groups
 
 
-def _lowest(done: Mapping[Job, Progression]) -> dict[tuple[str, str], float]:
-    """Return the lowest value of any method by kind and problem."""
-    lowest: dict[tuple[str, str], float] = defaultdict(lambda: math.inf)
+def _lowest(done: Mapping[Job, Progression]) -> dict[tuple[str, str, int], float]:
+    """Return the lowest value of any method by kind, problem and start."""
+    lowest: dict[tuple[str, str, int], float] = defaultdict(lambda: math.inf)
     for job, one in done.items():
-        lowest[job.kind, job.problem] = min(lowest[job.kind, job.problem], one.first, *one.values)
+        key = job.kind, job.problem, job.run
+        lowest[key] = min(lowest[key], one.first, *one.values)
     return lowest
 
 
 def _solved(
-    group: Sequence[tuple[Job, Progression]], lowest: Mapping[tuple[str, str], float]
+    group: Sequence[tuple[Job, Progression]], lowest: Mapping[tuple[str, str, int], float]
 ) -> dict[float, list[float]]:
     """Return by tau the evaluations over n + 1 until each problem is solved."""
     sizes, found = {one.name: one.n for one in more_wild.PROBLEMS}, {tau: list[float]() for tau in TAUS}
     for job, one in group:
-        low = lowest[job.kind, job.problem]
+        low = lowest[job.kind, job.problem, job.run]
         for tau, counts in found.items():
             counts.append(one.solved(low + tau * (one.first - low)) / (sizes[job.problem] + 1))
     return found

@@ -26,6 +26,16 @@ def test_shares_are_counted_from_the_lowest_value_of_any_method() -> None:
     assert short == [[1.0, 1.0, None, 0.0, 0.0, None]]  # these runs could not use 100 (n + 1) evaluations
 
 
+def test_every_start_is_a_problem_with_a_lowest_value_of_its_own() -> None:
+    """From start 1 the lowest value is 0.5, and it is reached. The 0 of start 0 does not count there."""
+    there = Progression(1.0, [1, 8], [1.0, 0.0], 0.1, 400)
+    here = Progression(1.0, [1, 20], [1.0, 0.5], 0.1, 400)
+    done = {Job("bard_n3", "smooth", "ours", 100, run): one for run, one in enumerate((there, here))}
+    (ours,) = rows(done)
+    assert ours[3:9] == [0.5, 1.0, 1.0, 0.5, 1.0, 1.0]
+    assert ours[-1] == 2
+
+
 @pytest.mark.parametrize("method", ["ours", "cma_es"])
 def test_every_lower_value_is_noted(method) -> None:
     """CMA-ES does not evaluate the start, whose value the targets refer to."""
@@ -70,7 +80,7 @@ def test_the_command_goes_on_where_it_was(tmp_path, capsys) -> None:
     assert "profiles.png" in capsys.readouterr().out
     with pytest.raises(SystemExit, match=r"problems must be some of .* got bard"):
         least_squares(problems=("bard",), out=tmp_path)
-    with pytest.raises(SystemExit, match="budget must be at least 1, run 0, limit positive, got 0, 0 and 600"):
+    with pytest.raises(SystemExit, match="budget and runs must be at least 1, run 0, .* got 0, 1, 0 and 600"):
         least_squares(budget=0, out=tmp_path)
     with pytest.raises(SystemExit, match="methods must have one that applies to wild, got dfo_ls"):
         least_squares(kinds=("wild",), methods="dfo_ls", problems=("rosenbrock_n2",), out=tmp_path)
@@ -83,3 +93,7 @@ def test_settings_are_compared_from_other_starts(tmp_path, capsys) -> None:
     assert ["difference=0.3" in shown[0], "difference=1e-07" in shown[1]] == [True, True]
     least_squares(methods="bfgs_fd", **given)
     assert len((tmp_path / "parts.jsonl").read_text().splitlines()) == 2  # the second is the one in use
+    least_squares(methods="bfgs_fd", **given, runs=2)
+    assert len((tmp_path / "parts.jsonl").read_text().splitlines()) == 3
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "bfgs_fd" in line][-1:]
+    assert row.split()[-1] == "2"

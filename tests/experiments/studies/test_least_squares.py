@@ -80,7 +80,7 @@ def test_the_command_goes_on_where_it_was(tmp_path, capsys) -> None:
     assert "profiles.png" in capsys.readouterr().out
     with pytest.raises(SystemExit, match=r"problems must be some of .* got bard"):
         least_squares(problems=("bard",), out=tmp_path)
-    with pytest.raises(SystemExit, match="budget and runs must be at least 1, run 0, .* got 0, 1, 0 and 600"):
+    with pytest.raises(SystemExit, match=r"budget and runs must be at least 1, run 0, .* got 0, 1, 0 and 600"):
         least_squares(budget=0, out=tmp_path)
     with pytest.raises(SystemExit, match="methods must have one that applies to wild, got dfo_ls"):
         least_squares(kinds=("wild",), methods="dfo_ls", problems=("rosenbrock_n2",), out=tmp_path)

@@ -60,8 +60,9 @@ def believed(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise
     if bool((z == z[0]).all() or (values == values[0]).all()):  # all are of one point, or none is lower than another
         return Belief(points[0], float(values.mean()), noise / math.sqrt(len(values)))
     z = z / (reach * math.sqrt(len(unit)))
-    process = GaussianProcess.fit(z, values[:, None], (*NOISES, *_FINE_NOISES, *HIGH_NOISES), noise)
+    size = float(values.abs().max())  # the squares of values / size neither overflow nor vanish
+    process = GaussianProcess.fit(z, values[:, None] / size, (*NOISES, *_FINE_NOISES, *HIGH_NOISES), noise / size)
     expected = process.predict(z)[:, 0]
     k = int(expected.argmin())
     error = float(process.uncertainty(process.covariance(z[k : k + 1])).sqrt())
-    return Belief(points[k], float(expected[k]), error)
+    return Belief(points[k], size * float(expected[k]), size * error)

@@ -212,6 +212,10 @@ def test_a_belief_is_of_the_nearest_hundred_evaluations_whatever_their_distance(
     wide = believed(1e3 * points, losses, zeros(2), vector(1.0, 1.0), 0.5)
     assert torch.equal(wide.x, 1e3 * x)
     assert wide[1:] == pytest.approx((value, error))
+    for size in (2.0**-900, 2.0**900):  # losses whose squares vanish or overflow
+        scaled = believed(points, size * losses, zeros(2), vector(1.0, 1.0), size * 0.5)
+        assert scaled.value / size == pytest.approx(value)
+        assert scaled.error / size == pytest.approx(error)
     single = points.float()
     same = believed(single, losses, zeros(2).float(), torch.ones(2), 0.5)
     assert torch.equal(same.x, single[(points == x).all(1)][0])

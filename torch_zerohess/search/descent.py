@@ -31,6 +31,8 @@ _HALVING = 0.5
 """Factor for sigma after a step to a point whose value is not finite."""
 _RESTART = 1.5
 """First sigma of a further round."""
+_DAMPING = 1e-3
+"""Added to the curvature of the model of an output that a step follows, over its mean curvature."""
 _WIDENINGS, _WIDENING = 8, 1.5
 """How often, and by which factor, sigma is widened to find evaluations around the best point."""
 
@@ -227,7 +229,7 @@ class LocalQuadratics(Method[DescentProgress]):
         near = weights > _NEAR
         if int(near.sum()) < (min(self._n, _ENOUGH) + 1 if known.need == 0 else 1):
             return known.sampling(2)
-        model = self._fitted(known, (points[near] - center) / sigma, near, weights[near])
+        model = self._fitted(known, (points[near] - center) / sigma, near, weights[near], _DAMPING)
         radius = known.reach * math.sqrt(self._n)
         lower, upper = (self.settings.lower - center) / sigma, (self.settings.upper - center) / sigma
         if model.basis is None:
@@ -237,12 +239,14 @@ class LocalQuadratics(Method[DescentProgress]):
             step = model.reduce(model.expand(s).clamp(lower, upper))
         return replace(known, model=model, step=step, need=0)
 
-    def _fitted(self, known: DescentProgress, u: Tensor, near: Tensor, weights: Tensor) -> LocalModel:
+    def _fitted(
+        self, known: DescentProgress, u: Tensor, near: Tensor, weights: Tensor, damping: float = 0.0
+    ) -> LocalModel:
         """Fit a model to the evaluations that are near, at u [P, n] with weights [P]."""
         outputs = known.pool.outputs
         if self.settings.loss is None or outputs is None or not self.follows:
             return fit_values(u, known.pool.values[near], weights)
-        return fit_outputs(u, outputs[near], weights, self.settings.loss, known.shape)
+        return fit_outputs(u, outputs[near], weights, self.settings.loss, known.shape, damping)
 
 
 def _capacity(n: int, *, loss_alone: bool) -> int:

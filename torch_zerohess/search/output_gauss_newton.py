@@ -3,7 +3,8 @@
 The Jacobian at the best point is that of quadratics through the nearest evaluations, one per output
 (`LeastNorm`). With the gradient and the Hessian of the loss it gives a quadratic of the loss, which is minimised within
 the region. The Hessian has the curvature of the outputs where that predicted the last step better. Where steps achieve
-what the quadratic promises, this converges fast. Where they do not, the method fails, and says so.
+what the quadratic promises, this converges fast. Where they do not, the method fails, and says so. Steps that are
+shorter than the tolerance and achieve nothing are an arrival: an adaptive solver rounds its outputs to 1e-8, say.
 
 Source: Dennis, Gay and Welsch (1981), "An adaptive nonlinear least-squares algorithm" (NL2SOL), for the choice;
 Cartis, Fiala, Marteau and Roberts (2019), "Improving the flexibility and robustness of model-based
@@ -20,7 +21,7 @@ from torch import Tensor
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.region_descent import BAD, RegionDescent
+from torch_zerohess.search.region_descent import BAD, LONG, RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress, latest
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.least_change import LeastNorm
@@ -45,6 +46,8 @@ class OutputProgress(RegionProgress):
     """Whether the quadratic has it."""
     curved_part: float = 0.0
     """Its part of the loss that is predicted at the end of the step."""
+    short: int = 0
+    """Rejected steps in a row that were shorter than the tolerance, to a minimum of the model within the region."""
     kept: bool = False
     """Whether a step has kept its promise since the method began, or began again."""
     failed: bool = False
@@ -116,7 +119,14 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         other = error + (-known.curved_part if known.curved else known.curved_part)
         known = replace(known, curved=known.curved != (abs(other) < abs(error)))
         kept = known.kept or ratio >= BAD
-        return replace(known, kept=kept, failed=known.rejected >= (_PATIENCE if kept else self._patience)), bad
+        is_short = known.length < LONG and known.length * known.sigma < self.settings.tolerance
+        short = known.short + is_short if known.rejected else 0
+        known = replace(known, kept=kept, short=short)
+        if known.rejected < (_PATIENCE if kept else self._patience):
+            return known, bad
+        if 2 * short <= known.rejected:
+            return replace(known, failed=True), bad
+        return replace(known, done=True, message="steps that are shorter than the tolerance achieve nothing"), bad
 
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
         assert self.settings.loss is not None

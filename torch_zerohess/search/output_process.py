@@ -135,7 +135,9 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         before = known.local
         if before is not None and torch.equal(before.lowest.point, best.point):
             begun = before.taking(known, "evaluations", "iterations")
-            begun = replace(begun, rejected=0, tied=0, lost=0, good=False, kept=False, failed=False, done=False)
+            begun = replace(
+                begun, rejected=0, short=0, tied=0, lost=0, good=False, kept=False, failed=False, done=False
+            )
         else:
             distance = (known.pool.points - best.point).norm(dim=1).sort().values[n]
             sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)

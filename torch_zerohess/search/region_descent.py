@@ -24,7 +24,7 @@ _FINEST = 1e-6
 """Sigma at which a round ends, over the tolerance of the search."""
 _FAR, _RELATIVELY = 3.0, 2.0
 """Evaluations farther than this, and than this times the distance of the n + 2 nearest ones, are left out."""
-BAD, _GOOD, _LONG = 0.1, 0.7, 0.8
+BAD, _GOOD, LONG = 0.1, 0.7, 0.8
 """Part of its promise that a rejected step achieves; a good step, and its length in units of the region."""
 _GROWTH, _SHRINKING = 2.0, 0.6
 """Factors for sigma after a good long step and after a rejected one."""
@@ -197,7 +197,7 @@ class RegionDescent(Method[R]):
     def _judged(self, known: R, ratio: float) -> tuple[R, Tensor | None]:
         """Change sigma by the part of its promise that a step achieved; or return where the model knows least [n]."""
         if ratio >= BAD:
-            grows = ratio > _GOOD and known.length > _LONG
+            grows = ratio > _GOOD and known.length > LONG
             sigma = _GROWTH * known.sigma if grows else known.sigma
             return replace(known, good=True, rejected=0, sigma=sigma), None
         known = replace(known, good=False, rejected=known.rejected + 1)
@@ -229,4 +229,4 @@ class RegionDescent(Method[R]):
 
 def _is_sound(known: RegionProgress) -> bool:
     """Whether the last step was good, and the next one ends at a minimum of the model within the region."""
-    return known.phase == "trial" and known.good and known.length < _LONG
+    return known.phase == "trial" and known.good and known.length < LONG

@@ -23,9 +23,6 @@ _RIDGES = (1e-6, 1e-3, 0.2)
 """Prior precisions of a slope, in evaluations; the evidence chooses."""
 _ROUNDING = 1e-15
 """Variation of values, relative to their size, that is rounding: the values are constant."""
-_DAMPING = 1e-3
-"""Added to the curvature of an image model, in units of its mean eigenvalue."""
-
 _INTERCEPT = 1e-9
 """Prior precision of the constant term of an output, in evaluations."""
 _JITTER = 1e-13
@@ -162,14 +159,19 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
 
 
 def fit_outputs(
-    u: Tensor, outputs: Tensor, weights: Tensor, loss: Callable[[Tensor], Tensor], shape: torch.Size
+    u: Tensor,
+    outputs: Tensor,
+    weights: Tensor,
+    loss: Callable[[Tensor], Tensor],
+    shape: torch.Size,
+    damping: float = 0.0,
 ) -> LocalModel:
     """Fit outputs [P, m] linearly at u [P, n]; return the quadratic model of `loss` after them (Gauss-Newton).
 
     The intercept is the smoothed output M = E f(x + sigma u), the slopes are its Jacobian J [n, m]. The model of the
     loss has the gradient J grad(loss)(M) and the Hessian J loss''(M) J^T. It smooths the output, loss(E f), not the
     loss, E loss(f). `loss` takes an output of the given `shape`. Derivatives of the loss that are not finite, such as
-    the derivative of a norm at zero, count as zero.
+    the derivative of a norm at zero, count as zero. `damping` times the mean curvature is added to the curvature.
     """
     P, _ = u.shape
     basis, s = _reduced(u)
@@ -186,17 +188,27 @@ def fit_outputs(
     gradient = jacobian @ downhill
     hessian = jacobian @ bend.mT
     hessian = 0.5 * (hessian + hessian.mT)
-    hessian.diagonal().add_(_DAMPING * hessian.diagonal().abs().mean())
+    hessian.diagonal().add_(damping * hessian.diagonal().abs().mean())
     spare = P - r - 1
-    left = (weights @ (outputs - design @ slopes).square()) / max(spare, 1)  # variance per output, [m]
+    missed = outputs - design @ slopes
     own = inverse.diagonal()[1:] if spare > 0 else torch.full_like(gradient, math.inf)
+
+    def error(directions: Tensor) -> Tensor:
+        """Standard errors [r] of J times directions [*, m]. What is missed is curved: it does not average out.
+
+        It may be the same for many outputs, or cancel between them: the larger estimate counts.
+        """
+        coherent = weights @ (missed @ directions.mT).square()
+        single = (weights @ missed.square()) @ directions.square().mT
+        return (own * torch.maximum(coherent, single) * (P / max(spare, 1))).sqrt().clamp_min(math.ulp(0.0))
+
     return LocalModel(
         expanded.value,
         gradient,
         hessian,
         basis,
-        own.sqrt() * (left @ downhill.square()).sqrt().clamp_min(math.ulp(0.0)),
-        2.0 * own.sqrt() * (bend.square() @ left).sqrt().clamp_min(math.ulp(0.0)),
+        error(downhill[None]),
+        2.0 * error(bend),
         intercept=intercept,
         jacobian=jacobian,
     )

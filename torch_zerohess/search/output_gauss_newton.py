@@ -4,7 +4,8 @@ The Jacobian at the best point is that of quadratics through the nearest evaluat
 (`LeastNorm`). With the gradient and the Hessian of the loss it gives a quadratic of the loss, which is minimised within
 the region. The Hessian has the curvature of the outputs where that predicted the last step better. Where steps achieve
 what the quadratic promises, this converges fast. Where they do not, the method fails, and says so. Steps that are
-shorter than the tolerance and achieve nothing are an arrival: an adaptive solver rounds its outputs to 1e-8, say.
+shorter than the tolerance, promise next to nothing and achieve nothing are an arrival: an adaptive solver rounds its
+outputs to 1e-8, say.
 
 Source: Dennis, Gay and Welsch (1981), "An adaptive nonlinear least-squares algorithm" (NL2SOL), for the choice;
 Cartis, Fiala, Marteau and Roberts (2019), "Improving the flexibility and robustness of model-based
@@ -12,12 +13,14 @@ derivative-free optimization solvers" (DFO-LS), for Gauss-Newton on interpolated
 derivative-free nonlinear least squares problems with POUNDERS", for quadratics of least norm.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.nonsmooth import kinked_minimum
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.method import Settings
@@ -30,6 +33,14 @@ from torch_zerohess.surrogates.quadratic import coefficients
 
 _PATIENCE = 5
 """Rejected steps in a row after which the method has failed."""
+_EXPANDED, _ROUNDED = 0.5, 1e-12
+"""Error of the quadratic's promise, over the promise and over the loss, with which its step is taken."""
+_STEEP = 10.0
+"""Slope of the penalty beyond the region, over the slope of the loss."""
+_ITERATIONS = 100
+"""Of the minimisation without the quadratic."""
+_NOTHING = 1e-8
+"""Promised decrease, over the loss, that is next to nothing."""
 _HOLES = 3
 """Values in a row that are not finite, after which it has failed."""
 
@@ -47,7 +58,7 @@ class OutputProgress(RegionProgress):
     curved_part: float = 0.0
     """Its part of the loss that is predicted at the end of the step."""
     short: int = 0
-    """Rejected steps in a row that were shorter than the tolerance, to a minimum of the model within the region."""
+    """Rejected steps in a row that were shorter than the tolerance and promised next to nothing."""
     kept: bool = False
     """Whether a step has kept its promise since the method began, or began again."""
     failed: bool = False
@@ -86,6 +97,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     def __init__(self, settings: Settings, capacity: int, patience: int | None = None) -> None:
         super().__init__(settings, min(coefficients(settings.n), capacity), capacity)
         self._patience = _PATIENCE if patience is None else patience
+        self._linear: tuple[Tensor, Tensor] | None = None  # output [m] and Jacobian [n, m] of the last quadratic
 
     def taking_over(self, known: DescentProgress | ProcessProgress, lowest: Best, sigma: float) -> OutputProgress:
         """Return the progress at the best point of a round of another search, with a region of the radius sigma."""
@@ -119,14 +131,15 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         other = error + (-known.curved_part if known.curved else known.curved_part)
         known = replace(known, curved=known.curved != (abs(other) < abs(error)))
         kept = known.kept or ratio >= BAD
-        is_short = known.length < LONG and known.length * known.sigma < self.settings.tolerance
+        nothing = known.promised <= _NOTHING * abs(known.lowest.loss)
+        is_short = known.length < LONG and known.length * known.sigma < self.settings.tolerance and nothing
         short = known.short + is_short if known.rejected else 0
         known = replace(known, kept=kept, short=short)
         if known.rejected < (_PATIENCE if kept else self._patience):
             return known, bad
         if 2 * short <= known.rejected:
             return replace(known, failed=True), bad
-        return replace(known, done=True, message="steps that are shorter than the tolerance achieve nothing"), bad
+        return replace(known, done=True, message="short steps promise and achieve nothing"), bad
 
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
         assert self.settings.loss is not None
@@ -138,10 +151,50 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         gradient = outputs.jacobian @ slope / known.sigma
         size = float(gradient.abs().max()) or 1.0
         unit = known.sigma**2 * size
+        self._linear = center, outputs.jacobian / known.sigma
         hessian = outputs.jacobian @ expanded.products(outputs.jacobian.view(self._n, *known.shape)).mT / unit
         curvature = outputs.hessian(slope) / unit
         hessian = 0.5 * (hessian + hessian.mT) + (curvature if known.curved else 0.0)
         return replace(known, size=size, gradient=gradient / size, hessian=hessian, curvature=curvature), len(nearest)
+
+    def _step(self, known: OutputProgress) -> tuple[Tensor, float]:
+        """Return the step to the minimum of the loss of the linear outputs, where the quadratic predicts another loss.
+
+        It does at the kinks of a loss, and where its curvature changes within the region.
+        """
+        s, promised = super()._step(known)
+        curvature = known.size * known.curvature if known.curved else torch.zeros_like(known.curvature)
+        before, _ = self._of_linear(known, curvature, torch.zeros_like(s))
+        after, _ = self._of_linear(known, curvature, s)
+        if abs(before - after - promised) <= _EXPANDED * promised + _ROUNDED * abs(before):
+            return s, promised
+        x, settings, radius = known.lowest.point, self.settings, known.sigma
+        lower, upper = settings.lower - x, settings.upper - x
+        steep = _STEEP * known.size * max(float(known.gradient.norm()), math.ulp(0.0))
+
+        def penalised(s: Tensor) -> tuple[float, Tensor]:
+            value, slope = self._of_linear(known, curvature, s)
+            length, beyond = float(s.norm()), (s - s.clamp(lower, upper))
+            value += steep * (max(length - radius, 0.0) + float(beyond.abs().sum()))
+            slope = slope + steep * beyond.sign()
+            return value, slope + steep * s / length if length > radius else slope
+
+        start = s if after < before else torch.zeros_like(s)
+        t = kinked_minimum(penalised, start, _ITERATIONS).clamp(lower, upper)
+        t = t * min(1.0, radius / max(float(t.norm()), math.ulp(0.0)))
+        return t, before - self._of_linear(known, curvature, t)[0]
+
+    def _of_linear(self, known: OutputProgress, curvature: Tensor, s: Tensor) -> tuple[float, Tensor]:
+        """Return the loss of the linear outputs at a step [n], with the curvature of the outputs, and its slope."""
+        assert self._linear is not None
+        assert self.settings.loss is not None
+        output, jacobian = self._linear
+        with torch.enable_grad():
+            y = (output + s @ jacobian).requires_grad_(True)
+            loss = self.settings.loss(y.view(known.shape))
+            (slope,) = torch.autograd.grad(loss, y)
+        bent = curvature @ s
+        return float(loss.detach()) + 0.5 * float(s @ bent), jacobian @ torch.nan_to_num(slope) + bent
 
     def _on_plateau(self, known: OutputProgress, generator: torch.Generator) -> tuple[OutputProgress, Tensor]:
         return replace(known, failed=True), known.points[:0]

@@ -84,6 +84,12 @@ class RegionDescent(Method[R]):
         """Return the root B of the metric after a quadratic through so many evaluations."""
         return known.root
 
+    def _step(self, known: R) -> tuple[Tensor, float]:
+        """Return the step [n] to the minimum of the quadratic within the region, and the decrease that it promises."""
+        x, settings = known.lowest.point, self.settings
+        s = region_step(known.gradient, known.hessian, known.sigma * known.root, settings.lower - x, settings.upper - x)
+        return s, -known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
+
     # The search.
 
     def first(self, generator: torch.Generator) -> tuple[R, Tensor]:
@@ -120,10 +126,7 @@ class RegionDescent(Method[R]):
         while known.sigma >= self._finest:
             known, count = self._modelled(known)
             x = known.lowest.point
-            s = region_step(
-                known.gradient, known.hessian, known.sigma * known.root, settings.lower - x, settings.upper - x
-            )
-            promised = -known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
+            s, promised = self._step(known)
             length = float(torch.linalg.solve(known.root, s).norm()) / known.sigma
             if length >= _STILL and promised > _ROUNDING * abs(known.lowest.loss):
                 end = (x + s).clamp(settings.lower, settings.upper)

@@ -44,6 +44,63 @@ def test_it_converges_fast_where_residuals_are_not_zero(n, most, seed, monkeypat
     assert evaluations(search(), bent, 1 + 1e-8) > 2 * most
 
 
+TIMES = torch.linspace(0.0, 3.0, 20, dtype=torch.float64)
+DECAY = vector(1.5, 2.0, 0.5)
+KINKED = {  # target, loss, and its least value, all at DECAY
+    # Of 20 outputs three are wrong: the sum of distances ignores them.
+    "sum of distances": (1.0 * torch.isin(torch.arange(20), torch.tensor([3, 9, 16])), lambda d: d.abs().sum(), 3.0),
+    # The error alternates more often than there are parameters: no decay is nearer.
+    "largest distance": (0.05 * (-1.0) ** torch.arange(20), lambda d: d.abs().max(), 0.05),
+    "norm": (torch.zeros(20), lambda d: d.norm(), 0.0),
+}
+
+
+def decays(x):
+    return x[:, :1] * torch.exp(-x[:, 1:2] * TIMES) + x[:, 2:]
+
+
+@pytest.mark.parametrize("name", KINKED)
+@pytest.mark.parametrize("bounds", [None, (vector(0.0, 0.0, -1.0), vector(4.0, 4.0, 2.0))])
+def test_a_loss_may_have_kinks(name, bounds, monkeypatch):
+    """With quadratics of the loss alone it is not there after three times as many evaluations."""
+    wrong, distance, least = KINKED[name]
+    target = decays(DECAY[None])[0] + wrong
+
+    def search(seed):
+        return Descent(
+            vector(0.5, 1.0, 0.0), sigma=0.5, loss=lambda y: distance(y - target), bounds=bounds, seed=seed, restarts=0
+        )
+
+    assert max(evaluations(search(seed), decays, least + 1e-6) for seed in range(3)) < 100
+    monkeypatch.setattr(output_gauss_newton, "_EXPANDED", float("inf"))
+    assert min(evaluations(search(seed), decays, least + 1e-6) for seed in range(3)) > 300
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rounded_outputs_do_not_keep_it_from_arriving(seed, monkeypatch):
+    """Residuals that are not zero, rounded to 1e-8 as by an adaptive solver: short steps promise what is not there."""
+
+    def found():
+        search = Descent(torch.full((4,), 2.0, dtype=torch.float64), sigma=0.5, loss=squares, seed=seed, restarts=0)
+        return run(search, lambda x: torch.round(1e8 * bent(x)) / 1e8, 300)
+
+    search = found()
+    assert search.done
+    assert search.evaluations < 100
+    assert search.value == pytest.approx(1.0, abs=1e-8)
+    monkeypatch.setattr(output_gauss_newton, "_NOTHING", 0.0)
+    assert found().evaluations > 1.2 * search.evaluations
+
+
+def test_the_hessian_of_an_output_is_not_damped():
+    """J^T J has curvatures of 2 to 8e-4. A thousandth of their mean would double the smallest one, as a step may."""
+    scale = vector(1.0, 0.3, 0.1, 0.02)
+    search = run(Descent(zeros(4), sigma=1.0, loss=squares, seed=0, restarts=0), lambda x: scale * x - 1.0, 60)
+    model, sigma = search.model_at_best()
+    found = torch.linalg.eigvalsh(model.full_hessian() / sigma**2)
+    torch.testing.assert_close(found, (2.0 * scale.square()).sort().values, rtol=1e-2, atol=0.0)
+
+
 def test_it_promises_what_gauss_newton_promises_in_its_turn():
     def nearly_affine(x):
         return torch.cat([bent(x)[:, :-1], (0.01 * x).tanh()], 1)

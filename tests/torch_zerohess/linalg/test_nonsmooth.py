@@ -1,0 +1,49 @@
+"""Minima of functions with kinks, which medians and half ranges tell, and of a smooth one."""
+
+import pytest
+import torch
+
+from torch_zerohess.linalg import nonsmooth
+from torch_zerohess.linalg.nonsmooth import kinked_minimum
+from truths import vector
+
+PLACES = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def minimum(f, iterations=100):
+    def with_slope(x):
+        x = x.clone().requires_grad_(True)
+        value = f(x)
+        return float(value.detach()), torch.autograd.grad(value, x)[0]
+
+    return kinked_minimum(with_slope, torch.full((4,), 2.0, dtype=torch.float64), iterations)
+
+
+def test_the_sum_of_distances_is_least_at_the_median() -> None:
+    found = minimum(lambda x: (x - PLACES).abs().sum())
+    torch.testing.assert_close(found, PLACES.median(0).values, rtol=0.0, atol=1e-6)
+
+
+def test_the_largest_distance_is_least_at_half_the_largest_range() -> None:
+    found = minimum(lambda x: (x - PLACES).abs().max())
+    least = 0.5 * float((PLACES.max(0).values - PLACES.min(0).values).max())
+    assert float((found - PLACES).abs().max()) == pytest.approx(least, rel=1e-6)
+
+
+def test_a_smooth_valley_is_followed_to_its_end(monkeypatch) -> None:
+    scale = vector(1.0, 10.0, 100.0, 1000.0)
+
+    def valley(x):
+        return (scale * (x - 1.0).square()).sum()
+
+    torch.testing.assert_close(minimum(valley, 30), torch.ones(4, dtype=torch.float64), rtol=0.0, atol=1e-6)
+    monkeypatch.setattr(nonsmooth, "_BISECTIONS", 1)
+    assert float((minimum(valley, 30) - 1.0).abs().max()) > 1e-3
+
+
+def test_no_value_is_above_the_first_one() -> None:
+    """A function without a minimum, and one that is not finite beyond 3."""
+    assert float(minimum(lambda x: x.sum(), 5).sum()) < 8.0
+    found = minimum(lambda x: torch.log(3.0 - x).sum() - x.sum())
+    assert bool((found < 3.0).all())
+    assert minimum(lambda x: 0.0 * x.sum()).tolist() == [2.0] * 4

@@ -1,0 +1,56 @@
+"""Minimum of a function with kinks whose slope is known, such as a sum of magnitudes."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+_DECREASE, _SLOPE = 1e-4, 0.9
+"""Part of the decrease that the slope promises, and part of the slope, of a line search: conditions of Wolfe."""
+_BISECTIONS = 30
+"""Points of a line search at most."""
+
+
+def kinked_minimum(function: Callable[[Tensor], tuple[float, Tensor]], start: Tensor, iterations: int) -> Tensor:
+    """Return the lowest point [n] that BFGS finds from `start` [n].
+
+    A line search by bisection ends at a kink with a slope of the other side, from which BFGS learns the kink as a large
+    curvature. It needs no convexity; there is no proof of convergence, but it is seen to converge linearly.
+
+    Args:
+        function: maps [n] to its value and a slope [n], float64.
+        start: its value is finite.
+        iterations: at most.
+
+    Source: Lewis and Overton (2013), "Nonsmooth optimization via quasi-Newton methods".
+    """
+    x, inverse = start, torch.eye(len(start), dtype=start.dtype, device=start.device)
+    value, slope = function(x)
+    for iteration in range(iterations):
+        direction = -inverse @ slope
+        down = float(slope @ direction)
+        if not down < 0.0:
+            break
+        low, high, length = 0.0, float("inf"), 1.0
+        for _ in range(_BISECTIONS):
+            new = x + length * direction
+            now, turned = function(new)
+            if not now <= value + _DECREASE * length * down:
+                high = length
+            elif float(turned @ direction) < _SLOPE * down:
+                low = length
+            else:
+                break
+            length = 2.0 * low if high == float("inf") else 0.5 * (low + high)
+        if not now < value:
+            break
+        step, change = new - x, turned - slope
+        x, value, slope = new, now, turned
+        curvature = float(step @ change)
+        if curvature <= 0.0:
+            continue
+        if iteration == 0:
+            inverse = inverse * (curvature / float(change @ change))
+        left = torch.eye(len(x), dtype=x.dtype, device=x.device) - torch.outer(step, change) / curvature
+        inverse = left @ inverse @ left.mT + torch.outer(step, step) / curvature
+    return x

@@ -610,3 +610,15 @@ def test_a_target_that_the_last_decision_finds_reached() -> None:
     fit = zh.minimize(noisy, zeros(2), sigma=1.0, target=0.05, seed=2, max_evaluations=150)
     assert (fit.status, fit.success, fit.evaluations) == ("target", True, 150)
     assert fit.value <= 0.05
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_border_of_a_region_that_fails_is_no_minimum_that_rounds_confirm(seed):
+    """The lowest point of the border is (0.6, 0.6). The loss goes on falling along the border from other points."""
+
+    def f(x):
+        return math.nan if float(x.sum()) > 1.2 else float((x - 1.0).square().sum())
+
+    fit = zh.minimize(f, zeros(2), sigma=0.5, max_evaluations=200, vectorized=False, seed=seed)
+    assert fit.status == "budget"
+    assert "fails next to x" in fit.message

@@ -17,14 +17,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.metric import learned
+from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import further_start, normal
 from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
-from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, are_same, arriving
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.plateau import is_plateau
@@ -165,7 +165,9 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         return self._ended(known, known.lowest, reason, generator, last=last)
 
     def _with_quadratic(self, known: MetricProgress) -> MetricProgress:
-        """Keep the quadratic of a round that has arrived, unless its minimum may be one of many.
+        """Keep the quadratic of a round that has arrived, unless its minimum is elsewhere or may be one of many.
+
+        It is elsewhere where the round has ended at the border of a region that fails.
 
         The last quadratic of the round is made of differences near rounding. A fit to more evaluations is better.
         """
@@ -177,6 +179,10 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
             slope, bend = model.full_gradient() / sigma, model.full_hessian() / sigma**2
         curvatures = torch.linalg.eigvalsh(bend)
         if float(curvatures[0]) < _UNIQUE * float(curvatures[-1]):
+            return replace(known, bottom=None)
+        x, root = known.lowest.point, torch.eye(self._n, dtype=bend.dtype, device=bend.device)
+        step = region_step(slope, bend, root, self.settings.lower - x, self.settings.upper - x)
+        if not are_same(x + step, x, self.settings.tolerance):
             return replace(known, bottom=None)
         return replace(known, bottom=known.lowest, slope=slope, bend=bend)
 

@@ -1,7 +1,7 @@
 """Descent on an output: it follows the smoothed output, and goes on by Gauss-Newton where the output is smooth.
 
 Following (`LocalQuadratics`) passes plateaus and small minima, but converges slowly near a minimum whose residuals are
-not zero. Interpolation (`OutputGaussNewton`) converges fast on smooth functions and stops at every kink. The evidence
+not zero. Interpolation (`OutputGaussNewton`) converges fast on smooth outputs and stops at their kinks. The evidence
 is a step that lowers the loss and whose output was predicted well. Where Gauss-Newton fails, the descent follows again
 from the best point, with the sigma that it had.
 """

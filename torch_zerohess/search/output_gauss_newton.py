@@ -1,16 +1,19 @@
 """Gauss-Newton for an output under a known loss, by interpolation in a trust region.
 
-The Jacobian at the best point is that of quadratics through the nearest evaluations, one per output
+The Jacobian at the best point is the Jacobian of quadratics through the nearest evaluations, one per output
 (`LeastNorm`). With the gradient and the Hessian of the loss it gives a quadratic of the loss, which is minimised within
-the region. The Hessian has the curvature of the outputs where that predicted the last step better. Where steps achieve
-what the quadratic promises, this converges fast. Where they do not, the method fails, and says so. Steps that are
-shorter than the tolerance, promise next to nothing and achieve nothing are an arrival: an adaptive solver rounds its
-outputs to 1e-8, say.
+the region. The Hessian has the curvature of the outputs where that predicted the last step better. At a kink of the
+loss the quadratic is wrong. There the loss of the linear outputs itself is minimised (`kinked_minimum`).
+
+Where steps achieve what the model promises, this converges fast. Where they do not, the method fails, and says so.
+Short steps that promise next to nothing and achieve nothing are an arrival: an adaptive solver of differential
+equations rounds its outputs to 1e-8, say.
 
 Source: Dennis, Gay and Welsch (1981), "An adaptive nonlinear least-squares algorithm" (NL2SOL), for the choice;
 Cartis, Fiala, Marteau and Roberts (2019), "Improving the flexibility and robustness of model-based
 derivative-free optimization solvers" (DFO-LS), for Gauss-Newton on interpolated outputs; Wild (2017), "Solving
-derivative-free nonlinear least squares problems with POUNDERS", for quadratics of least norm.
+derivative-free nonlinear least squares problems with POUNDERS", for quadratics of least norm; Larson, Menickelly and
+Wild (2019), "Derivative-free optimization methods", for composite losses with kinks.
 """
 
 import math

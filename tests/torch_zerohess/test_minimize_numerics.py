@@ -47,6 +47,9 @@ def test_an_output_may_have_the_largest_number(n, bounds):
 def test_a_start_that_models_cannot_take_is_refused():
     with pytest.raises(ValueError, match=r"the loss at the start x0 is -1.7\S*, below -1e\+305: scale the loss"):
         zh.minimize(lambda z: z[:, 0] - LARGEST, zeros(2), sigma=1.0)
+    for bounds in (None, (-2.0, 2.0)):
+        with pytest.raises(ValueError, match=r"the loss at the start x0 is 5.3\S*, above 1e\+305: scale the loss, or"):
+            zh.minimize(lambda z: 4.5e307 * (1.0 + (z - 0.3).square().sum(1)), zeros(2), sigma=0.5, bounds=bounds)
     with pytest.raises(ValueError, match=r"3 of 3 numbers of the output .* or beyond 1e\+100"):
         zh.minimize(lambda z: z[:, :1].expand(-1, 3) + LARGEST, zeros(2), sigma=1.0, loss=lambda y: y.tanh().sum())
 

@@ -130,9 +130,14 @@ class Program(Closing):
     def __call__(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...].
 
-        Raises TypeError for what is no tensor, ValueError if the program did not print one value per point.
+        Raises TypeError for what is no tensor, ValueError for a single point [n], or if the program did not print one
+        value per point.
         """
         check_tensors(x=x, aux=aux)
+        if x.dim() < 2:
+            raise ValueError(
+                f"x must be points [K, n], got {list(x.shape)}: a Program takes many, leave vectorized=True"
+            )
         if callable(self.command):
             if aux:
                 raise ValueError(f"aux must be empty for a command that is a function of x, got {len(aux)} tensors")

@@ -68,13 +68,12 @@ def as_tensor(result: Any) -> Tensor:
         first = leaf(result)
         # Arrays that are on no GPU go to the CPU, whatever the default device of torch.
         device = None if hasattr(result, "__cuda_array_interface__") else "cpu"
-        if isinstance(first, float):  # whatever the default dtype of torch
+        if isinstance(first, (int, float)):  # whatever the default dtype of torch, and above int64, too
             return torch.as_tensor(result, dtype=torch.float64, device=device)
         tensor = torch.as_tensor(result, device=device)
-        mixed = isinstance(first, int) and tensor.is_floating_point()  # [1, 2.5]
         exact = not (tensor.is_floating_point() or tensor.is_complex())
-        return torch.as_tensor(result, dtype=torch.float64, device=device) if mixed or exact else tensor
-    except (TypeError, ValueError, RuntimeError) as error:
+        return torch.as_tensor(result, dtype=torch.float64, device=device) if exact else tensor
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(
             f"fn must return a tensor or a NumPy array of numbers, got {type(result).__name__}: {error}"
         ) from error

@@ -98,12 +98,16 @@ def moderate(told: Evaluated) -> Evaluated:
 
 
 def check_start(start: Evaluated) -> None:
-    """Raise ValueError if the first point, which is the start, has no finite value."""
+    """Raise ValueError if the first point, which is the start, has no value that models can take."""
     loss, start = float(start.losses[0]), moderate(start)
-    if bool(start.finite[0]):
-        return
     if -math.inf < loss < -_LARGEST:
         raise ValueError(f"the loss at the start x0 is {loss}, below {-_LARGEST}: scale the loss")
+    if _LARGEST < loss < math.inf:
+        raise ValueError(
+            f"the loss at the start x0 is {loss}, above {_LARGEST}: scale the loss, or start where it is no penalty"
+        )
+    if bool(start.finite[0]):
+        return
     if start.outputs is None or not math.isfinite(loss):
         raise ValueError(f"the black box is not finite at the start x0: {loss}")
     count = int((~torch.isfinite(start.outputs[0])).sum())

@@ -387,6 +387,11 @@ def quarter(point: torch.Tensor) -> list[str]:
     return ["awk", f'BEGIN {{ printf "%.17g", ({float(point[0])!r} - 0.25)^2 }}']
 
 
+def test_a_program_takes_no_single_point():
+    with pytest.raises(ValueError, match=r"x must be points \[K, n\], got \[1\]: .* leave vectorized=True"):
+        zh.minimize(Program(quarter, format=float), torch.zeros(1), sigma=0.2, vectorized=False)
+
+
 def test_a_program_that_takes_arguments():
     """awk, which every system has: the minimum of a square."""
     assert shutil.which("awk")
@@ -420,6 +425,7 @@ def test_python_ends_where_a_server_still_runs(tmp_path):
         (lambda: Program([sys.executable, "-c", 3.0]), TypeError, r"got 3\.0 in it: write str\(3\.0\)"),
         (lambda: python("print([1.0])")(Z), ValueError, r"one value per point, a list of 2 .*, got \[1\]"),
         (lambda: python(ANSWER)([[1.0]]), TypeError, "x must be a tensor, got list"),
+        (lambda: python(ANSWER)(Z[0]), ValueError, r"x must be points \[K, n\], got \[2\]: .* leave vectorized=True"),
     ],
 )
 def test_wrong_arguments_are_named(make, error, message):

@@ -250,6 +250,14 @@ def test_masked_entries_are_not_a_number(kind, expected) -> None:
     assert masked[0, 1] is np.ma.masked
 
 
+@pytest.mark.parametrize("large", [2**63 - 1, 2**63, -(2**63) - 1, 10**30])
+def test_an_integer_may_be_of_any_size(large) -> None:
+    for values in (large, [large, 3], [[3], [large]], [large, 2.5], (True, large)):
+        assert torch.equal(as_tensor(values), torch.tensor(values, dtype=torch.float64))
+    with pytest.raises(TypeError, match=r"fn must return a tensor or .* numbers, got list: int too large to convert"):
+        as_tensor([10**400, large])
+
+
 def test_a_sparse_tensor_is_filled() -> None:
     dense = vector(0.0, 2.0, 0.0)[:, None]
     for sparse in (dense.to_sparse(), dense.long().to_sparse()):

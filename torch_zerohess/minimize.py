@@ -104,7 +104,8 @@ def minimize(
             prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
             from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
-            file, or of another x0, sigma, bounds or engine.
+            file, or of another x0, sigma, bounds or engine. A file that cannot be written later on, or that another
+            process writes, too, is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up, or three rounds in a row have arrived at the same point, or at points with the same loss. A later round
             counts as arrived as soon as the quadratic at a known minimum predicts its losses.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import check_state
 from torch_zerohess.minimization.belief import Belief, believed, lowest
+from torch_zerohess.minimization.checkpoint import Checkpoint
 from torch_zerohess.minimization.decision import Decision, decide
 from torch_zerohess.minimization.derivatives import quadratic_at
 from torch_zerohess.minimization.doubt import doubt
@@ -58,7 +59,7 @@ class Running:
         self.noise = noise
         """Standard deviation of repeated losses; None before it is known."""
         self._make, self._batch, self._least, self._most = make, batch, least, most
-        self._path, self._verbose = path, verbose
+        self._file, self._verbose = None if path is None else Checkpoint(path), verbose
         self._sure = noise is not None
         """Whether it is known, if there is no noise."""
         self._begun = self._written = self._said = time.monotonic()
@@ -67,18 +68,10 @@ class Running:
         """Evaluations before the decision that is being made, and those that it gets."""
         self.search = make(self.noise or 0.0)
         self.record = Record(call, lambda values: self.search.losses(values), self.search.x)
-        if path is None or not path.exists():
-            return
-        wrong = f"checkpoint must be a new file, or one that minimize wrote with the same settings, got {path}: "
-        try:
-            saved = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # it raises any, for a file of another kind
-            raise ValueError(f"{wrong}torch.load says {type(error).__name__}: {str(error)[:100]}") from error
-        try:
-            self._resume(saved)
-        except Exception as error:
-            name = "" if isinstance(error, ValueError | KeyError) else f"{type(error).__name__}: "
-            raise ValueError(f"{wrong}{name}{str(*error.args[:1])[:300]}") from error
+        if self._file is not None and self._file.exists:
+            saved = self._file.read()
+            with self._file.going_on():
+                self._resume(saved)
 
     @property
     def seconds(self) -> float:
@@ -203,15 +196,14 @@ class Running:
         self._deciding = None
 
     def write(self) -> None:
-        """Write the file; it is never half written."""
-        if self._path is None or not (self.begun or self.record.known):  # there is nothing to go on with
+        """Write the file, if there is one."""
+        if self._file is None or not (self.begun or self.record.known):  # there is nothing to go on with
             return
         self._written = time.monotonic()
-        draft = self._path.with_name(f"{self._path.name}.part")
         decided = None if self._decided is None else vars(self._decided)
         own = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
-        torch.save({**own, "search": self.search.state_dict(), "version": VERSION, **self.record.state_dict()}, draft)
-        draft.replace(self._path)
+        search = {"search": self.search.state_dict(), "version": VERSION}
+        self._file.write({**own, **search, **self.record.state_dict()})
 
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""

@@ -103,18 +103,22 @@ def minimize(
         time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but a
             prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
-            from it: the function and all settings but `max_evaluations` must be the same. ValueError if it is no such
-            file, or of another x0, sigma, bounds or engine. A file that cannot be written later on, or that another
+            from it, with its samples, whatever the seed: the function must be the same, and so must x0, sigma, bounds
+            and engine. Another `noise` than that of the file, given or measured, begins a new search from x0, which
+            keeps the evaluations; None goes on with that of the file. All other settings hold from then on. ValueError
+            if it is no such file, if what must be the same differs, or for other `restarts` or `tolerance` where the
+            search has come to an end by those in the file. A file that cannot be written later on, or that another
             process writes, too, is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
             up, or three rounds in a row have arrived at the same point, or at points with the same loss. A later round
             counts as arrived as soon as the quadratic at a known minimum predicts its losses.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
-            evaluations, and six more if the two differ. Where losses are counts, which may be equal by chance, x is
-            evaluated twice again when the search arrives or is about to end. Give the noise if fn is noisy elsewhere
-            but not at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth of
-            `max_evaluations` (4 to 48) is kept for the end: the best candidates are evaluated again, and x is the one
-            with the lowest mean. `value` is this mean and `value_error` its standard error.
+            evaluations, and six more if the two differ. For that, a `batch` that takes all evaluations is made shorter;
+            the message says so where they are too few to measure it. Where losses are counts, which may be equal by
+            chance, x is evaluated twice again when the search arrives or is about to end. Give the noise if fn is noisy
+            elsewhere but not at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth
+            of `max_evaluations` (4 to 48) is kept for the end: the best candidates are evaluated again, and x is the
+            one with the lowest mean. `value` is this mean and `value_error` its standard error.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
             in it. The search does not read the memory: the result is the same as without one. The next `estimate`
@@ -166,6 +170,12 @@ def minimize(
             f"max_evaluations must be at least {smallest}, the start, its samples and one step with {len(start)} "
             f"parameters, got {max_evaluations}"
         )
+    noise = None if noise is None else float(noise)  # the file has plain numbers
+    tolerance = settings.get("tolerance")
+    limits = {
+        "restarts": None if restarts is None else int(restarts),
+        "tolerance": None if tolerance is None else float(tolerance),
+    }
     own = None if workers is None else ProcessPool(workers)
     call = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
 
@@ -187,8 +197,7 @@ def minimize(
                 memory.add(points[numbers], values)
         return numbers, values, failure
 
-    running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, verbose=verbose)
-
+    running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, limits, verbose=verbose)
     stopping = Stopping(target, xtol, ftol, time_limit, agrees=restarts is None)
     end: tuple[Status, str]
     black_box = caller = "fn" if loss is None else "fn or loss"

@@ -4,7 +4,7 @@ import contextlib
 import os
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,16 @@ class Checkpoint:
         if what not in self._warned:
             self._warned.add(what)
             warnings.warn(f"checkpoint {str(self._path)!r} {what}{more}", UserWarning, stacklevel=2)
+
+
+def check_limits(given: Mapping[str, float | None], before: Mapping[str, float | None], end: str) -> None:
+    """Raise ValueError for a limit that differs from the one before, with which the search has come to its end."""
+    for name, value in given.items():
+        if value != before[name]:
+            raise ValueError(
+                f"{name} must be {before[name]} as there, where the search is done ({end}), got {value}: minimise from "
+                f"its x with a new file"
+            )
 
 
 def _state(path: Path) -> tuple[int, int] | None:

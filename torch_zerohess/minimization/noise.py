@@ -8,6 +8,8 @@ from torch import Tensor
 
 REPEATED = 8
 """Values at one point that tell the standard deviation of noise."""
+_AGAIN = 2
+"""Further evaluations of x where losses are counts: one would be equal to the first too often."""
 _ROUNDING = 1e-6
 """Difference of two values, relative to them, that is rounding: renders of one seed differ by 3e-8."""
 _SHARE, _MOST, _LEAST = 8, 48, 4
@@ -30,6 +32,38 @@ def are_counts(losses: Tensor) -> bool:
 def deviation(losses: Tensor) -> float:
     """Standard deviation of losses [K] at one point."""
     return float(losses.std())
+
+
+def noise_again(evaluate: Callable[[int], Tensor], before: Tensor, most: int) -> float | None:
+    """Evaluate a point again, up to `most` times; return the deviation of its losses, or None if they are equal.
+
+    Args:
+        evaluate: the point so many times, [count].
+        before: its losses so far [K].
+        most: how often it may be evaluated.
+    """
+    count = min(_AGAIN, most)
+    again = evaluate(count)
+    again = again[torch.isfinite(again)]
+    if not len(again) or not differs(again, before[-1]):
+        return None
+    further = min(REPEATED - _AGAIN, most - count)
+    every = torch.cat([before, again, evaluate(further) if further else again[:0]])
+    return deviation(every[torch.isfinite(every)])
+
+
+def opening(batch: int, least: int, most: int) -> int:
+    """Return how many points there may be in a first batch that measures noise, besides the start again.
+
+    A batch that takes all evaluations would leave none for that. It is shorter, and a second one follows anyway: so it
+    leaves what noise and the decision at the end need, too.
+
+    Args:
+        batch: points that are evaluated at once.
+        least: points that the search needs.
+        most: evaluations that there may be.
+    """
+    return most if batch + 1 < most else max(least, most - REPEATED - reserved(most))
 
 
 def reserved(evaluations: int) -> int:

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,13 @@ from torch import Tensor
 
 from torch_zerohess.arguments import check_state
 from torch_zerohess.minimization.belief import Belief, believed, lowest
-from torch_zerohess.minimization.checkpoint import Checkpoint
+from torch_zerohess.minimization.checkpoint import Checkpoint, check_limits
 from torch_zerohess.minimization.decision import Decision, decide
 from torch_zerohess.minimization.derivatives import quadratic_at
 from torch_zerohess.minimization.doubt import doubt
+from torch_zerohess.minimization.first_batch import FirstBatch
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
-from torch_zerohess.minimization.noise import REPEATED, are_counts, deviation, differs, reserved
+from torch_zerohess.minimization.noise import REPEATED, are_counts, noise_again, opening, reserved
 from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.minimization.wording import budget, worded
 from torch_zerohess.search.trust_region import TrustRegion
@@ -26,8 +27,6 @@ _PAUSE = 1.0
 """Seconds between two lines of `verbose`, and between two writes of a checkpoint."""
 _LUCK = 2.0
 """Standard deviations of the noise by which a value must lie below the target: the lowest of many values is lucky."""
-_AGAIN = 2
-"""Further evaluations of x where losses are counts: one would be equal to the first too often."""
 
 
 class Running:
@@ -41,6 +40,7 @@ class Running:
         least: evaluations that the search needs for one step.
         most: evaluations that there may be.
         path: of the file, or None.
+        limits: settings by name that end the search by itself, as the caller gave them.
         verbose: whether to write a line to stderr every second.
     """
 
@@ -53,15 +53,19 @@ class Running:
         least: int,
         most: int,
         path: Path | None,
+        limits: Mapping[str, float | None],
         *,
         verbose: bool,
     ) -> None:
         self.noise = noise
         """Standard deviation of repeated losses; None before it is known."""
         self._make, self._batch, self._least, self._most = make, batch, least, most
+        self._limits = dict(limits)
         self._file, self._verbose = None if path is None else Checkpoint(path), verbose
         self._sure = noise is not None
         """Whether it is known, if there is no noise."""
+        self._unmeasured = False
+        """Whether the evaluations were too few to measure noise."""
         self._begun = self._written = self._said = time.monotonic()
         self._decided: Decision | None = None
         self._deciding: tuple[int, int] | None = None
@@ -124,12 +128,19 @@ class Running:
         """
         search, points, self._deciding = self.search, self.record.requested, None
         if points is None:
-            measured = self.noise is None and self.left > max(len(search.ask()), self._batch) + 1
-            points = search.ask(max(self._batch - 1, 1)) if measured else search.ask(self._batch, limit=self.left)
+            measured = self.noise is None and self.left > len(search.ask()) + 1
+            self._unmeasured = self._unmeasured or (self.noise is None and not measured)
+            if measured:
+                limit = opening(self._batch, len(search.ask()), self.left)
+                points = search.ask(max(self._batch - 1, 1), limit=limit)
+            else:
+                points = search.ask(self._batch, limit=self.left)
         else:
             measured, points = self.noise is None, points[: len(search.missing)]
         if measured:
-            self._first(points)
+            known = FirstBatch(self.record, search, self._make, self._batch, self._most - self._least)
+            self.noise, self.search, points, losses = known.measured(points)
+            self._noted(points, losses)
             return
         self.noise = self.noise or 0.0
         values = self.record.values(points)
@@ -149,14 +160,10 @@ class Running:
         x, (points, losses) = self.search.x[None], self.record.told
         before = losses[(points == x).all(1)]
         if are_counts(losses) and len(before):
-            again = self._evaluated(x.expand(min(_AGAIN, self.left), -1))
-            again = again[torch.isfinite(again)]
-            if len(again) and differs(again, before[-1]):
-                count = min(REPEATED - _AGAIN, self.left)
-                further = self._evaluated(x.expand(count, -1)) if count else again[:0]
-                every = torch.cat([before, again, further])
-                self.noise = deviation(every[torch.isfinite(every)])
-                self.search = self._make(self.noise)
+            found = noise_again(lambda count: self._evaluated(x.expand(count, -1)), before, self.left)
+            if found is not None:
+                self.noise, self.search = found, self._make(found)
+            self._unmeasured = False
         self._sure = True
 
     def ending(self, *, arrived: bool) -> Status:
@@ -202,6 +209,7 @@ class Running:
         self._written = time.monotonic()
         decided = None if self._decided is None else vars(self._decided)
         own = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
+        own |= {"unmeasured": self._unmeasured, "limits": self._limits}
         search = {"search": self.search.state_dict(), "version": VERSION}
         self._file.write({**own, **search, **self.record.state_dict()})
 
@@ -220,7 +228,16 @@ class Running:
             evaluations=self.evaluations,
             points=points,
             values=losses,
-            message=worded(message, status, equal, why, search.untouched, arrived=search.solved, success=success),
+            message=worded(
+                message,
+                status,
+                equal,
+                why,
+                search.untouched,
+                arrived=search.solved,
+                success=success,
+                measuring=self._least + 1 if self._unmeasured else 0,
+            ),
             engine=search.engine,
             success=success,
             status=status,
@@ -232,13 +249,20 @@ class Running:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
         names = "noise", "sure", "decided", "deciding", "search", *self.record.state_dict(), "version"
         check_state(saved, dict.fromkeys(names), "minimize")
-        self.noise = saved["noise"]
+        given, self.noise = self.noise, saved["noise"]
         self.search = self._make(self.noise or 0.0)
         self.record.load_state_dict(saved, x := self.search.x)
         self.search.load_state_dict(saved["search"])
         self._deciding, self._sure = saved["deciding"], saved["sure"]
         if saved["decided"] is not None:
             self._decided = Decision(**saved["decided"] | {"x": saved["decided"]["x"].to(x)})
+        self._unmeasured = saved.get("unmeasured", False) and given is None
+        if given is not None and given != self.noise:  # a new search, which keeps the evaluations
+            self.record.note_known()
+            self.noise, self.search, self._decided, self._deciding = given, self._make(given), None, None
+        elif self.search.done:
+            check_limits(self._limits, saved.get("limits", self._limits), self.search.message)
+        self._sure = self._sure or given is not None
 
     @property
     def _last(self) -> Decision | None:
@@ -262,30 +286,6 @@ class Running:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
         points, losses = self.record.keeping(self.search.untouched, self.search.x)
         return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
-
-    def _first(self, points: Tensor) -> None:
-        """Evaluate the first points [K, n], and the start again; where its values differ, as often as noise needs."""
-        start, record = points[:1], self.record
-        every = torch.cat([points, start])
-        known = record.known - len(every)  # of a measurement that was interrupted
-        values = record.values(every)
-        if not differs(values[0], values[-1]):
-            again = self.search.losses(values[-1:])  # it may raise: the search is not told before
-            self.search.tell(values[:-1])
-            self.noise = 0.0
-            self._noted(every, torch.cat([self.search.told, again]))
-            return
-        count = max(min(REPEATED - 2, self._most - len(every) - self._least), known, 0)
-        every = torch.cat([every, start.repeat(count, 1)])
-        values = record.values(every)
-        losses = self.search.losses(values)
-        at_start = torch.cat([losses[:1], losses[len(points) :]])
-        noise = deviation(at_start[torch.isfinite(at_start)])
-        search = self._make(noise)
-        if torch.equal(search.ask(max(self._batch - 1, 1)), points):
-            search.tell(values[: len(points)])
-        self.noise, self.search = noise, search  # not before: an interrupted measurement is made again
-        self._noted(every, losses)
 
     def _evaluated(self, points: Tensor) -> Tensor:
         """Return the losses [K] of points [K, n], which are not told to the search."""

@@ -9,7 +9,15 @@ _NAMED = 5
 
 
 def worded(
-    message: str, status: Status, equal: int, doubt: str, untouched: Tensor | None, *, arrived: bool, success: bool
+    message: str,
+    status: Status,
+    equal: int,
+    doubt: str,
+    untouched: Tensor | None,
+    *,
+    arrived: bool,
+    success: bool,
+    measuring: int = 0,
 ) -> str:
     """Return the message of a result.
 
@@ -21,6 +29,7 @@ def worded(
         untouched: which parameters no output was found to depend on, bools [n]; or None.
         arrived: whether the search has arrived at x.
         success: of the result.
+        measuring: evaluations with which noise would have been measured; 0 if it was, or was given.
     """
     cut = status in ("budget", "time")
     if equal and status != "target":
@@ -29,6 +38,8 @@ def worded(
         message += f"; {doubt}"
     if success and cut:
         message += "; the search had arrived at x, a minimum at least of its surroundings"
+    if measuring:
+        message += f"; noise was not measured: give noise, or max_evaluations of at least {measuring}"
     return message + _on_untouched(untouched)
 
 

@@ -7,6 +7,7 @@ import shutil
 import threading
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from searches import tilted, zeros
@@ -16,6 +17,10 @@ from torch_zerohess.minimization import running
 from torch_zerohess.minimization.checkpoint import Checkpoint
 
 SETTINGS = {"sigma": 2.0, "seed": 0, "max_evaluations": 20}
+
+
+def interrupt():
+    raise KeyboardInterrupt
 
 
 def then(event, call):
@@ -155,3 +160,59 @@ def test_a_write_that_was_interrupted_is_none_of_another_process(tmp_path, monke
             with pytest.raises(KeyboardInterrupt):
                 file.write({"k": [1] * 1000})
         file.write({"k": 2})
+
+
+@pytest.mark.parametrize(("before", "noise"), [(None, 0.3), (0.1, 0.3), (0.1, 0.0), (0.1, 0.1), (0.1, None)])
+def test_another_noise_begins_a_new_search_that_keeps_the_evaluations(before, noise, tmp_path):
+    """The file has noise that was measured, none, or noise that was given."""
+    path, fewer = tmp_path / "search.pt", {**SETTINGS, "checkpoint": tmp_path / "search.pt"}
+    part = zh.minimize(tilted, zeros(2), noise=before, **fewer)
+    more = {**fewer, "max_evaluations": 40}
+    fit = zh.minimize(tilted, zeros(2), noise=noise, **more)
+    assert fit.noise == (0.1 if noise is None else noise)
+    assert (fit.value_error > 0) == (fit.noise > 0)
+    assert torch.equal(fit.points[: part.evaluations], part.points)
+    again = fit.points[part.evaluations].tolist() == [0.0, 0.0]
+    assert again == (noise not in (None, before))
+    assert torch.load(path)["noise"] == fit.noise
+    assert torch.equal(zh.minimize(tilted, zeros(2), noise=noise, **more).points, fit.points)
+
+
+@pytest.mark.parametrize("call", [1, 3, 4, 9])
+def test_noise_that_is_given_after_an_interruption(call, tmp_path):
+    """Every value is kept: of the first batch, the measurement of noise, and what follows it."""
+    f, count = then(interrupt, call), []
+    settings = {"sigma": 2.0, "seed": 0, "vectorized": False, "checkpoint": tmp_path / "search.pt"}
+
+    def fn(x):
+        value = f(x[None])[0]
+        count.append(value)
+        return value
+
+    assert zh.minimize(fn, zeros(2), **settings).evaluations == call
+    fit = zh.minimize(fn, zeros(2), noise=0.3, max_evaluations=30, **settings)
+    assert (fit.noise, fit.evaluations) == (0.3, 30)
+    assert fit.values.tolist() == [float(one) for one in count]
+
+
+def test_noise_and_limits_of_numpy_are_plain_numbers_in_the_file(tmp_path):
+    given = {"noise": np.float64(0.1), "restarts": np.int64(0), "tolerance": np.float64(0.1)}
+    for _ in range(2):
+        fit = zh.minimize(tilted, zeros(2), checkpoint=tmp_path / "search.pt", **SETTINGS, **given)
+    assert fit.noise == 0.1
+
+
+@pytest.mark.parametrize(("name", "value"), [("restarts", 3), ("restarts", None), ("tolerance", 1e-4)])
+def test_limits_that_a_search_has_come_to_cannot_be_others(name, value, tmp_path):
+    """They are honoured where the search goes on."""
+    settings = {"restarts": 0, "tolerance": 0.05, **SETTINGS}
+    path = tmp_path / "search.pt"
+    fit = zh.minimize(tilted, zeros(2), checkpoint=path, **settings)
+    assert fit.evaluations < 20
+    message = rf"{name} must be {settings[name]} as there, where the search is done \(.*\), got {value}: minimise from"
+    with pytest.raises(ValueError, match=message):
+        zh.minimize(tilted, zeros(2), checkpoint=path, **{**settings, name: value})
+    assert zh.minimize(tilted, zeros(2), checkpoint=path, **settings).message == fit.message
+    path.unlink()
+    zh.minimize(tilted, zeros(2), checkpoint=path, **{**settings, "max_evaluations": 7})
+    zh.minimize(tilted, zeros(2), checkpoint=path, **{**settings, name: value})

@@ -9,7 +9,7 @@ from searches import TARGET, bowl, zeros
 import torch_zerohess as zh
 from torch_zerohess.minimization.belief import believed
 from torch_zerohess.minimization.decision import decide
-from torch_zerohess.minimization.noise import differs, distinct, lowest_mean, reserved
+from torch_zerohess.minimization.noise import REPEATED, differs, distinct, lowest_mean, reserved
 from truths import vector
 
 
@@ -140,6 +140,42 @@ def test_noise_survives_a_checkpoint(tmp_path):
     fit = zh.minimize(f, zeros(2), max_evaluations=60, **settings)
     assert fit.noise > 0.1
     assert len(torch.unique(f.points[0], dim=0)) == len(f.points[0])
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+@pytest.mark.parametrize("batch", [63, 64, 1000])
+def test_a_batch_of_all_evaluations_leaves_enough_to_measure_noise(batch, bounds):
+    """And for a step and a decision. The deviation of eight values is right within a factor of 3 but for 1e-4."""
+    settings = {"sigma": 2.0, "bounds": bounds, "seed": 0, "max_evaluations": 64, "batch": batch}
+    f = Counted(noisy(0))
+    fit = zh.minimize(f, zeros(2), **settings)
+    first = torch.cat(f.points[:2])
+    assert int((first == 0.0).all(1).sum()) == REPEATED
+    assert fit.evaluations == 64 > len(first) + reserved(64)
+    assert 0.1 < fit.noise < 0.9
+    assert fit.value_error > 0.1 / math.sqrt(reserved(64))
+    g = Counted(bowl)
+    assert zh.minimize(g, zeros(2), **settings).noise == 0.0
+    assert torch.equal(g.points[0][-1], g.points[0][0])
+
+
+def test_a_batch_that_leaves_a_step_is_not_shortened():
+    f = Counted(bowl)
+    zh.minimize(f, zeros(2), sigma=2.0, bounds=(-5, 5), seed=0, max_evaluations=64, batch=62)
+    assert [len(one) for one in f.points[:2]] == [62, 2]
+
+
+@pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])
+def test_where_noise_is_not_measured_the_message_says_so(bounds, tmp_path):
+    settings = {"sigma": 2.0, "bounds": bounds, "seed": 0, "batch": 4}
+    said = "; noise was not measured: give noise, or max_evaluations of at least 5"
+    path = tmp_path / "search.pt"
+    for fn, resumed in ((bowl, 4), (noisy(0), 20)):
+        assert zh.minimize(fn, zeros(2), max_evaluations=4, checkpoint=path, **settings).message.endswith(said)
+        assert said in zh.minimize(fn, zeros(2), max_evaluations=resumed, checkpoint=path, **settings).message
+        path.unlink()
+        for given in ({"max_evaluations": 5}, {"max_evaluations": 4, "noise": 0.0}):
+            assert "measured" not in zh.minimize(fn, zeros(2), **given, **settings).message
 
 
 def test_few_evaluations_go_to_the_search_first():

@@ -112,7 +112,8 @@ class SampleJacobian:
         def part(at: Places) -> Jacobian:
             if at in outer:
                 return OuterProducts(by_slopes[at], inputs[at])
-            return Rows(by_rows[at].flatten(2).flatten(0, 1))
+            found = by_rows[at].flatten(0, 1)
+            return Rows(found.reshape(len(found), chosen[at].numel()))
 
         return Blocks([part(at) for at in chosen], [one.numel() for one in chosen.values()])
 

@@ -98,20 +98,20 @@ class SparseBlackBox(nn.Module):
         center = working(x).detach().reshape(-1, n).clone()
         values = evaluate_center(self.call, center, ()).to(center.dtype)
         if transforms.derivative_possible(x):
-            self.jacobians = jacobians = self._jacobians(center)
+            self.jacobians = jacobians = self._jacobians(center, values.shape[1:])
             change = Input.apply(working(x)).reshape(-1, n) - center
             with without_autocast(x.device):
                 values = values + torch.stack([J.matvec(d) for J, d in zip(jacobians, change, strict=True)])
         return values.reshape((*batch, *values.shape[1:])).to(x.dtype)
 
-    def _jacobians(self, points: Tensor) -> list[SparseJacobian]:
-        """Return the Jacobian at every point [B, n]. Each begins with what was found last."""
+    def _jacobians(self, points: Tensor, shape: Sequence[int]) -> list[SparseJacobian]:
+        """Return the Jacobian at every point [B, n] of outputs of a shape; each begins with what was found last."""
         seed, call = self.smoothing.drawn_seed(), self.call
         known = self.jacobians[-1] if self.jacobians else None
+        if known is not None and (known.n, tuple(known.shape)) != (points.shape[1], tuple(shape)):
+            known = None
         found: list[SparseJacobian] = []
         for b, point in enumerate(points):
-            if known is not None and known.n != len(point):
-                known = None
             known = sparse_jacobian(
                 call.fn,
                 point,

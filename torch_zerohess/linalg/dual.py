@@ -32,4 +32,4 @@ def dual_step(J: Jacobian, A: Tensor, g: Tensor, radius: float, damping: float) 
     scale = min(1.0, radius / length) if length > 0.0 else 1.0
     moved = -scale * (gram @ w)  # J s
     decrease = -float(g @ moved + 0.5 * moved @ A @ moved)
-    return Step(-scale * J.rmatvec(w), decrease, "boundary" if scale < 1.0 else "converged")
+    return Step(-scale * J.rmatvec(w).double(), decrease, "boundary" if scale < 1.0 else "converged")

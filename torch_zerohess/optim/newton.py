@@ -60,18 +60,16 @@ class Newton(NewtonStep):
         max_radius: float = math.inf,
         lr: float = 1.0,
     ) -> None:
-        checked_number("radius", radius, above=0.0, below=math.inf)
-        checked_number("max_radius", max_radius, above=0.0)
         check_bool(adapt=adapt)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'shift' or 'abs', got {modification!r}")
         defaults = {
             "lr": lr,
-            "radius": radius,
+            "radius": checked_number("radius", radius, above=0.0, below=math.inf),
             "curvature": curvature,
             "modification": modification,
-            "adapt": adapt,
-            "max_radius": max_radius,
+            "adapt": bool(adapt),
+            "max_radius": checked_number("max_radius", max_radius, above=0.0),
         }
         super().__init__(params, defaults)
         n = sum(one.numel() for one in self._parameters)

@@ -89,18 +89,18 @@ class NewtonCG(NewtonStep):
         output_radius: float | None = None,
         lr: float = 1.0,
     ) -> None:
-        checked_number("radius", radius, above=0.0, below=math.inf)
-        for name, value in (("tolerance", tolerance), ("max_radius", max_radius)):
-            checked_number(name, value, above=0.0)
-        for name, value in (("damping", damping), ("noise", noise)):
-            checked_number(name, value, 0.0, below=math.inf)
+        radius = checked_number("radius", radius, above=0.0, below=math.inf)
+        tolerance = checked_number("tolerance", tolerance, above=0.0)
+        max_radius = checked_number("max_radius", max_radius, above=0.0)
+        damping = checked_number("damping", damping, 0.0, below=math.inf)
+        noise = checked_number("noise", noise, 0.0, below=math.inf)
         check_bool(adapt=adapt)
         if solver not in SOLVERS:
             raise ValueError(f"solver must be one of {', '.join(map(repr, SOLVERS))}, got {solver!r}")
         if modification not in (None, "abs"):
             raise ValueError(f"modification must be None or 'abs', got {modification!r}")
         if output_radius is not None:
-            checked_number("output_radius", output_radius, above=0.0)
+            output_radius = checked_number("output_radius", output_radius, above=0.0)
         if (modification or solver == "dual" or output_radius) and curvature != "gauss_newton":
             what = "modification 'abs'" if modification else "solver 'dual'" if solver == "dual" else "output_radius"
             raise ValueError(f"{what} needs curvature 'gauss_newton', got {curvature!r}")
@@ -115,7 +115,7 @@ class NewtonCG(NewtonStep):
             "iterations": checked_integer("iterations", iterations, 1),
             "tolerance": tolerance,
             "damping": damping,
-            "adapt": adapt,
+            "adapt": bool(adapt),
             "max_radius": max_radius,
             "noise": noise,
             "output_radius": output_radius,

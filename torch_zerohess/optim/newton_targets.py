@@ -50,9 +50,8 @@ class NewtonTargets:
     def __init__(
         self, *, relative_damping: float = 1e-3, iterations: int = 16, output_radius: float = math.inf
     ) -> None:
-        for name, value in (("relative_damping", relative_damping), ("output_radius", output_radius)):
-            checked_number(name, value, above=0.0)
-        self.relative_damping, self.output_radius = relative_damping, output_radius
+        self.relative_damping = checked_number("relative_damping", relative_damping, above=0.0)
+        self.output_radius = checked_number("output_radius", output_radius, above=0.0)
         self.iterations = checked_integer("iterations", iterations, 1)
         self.losses: Tensor | None = None
         """[B], of the last call."""

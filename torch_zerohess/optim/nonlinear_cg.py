@@ -69,15 +69,15 @@ class NonlinearCG(SecondOrder):
         modification: str = "abs",
         lr: float = 1.0,
     ) -> None:
-        checked_number("radius", radius, above=0.0, below=math.inf)
-        checked_number("line_search_tolerance", line_search_tolerance, 0.0, below=math.inf)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'abs' or 'radius', got {modification!r}")
         defaults = {
             "lr": lr,
-            "radius": radius,
+            "radius": checked_number("radius", radius, above=0.0, below=math.inf),
             "line_search_iterations": checked_integer("line_search_iterations", line_search_iterations, 1),
-            "line_search_tolerance": line_search_tolerance,
+            "line_search_tolerance": checked_number(
+                "line_search_tolerance", line_search_tolerance, 0.0, below=math.inf
+            ),
             "recompute": checked_integer("recompute", recompute, 1),
             "curvature": curvature,
             "modification": modification,

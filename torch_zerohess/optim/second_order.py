@@ -148,7 +148,7 @@ class SecondOrder(Optimizer):
     """An optimizer with one Hessian, hence one group of parameters."""
 
     def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any]) -> None:
-        checked_lr(defaults)
+        defaults["lr"] = checked_lr(defaults)
         if defaults["curvature"] not in CURVATURES:
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
         super().__init__(params, defaults)
@@ -188,6 +188,8 @@ class SecondOrder(Optimizer):
     def _model(self, closure: Closure, *, separate: bool = False) -> Model:
         """Evaluate the closure where the parameters are; `separate` keeps the estimates of several losses apart."""
         curvature = self.param_groups[0]["curvature"]
+        if torch.is_inference_mode_enabled():
+            raise RuntimeError("a step needs derivatives of the loss, which inference mode forbids: use torch.no_grad")
         with torch.enable_grad():
             if not callable(closure):
                 raise TypeError(f"closure must be callable, a function that returns the loss, got {closure!r}")

@@ -16,7 +16,7 @@ from torch_zerohess.version import VERSION
 _GROWTH = 1.3
 """The surrogate is fitted again when there are this times as many evaluations as at the last fit."""
 _FEWEST = 8
-"""Evaluations at the first fit."""
+"""Evaluations at the first fit, and the least capacity: with less there would never be a fit."""
 _EXCESS = 1.05
 """Evaluations over the capacity at which they are thinned."""
 _BLOCK = 1024
@@ -45,7 +45,7 @@ class Memory:
             Gaussian process or an affine map, of the coordinates of large outputs, chosen by held-out evaluations. An
             affine map of hundreds of parameters is sparse where its outputs depend on few of them each. The layer gives
             the parameters of a module no gradient. Do not call the module in another thread during a call of the layer.
-        capacity: evaluations that are kept. Beyond it, of points that are close to each other the older are dropped.
+        capacity: evaluations that are kept, at least 8. Beyond it, of points that are close to each other the older are dropped.
             Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
             None: all of them. 0: none; the estimate is then the first term alone, and biased towards g.
@@ -77,7 +77,7 @@ class Memory:
         order: int = 2,
         draws: int | None = None,
     ) -> None:
-        capacity = checked_integer("capacity", capacity, 2)
+        capacity = checked_integer("capacity", capacity, _FEWEST)
         fresh = None if fresh is None else checked_integer("fresh", fresh, 0)
         draws = None if draws is None else checked_integer("draws", draws, 3)
         if surrogate is not None and not callable(surrogate):

@@ -27,6 +27,15 @@ class Net(nn.Module):
         return self._forward(self, x)
 
 
+class Factor(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.tensor(1.5))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.factor * x
+
+
 class OwnProduct(torch.autograd.Function):
     """A product whose derivative is its own: half of the true one."""
 
@@ -58,6 +67,10 @@ def in_rows(x: Tensor) -> Tensor:
 # Network, and the weights that are used as one product with a vector.
 NETWORKS = {
     "two layers": lambda: (nn.Sequential(linear(6), nn.Tanh(), linear(2, 6)), {"0.weight", "2.weight"}),
+    "a parameter without dimensions": lambda: (
+        Net(lambda net, x: net.b(net.a(x).tanh()), a=linear(), b=Factor()),
+        {"a.weight"},
+    ),
     "no bias": lambda: (nn.Sequential(linear(bias=False), nn.Tanh()), {"0.weight"}),
     "a convolution before": lambda: (
         nn.Sequential(nn.Unflatten(1, (1, 4)), nn.Conv1d(1, 2, 3), nn.Tanh(), nn.Flatten(), linear(3)),

@@ -117,6 +117,19 @@ def test_an_empty_batch_after_another_one():
     assert (y.shape, x.grad.shape) == ((0, 10, 10), (0, N))
 
 
+def test_another_shape_of_the_output_starts_afresh():
+    shown = {"rows": 10}
+    layer = zh.SparseBlackBox(lambda z: blurred(z)[:, : shown["rows"]], SMOOTHING)
+    x = drawn(1, N).requires_grad_()
+    layer(x).sum().backward()
+    shown["rows"] = 6
+    fresh = zh.SparseBlackBox(layer.call.fn, SMOOTHING)
+    (found,) = torch.autograd.grad(layer(x).sum(), x)
+    (expected,) = torch.autograd.grad(fresh(x).sum(), x)
+    assert torch.equal(found, expected)
+    assert layer.jacobians[0].shape == (6, 10)
+
+
 def test_one_seed_gives_the_same_bits_and_every_element_its_own_noise():
     x, seen = X[:1].repeat(2, 1).requires_grad_(), []
 

@@ -273,3 +273,28 @@ def test_wrong_settings_say_so() -> None:
         zh.optim.NewtonCG([{"params": list(net.parameters()), "solver": "stehaug"}])  # type: ignore[list-item]
     with pytest.raises(TypeError, match="adapt must be True or False, got 'no'"):
         zh.optim.Newton(net.parameters(), adapt="no")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("solver", ["steihaug", "clip", "dual"])
+@pytest.mark.parametrize("adapt", [True, False])
+@pytest.mark.parametrize("output_radius", [None, 0.05])
+def test_single_precision_takes_the_steps_of_double(solver: str, adapt: bool, output_radius: float | None) -> None:
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        net, images = network().to(dtype), IMAGES.to(dtype)
+        optimizer = zh.optim.NewtonCG(
+            net.parameters(),
+            curvature="gauss_newton",
+            solver=solver,
+            damping=1e-2,
+            adapt=adapt,
+            output_radius=output_radius,
+        )
+
+        def closure(net: nn.Module = net, images: Tensor = images) -> tuple[Tensor, Tensor]:
+            y = net(images)
+            return y.square().mean(), y
+
+        found.append([float(optimizer.step(closure)) for _ in range(3)])  # type: ignore[arg-type]
+    assert found[1][2] < found[1][1] < found[1][0]
+    assert found[0] == pytest.approx(found[1], rel=1e-3)

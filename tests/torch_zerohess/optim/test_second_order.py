@@ -1,5 +1,6 @@
 """The quadratic model of a loss that the second-order optimizers share."""
 
+import numpy as np
 import pytest
 import torch
 from torch.optim import lr_scheduler
@@ -174,3 +175,34 @@ def test_steps_under_autocast_see_the_weights_that_they_have_changed(make) -> No
 def test_complex_parameters_are_refused(make) -> None:
     with pytest.raises(TypeError, match=r"params must be real, got torch.complex64: optimize torch.view_as_real"):
         make([torch.ones(2, dtype=torch.complex64, requires_grad=True)])
+
+
+@pytest.mark.parametrize("make", [zh.optim.Newton, zh.optim.NewtonCG, zh.optim.NonlinearCG])
+def test_inference_mode_is_named(make) -> None:
+    p = torch.nn.Parameter(vector(1.0, 2.0))
+    with torch.inference_mode(), pytest.raises(RuntimeError, match="inference mode forbids: use torch.no_grad"):
+        make([p]).step(lambda: (p**4).sum())
+    with torch.no_grad():
+        make([p]).step(lambda: (p**4).sum())
+    assert float(p.detach().abs().max()) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("make", "settings"),
+    [
+        (zh.optim.Newton, ("max_radius",)),
+        (zh.optim.NewtonCG, ("max_radius", "tolerance", "damping", "noise", "output_radius", "iterations")),
+        (zh.optim.NonlinearCG, ("line_search_tolerance", "line_search_iterations", "recompute")),
+    ],
+)
+def test_settings_of_numpy_are_saved_as_numbers(make, settings: tuple[str, ...], tmp_path) -> None:
+    p = torch.nn.Parameter(vector(1.0, 2.0))
+    whole = {"iterations", "line_search_iterations", "recompute"}
+    given = {name: np.int64(3) if name in whole else np.float64(0.5) for name in (*settings, "lr", "radius")}
+    if make is not zh.optim.NonlinearCG:
+        given["adapt"] = np.bool_(True)
+    if make is zh.optim.NewtonCG:
+        given["curvature"] = "gauss_newton"
+    torch.save(make([p], **given).state_dict(), tmp_path / "state.pt")
+    group = torch.load(tmp_path / "state.pt", weights_only=True)["param_groups"][0]
+    assert all(group[name] == one for name, one in given.items())

@@ -131,6 +131,7 @@ def test_a_module_without_fit_is_ready_and_never_fitted() -> None:
     ("options", "error"),
     [
         ({"capacity": 1}, ValueError),
+        ({"capacity": 7}, ValueError),
         ({"capacity": 2.5}, TypeError),
         ({"fresh": -1}, ValueError),
         ({"fresh": True}, TypeError),

@@ -17,6 +17,7 @@ LAYERS = {
             "version",
             "arguments",
             "precision",
+            "evaluation_mode",
             "choice",
             "smoothing",
             "losses",

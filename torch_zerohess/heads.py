@@ -58,8 +58,11 @@ class LocalEntropy:
     The estimate is the logarithm of a sample mean, hence biased if the samples are few.
 
     Args:
-        head: outputs [K, *out], *aux [K, ...] -> losses [K].
+        head: outputs [K, *out], *aux [K, ...] -> losses [K]; no local entropy itself.
         temperature: T over the mean loss.
+
+    It takes all samples of an element, which only the layer has: it must be the `head` of the layer itself, not a part
+    of another function.
     """
 
     head: Callable[..., Tensor]
@@ -68,8 +71,13 @@ class LocalEntropy:
     def __post_init__(self) -> None:
         if not callable(self.head):
             raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {self.head!r}")
+        if isinstance(self.head, LocalEntropy):
+            raise TypeError(f"head must give losses, not be a LocalEntropy itself, got {self.head!r}")
         checked_number("temperature", self.temperature, above=0.0, below=math.inf)
 
     def __call__(self, outputs: Tensor, *aux: Tensor) -> Tensor:
-        """Return the losses [K] themselves; the layer takes the local entropy over its samples."""
-        return self.head(outputs, *aux)
+        """Raise TypeError: the layer calls `head` and takes the local entropy over its samples."""
+        raise TypeError(
+            "LocalEntropy must be the head of a BlackBox itself, head=LocalEntropy(...), not a part of another "
+            "function: put the other function into it"
+        )

@@ -14,33 +14,45 @@ from torch import Tensor
 from torch_zerohess.autograd import transforms
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.expansion import Expansion
+from torch_zerohess.smoothing import Smoothing
+
+General = Callable[..., Tensor]
+"""(expansion, x [B, n], *, center [B, n], zero) -> the expansion around `center` at x, with a graph."""
 
 
 class ClosedForm(torch.autograd.Function):
-    """`apply(x, expansion, general)`: the base of the expansion around x, [*batch, *out] for x [*batch, n].
+    """`apply(x, expansion, smoothing, keep, general)`: the base of the expansion around x, [*batch, *out].
 
-    general: the same value as a function of x [B, n] with a graph, for derivatives of the gradient and for `vmap` over
-    it. Like `Input`, it saves the input of the black box.
+    smoothing, keep: what the expansion was drawn with, see `Expansion.rebuild`.
+    general: the same value as a function of x with a graph, for derivatives of the gradient and for `vmap` over it.
+
+    Like `Input`, it saves the input of the black box, x [*batch, n]. All tensors are saved where torch frees them after
+    `backward`: a loss that is kept for a report would keep the evaluations otherwise.
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, expansion: Expansion, general: Callable[[Tensor], Tensor]) -> Tensor:
-        ctx.save_for_backward(x)
-        ctx.expansion, ctx.general = expansion, general
+    def forward(
+        ctx: Any, x: Tensor, expansion: Expansion, smoothing: Smoothing, keep: bool, general: General
+    ) -> Tensor:
+        ctx.save_for_backward(x, *expansion.tensors())
+        ctx.smoothing, ctx.keep, ctx.general = smoothing, keep, general
         base = expansion.base.reshape((*x.shape[:-1], *expansion.base.shape[1:]))
         return base.to(x.dtype, copy=True)  # the base may share memory with values
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        (x,) = ctx.saved_tensors
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        x, *tensors = ctx.saved_tensors
+        center = x.detach().reshape(-1, x.shape[-1])
+        expansion = Expansion.rebuild(tensors, center, ctx.smoothing, ctx.keep)
         again = torch.is_grad_enabled()
         if again or transforms.watched(gradient) or transforms.forward_mode_active():
             with torch.enable_grad():
                 with transforms.outside():
                     marked = Input.apply(x)
-                value = ctx.general(marked.reshape(-1, x.shape[-1]))
+                value = ctx.general(expansion, marked.reshape(center.shape), center=center, zero=True)
             (result,) = torch.autograd.grad(value, x, gradient.reshape(value.shape), create_graph=again)
-            return result, None, None
-        c = ctx.expansion.coefficients
+            return result, None, None, None, None
+        c = expansion.coefficients
         a = torch.bmm(c, gradient.double().reshape(len(c), -1, 1)).mT
-        return ctx.expansion.stein.scaled_gradient(a, ctx.expansion.sigma).reshape(x.shape).to(x.dtype), None, None
+        result = expansion.stein.scaled_gradient(a, expansion.sigma).reshape(x.shape).to(x.dtype)
+        return result, None, None, None, None

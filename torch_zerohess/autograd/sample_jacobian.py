@@ -10,11 +10,12 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.overrides import TorchFunctionMode
 
+from torch_zerohess.evaluation_mode import BATCH_NORMS, mixes_in_evaluation
 from torch_zerohess.linalg.flat import flattened
 from torch_zerohess.linalg.jacobians import Blocks, Jacobian, OuterProducts, Rows
 
 _OF_TRAINING = (
-    *(nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm),
+    *BATCH_NORMS,
     *(nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout, nn.RReLU),
 )
 """Modules that in training mode mix samples or draw random numbers."""
@@ -71,12 +72,9 @@ class SampleJacobian:
         A weight whose only use is one product with a vector per sample, as in `torch.nn.Linear`, needs no row of J.
         Where torch's `vmap` does not know an operation of the network, as of GRU, there are B n backward passes.
         """
+        if (mixing := mixes_in_evaluation(self._network)) is not None:
+            raise ValueError(f"network has {mixing}, too: it has no Jacobian per sample")
         for name, one in self._network.named_modules():
-            if isinstance(one, _OF_TRAINING) and getattr(one, "running_mean", 0) is None:
-                raise ValueError(
-                    f"network has a {type(one).__name__} without running statistics ({name!r}), which mixes samples in "
-                    "evaluation mode, too: it has no Jacobian per sample"
-                )
             dropout = isinstance(one, _WITH_DROPOUT) and float(one.dropout) > 0.0
             if one.training and (dropout or (isinstance(one, _OF_TRAINING) and getattr(one, "p", 1.0) > 0.0)):
                 kind = type(one).__name__ + " with dropout" * dropout

@@ -15,6 +15,7 @@ from torch.nn.parameter import is_lazy
 
 from torch_zerohess.estimation.head import apply_head
 from torch_zerohess.estimation.outer import Outer
+from torch_zerohess.evaluation_mode import evaluation_mode
 from torch_zerohess.heads import SquaredError
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
@@ -32,8 +33,8 @@ _ROUNDING, _DEVIATION = 16.0, 0.01
 
 _PLAIN = (torch.jit.ScriptModule, nn.DataParallel)
 """Modules whose parameters cannot be exchanged for a call."""
-_exchanged = threading.RLock()
-"""Held while a module has other parameters."""
+_changed = threading.RLock()
+"""Held while a module has other parameters or another mode."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ class Prediction:
     def _outputs(self, z: Tensor) -> Tensor:
         """Return the predictions [B, E, *out] at points z [B, E, n]."""
         with without_autocast(z.device):
-            outputs: Tensor = _as_constant(self._surrogate, z.flatten(0, 1))
+            outputs: Tensor = as_constant(self._surrogate, z.flatten(0, 1))
         return self._checked(outputs, z.shape[:2].numel()).unflatten(0, z.shape[:2])
 
     def _checked(self, outputs: Tensor, count: int) -> Tensor:
@@ -197,15 +198,20 @@ def _negligible(values: Tensor, dtype: torch.dtype) -> Tensor:
     return signs * size[:, None]
 
 
-def _as_constant(surrogate: Any, z: Tensor) -> Tensor:
-    """Call a surrogate, a module without a graph to its parameters: they are constants of the estimate."""
+def as_constant(surrogate: Any, z: Tensor) -> Tensor:
+    """Call a surrogate, a module in evaluation mode and without a graph to its parameters.
+
+    They are constants of the estimate, and what is predicted for a point may not depend on the other points.
+    """
     try:
-        if isinstance(surrogate, nn.Module) and not isinstance(surrogate, _PLAIN):
-            named = dict(surrogate.named_parameters())
-            if any(one.requires_grad for one in named.values()) and not any(map(is_lazy, named.values())):
-                with _exchanged:
+        if not isinstance(surrogate, nn.Module):
+            return surrogate(z)
+        with _changed, evaluation_mode(surrogate):
+            if not isinstance(surrogate, _PLAIN):
+                named = dict(surrogate.named_parameters())
+                if any(one.requires_grad for one in named.values()) and not any(map(is_lazy, named.values())):
                     return functional_call(surrogate, {name: one.detach() for name, one in named.items()}, (z,))
-        return surrogate(z)
+            return surrogate(z)
     except RuntimeError as error:
         if "data pointer" in str(error):  # NumPy got a tensor of a transform
             raise RuntimeError("the surrogate of the memory is not made of torch: torch.func cannot map it") from error

@@ -98,14 +98,14 @@ class BlackBoxCall:
         if self.joint:
             return (self._jointly(_copied(points.transpose(0, 1)), aux),) * 2
         flat = points.flatten(0, 1) if spare else _copied(points.flatten(0, 1))
-        if self.head is None:
+        if self.outer.head is None:
             values = self(flat, [one.repeat_interleave(E, 0) for one in aux])
             values = values.reshape(B, E, *values.shape[1:])
             self._lost(flat)
             return values, values
         outputs = self(flat, []).unflatten(0, (B, E))
         before = times_changed(outputs)
-        values, lost = apply_head(self.head, outputs, aux), self._lost(flat)
+        values, lost = apply_head(self.outer.head, outputs, aux), self._lost(flat)
         if times_changed(outputs) != before:
             raise ValueError("head must not change the outputs of the black box, which are kept: use a copy of them")
         if lost:  # a head may make a number of NaN

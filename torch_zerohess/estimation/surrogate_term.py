@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.control import Control, Prediction
+from torch_zerohess.estimation.control import Control, Prediction, as_constant
 from torch_zerohess.estimation.stein import Quantity
 
 _SOBOL = 64
@@ -250,7 +250,7 @@ def jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
     """
     with torch.inference_mode(False), torch.enable_grad():
         at = z.clone().requires_grad_()
-        outputs = surrogate(at).reshape(len(z), -1)
+        outputs = as_constant(surrogate, at).reshape(len(z), -1)
         if bool((outputs == outputs[:1]).all()):
             return None
         if not outputs.requires_grad:

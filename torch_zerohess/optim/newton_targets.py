@@ -13,6 +13,8 @@ _DENSE = 16
 """Outputs up to which the Hessian of every element is formed and solved."""
 _TOLERANCE = 1e-2
 """Residual of conjugate gradients, relative to the gradient."""
+_COUPLED, _ROUNDING = 1e-3, 32.0
+"""Relative error of a product of Hessians at which losses depend on other elements: at least, and in roundings of y."""
 _PATIENCE = 100
 """Calls between two preconditioners at least."""
 
@@ -57,6 +59,8 @@ class NewtonTargets:
         """[B], of the last call."""
         self._factor: Tensor | None = None
         self._age = 0
+        self._checked = False
+        """Whether losses of more outputs are each of their own element, since the preconditioner was made."""
 
     def __repr__(self) -> str:
         names = ("relative_damping", "iterations", "output_radius")
@@ -66,7 +70,8 @@ class NewtonTargets:
         """Return the targets [B, n], without a graph.
 
         Raises TypeError for y that is no tensor, and RuntimeError in inference mode. Raises ValueError for y that is
-        not [B, n], for losses that are not [B] or have no graph, and for a gradient or curvature that is not finite.
+        not [B, n], for losses that are not [B], have no graph or depend on other elements, and for a gradient or
+        curvature that is not finite.
 
         Args:
             losses: outputs [B, n] -> losses [B], twice differentiable, each of its own element.
@@ -107,16 +112,18 @@ class NewtonTargets:
 
         step = self._dense(product, gradient) if y.shape[1] <= _DENSE else self._iterate(product, gradient)
         _check(step)
-        length = step.norm(dim=1, keepdim=True)
-        return y.detach() - step * (
-            self.output_radius / length.clamp_min(self.output_radius) if self.output_radius < math.inf else 1.0
-        )
+        if self.output_radius < math.inf:
+            length = step.double().norm(dim=1, keepdim=True)
+            step = step * (self.output_radius / length.clamp_min(self.output_radius)).to(step.dtype)
+        return y.detach() - step
 
     def _dense(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
         n = gradient.shape[1]
         units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
-        columns = [product(unit.expand_as(gradient)) for unit in units]
-        h = _magnitudes(torch.stack(columns, 2).double())
+        columns = torch.stack([product(unit.expand_as(gradient)) for unit in units], 2)
+        v = _random(gradient)
+        _check_elements(product, v, torch.einsum("bij,bj->bi", columns, v))
+        h = _magnitudes(columns.double())
         shift = self._shift(h.diagonal(dim1=1, dim2=2).abs().mean(1))
         h = h + shift[:, None, None] * torch.eye(n, dtype=h.dtype, device=h.device)
         return torch.linalg.solve(h, gradient.double()).to(gradient.dtype)
@@ -133,6 +140,10 @@ class NewtonTargets:
         _check(size)
         if self._factor is None or self._factor.shape[0] != n:
             self._precondition(product, gradient, size)
+        if not self._checked and len(gradient) > 1:
+            v = _random(gradient)
+            _check_elements(product, v, product(v))
+            self._checked = True
         step, converged = self._solve(product, gradient, size)
         self._age += 1
         if not converged and self._age > _PATIENCE:
@@ -152,7 +163,7 @@ class NewtonTargets:
         h = _magnitudes(torch.cat(columns).double())
         shift = self._shift(h.diagonal().abs().mean())
         self._factor = torch.linalg.cholesky(h + shift * torch.eye(n, dtype=h.dtype, device=h.device))
-        self._age = 0
+        self._age, self._checked = 0, False
 
     def _solve(self, product: Callable[[Tensor], Tensor], gradient: Tensor, size: Tensor) -> tuple[Tensor, bool]:
         """Solve (H + relative_damping h I) s = g for all elements.
@@ -161,35 +172,57 @@ class NewtonTargets:
         """
         factor, shift, unit = self._factor, self._shift(size), torch.where(size > 0, size, 1.0)
         assert factor is not None
+        shift, unit, g = shift.double(), unit.double(), gradient.double()  # squares neither over- nor underflow
 
         def precondition(r: Tensor) -> Tensor:
-            return torch.cholesky_solve(r.double().mT, factor).mT.to(r.dtype) / unit
+            return torch.cholesky_solve(r.mT, factor).mT / unit
 
-        s, r = torch.zeros_like(gradient), gradient
+        s, r = torch.zeros_like(g), g
         z = precondition(r)
         p, rz = z, (r * z).sum(1, keepdim=True)
-        going = gradient.norm(dim=1, keepdim=True) > 0
+        least = _TOLERANCE * g.norm(dim=1, keepdim=True)
+        going = least > 0
         for iteration in range(self.iterations):
-            hp = product(p) + shift * p
+            hp = product(p.to(gradient.dtype)).double() + shift * p
             bend = (p * hp).sum(1, keepdim=True)
             if not iteration:
                 s = torch.where(going & (bend <= 0), p, s)  # the gradient, in the metric of the preconditioner
             going = going & (bend > 0)
             length = torch.where(going, rz / bend.clamp_min(torch.finfo(bend.dtype).tiny), 0.0)
             s, r = s + length * p, r - length * hp
-            going = going & (r.norm(dim=1, keepdim=True) > _TOLERANCE * gradient.norm(dim=1, keepdim=True))
+            going = going & (r.norm(dim=1, keepdim=True) > least)
             if not bool(going.any()):
-                return s, True
+                return s.to(gradient.dtype), True
             z = precondition(r)
             before, rz = rz, (r * z).sum(1, keepdim=True)
             p = z + torch.where(before == 0, 0.0, rz / before) * p  # an element that has ended may have nothing left
-        return s, False
+        return s.to(gradient.dtype), False
 
 
 def _magnitudes(h: Tensor) -> Tensor:
     """Return Hessians [..., n, n], symmetric and with the magnitudes of their eigenvalues."""
     _check(h)
     return magnitudes(0.5 * (h + h.mT))
+
+
+def _random(like: Tensor) -> Tensor:
+    return torch.rand(like.shape, generator=torch.Generator().manual_seed(0), device="cpu").to(like)
+
+
+def _check_elements(product: Callable[[Tensor], Tensor], v: Tensor, image: Tensor) -> None:
+    """Raise ValueError if a loss depends on another element; image: the product of the Hessians with v, [B, n].
+
+    The product with c_b v_b is then not c_b times the image of element b, with another c_b for every element.
+    """
+    if len(v) == 1:
+        return
+    c = 0.5 + torch.rand(len(v), 1, generator=torch.Generator().manual_seed(1), device="cpu").to(v)
+    error = (product(c * v) - c * image).double().norm()
+    if float(error) > max(_COUPLED, _ROUNDING * torch.finfo(v.dtype).eps) * float(image.double().norm()):
+        raise ValueError(
+            "losses(y) must be each of its own element of the batch, but one depends on the outputs of another: leave "
+            "out what couples them, such as a mean over the batch"
+        )
 
 
 def _check(x: Tensor) -> None:

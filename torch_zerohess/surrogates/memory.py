@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.arguments import check_state, checked_integer
+from torch_zerohess.evaluation_mode import mixes_in_evaluation
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.coefficient import Coefficient
@@ -45,8 +46,9 @@ class Memory:
             Gaussian process or an affine map, of the coordinates of large outputs, chosen by held-out evaluations. An
             affine map of hundreds of parameters is sparse where its outputs depend on few of them each. The layer gives
             the parameters of a module no gradient. Do not call the module in another thread during a call of the layer.
-        capacity: evaluations that are kept, at least 8. Beyond it, of points that are close to each other the older are dropped.
-            Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
+            It calls a module in evaluation mode, whatever its mode is, and leaves mode and buffers as they are.
+        capacity: evaluations that are kept, at least 8. Beyond it, of points that are close to each other the older are
+            dropped. Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
             None: all of them. 0: none; the estimate is then the first term alone, and biased towards g.
             Under `vmap` each element is a batch of its own: all of them get new evaluations, unless there are none.
@@ -84,6 +86,8 @@ class Memory:
             raise TypeError(f"surrogate must have fit(points, outputs) and __call__(z), got {surrogate!r}")
         if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):
             raise TypeError(f"surrogate must have fit(points, outputs), got {type(surrogate).__name__} without it")
+        if isinstance(surrogate, nn.Module) and (mixing := mixes_in_evaluation(surrogate)) is not None:
+            raise ValueError(f"surrogate has {mixing}, too: its output at a point would depend on the other points")
         self.surrogate: Any = AutomaticSurrogate(capacity=capacity) if surrogate is None else surrogate
         if checked_integer("order", order) not in (1, 2):
             raise ValueError(f"order must be 1 or 2, got {order}")

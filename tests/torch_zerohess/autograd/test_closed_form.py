@@ -1,12 +1,16 @@
 """The closed form of plain eager mode against the general graph, which transforms and higher derivatives use."""
 
+import gc
+
 import pytest
 import torch
 from torch.autograd import forward_ad
+from torch.utils.weak import TensorWeakRef
 
 from torch_zerohess import BlackBox, Memory, Smoothing
 from torch_zerohess.autograd import blackbox
 from torch_zerohess.autograd.closed_form import ClosedForm
+from torch_zerohess.estimation import perturbations
 from torch_zerohess.heads import LocalEntropy
 
 
@@ -79,3 +83,55 @@ def test_a_graph_that_was_freed_says_so() -> None:
     y.backward()
     with pytest.raises(RuntimeError, match="second time"):
         y.backward()
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+@pytest.mark.parametrize("stored", [True, False])
+def test_a_loss_that_is_kept_keeps_no_evaluations_after_backward(settings, stored, monkeypatch) -> None:
+    held, expand = [], blackbox.opaque.expand
+
+    def noted(*given):
+        expansion = expand(*given)
+        held.extend(TensorWeakRef(one) for one in (expansion.coefficients, *expansion.stein.tensors()))
+        return expansion
+
+    monkeypatch.setattr(blackbox.opaque, "expand", noted)
+    if not stored:
+        monkeypatch.setattr(perturbations, "STORED", 0)
+    layer = BlackBox(image, Smoothing(sigma=0.3, samples=16, seed=3, **settings))
+    x = torch.tensor([[0.3, -0.2], [1.0, 0.5]], dtype=torch.float64, requires_grad=True)
+    loss = layer(x).sum()
+    assert held[0]() is not None
+    loss.backward()
+    gc.collect()
+    assert all(one() is None for one in held)
+    assert loss.grad_fn is not None
+
+
+def test_samples_that_are_drawn_again_have_the_same_derivatives(monkeypatch) -> None:
+    layer = BlackBox(image, Smoothing(sigma=0.3, samples=16, seed=3, sampler="random"))
+    found = []
+    for most in (perturbations.STORED, 0):
+        monkeypatch.setattr(perturbations, "STORED", most)
+        x = torch.tensor([[0.3, -0.2], [1.0, 0.5]], requires_grad=True)
+        (slope,) = torch.autograd.grad(layer(x).square().sum(), x, create_graph=True)
+        found.append((slope.detach(), *torch.autograd.grad(slope.square().sum(), x)))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_saved_tensors_of_the_layer_can_be_moved_elsewhere() -> None:
+    layer, sizes = BlackBox(image, Smoothing(sigma=0.3, samples=16, seed=3)), []
+
+    def pack(one: torch.Tensor) -> torch.Tensor:
+        sizes.append(one.numel())
+        return one.clone()
+
+    found = []
+    for hook in (pack, lambda one: one):
+        x = torch.tensor([[0.3, -0.2], [1.0, 0.5]], requires_grad=True)
+        with torch.autograd.graph.saved_tensors_hooks(hook, lambda one: one):
+            layer(x).sum().backward()
+        found.append(x.grad)
+    assert torch.equal(*found)
+    assert max(sizes) >= 2 * 16 * 3  # the coefficients [B, K, P] are among them

@@ -1,5 +1,6 @@
 """The local entropy of a layer: its closed form, and the plateau that it leaves."""
 
+import functools
 import math
 
 import pytest
@@ -100,3 +101,14 @@ def test_a_layer_may_be_compiled_before_its_first_call() -> None:
     call = torch.compile(compiled, fullgraph=True, backend="aot_eager")
     slopes = [torch.autograd.grad(box(x).sum(), x)[0] for box in (call, eager)]
     torch.testing.assert_close(*slopes)
+
+
+def test_a_local_entropy_inside_of_another_function_is_refused() -> None:
+    inner = zh.heads.LocalEntropy(square)
+    x = torch.ones(2, 1, requires_grad=True)
+    for head in (lambda y: inner(y), functools.partial(inner)):
+        layer = zh.BlackBox(identity, zh.Smoothing(sigma=0.5, samples=8), head=head)
+        with pytest.raises(TypeError, match="LocalEntropy must be the head of a BlackBox itself"):
+            layer(x)
+    with pytest.raises(TypeError, match="head must give losses, not be a LocalEntropy itself"):
+        zh.heads.LocalEntropy(inner)

@@ -647,3 +647,32 @@ def test_a_surrogate_that_predicts_no_numbers_is_left_out() -> None:
         plain(other).sum().backward()
         assert torch.equal(leaf.grad, other.grad)
     assert memory.coefficient == 0.0
+
+
+@pytest.mark.parametrize("n", [2, 10])
+@pytest.mark.parametrize("inner", [nn.BatchNorm1d(8), nn.Dropout(0.5), nn.RReLU()], ids=lambda one: type(one).__name__)
+def test_a_module_in_training_mode_is_called_in_evaluation_mode(n: int, inner: nn.Module) -> None:
+    """What it predicts for a point would depend on the other points, or on chance."""
+    torch.manual_seed(0)
+    net = nn.Sequential(nn.Linear(n, 8), copy.deepcopy(inner), nn.Linear(8, 1)).double().train()
+    before = copy.deepcopy(net.state_dict())
+    x = torch.linspace(-1.0, 1.0, 4 * n, dtype=torch.float64).view(4, n).requires_grad_()
+    found = []
+    for mode in (True, False):
+        memory = zh.Memory(copy.deepcopy(net).train(mode))
+        box = zh.BlackBox(copy.deepcopy(net).eval(), zh.Smoothing(sigma=SIGMA, samples=8, seed=0), memory=memory)
+        for _ in range(4):
+            (slope,) = torch.autograd.grad(box(x).square().sum(), x)
+        memory.pathwise = None
+        found += [slope, torch.func.grad(lambda z, box=box: box(z).square().sum())(x.detach())]
+        assert memory.coefficient > 0.0
+        assert all(one.training is mode for one in memory.surrogate.modules())
+        assert all(torch.equal(one, before[name]) for name, one in memory.surrogate.state_dict().items())
+    assert torch.equal(found[0], found[2])
+    assert torch.equal(found[1], found[3])
+
+
+def test_a_module_that_mixes_points_in_evaluation_mode_is_refused() -> None:
+    net = nn.Sequential(nn.Linear(2, 3), nn.BatchNorm1d(3, track_running_stats=False))
+    with pytest.raises(ValueError, match=r"surrogate has a BatchNorm1d without running statistics \('1'\)"):
+        zh.Memory(net)

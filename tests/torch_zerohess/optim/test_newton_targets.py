@@ -149,3 +149,34 @@ def test_an_element_on_a_plateau_stays_while_others_move() -> None:
     assert float(targets[0].abs().max()) == 0.0
     assert bool(torch.isfinite(targets).all())
     assert float(losses(targets)[1:].max()) < 0.1 * float(losses(y)[1:].min())
+
+
+COUPLED = {
+    "all": lambda y: (y - y.mean(0)).square().sum(1),
+    "two": lambda y: y.square().sum(1) + torch.stack([y[2, 0] * y[0, 0], *(0.0 * y[1:, 0])]),
+}
+
+
+@pytest.mark.parametrize("coupled", COUPLED.values(), ids=COUPLED.keys())
+@pytest.mark.parametrize("n", [3, 20])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_losses_that_couple_elements_are_refused(coupled, n: int, dtype: torch.dtype) -> None:
+    targets, y = NewtonTargets(), torch.randn(5, n, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"losses\(y\) must be each of its own element"):
+            targets(coupled, y)
+    assert targets(lambda y: y.sum(1).square(), y).shape == y.shape  # a curvature of rank 1
+
+
+@pytest.mark.parametrize("n", [3, 20])
+@pytest.mark.parametrize("scale", [1e-30, 1e25])
+def test_the_scale_of_the_losses_does_not_matter(n: int, scale: float) -> None:
+    y = torch.linspace(-1.0, 1.0, 2 * n).view(2, n)
+    found = NewtonTargets(relative_damping=1e-6)(lambda y: scale * (y - 3.0).square().sum(1), y)
+    torch.testing.assert_close(found, torch.full_like(y, 3.0), rtol=1e-4, atol=0.0)
+
+
+@pytest.mark.parametrize("n", [3, 20])
+def test_a_step_of_any_length_is_shortened_to_the_radius(n: int) -> None:
+    found = NewtonTargets(output_radius=2.0)(lambda y: (y - 1e25).square().sum(1), torch.zeros(2, n))
+    torch.testing.assert_close(found.norm(dim=1), torch.full((2,), 2.0))

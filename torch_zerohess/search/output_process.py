@@ -1,9 +1,9 @@
 """A Gaussian process of the output that Gauss-Newton finishes: `GaussianProcessSearch` where there is a loss.
 
 Gauss-Newton interpolates outputs next to the minimum (`OutputGaussNewton`). If its steps do not keep their promise, as
-where outputs jump, the process goes on alone. Gauss-Newton begins again once it promises more than the process has
-achieved in the meantime. On a plateau with ripples each step of the process finds something a little better. Where
-nothing much better comes, the process looks where it knows least.
+where outputs jump, the process goes on alone. Gauss-Newton begins again once its first step promises more than an
+evaluation of the process has gained in the meantime. On a plateau with ripples each step of the process finds something
+a little better. Where nothing much better comes, the process looks where it knows least.
 """
 
 import math
@@ -98,7 +98,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
                 known = replace(known, finished=known.best.point)
                 known, points = self._begun_newton(known, _WORTH * abs(now), generator)
             elif self.tells_noise(known) and self._is_due(known):
-                known, points = self._begun_newton(known, max(known.alone_from - now, 0.0), generator)
+                known, points = self._begun_newton(known, max(known.alone_from - now, 0.0) / known.alone, generator)
             if known.finishing:
                 return known, points
         return self._went_on(known), evaluated.points[:0]

@@ -69,7 +69,7 @@ def test_it_does_not_begin_where_little_is_left_to_gain():
 
 
 def test_gauss_newton_finishes_where_the_loss_has_a_constant_that_is_not_left_out():
-    """A swing of 40 numbers and residuals of 0.1. The process alone gains more at once than is left in the end.
+    """A swing of 40 numbers and residuals of 0.3. The process alone gains more at once than is left in the end.
 
     Gauss-Newton begins where its first step promises more than an evaluation of the process has gained.
     """
@@ -79,9 +79,9 @@ def test_gauss_newton_finishes_where_the_loss_has_a_constant_that_is_not_left_ou
         a, b, c, d = (one[:, None] for one in x.unbind(1))
         return a * torch.exp(-b * times) * torch.cos(c * times + d)
 
-    target = wide(vector(1.0, 0.3, 2.0, 0.5)[None])[0] + 0.1 * torch.cos(7.0 * torch.arange(40, dtype=torch.float64))
-    least, total = 0.19596380491618448, 0  # by Gauss-Newton with the Jacobian of autograd
-    for seed in (1, 10):
+    target = wide(vector(1.0, 0.3, 2.0, 0.5)[None])[0] + 0.3 * torch.cos(7.0 * torch.arange(40, dtype=torch.float64))
+    least, total = 1.7588307806487053, 0  # by Gauss-Newton with the Jacobian of autograd
+    for seed in range(7, 11):
         found = GaussianProcessSearch(
             vector(0.5, 0.6, 1.6, 0.0),
             sigma=0.2,
@@ -93,7 +93,7 @@ def test_gauss_newton_finishes_where_the_loss_has_a_constant_that_is_not_left_ou
         while found.value > least * (1.0 + 1e-6) and found.evaluations < 200:
             found.tell(wide(found.ask()))
         total += found.evaluations
-    assert total < 160
+    assert total < 290
 
 
 def steps(x):

@@ -77,6 +77,31 @@ def test_a_loss_may_have_kinks(name, bounds, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_at_a_kink_the_step_is_the_best_one_in_the_region(seed, monkeypatch):
+    """Linear outputs: the first step is as low as the lowest point on a circle around the best of the first points.
+
+    The minimum is 10 regions away, in another direction.
+    """
+
+    def outputs(x):
+        return torch.stack([10.0 * x[:, 0] + x[:, 1] - 5.0, x[:, 1] - 10.0], 1)
+
+    def ratio():
+        search = Descent(zeros(2), sigma=1.0, loss=lambda y: y.abs().sum(), seed=seed)
+        search.tell(outputs(search.ask()))
+        center, before = search.x, search.value
+        angle = torch.linspace(0.0, 2.0 * torch.pi, 3601, dtype=torch.float64)
+        circle = center + torch.stack([angle.cos(), angle.sin()], 1)
+        least = float(outputs(circle).abs().sum(1).min())
+        search.tell(outputs(search.ask()))
+        return (before - search.value) / (before - least)
+
+    assert ratio() > 0.99
+    monkeypatch.setattr(output_gauss_newton, "_STEEP", 0.0)
+    assert ratio() < 0.95
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_rounded_outputs_do_not_keep_it_from_arriving(seed, monkeypatch):
     """Residuals that are not zero, rounded to 1e-8 as by an adaptive solver: short steps promise what is not there."""
 

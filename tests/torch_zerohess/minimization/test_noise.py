@@ -152,6 +152,8 @@ def test_a_batch_of_all_evaluations_leaves_enough_to_measure_noise(batch, bounds
     first = torch.cat(f.points[:2])
     assert int((first == 0.0).all(1).sum()) == REPEATED
     assert fit.evaluations == 64 > len(first) + reserved(64)
+    if bounds is not None:  # a step: the process in noise has the same first points, and is told of them
+        assert bool((f.points[2][0] != 0.0).any())
     assert 0.1 < fit.noise < 0.9
     assert fit.value_error > 0.1 / math.sqrt(reserved(64))
     g = Counted(bowl)

@@ -14,8 +14,8 @@ _BISECTIONS = 30
 def kinked_minimum(function: Callable[[Tensor], tuple[float, Tensor]], start: Tensor, iterations: int) -> Tensor:
     """Return the lowest point [n] that BFGS finds from `start` [n].
 
-    A line search by bisection ends at a kink with a slope of the other side, from which BFGS learns the kink as a large
-    curvature. It needs no convexity; there is no proof of convergence, but it is seen to converge linearly.
+    At a kink the line search, a bisection, ends with a slope of the other side. So BFGS learns the kink as a large
+    curvature. The function need not be convex. Convergence is not proven.
 
     Args:
         function: maps [n] to its value and a slope [n], float64.

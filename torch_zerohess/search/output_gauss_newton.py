@@ -161,9 +161,9 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         return replace(known, size=size, gradient=gradient / size, hessian=hessian, curvature=curvature), len(nearest)
 
     def _step(self, known: OutputProgress) -> tuple[Tensor, float]:
-        """Return the step to the minimum of the loss of the linear outputs, where the quadratic predicts another loss.
+        """Return the step to the minimum of the quadratic. If that is wrong, minimise the loss of the linear outputs.
 
-        It does at the kinks of a loss, and where its curvature changes within the region.
+        The quadratic is wrong at a kink of the loss, and where the curvature of the loss changes within the region.
         """
         s, promised = super()._step(known)
         curvature = known.size * known.curvature if known.curved else torch.zeros_like(known.curvature)
@@ -177,7 +177,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
 
         def penalised(s: Tensor) -> tuple[float, Tensor]:
             value, slope = self._of_linear(known, curvature, s)
-            length, beyond = float(s.norm()), (s - s.clamp(lower, upper))
+            length, beyond = float(s.norm()), s - s.clamp(lower, upper)
             value += steep * (max(length - radius, 0.0) + float(beyond.abs().sum()))
             slope = slope + steep * beyond.sign()
             return value, slope + steep * s / length if length > radius else slope

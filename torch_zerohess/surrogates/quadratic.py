@@ -194,9 +194,10 @@ def fit_outputs(
     own = inverse.diagonal()[1:] if spare > 0 else torch.full_like(gradient, math.inf)
 
     def error(directions: Tensor) -> Tensor:
-        """Standard errors [r] of J times directions [*, m]. What is missed is curved: it does not average out.
+        """Return the standard errors [r] of J times directions [*, m].
 
-        It may be the same for many outputs, or cancel between them: the larger estimate counts.
+        What the linear fit misses is curved, so it does not average out over the evaluations. Errors of the outputs may
+        add up, or be independent of each other: the larger estimate counts.
         """
         coherent = weights @ (missed @ directions.mT).square()
         single = (weights @ missed.square()) @ directions.square().mT

@@ -59,6 +59,7 @@ COMMANDS = {
     ),
     "noise": Command("experiments.studies.noise:noise", "our search and others on noisy functions of BBOB", long=True),
     "minima": Command("experiments.studies.minima:minima", "what is said at the end of noisy searches", long=True),
+    "endings": Command("experiments.studies.endings:endings", "when searches of convex functions end", long=True),
     "batches": Command("experiments.studies.batches:batches", "several points at once, in worker processes", long=True),
     "recovery": Command("experiments.studies.recovery:recovery", "sparse Jacobians from few samples", long=True),
     "sparse_layers": Command(

@@ -109,9 +109,10 @@ def minimize(
             if it is no such file, if what must be the same differs, or for other `restarts` or `tolerance` where the
             search has come to an end by those in the file. A file that cannot be written later on, or that another
             process writes, too, is a `UserWarning`, once.
-        restarts: how often to go on after the search has arrived at a minimum. If None, until max_evaluations are used
-            up, or three rounds in a row have arrived at the same point, or at points with the same loss. A later round
-            counts as arrived as soon as the quadratic at a known minimum predicts its losses.
+        restarts: how often to go on after the search has arrived at a minimum. 0 ends it there: give it for a function
+            that has only one minimum. If None, until max_evaluations are used up, or three rounds in a row have arrived
+            at the same point, or at points with the same loss. A later round counts as arrived as soon as the quadratic
+            at a known minimum predicts its losses.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
             evaluations, and six more if the two differ. For that, a `batch` that takes all evaluations is made shorter;
             the message says so where they are too few to measure it. Where losses are counts, which may be equal by

@@ -32,12 +32,11 @@ class AutomaticSurrogate:
 
     Args:
         rank: coordinates of an output, at most.
-        capacity: points that are used, the latest ones.
+        capacity: points that are used, the latest ones; at least 2.
     """
 
     def __init__(self, *, rank: int = 128, capacity: int = 4000) -> None:
-        rank = checked_integer("rank", rank, 1)
-        self.rank, self.capacity = rank, capacity
+        self.rank, self.capacity = checked_integer("rank", rank, 1), checked_integer("capacity", capacity, 2)
         self.space: LowRank | None = None
         """The coordinates of the latest fit; None where outputs have few elements."""
         self.model: Surrogate | None = None

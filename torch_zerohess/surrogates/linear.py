@@ -17,7 +17,7 @@ class LinearSurrogate:
     directions that the points do not span.
 
     Args:
-        capacity: points that are used, the latest ones.
+        capacity: points that are used, the latest ones; at least 2.
 
     Example:
         >>> surrogate = LinearSurrogate()
@@ -27,8 +27,7 @@ class LinearSurrogate:
     """
 
     def __init__(self, *, capacity: int = 4000) -> None:
-        capacity = checked_integer("capacity", capacity, 2)
-        self.capacity = capacity
+        self.capacity = checked_integer("capacity", capacity, 2)
         self._middle = self._mean = torch.empty(0, device="cpu")
         self._slope: Tensor | None = None
         self._squares: Tensor | None = None  # of the slope, summed over the elements of the output [n]

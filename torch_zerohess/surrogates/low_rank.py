@@ -71,12 +71,12 @@ class LowRankSurrogate:
     Args:
         model: surrogate of the coordinates [r].
         rank: r at most.
-        capacity: points that are used, the latest ones.
+        capacity: points that are used, the latest ones; at least 2.
     """
 
     def __init__(self, model: Surrogate, *, rank: int = 128, capacity: int = 4000) -> None:
-        rank = checked_integer("rank", rank, 1)
-        self.model, self.rank, self.capacity = model, rank, capacity
+        self.model, self.rank = model, checked_integer("rank", rank, 1)
+        self.capacity = checked_integer("capacity", capacity, 2)
         self._space: LowRank | None = None
 
     @property

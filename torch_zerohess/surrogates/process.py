@@ -22,7 +22,7 @@ class ProcessSurrogate:
     each.
 
     Args:
-        capacity: points that are used, the latest ones.
+        capacity: points that are used, the latest ones; at least 2.
 
     Example:
         >>> points = torch.linspace(0, 6, 20)[:, None]
@@ -33,8 +33,7 @@ class ProcessSurrogate:
     """
 
     def __init__(self, *, capacity: int = 4000) -> None:
-        capacity = checked_integer("capacity", capacity, 2)
-        self.capacity = capacity
+        self.capacity = checked_integer("capacity", capacity, 2)
         self._process: InducedProcess | None = None
         self._lengths = torch.empty(0, device="cpu")
         self._shape = torch.Size()

@@ -22,7 +22,7 @@ class SparseSurrogate:
         keep: parameters that an element depends on, at most.
         rate: of false discoveries among them.
         grid: rows and columns (and channels) of the parameters, if they lie beside each other.
-        capacity: points that are used, the latest ones.
+        capacity: points that are used, the latest ones; at least 2.
 
     Example:
         >>> points = torch.randn(40, 100, generator=torch.Generator().manual_seed(0))

@@ -1,5 +1,7 @@
 """What all surrogates have in common."""
 
+import functools
+
 import pytest
 import torch
 
@@ -23,3 +25,20 @@ def test_a_surrogate_that_was_not_fitted_says_so(surrogate):
     if hasattr(surrogate, "variance"):
         with pytest.raises(RuntimeError, match="fit the surrogate to evaluations before it is used"):
             surrogate.variance(torch.ones(3))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        surrogates.AutomaticSurrogate,
+        surrogates.LinearSurrogate,
+        functools.partial(surrogates.LowRankSurrogate, surrogates.LinearSurrogate()),
+        surrogates.ProcessSurrogate,
+        surrogates.SparseSurrogate,
+    ],
+)
+def test_a_capacity_is_at_least_two(make):
+    """With a capacity of 0, `points[-0:]` would be all of them."""
+    for capacity in (1, 0, -5):
+        with pytest.raises(ValueError, match=f"capacity must be at least 2, got {capacity}"):
+            make(capacity=capacity)

@@ -43,8 +43,7 @@ class FirstBatch:
         every = torch.cat([every, start.repeat(count, 1)])
         values = record.values(every)
         losses = self.search.losses(values)
-        at_start = torch.cat([losses[:1], losses[len(points) :]])
-        noise = deviation(at_start[torch.isfinite(at_start)])
+        noise = deviation(torch.cat([losses[:1], losses[len(points) :]]))
         search = self.make(noise)
         if torch.equal(search.ask(max(self.batch - 1, 1), limit=len(points)), points):
             search.tell(values[: len(points)])

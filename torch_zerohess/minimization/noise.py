@@ -30,8 +30,9 @@ def are_counts(losses: Tensor) -> bool:
 
 
 def deviation(losses: Tensor) -> float:
-    """Standard deviation of losses [K] at one point."""
-    return float(losses.std())
+    """Standard deviation of the finite losses [K] at one point; 0 if there is only one."""
+    finite = losses[torch.isfinite(losses)]
+    return float(finite.std()) if len(finite) > 1 else 0.0
 
 
 def noise_again(evaluate: Callable[[int], Tensor], before: Tensor, most: int) -> float | None:
@@ -48,8 +49,7 @@ def noise_again(evaluate: Callable[[int], Tensor], before: Tensor, most: int) ->
     if not len(again) or not differs(again, before[-1]):
         return None
     further = min(REPEATED - _AGAIN, most - count)
-    every = torch.cat([before, again, evaluate(further) if further else again[:0]])
-    return deviation(every[torch.isfinite(every)])
+    return deviation(torch.cat([before, again, evaluate(further) if further else again[:0]]))
 
 
 def opening(batch: int, least: int, most: int) -> int:

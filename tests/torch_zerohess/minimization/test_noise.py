@@ -1,5 +1,6 @@
 """Noise that nobody declared: it is noticed, and the value that is returned is the mean, not the luckiest draw."""
 
+import itertools
 import math
 
 import pytest
@@ -68,6 +69,21 @@ def test_the_value_is_unbiased_and_its_error_true():
         scores.append((fit.value - float(bowl(fit.x[None])[0])) / fit.value_error)
         assert 0.1 < fit.noise < 0.7
     assert abs(float(vector(*scores).mean())) < 5 / math.sqrt(6)
+
+
+def test_one_finite_loss_at_the_start_tells_no_noise():
+    """The output at x0 differs from call to call, and its loss is finite at the first call alone."""
+    calls, start = itertools.count(), bowl(zeros(2)[None])[0]
+
+    def counted(z):
+        return torch.stack([bowl(z), vector(*(next(calls) for _ in z))], 1)
+
+    def loss(y):
+        return torch.where((y[0] == start) & (y[1] > 0), math.nan, y[0])
+
+    fit = zh.minimize(counted, zeros(2), sigma=1.0, loss=loss, seed=0, max_evaluations=40)
+    assert fit.noise == 0.0
+    assert fit.value < float(start)
 
 
 def test_a_function_without_noise_has_no_error_and_costs_one_evaluation_more():

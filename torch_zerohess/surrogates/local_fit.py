@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms, symmetric
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, factored, quadratic_terms, symmetric
 
 _SPARE = 5
 """Evaluations beyond the coefficients of a quadratic, at least: the residuals give the standard errors."""
@@ -15,8 +15,6 @@ _MOST = 3
 """Evaluations that are tried at most, over the coefficients."""
 _REACH = 2.0
 """Distance of the farthest evaluation, in units of the width."""
-_RANK = 1e-9
-"""Smallest pivot of the design, relative to the largest, with which the evaluations tell all coefficients."""
 
 
 def quadratic_around(x: Tensor, points: Tensor, values: Tensor) -> tuple[LocalModel, float, float] | None:
@@ -56,11 +54,10 @@ def _least_squares(u: Tensor, values: Tensor) -> tuple[LocalModel, float] | None
     if size == 0.0:
         return None
     design = quadratic_terms(u)
-    q, r = torch.linalg.qr(design)
-    pivots = r.diagonal().abs()
-    if float(pivots.min()) < _RANK * float(pivots.max()):
+    factors = factored(design)
+    if factors is None:
         return None
-    inverse = torch.linalg.solve_triangular(r, torch.eye(len(r), dtype=r.dtype, device=r.device), upper=True)
+    q, inverse = factors
     target = (values - base) / size
     solution = inverse @ (q.mT @ target)
     spare = P - design.shape[1]

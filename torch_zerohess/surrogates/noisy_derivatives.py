@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torch_zerohess.surrogates.gaussian_process import CONSTANT, DEVIATION_DEGREES
 from torch_zerohess.surrogates.inducing import decomposed
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms, symmetric
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, factored, quadratic_terms, symmetric
 
 _LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Lengths of the process, in units of the width."""
@@ -37,8 +37,6 @@ _SHORT = 6.0
 large derivatives."""
 _LARGE = 0.1
 """The prior of a ratio is its power with minus this exponent: a process is small if the values do not tell its size."""
-_RANK = 1e-9
-"""Smallest pivot of the quadratic, relative to the largest, with which the points tell all its coefficients."""
 
 
 class _Kernel(NamedTuple):
@@ -129,8 +127,7 @@ def _model(u: Tensor, values: Tensor, noise: float) -> LocalModel | None:
     mean = weights @ choices.means
     error = (weights @ (choices.variances + (choices.means - mean).square())).sqrt()
     mean, error = largest * (size * mean), largest * (size * error)
-    row, column = torch.triu_indices(n, n, device=u.device)
-    slope, bend = error[1 : n + 1], error[n + 1 :][row == column]
+    slope, bend = error[1 : n + 1], symmetric(error[n + 1 :], n).diagonal()
     value = largest * float(base) + float(mean[0])
     return LocalModel(value, mean[1 : n + 1], symmetric(mean[n + 1 :], n), None, slope, bend)
 
@@ -142,17 +139,14 @@ def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
     quadratic takes its part out of features and values (restricted likelihood). The eigenvectors of what is left serve
     all sizes of the process.
     """
-    terms = quadratic_terms(u)
-    orthonormal, triangle = torch.linalg.qr(terms)
-    pivots = triangle.diagonal().abs()
-    if float(pivots.min()) < _RANK * float(pivots.max()):
+    factors = factored(quadratic_terms(u))
+    if factors is None:
         return None
-    one = torch.eye(len(triangle), dtype=u.dtype, device=u.device)
-    inverse = torch.linalg.solve_triangular(triangle, one, upper=True)
+    orthonormal, inverse = factors
     quadratic = inverse @ (orthonormal.mT @ change)
     rest = change - orthonormal @ (orthonormal.mT @ change)
     known = DEVIATION_DEGREES * noise**2
-    degrees = len(u) - len(triangle) + DEVIATION_DEGREES
+    degrees = len(u) - len(inverse) + DEVIATION_DEGREES
     ratios = u.new_tensor(_RATIOS)[:, None]
     found = []
     for kernel, length in itertools.product(_KERNELS, _LENGTHS):

@@ -25,6 +25,8 @@ _ROUNDING = 1e-15
 """Variation of values, relative to their size, that is rounding: the values are constant."""
 _INTERCEPT = 1e-9
 """Prior precision of the constant term of an output, in evaluations."""
+_RANK = 1e-9
+"""Smallest pivot of the terms of a quadratic, relative to the largest, with which points tell all its coefficients."""
 _JITTER = 1e-13
 """Added to a kernel matrix, in units of its mean diagonal element, so that rounding leaves it definite."""
 
@@ -104,6 +106,16 @@ def quadratic_terms(u: Tensor) -> Tensor:
     row, column = torch.triu_indices(u.shape[1], u.shape[1], device=u.device)
     products = u[:, row] * u[:, column]
     return torch.cat([torch.ones_like(u[:, :1]), u, torch.where(row == column, 0.5 * products, products)], 1)
+
+
+def factored(terms: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return Q [P, q] and R^-1 [q, q] of terms = Q R [P, q]; None if the points do not tell every coefficient."""
+    q, r = torch.linalg.qr(terms)
+    pivots = r.diagonal().abs()
+    if float(pivots.min()) < _RANK * float(pivots.max()):
+        return None
+    one = torch.eye(len(r), dtype=r.dtype, device=r.device)
+    return q, torch.linalg.solve_triangular(r, one, upper=True)
 
 
 def symmetric(upper: Tensor, n: int) -> Tensor:

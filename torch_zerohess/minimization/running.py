@@ -15,7 +15,7 @@ from torch_zerohess.minimization.checkpoint import Checkpoint, check_limits
 from torch_zerohess.minimization.decision import Decision, decide
 from torch_zerohess.minimization.derivatives import quadratic_at
 from torch_zerohess.minimization.doubt import doubt
-from torch_zerohess.minimization.first_batch import FirstBatch
+from torch_zerohess.minimization.first_batch import evaluate_first_batch
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
 from torch_zerohess.minimization.noise import REPEATED, are_counts, noise_again, opening, reserved
 from torch_zerohess.minimization.record import Call, Record
@@ -138,8 +138,9 @@ class Running:
         else:
             measured, points = self.noise is None, points[: len(search.missing)]
         if measured:
-            known = FirstBatch(self.record, search, self._make, self._batch, self._most - self._least)
-            self.noise, self.search, points, losses = known.measured(points)
+            most = self._most - self._least
+            found = evaluate_first_batch(points, self.record, search, self._make, self._batch, most)
+            self.noise, self.search, points, losses = found
             self._noted(points, losses)
             return
         self.noise = self.noise or 0.0

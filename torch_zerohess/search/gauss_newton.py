@@ -109,7 +109,7 @@ class GaussNewton(Method[Q]):
 
     def asked(self, known: Q, generator: torch.Generator) -> tuple[Q, Tensor]:
         """Ask for what the phase says."""
-        return self.step(known) if known.phase == "trial" else self.samples(known, generator)
+        return (known, self.trials(known)) if known.phase == "trial" else self.samples(known, generator)
 
     def sampled(self, known: Q, evaluated: Evaluated) -> Q:
         """Renew the Jacobian by samples, the first of which is the start at the beginning."""
@@ -119,11 +119,11 @@ class GaussNewton(Method[Q]):
             evaluated = evaluated.those(slice(1, None))
         return self.renewed(known, evaluated)
 
-    def step(self, known: Q) -> tuple[Q, Tensor]:
-        """Ask for steps of all lengths."""
+    def trials(self, known: Q) -> Tensor:
+        """Return the ends of steps of all lengths [k, n]."""
         radii = known.center.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
         points = known.center + self.steps(known, radii)
-        return known, points.clamp(self.settings.lower, self.settings.upper)
+        return points.clamp(self.settings.lower, self.settings.upper)
 
     def taken(self, known: Q, evaluated: Evaluated) -> Q:
         """Go to the best of the steps with finite values if it lowers the loss."""

@@ -45,7 +45,7 @@ class LossProgress(FinishedProgress):
     """Whether the latest quadratics have begun beside the best point. Such quadratics confirm no minimum."""
 
     def is_minimum(self, tolerance: float) -> bool:
-        return torch.equal(self.solved, self.best.point) and super().is_minimum(tolerance)
+        return self.is_solved and super().is_minimum(tolerance)
 
 
 class LossProcess(FinishedProcess[LossProgress]):

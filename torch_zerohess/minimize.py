@@ -126,6 +126,8 @@ def minimize(
             measures how well a surrogate of the evaluations predicts, and later ones use the surrogate.
         settings: further ones of `TrustRegion`: tolerance, pool, grid.
 
+    Raises ValueError for an argument out of range, TypeError for one of another type or an unknown name.
+
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. Ctrl-C while the
     last checkpoint is written, or while workers end, returns it, too. An exception of fn, loss or callback passes, with
     the `Minimum` so far as its attribute `minimum`. Ctrl-C and exceptions keep, also in the checkpoint, the points of

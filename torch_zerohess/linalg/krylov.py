@@ -12,6 +12,7 @@ _INVARIANT = 1e-10
 _SHIFTS = (1e-10, 1e8)
 """Range of the shift that shortens a step, in units of the largest curvature."""
 _BISECTIONS = 60
+"""Halvings of the logarithm of that range: a shift is then known to 16 digits."""
 
 
 def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: Tensor, *, iterations: int) -> Tensor:

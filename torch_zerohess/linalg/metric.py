@@ -10,6 +10,7 @@ _LEAST = 1e-9
 _WIDEST = 16.0
 """Bound on logarithms of squared lengths of a metric: axes differ by a factor of e^16 at most."""
 _SMALLEST = 1e-300
+"""Least number of which a logarithm is taken."""
 
 
 def learned(root: Tensor, hessian: Tensor, rate: float, floor: float = 0.0) -> Tensor:

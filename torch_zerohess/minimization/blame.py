@@ -4,6 +4,7 @@ import torch
 
 _NUMERICAL = torch.linalg.LinAlgError  # type: ignore[attr-defined]
 _OWN = tuple(f"torch_zerohess.{folder}." for folder in ("search", "surrogates", "linalg"))
+"""Beginnings of the names of modules with models of a search."""
 
 
 def blamed(error: Exception, caller: str) -> str:

@@ -23,7 +23,7 @@ def evaluate_first_batch(
         search: one that knows nothing, for a loss without noise.
         make: the search for a standard deviation of repeated losses.
         batch: points that are evaluated at once.
-        most: evaluations that there may be.
+        most: evaluations that it may make.
     """
     start = points[:1]
     every = torch.cat([points, start])

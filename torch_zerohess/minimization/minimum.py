@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Status = Literal["target", "solved", "stalled", "budget", "time", "callback", "interrupted", "failed"]
+"""How a search has ended, see `Minimum`."""
 
 
 class Observation(NamedTuple):

@@ -151,7 +151,7 @@ class BlockGaussNewton(AskTell[BlockProgress]):
         tolerance: radius, in units of sigma, at which the search has arrived.
         seed: of the directions; from torch's global generator if None.
 
-    Raises ValueError for settings out of range.
+    Raises ValueError for settings out of range, TypeError for settings of another type.
 
     Example:
         >>> A = torch.randn(200, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -36,8 +36,9 @@ class Descent(AskTell[Any]):
     random point, or in turn from a random point and around the best one with more samples per iteration.
 
     It has the settings of `AskTell`. With an output and with more than 40 parameters, decreases below twice the `noise`
-    do not count. By default the pool keeps three times the evaluations that the quadratic of a loss is fitted to, in
-    noise twice, and of an output max(60, 6 n).
+    do not count. By default the pool keeps max(60, 6 n) evaluations of an output. Of a loss alone it keeps three
+    times as many as the quadratic is fitted to, and at least 200; in noise twice as many; with more than 40 parameters
+    max(500, 6 n).
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
     order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation.

@@ -35,8 +35,10 @@ class GaussianProcessSearch(AskTell[Any]):
     time of a step grows with the third power of their number. More than four parameters are allowed, but random
     candidates cover a box of so many dimensions badly.
 
-    Raises ValueError for settings out of range, or if a bound is missing or infinite. Source: Rasmussen and Williams
-    (2006) for the process; Astudillo and Frazier (2019) for the composite function.
+    Raises ValueError for settings out of range, or if a bound is missing or infinite; TypeError for settings of another
+    type.
+
+    Source: Rasmussen and Williams (2006) for the process; Astudillo and Frazier (2019) for the composite function.
 
     Example:
         >>> target = torch.tensor([0.3, 0.7]).sin()

@@ -41,9 +41,10 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
             evidence, which helps where outputs depend on patches of parameters. None: they lie in no order.
         keep: parameters per output, at most; 16 if None, or all of them if they are fewer.
-        samples: of an iteration at first, at least keep + 2. An iteration that hardly lowers the loss doubles
-            them, once; a good one halves them again.
-        rate: of false discoveries among the parameters that are found in a batch.
+        samples: of an iteration at first, at least 8 and at least keep + 2. An iteration that hardly lowers the loss
+            doubles them, once; a good one halves them again.
+        rate: of false discoveries among the pairs of output and parameter that are found in a round of a fit, see
+            `sparse_jacobian`.
         radius: first length of a step, root mean square over the parameters, in units of sigma. It is at least 1 if
             the first Jacobian predicts 90 % of held-out samples.
         share: distance of the samples, in units of the radius; the first ones have the distance sigma.
@@ -55,7 +56,8 @@ class LocalGaussNewton(AskTell[LocalProgress]):
 
     Outputs [h, w] and [h, w, channels] are images, whose neighbouring pixels share evidence.
 
-    Raises ValueError for settings out of range, and from the first `tell` for outputs of one number.
+    Raises ValueError for settings out of range, TypeError for settings of another type, and ValueError from the first
+    `tell` for outputs of one number.
 
     Example:
         >>> import torch

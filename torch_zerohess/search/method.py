@@ -26,8 +26,9 @@ class Settings:
     start: Tensor
     """[n], float64."""
     lower: Tensor
-    """[n], float64."""
+    """[n], float64; minus infinity where there is no bound."""
     upper: Tensor
+    """[n], float64; infinity where there is no bound."""
     loss: Callable[[Tensor], Tensor] | None
     restarts: int
     tolerance: float

@@ -43,7 +43,7 @@ class AskTell(ABC, Generic[P]):
         pool: evaluations kept; a default by the number of parameters if None.
         seed: of the samples; from torch's global generator if None.
 
-    Raises ValueError for settings out of range.
+    Raises ValueError for settings out of range, TypeError for settings of another type.
     """
 
     def __init__(

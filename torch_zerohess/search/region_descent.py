@@ -206,6 +206,7 @@ class RegionDescent(Method[R]):
         known = replace(known, good=False, rejected=known.rejected + 1)
         u = known.scaled
         distance = u.norm(dim=1)
+        # Where few evaluations are close, the model may be at fault, or the region may be too large: each in turn.
         if int((distance <= _CLOSE).sum()) > self._n or known.rejected % 2 == 0:
             return replace(known, sigma=_SHRINKING * known.sigma), None
         nearest = u[distance.argsort()[: self._fitted]]

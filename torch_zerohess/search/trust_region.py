@@ -50,7 +50,7 @@ class TrustRegion(AskTell[Any]):
         grid: rows and columns in which the parameters lie, for the engine "local": see `LocalGaussNewton`.
         seed: of the samples; from torch's global generator if None.
 
-    Raises ValueError for settings out of range.
+    Raises ValueError for settings out of range, TypeError for settings of another type.
 
     Example:
         >>> import torch

@@ -61,8 +61,8 @@ class Coefficient:
         if len(self.moments) != len(new):
             self.moments = [[0.0, 0.0] for _ in new]
         self.moments = [
-            [_KEPT * old + (1.0 - _KEPT) * one for old, one in zip(kept, moments, strict=True)]
-            for kept, moments in zip(self.moments, new, strict=True)
+            [_KEPT * old + (1.0 - _KEPT) * one for old, one in zip(known, moments, strict=True)]
+            for known, moments in zip(self.moments, new, strict=True)
         ]
 
 

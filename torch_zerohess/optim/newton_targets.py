@@ -13,8 +13,10 @@ _DENSE = 16
 """Outputs up to which the Hessian of every element is formed and solved."""
 _TOLERANCE = 1e-2
 """Residual of conjugate gradients, relative to the gradient."""
-_COUPLED, _ROUNDING = 1e-3, 32.0
-"""Relative error of a product of Hessians at which losses depend on other elements: at least, and in roundings of y."""
+_COUPLED = 1e-3
+"""Relative error of a derivative at which losses depend on other elements."""
+_REPEATED = 8.0
+"""The same in differences between two backward passes, which on a GPU may add in another order."""
 _PATIENCE = 100
 """Calls between two preconditioners at least."""
 
@@ -34,6 +36,9 @@ class NewtonTargets:
     by conjugate gradients on Hessian-vector products, and h is |v^T H v| / n with random signs v (Hutchinson 1989). The
     preconditioner is one matrix: column i is from the Hessian over h of element i modulo B. It is made again when the
     solution takes too many iterations. An affine black box with a quadratic loss takes one.
+
+    Every call checks by two more backward passes, of first and of second order, that no loss depends on the outputs of
+    another element.
 
     Args:
         relative_damping: of the Hessian, in units of h; positive.
@@ -59,8 +64,6 @@ class NewtonTargets:
         """[B], of the last call."""
         self._factor: Tensor | None = None
         self._age = 0
-        self._checked = False
-        """Whether losses of more outputs are each of their own element, since the preconditioner was made."""
 
     def __repr__(self) -> str:
         names = ("relative_damping", "iterations", "output_radius")
@@ -104,6 +107,12 @@ class NewtonTargets:
 
         _check(gradient)
 
+        def slopes(c: Tensor) -> Tensor:
+            (cg,) = torch.autograd.grad(values, at, c.to(values), retain_graph=True)
+            return cg
+
+        _check_elements(slopes, gradient)
+
         def product(v: Tensor) -> Tensor:
             if not g.requires_grad:  # a loss that is linear in y
                 return torch.zeros_like(v)
@@ -121,8 +130,8 @@ class NewtonTargets:
         n = gradient.shape[1]
         units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
         columns = torch.stack([product(unit.expand_as(gradient)) for unit in units], 2)
-        v = _random(gradient)
-        _check_elements(product, v, torch.einsum("bij,bj->bi", columns, v))
+        v = torch.rand(gradient.shape, generator=torch.Generator().manual_seed(0), device="cpu").to(gradient)
+        _check_elements(lambda c: product(c[:, None] * v), torch.einsum("bij,bj->bi", columns, v))
         h = _magnitudes(columns.double())
         shift = self._shift(h.diagonal(dim1=1, dim2=2).abs().mean(1))
         h = h + shift[:, None, None] * torch.eye(n, dtype=h.dtype, device=h.device)
@@ -136,14 +145,12 @@ class NewtonTargets:
         n = gradient.shape[1]
         coins = torch.rand(n, generator=torch.Generator().manual_seed(0), device="cpu")
         signs = torch.where(coins < 0.5, -1.0, 1.0).to(gradient)
-        size = (product(signs.expand_as(gradient)) @ signs)[:, None].abs() / n
+        image = product(signs.expand_as(gradient))
+        size = (image @ signs)[:, None].abs() / n
         _check(size)
+        _check_elements(lambda c: product(c[:, None] * signs), image)
         if self._factor is None or self._factor.shape[0] != n:
             self._precondition(product, gradient, size)
-        if not self._checked and len(gradient) > 1:
-            v = _random(gradient)
-            _check_elements(product, v, product(v))
-            self._checked = True
         step, converged = self._solve(product, gradient, size)
         self._age += 1
         if not converged and self._age > _PATIENCE:
@@ -163,7 +170,7 @@ class NewtonTargets:
         h = _magnitudes(torch.cat(columns).double())
         shift = self._shift(h.diagonal().abs().mean())
         self._factor = torch.linalg.cholesky(h + shift * torch.eye(n, dtype=h.dtype, device=h.device))
-        self._age, self._checked = 0, False
+        self._age = 0
 
     def _solve(self, product: Callable[[Tensor], Tensor], gradient: Tensor, size: Tensor) -> tuple[Tensor, bool]:
         """Solve (H + relative_damping h I) s = g for all elements.
@@ -205,20 +212,30 @@ def _magnitudes(h: Tensor) -> Tensor:
     return magnitudes(0.5 * (h + h.mT))
 
 
-def _random(like: Tensor) -> Tensor:
-    return torch.rand(like.shape, generator=torch.Generator().manual_seed(0), device="cpu").to(like)
+def _check_elements(derivative: Callable[[Tensor], Tensor], image: Tensor) -> None:
+    """Raise ValueError if a loss depends on another element.
 
+    The derivative of element b, of the losses times factors c [B], is then not c_b times the one without factors. The
+    factors are powers of two, which do not change the rounding. Those of up to 8 elements differ.
 
-def _check_elements(product: Callable[[Tensor], Tensor], v: Tensor, image: Tensor) -> None:
-    """Raise ValueError if a loss depends on another element; image: the product of the Hessians with v, [B, n].
-
-    The product with c_b v_b is then not c_b times the image of element b, with another c_b for every element.
+    Args:
+        derivative: factors [B] -> gradient or product of the Hessians [B, n].
+        image: the derivative without factors, [B, n].
     """
-    if len(v) == 1:
+    B = len(image)
+    if B == 1:
         return
-    c = 0.5 + torch.rand(len(v), 1, generator=torch.Generator().manual_seed(1), device="cpu").to(v)
-    error = (product(c * v) - c * image).double().norm()
-    if float(error) > max(_COUPLED, _ROUNDING * torch.finfo(v.dtype).eps) * float(image.double().norm()):
+    c = (0.5 ** (torch.randperm(B, generator=torch.Generator().manual_seed(1), device="cpu") % 8)).to(image)
+    scaled, ones = derivative(c) / c[:, None], torch.ones_like(c)
+    least = torch.finfo(image.dtype).tiny * math.sqrt(image.numel())  # half precision: factors lose what is below it
+
+    def norm(x: Tensor) -> float:
+        return float(x.double().norm())
+
+    if norm(scaled - image) <= max(least, _COUPLED * norm(image)):
+        return
+    image, again = derivative(ones), derivative(ones)  # rounding that differs from pass to pass, and of the image
+    if norm(scaled - image) > max(least, _COUPLED * norm(image), _REPEATED * norm(again - image)):
         raise ValueError(
             "losses(y) must be each of its own element of the batch, but one depends on the outputs of another: leave "
             "out what couples them, such as a mean over the batch"

@@ -154,6 +154,8 @@ def test_an_element_on_a_plateau_stays_while_others_move() -> None:
 COUPLED = {
     "all": lambda y: (y - y.mean(0)).square().sum(1),
     "two": lambda y: y.square().sum(1) + torch.stack([y[2, 0] * y[0, 0], *(0.0 * y[1:, 0])]),
+    "linear": lambda y: (y - 1.0).square().sum(1) + 3.0 * y.roll(1, 0).sum(1),
+    "linear in two": lambda y: y.square().sum(1) + torch.stack([y[2, 0], *(0.0 * y[1:, 0])]),
 }
 
 
@@ -166,6 +168,84 @@ def test_losses_that_couple_elements_are_refused(coupled, n: int, dtype: torch.d
         with pytest.raises(ValueError, match=r"losses\(y\) must be each of its own element"):
             targets(coupled, y)
     assert targets(lambda y: y.sum(1).square(), y).shape == y.shape  # a curvature of rank 1
+
+
+@pytest.mark.parametrize("coupled", COUPLED.values(), ids=COUPLED.keys())
+@pytest.mark.parametrize("n", [3, 20])
+def test_losses_are_checked_in_every_call(coupled, n: int) -> None:
+    targets, y = NewtonTargets(), torch.randn(5, n, generator=torch.Generator().manual_seed(0))
+    for good in (y[:1], y):
+        targets(lambda y: y.square().sum(1), good)
+        with pytest.raises(ValueError, match=r"losses\(y\) must be each of its own element"):
+            targets(coupled, y)
+
+
+@pytest.mark.parametrize("n", [3, 20])
+def test_second_derivatives_that_couple_elements_are_refused(n: int) -> None:
+    """Where the outputs are zero, the gradient does not show that they are multiplied."""
+    targets, y = NewtonTargets(), torch.zeros(5, n)
+    targets(lambda y: y.square().sum(1), y)
+    with pytest.raises(ValueError, match=r"losses\(y\) must be each of its own element"):
+        targets(COUPLED["two"], y)
+
+
+class Rounded(torch.autograd.Function):
+    """A sum over each row, whose backward pass rounds in another way each time."""
+
+    @staticmethod
+    def forward(ctx, y):
+        ctx.shape = y.shape
+        return y.sum(1)
+
+    @staticmethod
+    def backward(ctx, g):
+        return g[:, None] * (1.0 + 1e-6 * torch.randn(ctx.shape))
+
+
+ROUNDING = {
+    "of each pass": (torch.float32, lambda y: 1e3 * (Rounded.apply(y) - y.sum(1))),
+    "of products": (torch.float32, lambda y: 1e3 * (torch.pi * (torch.e * y).sum(1) - (torch.pi * torch.e) * y.sum(1))),
+    "of half precision": (torch.float16, lambda y: 1e-6 * y.sum(1)),
+}
+
+
+@pytest.mark.parametrize("n", [3, 20])
+@pytest.mark.parametrize(("dtype", "added"), ROUNDING.values(), ids=ROUNDING.keys())
+def test_rounding_at_a_minimum_is_not_taken_for_other_elements(added, dtype: torch.dtype, n: int) -> None:
+    """All of the gradient is rounding."""
+    torch.manual_seed(0)
+    y = torch.full((12, n), 3.0, dtype=dtype)
+    for _ in range(20):
+        found = NewtonTargets()(lambda y: (y - 3.0).square().sum(1) + added(y), y)
+        torch.testing.assert_close(found, y, rtol=0.0, atol=0.02)
+
+
+LAYERS = {
+    "auto": lambda: zh.BlackBox(torch.round, zh.Smoothing.auto(sigma=0.5, samples=16)),
+    "without pairs": lambda: zh.BlackBox(torch.round, zh.Smoothing(sigma=0.5, samples=8, antithetic=False)),
+    "noise": lambda: zh.BlackBox(lambda z: z + torch.randn_like(z), zh.Smoothing(sigma=0.5, samples=8)),
+    "sparse": lambda: zh.SparseBlackBox(torch.round, zh.Smoothing(sigma=0.5, samples=40)),
+}
+HEADS = {"squares": zh.heads.SquaredError(), "entropy": zh.heads.LocalEntropy(zh.heads.SquaredError(), 0.5)}
+
+
+@pytest.mark.parametrize("n", [3, 20])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sampled_losses_are_of_their_own_elements(n: int, dtype: torch.dtype) -> None:
+    """No layer is refused, from the first call to the last, near a minimum."""
+    torch.manual_seed(0)
+    wanted = torch.randn(24, n, dtype=dtype)
+    layers = {name: make() for name, make in LAYERS.items()}
+    losses = {name: lambda y, name=name: (layers[name](y) - wanted).square().sum(1) for name in layers}
+    for name, head in HEADS.items():
+        for memory in (None, zh.Memory(fresh=2)):
+            layer = zh.BlackBox(torch.sin, zh.Smoothing(sigma=0.5, samples=4), head=head, memory=memory)
+            losses[f"{name} {memory}"] = lambda y, layer=layer: layer(y, wanted)
+    for one in losses.values():
+        targets, y = NewtonTargets(relative_damping=0.1, output_radius=0.5), torch.zeros(24, n, dtype=dtype)
+        for _ in range(5):
+            y = targets(one, y)
+        assert bool(torch.isfinite(y).all())
 
 
 @pytest.mark.parametrize("n", [3, 20])

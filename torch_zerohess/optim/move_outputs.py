@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
 from torch_zerohess.linalg.flat import add_parts
+from torch_zerohess.optim.processes import check_alone
 from torch_zerohess.precision import without_autocast
 
 
@@ -32,6 +33,7 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
         ValueError: a change of a wrong shape or that is not finite, a damping that is not positive, no inputs, or a
             network whose outputs do not change with its weights, are random or mix samples, or whose Jacobian is not
             finite.
+        RuntimeError: a network in `DistributedDataParallel` of several processes, of which each would step alone.
 
     Example:
         >>> network, x = torch.nn.Linear(3, 2), torch.eye(3)[:2]
@@ -45,6 +47,8 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
         raise TypeError(f"network must be a torch.nn.Module, got {type(network).__name__}")
     check_tensors(inputs=inputs, change=change)
     weights = [one for one in network.parameters() if one.requires_grad]
+    for module in network.modules():
+        check_alone(module, weights)
     if not weights:
         raise ValueError("network must have weights that require grad, got none")
     if not len(inputs):

@@ -39,6 +39,7 @@ class Newton(NewtonStep):
         adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`.
         max_radius: the radius never grows beyond it.
         lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change.
+        distributed: whether all processes of `torch.distributed` make the step together, see `NewtonCG`.
 
     The closure of `step` returns a loss with a graph, as for `NewtonCG`; of several losses the mean is taken.
 
@@ -59,6 +60,7 @@ class Newton(NewtonStep):
         adapt: bool = True,
         max_radius: float = math.inf,
         lr: float = 1.0,
+        distributed: bool = False,
     ) -> None:
         check_bool(adapt=adapt)
         if modification not in MODIFICATIONS:
@@ -71,7 +73,7 @@ class Newton(NewtonStep):
             "adapt": bool(adapt),
             "max_radius": checked_number("max_radius", max_radius, above=0.0),
         }
-        super().__init__(params, defaults)
+        super().__init__(params, defaults, distributed=distributed)
         n = sum(one.numel() for one in self._parameters)
         if n > MOST:
             raise ValueError(f"params must have at most {MOST} numbers, whose Hessian is formed, got {n}: use NewtonCG")

@@ -58,6 +58,10 @@ class NewtonCG(NewtonStep):
             None: any. Sampled derivatives describe a black box within about sigma of y. Steps of the weights that are
             short can still move y far beyond it. Needs curvature "gauss_newton".
         lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change.
+        distributed: whether all processes of `torch.distributed` make the step together, on the mean of their losses:
+            each calls the optimizer with its part of the batch, and with equal parameters. Without it, a network in
+            `DistributedDataParallel`, which averages the gradients of `backward` alone, is refused. Not with solver
+            "dual".
 
     The closure of `step` returns a loss with a graph and does not call backward. With "gauss_newton" it may return a
     pair (loss, y) instead, where y are the tensors at which the white box ends, if no `BlackBox` marks them. For solver
@@ -88,6 +92,7 @@ class NewtonCG(NewtonStep):
         noise: float = 2.0,
         output_radius: float | None = None,
         lr: float = 1.0,
+        distributed: bool = False,
     ) -> None:
         radius = checked_number("radius", radius, above=0.0, below=math.inf)
         tolerance = checked_number("tolerance", tolerance, above=0.0)
@@ -106,6 +111,8 @@ class NewtonCG(NewtonStep):
             raise ValueError(f"{what} needs curvature 'gauss_newton', got {curvature!r}")
         if solver == "dual" and not damping > 0.0:
             raise ValueError(f"solver 'dual' needs a positive damping, got {damping}")
+        if solver == "dual" and distributed:
+            raise ValueError("solver 'dual' is not distributed: use solver 'steihaug' or 'clip'")
         defaults = {
             "lr": lr,
             "radius": radius,
@@ -120,7 +127,7 @@ class NewtonCG(NewtonStep):
             "noise": noise,
             "output_radius": output_radius,
         }
-        super().__init__(params, defaults)
+        super().__init__(params, defaults, distributed=distributed)
 
     @property
     def _output_modification(self) -> str | None:

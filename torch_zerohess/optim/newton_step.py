@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.step import Step
+from torch_zerohess.optim import processes
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr, parts_of
 
 _ROUNDING = 10.0
@@ -73,7 +74,8 @@ class NewtonStep(SecondOrder):
         self._add(s)
         try:
             with torch.no_grad():
-                actual = float(loss) - float(parts_of(closure())[0].mean())
+                there = parts_of(closure())[0].mean().to(s.device)
+            actual = float(loss) - float(processes.mean(there) if self._distributed else there)
         finally:
             if not 0.0 < actual < math.inf:
                 self._restore(before)

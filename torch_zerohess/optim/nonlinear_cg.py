@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.linalg.flat import flattened, split_like
+from torch_zerohess.optim import processes
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr
 
 MODIFICATIONS = ("abs", "radius")
@@ -47,6 +48,7 @@ class NonlinearCG(SecondOrder):
         curvature: "exact", or "gauss_newton" for J^T H J of the black boxes behind a network.
         modification: "abs" or "radius", of curvature that is not positive.
         lr: factor from 0 to 1 on every move, which the schedulers of `torch.optim.lr_scheduler` change.
+        distributed: whether all processes of `torch.distributed` make the step together, see `NewtonCG`.
 
     Example:
         >>> x = torch.tensor([3.0, -2.0], dtype=torch.float64, requires_grad=True)
@@ -68,6 +70,7 @@ class NonlinearCG(SecondOrder):
         curvature: str = "exact",
         modification: str = "abs",
         lr: float = 1.0,
+        distributed: bool = False,
     ) -> None:
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'abs' or 'radius', got {modification!r}")
@@ -82,7 +85,7 @@ class NonlinearCG(SecondOrder):
             "curvature": curvature,
             "modification": modification,
         }
-        super().__init__(params, defaults)
+        super().__init__(params, defaults, distributed=distributed)
 
     def step(self, closure: Closure, hvp: Product | None = None) -> Tensor:  # type: ignore[override]
         """Search along one direction and return the loss before it, [] without a graph.
@@ -164,7 +167,8 @@ class NonlinearCG(SecondOrder):
         if not isinstance(result, Tensor) or result.shape != d.shape:
             shape = list(result.shape) if isinstance(result, Tensor) else type(result).__name__
             raise ValueError(f"hvp must return a tensor of shape {list(d.shape)}, got {shape}")
-        return result.detach().double()
+        image = result.detach().double()
+        return processes.mean(image) if self._distributed else image
 
     def _get(self, name: str) -> Tensor | None:
         """Return a vector of the state, [N] float64, or None where a parameter has none."""

@@ -1,6 +1,7 @@
 """Shared by the second-order optimizers: one group of parameters as a vector, and the quadratic model of a loss."""
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from functools import cached_property
 from typing import Any
 
@@ -8,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from torch_zerohess.arguments import check_state, checked_number
+from torch_zerohess.arguments import check_bool, check_state, checked_number
 from torch_zerohess.autograd.blocks import jacobian as white_box_jacobian
 from torch_zerohess.autograd.blocks import output_blocks
 from torch_zerohess.autograd.curvature import CurvatureOperator
@@ -18,6 +19,7 @@ from torch_zerohess.linalg.flat import add_parts, flattened, overwrite, split_li
 from torch_zerohess.linalg.jacobians import Jacobian, Rows
 from torch_zerohess.linalg.magnitudes import magnitudes
 from torch_zerohess.linalg.step import Step
+from torch_zerohess.optim import processes
 
 Loss = Tensor | tuple[Tensor, Tensor | Sequence[Tensor]] | tuple[Tensor, Tensor | Sequence[Tensor], SampleJacobian]
 """What a closure returns: loss, (loss, y), or (loss, y, jacobian), with the inputs y of the black boxes."""
@@ -34,7 +36,8 @@ TRIALS = 10
 class Model:
     """Loss, gradient and Hessian at one point, N parameters; R estimates of them where R losses were given.
 
-    The curvature is taken from the graph of the loss, so that all products use the samples of one forward pass.
+    The curvature is taken from the graph of the loss, so that all products use the samples of one forward pass. With
+    `distributed` all is the mean over the processes, of which each calls the same methods.
     """
 
     def __init__(
@@ -43,13 +46,18 @@ class Model:
         operators: Sequence[CurvatureOperator],
         modification: str | None = None,
         jacobian: SampleJacobian | None = None,
+        distributed: bool = False,
     ) -> None:
-        self.loss = losses.detach().mean()
+        self._distributed = distributed
+        self.loss = self._mean(losses.detach().mean().to(operators[0].device))
         """[], the mean of the losses."""
-        self.gradients = torch.stack([one.gradient for one in operators]).double()
+        self.gradients = self._mean(torch.stack([one.gradient for one in operators]).double())
         """[R, N], float64"""
         self._operators, self._jacobian = operators, jacobian
         self._blocks = None if modification is None else [self._modified(one) for one in operators]
+
+    def _mean(self, x: Tensor) -> Tensor:
+        return processes.mean(x) if self._distributed else x
 
     @staticmethod
     def _modified(operator: CurvatureOperator) -> list[Tensor]:
@@ -72,9 +80,9 @@ class Model:
             return torch.zeros_like(self.gradients)
         unit = v / length
         if self._blocks is None:
-            return torch.stack([one @ unit for one in self._operators]).double() * length
+            return self._mean(torch.stack([one @ unit for one in self._operators]).double()) * length
         pairs = zip(self._operators, self._blocks, strict=True)
-        return torch.stack([self._through(operator, blocks, unit) for operator, blocks in pairs]) * length
+        return self._mean(torch.stack([self._through(operator, blocks, unit) for operator, blocks in pairs])) * length
 
     @staticmethod
     def _through(operator: CurvatureOperator, blocks: Sequence[Tensor], v: Tensor) -> Tensor:
@@ -118,7 +126,8 @@ class Model:
             moved = operator.output_step(s)
         else:
             moved = split_like(self._white_box.matvec(s), operator.through)
-        return max(float(one.norm(dim=-1).max()) for one in moved)
+        longest = torch.stack([one.norm(dim=-1).max().double() for one in moved]).max()
+        return float(processes.largest(longest) if self._distributed else longest)
 
     def _dense(self, index: int) -> list[Tensor]:
         """Blocks [n, n] of one operator, modified if they are to be."""
@@ -127,7 +136,7 @@ class Model:
 
     def hessian(self) -> Tensor:
         """Return the mean Hessian [N, N], float64 and symmetric."""
-        dense = torch.stack([one.to_dense() for one in self._operators]).double().mean(0)
+        dense = self._mean(torch.stack([one.to_dense() for one in self._operators]).double().mean(0))
         return 0.5 * (dense + dense.mT)
 
 
@@ -145,9 +154,20 @@ def checked_lr(group: dict[str, Any]) -> float:
 
 
 class SecondOrder(Optimizer):
-    """An optimizer with one Hessian, hence one group of parameters."""
+    """An optimizer with one Hessian, hence one group of parameters.
 
-    def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any]) -> None:
+    With `distributed` a step uses the mean over all processes of `torch.distributed`, of loss, gradient and curvature.
+    All of them make it, from equal parameters. It is no setting of a group: a state may go on in another number of
+    processes.
+    """
+
+    _distributed = False
+
+    def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any], *, distributed: bool = False) -> None:
+        check_bool(distributed=distributed)
+        if distributed:
+            processes.check_started()
+        self._distributed = bool(distributed)
         defaults["lr"] = checked_lr(defaults)
         if defaults["curvature"] not in CURVATURES:
             raise ValueError(f"curvature must be 'exact' or 'gauss_newton', got {defaults['curvature']!r}")
@@ -168,6 +188,10 @@ class SecondOrder(Optimizer):
                 f"{type(self).__name__}"
             )
         super().add_param_group(param_group)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has: that of torch, and whether it is distributed."""
+        return super().__getstate__() | {"_distributed": self._distributed}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take a loaded state, after all hooks. KeyError if it lacks a setting: it is of another optimizer."""
@@ -193,7 +217,8 @@ class SecondOrder(Optimizer):
         with torch.enable_grad():
             if not callable(closure):
                 raise TypeError(f"closure must be callable, a function that returns the loss, got {closure!r}")
-            losses, through, jacobian = parts_of(closure())
+            with nullcontext() if self._distributed else processes.refused(self._parameters):
+                losses, through, jacobian = parts_of(closure())
             if not losses.requires_grad:
                 raise ValueError("closure must return a loss with a graph, got one without: no parameter is in it")
             parts = list(losses.reshape(-1).unbind()) if separate else [losses.mean()]
@@ -205,7 +230,9 @@ class SecondOrder(Optimizer):
                         "closure must return the loss without calling backward: the graph of the loss is freed by it"
                     ) from error
                 raise
-            return Model(losses, of_parts, self._output_modification, jacobian)
+            if self._distributed:
+                processes.check_equal(self._parameters, len(parts))
+            return Model(losses, of_parts, self._output_modification, jacobian, self._distributed)
 
     def _add(self, step: Tensor) -> None:
         """Add step [N] to the parameters."""

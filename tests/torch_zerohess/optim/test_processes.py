@@ -1,0 +1,172 @@
+"""Optimizers in two processes of `torch.distributed`: this file is the program that each of them runs."""
+
+import copy
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+
+import torch_zerohess as zh
+
+X = torch.randn(2, 8, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+"""A batch, in two halves."""
+GREY_BOX = {"curvature": "gauss_newton", "solver": "clip", "modification": "abs", "output_radius": 0.05}
+KINDS = {
+    "NewtonCG": (zh.optim.NewtonCG, {"noise": 0.0}),
+    "NewtonCG with noise": (zh.optim.NewtonCG, {"noise": 0.5}),
+    "NewtonCG through outputs": (zh.optim.NewtonCG, GREY_BOX),
+    "Newton": (zh.optim.Newton, {}),
+    "NonlinearCG": (zh.optim.NonlinearCG, {}),
+    "NonlinearCG with products": (zh.optim.NonlinearCG, {}),
+}
+Numbers = dict[str, list[float]]
+
+
+def network(seed: int = 0) -> nn.Module:
+    torch.manual_seed(seed)
+    return nn.Sequential(nn.Linear(4, 3), nn.Tanh(), nn.Linear(3, 2)).double()
+
+
+def weights(net: nn.Module) -> list[float]:
+    return torch.cat([one.detach().reshape(-1) for one in net.parameters()]).tolist()
+
+
+def run(name: str, x: torch.Tensor, *, distributed: bool = True, wrapped: bool = False) -> list[float]:
+    """Losses of three steps, and the weights after them; x: halves of the batch [1 or 2, 8, 4]."""
+    kind, settings = KINDS[name]
+    net = network()
+    net, optimizer = copy.deepcopy((net, kind(net.parameters(), radius=0.3, distributed=distributed, **settings)))
+    called = DistributedDataParallel(net) if wrapped else net
+
+    def closure():
+        y = called(x)
+        losses = (y.square().sum(-1) - 1.5).square() + y[..., 0]
+        loss = losses.view(len(x), 4, 2).mean((0, 2))  # four estimates
+        return (loss, y) if settings.get("curvature") == "gauss_newton" else loss
+
+    def product(v: torch.Tensor) -> torch.Tensor:
+        return zh.autograd.curvature.CurvatureOperator(closure().mean(), list(net.parameters())) @ v
+
+    given = (product,) if name.endswith("products") else ()
+    losses = [float(optimizer.step(closure, *given)) for _ in range(3)]
+    return losses + weights(net)
+
+
+def message(call) -> str:
+    try:
+        call()
+    except (RuntimeError, ValueError) as error:
+        return f"{type(error).__name__}: {error}"
+    return "none"
+
+
+def worker(rank: int) -> dict[str, object]:
+    x = X[rank : rank + 1]
+    found: dict[str, object] = {name: run(name, x, wrapped=True) for name in KINDS}
+    found["unwrapped"] = run("NewtonCG", x)
+    for name, (kind, settings) in KINDS.items():
+        net = DistributedDataParallel(network())
+        optimizer = kind(net.parameters(), **settings)
+        found[f"{name} alone"] = message(lambda o=optimizer, net=net: o.step(lambda: net(x).square().mean()))
+        found[f"{name} unchanged"] = weights(net) == weights(network())
+    net = DistributedDataParallel(network())
+    dual = zh.optim.NewtonCG(net.parameters(), curvature="gauss_newton", solver="dual", damping=0.1)
+
+    def with_jacobian():
+        y = net(x[0])
+        return y.square().mean(), y, zh.optim.SampleJacobian(net, x[0])
+
+    found["dual alone"] = message(lambda: dual.step(with_jacobian))
+    found["move_outputs alone"] = message(lambda: zh.optim.move_outputs(net, x[0], torch.ones(8, 2)))
+    other = network(seed=rank)
+    found["parameters"] = message(
+        lambda: zh.optim.NewtonCG(other.parameters(), distributed=True).step(lambda: other(x).square().mean())
+    )
+    found["losses"] = message(
+        lambda: zh.optim.NewtonCG(net.parameters(), distributed=True).step(
+            lambda: net(x).square().mean((0, 2))[: 4 + rank]
+        )
+    )
+    groups = [distributed.new_group([one]) for one in range(2)]
+    single, fixed = DistributedDataParallel(network(), process_group=groups[rank]), net
+    found["one process"] = message(
+        lambda: zh.optim.NewtonCG(single.parameters()).step(lambda: (single(x) - fixed(x).detach()).square().mean())
+    )
+    return found
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory) -> list[dict]:
+    """What the two processes found."""
+    folder = tmp_path_factory.mktemp("processes")
+    started = [
+        subprocess.Popen([sys.executable, __file__, str(rank), str(folder)], stderr=subprocess.PIPE, text=True)
+        for rank in range(2)
+    ]
+    try:
+        errors = [one.communicate(timeout=200)[1] for one in started]
+    finally:
+        for one in started:
+            one.kill()
+    assert [one.returncode for one in started] == [0, 0], "\n".join(errors)
+    return [json.loads((folder / f"{rank}.json").read_text()) for rank in range(2)]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_processes_take_the_step_of_the_whole_batch(name: str, both: list[dict]) -> None:
+    """Equal to the last bit in both, and up to rounding equal to the step of one process."""
+    assert both[0][name] == both[1][name]
+    alone = torch.tensor(run(name, X, distributed=False))
+    torch.testing.assert_close(torch.tensor(both[0][name]), alone, rtol=1e-6, atol=1e-6)
+    assert float(alone[2]) < float(alone[0])
+
+
+def test_a_network_needs_no_wrapper(both: list[dict]) -> None:
+    assert both[0]["unwrapped"] == both[1]["unwrapped"] == both[0]["NewtonCG"]
+
+
+@pytest.mark.parametrize("name", [*KINDS, "dual", "move_outputs"])
+def test_a_step_of_each_process_alone_is_refused(name: str, both: list[dict]) -> None:
+    for one in both:
+        expected = "RuntimeError: the network is a DistributedDataParallel of 2 processes"
+        assert one[f"{name} alone"].startswith(expected), one[f"{name} alone"]
+        assert one.get(f"{name} unchanged", True)
+
+
+@pytest.mark.parametrize("what", ["parameters", "losses"])
+def test_processes_that_differ_are_told_so_in_all_of_them(what: str, both: list[dict]) -> None:
+    for one in both:
+        assert f"but their {what} differ" in one[what], one[what]
+
+
+def test_other_networks_and_groups_of_one_process_may_be_wrapped(both: list[dict]) -> None:
+    assert [one["one process"] for one in both] == ["none", "none"]
+
+
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
+def test_the_setting_is_checked(kind: type) -> None:
+    net = network()
+    with pytest.raises(RuntimeError, match=r"call torch\.distributed\.init_process_group first"):
+        kind(net.parameters(), distributed=True)
+    with pytest.raises(TypeError, match="distributed must be True or False"):
+        kind(net.parameters(), distributed="yes")
+
+
+def test_the_dual_solver_is_not_distributed() -> None:
+    settings = {"curvature": "gauss_newton", "solver": "dual", "damping": 0.1}
+    with pytest.raises(ValueError, match="solver 'dual' is not distributed: use solver 'steihaug' or 'clip'"):
+        zh.optim.NewtonCG(network().parameters(), distributed=True, **settings)
+
+
+if __name__ == "__main__":
+    rank, folder = int(sys.argv[1]), Path(sys.argv[2])
+    distributed.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=2)
+    found = worker(rank)
+    distributed.barrier()
+    distributed.destroy_process_group()
+    (folder / f"{rank}.json").write_text(json.dumps(found))

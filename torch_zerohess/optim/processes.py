@@ -33,14 +33,14 @@ def check_started() -> None:
 def check_equal(parameters: Sequence[Tensor], losses: int) -> None:
     """Raise ValueError, in all processes, if parameters or numbers of losses differ between them."""
     sums = torch.stack([one.detach().double().sum() for one in parameters]).nan_to_num()
-    weights = torch.arange(1.0, 1.0 + len(sums)).to(sums)
-    here = torch.stack([sums.new_tensor(losses), sums.sum(), (weights * sums).sum()])
-    for same, what in zip((largest(here) == -largest(-here)).tolist(), ("losses", *2 * ["parameters"]), strict=True):
-        if not same:
-            raise ValueError(
-                f"the processes must have the same parameters and as many losses, but their {what} differ: start with "
-                "the same parameters, as DistributedDataParallel does, and change them in all processes"
-            )
+    here = torch.cat([sums.new_tensor([losses]), sums])
+    different = largest(here) != -largest(-here)
+    if bool(different.any()):
+        what = "losses" if bool(different[0]) else "parameters"
+        raise ValueError(
+            f"the processes must have the same parameters and as many losses, but their {what} differ: start with "
+            "the same parameters, as DistributedDataParallel does, and change them in all processes"
+        )
 
 
 @contextmanager

@@ -228,10 +228,10 @@ def minimize(
         if not running.evaluations:
             raise
         end = "interrupted", "interrupted"
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a simulator may end by sys.exit
         if running.evaluations:
             with contextlib.suppress(Exception):  # nothing takes the place of the caller's own error
-                error.minimum = running.minimum("failed", f"{blamed(error, caller)} raised {error!r}")  # type: ignore[attr-defined]
+                error.minimum = running.minimum("failed", f"{blamed(error, caller)} raised {error!r}")  # type: ignore[union-attr]
         raise
     finally:
         try:

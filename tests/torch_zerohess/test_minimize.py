@@ -249,6 +249,15 @@ def test_bounds_in_every_form(bounds):
     torch.testing.assert_close(fit.x, vector(2.0, 0.0), rtol=0, atol=1e-4)
 
 
+def test_bounds_of_scipy_may_be_numbers():
+    """SciPy makes arrays [1] of them."""
+    fit = zh.minimize(
+        tilted, vector(0.0, 1.0), sigma=1.0, seed=0, bounds=scipy.optimize.Bounds(0, 2), max_evaluations=60
+    )
+    assert bool(((fit.points >= 0) & (fit.points <= 2)).all())
+    torch.testing.assert_close(fit.x, vector(2.0, 0.0), rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
 def test_bounds_in_an_array_are_read_as_in_a_list(kind):
     for pairs, x in (([[-1.0, 2.0], [0.0, 9.0], [3.0, 4.0]], vector(0.0, 1.0, 3.0)), ([[5.0, 6.0]], vector(5.0))):

@@ -63,9 +63,10 @@ def test_every_value_that_is_known_is_kept_and_paid_once(noise, bounds, tmp_path
         assert torch.equal(rest.x, whole.x)
 
 
-def test_an_exception_keeps_them_too(tmp_path):
-    f = Point(2, ZeroDivisionError)
-    with pytest.raises(ZeroDivisionError) as caught:
+@pytest.mark.parametrize("error", [ZeroDivisionError, SystemExit])
+def test_an_exception_keeps_them_too(error, tmp_path):
+    f = Point(2, error)
+    with pytest.raises(error) as caught:
         zh.minimize(f, zeros(2), checkpoint=tmp_path / "search.pt", **SETTINGS)
     found = caught.value.minimum
     assert (found.status, found.evaluations, found.value) == ("failed", 2, min(f.values))

@@ -124,7 +124,14 @@ class OnnxFunction:
             raise ValueError(f"aux must be {len(self.aux)} tensors for {list(self.aux)}, got {len(aux)}")
         self._check_rounding(x)
         if self._batched and len(x):
-            return self._run(x, aux).to(x.device)
+            values = self._run(x, aux)
+            if values.shape[:1] != (len(x),):
+                raise ValueError(
+                    f"output {self.output!r} must have one value per point, [{len(x)}, ...] for {len(x)} points, got "
+                    f"{list(values.shape)}: it joins the points of the batch. Export the model for a batch of 1, or an "
+                    "output before it is joined"
+                )
+            return values.to(x.device)
         rows = [self._one(x[k : k + 1], tuple(one[k : k + 1] for one in aux)) for k in range(len(x))]
         return torch.stack(rows).to(x.device) if rows else x.new_empty(0)
 

@@ -4,6 +4,7 @@ import concurrent.futures
 import hashlib
 import pickle
 import threading
+import traceback
 import uuid
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,6 +17,7 @@ from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
+from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
 from torch_zerohess.evaluators.values import checked_values
 
@@ -24,8 +26,9 @@ _HELD = 4
 _held: dict[str, Callable[..., Any]] = {}
 _lock = threading.Lock()
 
-Tasks = list[tuple[Chunk, "concurrent.futures.Future[bytes]"]]
-"""Chunks, and their values as bytes."""
+Answer = tuple[bool, bytes]
+"""True and the values of a chunk, or False and the error of the black box."""
+Tasks = list[tuple[Chunk, "concurrent.futures.Future[Answer]"]]
 
 
 class Executor(Closing):
@@ -39,8 +42,9 @@ class Executor(Closing):
     call they take the new one. Do not change one that only loky or dask can pickle.
 
     Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception
-    of the first point is raised. An executor whose workers ended raises its own error (`BrokenExecutor`): it has no
-    limit of time and no second try, which `ProcessPool` and `Ray` have.
+    of the first point is raised, also SystemExit; one that cannot be sent is a RuntimeError that names it. An executor
+    whose workers ended raises its own error (`BrokenExecutor`): it has no limit of time and no second try, which
+    `ProcessPool` and `Ray` have.
 
     The executor is the caller's: `close()` does not shut it down.
 
@@ -135,14 +139,18 @@ def _state(fn: Callable[..., Any]) -> bytes:
 
 def _joined(batch: Batch, tasks: Tasks) -> Tensor:
     for chunk, task in tasks:  # in order, so that the first error is of the first point
-        batch.came(chunk, transfer.unpacked(task.result())[0])
+        good, data = task.result()
+        if not good:
+            raise loaded_error(data)
+        batch.came(chunk, transfer.unpacked(data)[0])
     return batch.result()
 
 
 def _known(tasks: Tasks) -> dict[int, Tensor]:
     """Return the values of the tasks that have succeeded, by the number of their point."""
     done = [(chunk, task) for chunk, task in tasks if task.done() and not task.cancelled() and not task.exception()]
-    values = [(chunk, transfer.unpacked(task.result())[0]) for chunk, task in done]
+    answers = [(chunk, *task.result()) for chunk, task in done]
+    values = [(chunk, transfer.unpacked(data)[0]) for chunk, good, data in answers if good]
     return {chunk.start + k: one for chunk, rows in values for k, one in enumerate(rows.tensor())}
 
 
@@ -162,14 +170,33 @@ def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[
         task.add_done_callback(one_less)
 
 
-def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str) -> bytes:
-    """Return the values of a chunk, in a worker. The first fn with a name stays: what comes later is a copy of it."""
+def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str) -> Answer:
+    """Return the values of a chunk, or its error, in a worker.
+
+    The first fn with a name stays: what comes later is a copy of it. An error is returned in a form that the caller can
+    read for certain: one that cannot be unpickled would break an executor of processes for good.
+    """
     become_worker(caller)
     with _lock:
         fn = _held.setdefault(name, fn)
         while len(_held) > _HELD:
             _held.pop(next(iter(_held)))
-    return values_of(fn, data)
+    try:
+        return True, values_of(fn, data)
+    except BaseException as error:  # SystemExit too
+        if caller == identity():  # a thread: the error itself can be raised
+            raise
+        return False, dumped_error(error, traceback.format_exc(), _dumps())
+
+
+def _dumps() -> Callable[[Any], bytes]:
+    """Return what writes errors: cloudpickle, which loky and dask bring, also writes classes of a script."""
+    try:
+        import cloudpickle
+    except ModuleNotFoundError:
+        return pickle.dumps
+    dumps: Callable[[Any], bytes] = cloudpickle.dumps
+    return dumps
 
 
 def values_of(fn: Callable[..., Any], data: bytes) -> bytes:

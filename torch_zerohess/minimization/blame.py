@@ -7,7 +7,7 @@ _OWN = tuple(f"torch_zerohess.{folder}." for folder in ("search", "surrogates", 
 """Beginnings of the names of modules with models of a search."""
 
 
-def blamed(error: Exception, caller: str) -> str:
+def blamed(error: BaseException, caller: str) -> str:
     """Return "the search" for a numerical failure of its own models, else `caller`, the name of a caller's function."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:

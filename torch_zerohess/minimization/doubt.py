@@ -75,7 +75,14 @@ def has_cusp(points: Tensor, losses: Tensor, x: Tensor, unit: Tensor) -> bool:
 
 
 def doubt(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> str:
-    """Return why x may be no minimum, in words; empty if there is no doubt. Arguments as of `jumps`."""
+    """Return why x may be no minimum, in words; empty if there is no doubt. Arguments as of `jumps`.
+
+    Distances are in units of the extent of the points where it is smaller than sigma, as in a narrow box.
+    """
+    if not len(points):
+        return ""
+    extent = points.amax(0) - points.amin(0)
+    unit = torch.where(extent > 0, torch.minimum(unit, extent), unit)
     beside = ((points - x) / unit).norm(dim=1) <= _NEXT[-1][0]
     if is_unbounded(losses) or bool((losses[beside] == -torch.inf).any()):
         return UNBOUNDED

@@ -127,8 +127,9 @@ def _sides(bounds: Any, n: int) -> tuple[Any, Any]:
     A list of tuples is a list of pairs. An array or tensor is read as the list of its rows. Two rows of two numbers are
     taken where only one reading has lower < upper, or both are the same. A tuple of two lists is never taken for pairs.
     """
-    if hasattr(bounds, "lb") and hasattr(bounds, "ub"):  # scipy.optimize.Bounds
-        return bounds.lb, bounds.ub
+    if hasattr(bounds, "lb") and hasattr(bounds, "ub"):  # scipy.optimize.Bounds, which makes arrays [1] of numbers
+        lower, upper = (one.item() if getattr(one, "size", 0) == 1 else one for one in (bounds.lb, bounds.ub))
+        return lower, upper
     if hasattr(bounds, "tolist"):
         bounds = bounds.tolist()
     if isinstance(bounds, str) or not hasattr(bounds, "__iter__"):

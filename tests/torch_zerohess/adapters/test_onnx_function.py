@@ -138,6 +138,15 @@ def test_wrong_inputs():
         OnnxFunction("no.onnx")
 
 
+def test_an_output_that_joins_the_points_of_a_batch_is_refused():
+    inputs = [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["K", 2])]
+    outputs = [helper.make_tensor_value_info("y", TensorProto.FLOAT, [])]
+    graph = helper.make_graph([helper.make_node("ReduceMean", ["x"], ["y"], keepdims=0)], "mean", inputs, outputs)
+    mean = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+    with pytest.raises(ValueError, match=r"output 'y' must have one value per point, .* got \[\]: it joins"):
+        OnnxFunction(mean)(Z)
+
+
 @pytest.mark.parametrize("batch", ["K", 1])
 @pytest.mark.parametrize(("kind", "sigma"), [(TensorProto.FLOAT, 1e-8), (TensorProto.FLOAT16, 1e-4)])
 def test_points_that_round_to_one_are_refused(batch, kind, sigma):

@@ -34,6 +34,24 @@ def loky():
 
 
 @pytest.mark.parametrize("make", [standard, loky])
+def test_an_error_that_cannot_be_read_is_named_and_breaks_no_pool(make):
+    with make() as pool:
+        evaluator = Executor(pool)
+        for _ in range(2):
+            with pytest.raises(RuntimeError, match=r"^Odd: a$") as raised:
+                evaluator(black_boxes.odd, Z)
+            assert "in odd" in str(raised.value.__cause__)
+            assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
+        with pytest.raises(SystemExit, match="done"):
+            evaluator(black_boxes.leaving, Z)
+
+
+def test_a_thread_raises_the_error_itself(threads):
+    with pytest.raises(black_boxes.Odd):
+        Executor(threads)(black_boxes.odd, Z)
+
+
+@pytest.mark.parametrize("make", [standard, loky])
 def test_pools_of_processes(make, tmp_path):
     with make() as pool:
         evaluator = Executor(pool)

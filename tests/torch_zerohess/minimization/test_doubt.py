@@ -58,3 +58,12 @@ def test_a_cusp_is_steeper_the_nearer(fn, expected):
     points, unit = 7.0 + 3.0 * distance[:, None], vector(3.0)
     assert has_cusp(points, fn(distance), points[0], unit) is expected
     assert has_cusp(points[1:], fn(distance[1:]), points[0], unit) is False
+
+
+def test_in_a_box_narrower_than_sigma_distances_are_relative_to_the_box():
+    """A smooth parabola in [0, 0.01], and the same with a jump beside its minimum; sigma is 1."""
+    points = torch.linspace(0.0, 0.01, 21, dtype=torch.float64)[:, None]
+    losses, x = ((points[:, 0] - 0.004) / 0.01).square(), vector(0.004)
+    assert doubt(points, losses, x, 0.0, vector(1.0)) == ""
+    points, losses = torch.cat([points, x[None] + 1e-4]), torch.cat([losses, vector(0.3)])
+    assert "jumps" in doubt(points, losses, x, 0.0, vector(1.0))

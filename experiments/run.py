@@ -39,7 +39,7 @@ def run(
     """Run methods on tasks, or go on with runs that were interrupted: the same command does both.
 
     Args:
-        tasks: names, see `list`; those named cnn train a network on images of a mug, through a path tracer.
+        tasks: names, see `list`, in any case; those named cnn train a network on images of a mug.
         methods: names separated by commas, or all that apply.
         runs: independent runs of each method, with other starts; 20, for networks 1, if not given.
         preset: fast takes minutes; paper has the source's sizes.

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import torch
 from torch import Tensor
@@ -121,10 +121,10 @@ def least_squares(
     torch.set_num_threads(1)
     there = {one.name: one for one in more_wild.PROBLEMS}
     names = chosen("problems", problems or tuple(there), list(there))
-    chosen("kinds", kinds, list(get_args(more_wild.Kind)))
+    wanted_kinds = cast("list[more_wild.Kind]", chosen("kinds", kinds, list(get_args(more_wild.Kind))))
     wanted = SUITE.wanted(methods, over)
     parts, done = KeptParts(out), dict[Job, Progression]()
-    wanted_runs = list(itertools.product(range(run, run + runs), kinds, names, wanted))
+    wanted_runs = list(itertools.product(range(run, run + runs), wanted_kinds, names, wanted))
     for start, kind, name, (method, settings) in progress(wanted_runs, "runs"):
         problem, job = there[name], Job(name, kind, method, budget, start, settings)
         task = more_wild.task(problem, budget * (problem.n + 1), kind)

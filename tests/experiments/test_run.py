@@ -49,6 +49,7 @@ def test_list_says_what_is_missing(monkeypatch):
         ({"tasks": ("quat",)}, r"TASK must be some of .* got quat \(did you mean quad\?\)"),
         ({"tasks": ()}, "TASK must be some of .* got none"),
         ({"tasks": ("quad",), "methods": "cma"}, r"methods must be some of .* got cma \(did you mean cma_es"),
+        ({"tasks": ("quad",), "methods": "CMA"}, r"methods must be some of .* got CMA \(did you mean cma_es"),
         ({"tasks": ("quad",), "runs": 0}, "runs must be at least 1, got 0"),
         ({"tasks": ("quad",), "jobs": -1}, "jobs must be at least 1, got -1"),
         ({"tasks": ("cnn",), "methods": "cma_es"}, "no method of this command can be run on these tasks"),
@@ -63,6 +64,13 @@ def test_list_says_what_is_missing(monkeypatch):
 def test_wrong_arguments_are_named(arguments, message, tmp_path):
     with pytest.raises(SystemExit, match=message):
         run(arguments.pop("tasks"), out=tmp_path, **arguments)
+
+
+def test_names_are_taken_in_any_case(tmp_path, one_process, capsys):
+    """Documents print MUG for mug."""
+    run(("QUAD", "quad"), methods="Cobyqa", runs=1, out=tmp_path)
+    assert "1 of 1 runs have ended" in capsys.readouterr().out
+    assert (tmp_path / "quad" / "cobyqa" / "0.json").exists()
 
 
 def test_tasks_that_no_method_goes_with_are_left_out(tmp_path, one_process, capsys):

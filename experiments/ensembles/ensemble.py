@@ -17,6 +17,7 @@ from experiments.methods.settings import settings as settings_of
 from experiments.problems import catalogue
 from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Preset, Task
+from experiments.runs.outputs import check_folder
 from experiments.runs.records import Outcome, Preparation, Record, read_outcome
 from experiments.runs.trial import LEVELS, LIMIT
 
@@ -56,6 +57,7 @@ class Ensemble:
                 raise SystemExit(f"{name} must be at least 1, got {value}")
         if self.limit is not None and not self.limit > 0:
             raise SystemExit(f"limit must be a positive number of seconds, got {self.limit:g}")
+        check_folder(self.folder)
 
     def plan(
         self, tasks: Sequence[str | Task | NetworkTask], methods: Sequence[str | Method] | None = None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from experiments.ensembles import provenance
+from experiments.runs.outputs import check_folder
 
 NAME = "parts.jsonl"
 Row = TypeVar("Row")
@@ -20,10 +21,11 @@ class KeptParts:
     commands.
 
     Args:
-        folder: of the study; made by the first part that is measured.
+        folder: of the study; made by the first part that is measured. SystemExit if it cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
+        check_folder(folder)
         self._path = folder / NAME
         self._noted = False
         self._code = provenance.version()

@@ -24,6 +24,7 @@ from experiments.reports.savings import kept_saving
 from experiments.reports.similarity import described, measures
 from experiments.reports.speed_ups import HEADERS
 from experiments.reports.summary import Summary, summarize, task_table
+from experiments.runs.outputs import check_file
 
 _STYLE = """
 figure { width: 170px; margin: .3em } figcaption { text-align: center; overflow-wrap: anywhere }
@@ -47,6 +48,7 @@ def report(
     path = out or folder / "report.html"
     if path.is_dir():
         raise SystemExit(f"out must be a file, such as {path / 'report.html'}, got the folder {path}")
+    check_file(out)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page(folder), encoding="utf-8")

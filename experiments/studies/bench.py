@@ -20,6 +20,7 @@ import torch_zerohess as zh
 from experiments.reports.progress import progress
 from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
+from experiments.runs.outputs import check_file
 from experiments.runs.records import write
 from experiments.studies.bench_memory import memory_ratios
 from experiments.studies.bench_ratios import Ratio, ratios
@@ -98,6 +99,7 @@ def bench(
         least = 0 if name in ("memory_n", "remembered") else 1
         if value < least:
             raise SystemExit(f"{name} must be at least {least}, got {value}")
+    check_file(out)
     if store is not None:
         may_keep(store)
     threads, available = torch.get_num_threads(), extension.available

@@ -21,6 +21,7 @@ import torch
 import torch_zerohess as zh
 from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
+from experiments.runs.outputs import check_file
 from experiments.runs.records import write
 from experiments.studies.bench_ratios import Ratio, finished, hessian, in_turn, noise, redrawn, sampler
 from torch_zerohess.sampling import proposals
@@ -56,6 +57,7 @@ def bench_device(
     for name, value in {"repeats": repeats, "n": n, "samples": samples, "wide": wide}.items():
         if value < 1:
             raise SystemExit(f"{name} must be at least 1, got {value}")
+    check_file(out)
     if store is not None:
         may_keep(store)
     rows = [

@@ -37,6 +37,7 @@ from experiments.reports.overview_networks import PREFERRED
 from experiments.reports.progress import progress
 from experiments.reports.results import Run
 from experiments.reports.tables import table
+from experiments.runs.outputs import check_folder
 from experiments.runs.trial import LEVELS
 from experiments.studies import lobes
 from experiments.studies.estimator_curves import draw_operators, orders
@@ -94,6 +95,7 @@ def figures(
     if runs < 2 or seed < 0 or not limit > 0:
         raise SystemExit(f"runs must be at least 2, seed at least 0, limit positive, got {runs}, {seed} and {limit:g}")
     wanted = chosen("NUMBER", names or tuple(FIGURES), list(FIGURES))
+    check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     setting = Setting(out, runs, seed, preset, limit, variant)

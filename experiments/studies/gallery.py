@@ -34,6 +34,7 @@ from experiments.reports.similarity import described, measures
 from experiments.reports.supplement_figures import Column
 from experiments.reports.tables import table
 from experiments.runs.attempt import attempt
+from experiments.runs.outputs import check_folder
 from experiments.runs.records import Record
 from experiments.runs.trial import LIMIT, Trial
 
@@ -84,6 +85,7 @@ def gallery(
     if method is not None:
         (method,) = chosen("method", [method], list(METHODS))
     out = out or folder / "gallery"
+    check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     shown = traces(chosen("tasks", tasks, list(FITTING)), method, run, limit, preset, variant)

@@ -23,6 +23,7 @@ from experiments.problems import catalogue
 from experiments.problems.task import Task
 from experiments.reports import result_files
 from experiments.reports.tables import table
+from experiments.runs.outputs import check_folder
 
 PENALTIES = (0.3, 0.1, 0.03, 0.01)
 """Of LASSO, in units of the smallest one that leaves no entry."""
@@ -77,6 +78,7 @@ def recovery(
         raise SystemExit(f"n must exceed entries, and pairs be at least 16, got {n}, {entries} and {pairs}")
     if store:
         result_files.may_keep(store)
+    check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     rows = [row for size in n for count in pairs for row in compared(size, entries, count, seed, lasso)]

@@ -25,6 +25,7 @@ import torch_zerohess as zh
 from experiments.reports.progress import progress
 from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
+from experiments.runs.outputs import check_file
 from experiments.runs.records import write
 from experiments.studies.coverage import coverage
 from experiments.studies.stability_cases import Case, cases
@@ -75,6 +76,7 @@ def stability(
     Raises:
         SystemExit: with status 1, if something is wrong.
     """
+    check_file(out)
     if store is not None:
         may_keep(store)
     rows = [row for case in progress(cases(largest), "cases") for row in _rows(case, seed)]

@@ -33,6 +33,7 @@ from experiments.problems.catalogue import chosen
 from experiments.reports.progress import progress
 from experiments.reports.result_files import keep, may_keep
 from experiments.reports.tables import table
+from experiments.runs.outputs import check_folder
 from experiments.studies.estimator_choice import SIZES, compare, summary
 from experiments.studies.estimator_curves import AXES, Measurement, draw
 from experiments.studies.estimator_problems import PROBLEMS, QUANTITIES, Function, Problem, made_problem
@@ -107,6 +108,7 @@ def variance(
     names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
     known = {method.name: method for method in (*ESTIMATORS, *ALONE)}
     picked = chosen("methods", methods, list(known))
+    check_folder(out)
     compared = [method for name, method in known.items() if name in picked]
     made = [made_problem(name, max(budgets) * _TRUTH_SHARE, side, seed) for name in progress(names, "truth")]
     tallies = [_Tally(one, method, budget) for one in made for method in compared for budget in budgets]

@@ -31,6 +31,7 @@ from torch import Tensor
 from experiments.problems import catalogue
 from experiments.reports.progress import progress
 from experiments.reports.tables import table
+from experiments.runs.outputs import check_file
 from experiments.runs.records import write
 from experiments.studies.bench_ratios import in_turn
 from torch_zerohess.evaluators import Factory, Inline, ProcessPool
@@ -120,6 +121,7 @@ def workers(
             raise SystemExit(f"{name} must be at least {smallest}, got {value}")
     if task:
         (task,) = catalogue.chosen("task", [task], list(catalogue.FITTING))
+    check_file(out)
     costs = _costs(count, task, points, repeats) if repeats else []
     faults = disturb(count, evaluations, kills, hangs, seed) if evaluations else None
     if costs:

@@ -52,6 +52,24 @@ def test_every_command_can_be_called_and_has_help(name, capsys) -> None:
         assert argument.kind is argument.POSITIONAL_ONLY or shown in printed
 
 
+def test_where_nothing_can_be_written_nothing_is_measured(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    taken = tmp_path / "file"
+    taken.touch()
+    out = str(taken / "below")
+    needed = {"run": ["quad"], "report": ["results"], "bench_device": ["--device", "cpu"]}
+    with_out = [name for name, one in COMMANDS.items() if "out" in inspect.signature(one.load()).parameters]
+    assert len(with_out) >= 16
+    refused = f"out must be a (folder|file) that can be written, got {re.escape(out)}: Not a directory"
+    for name in with_out:
+        with pytest.raises(SystemExit, match=refused):
+            main([name, *needed.get(name, []), "--out", out])
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert "%" not in said.err  # of a progress bar
+    assert list(tmp_path.iterdir()) == [taken]
+
+
 def test_a_long_command_says_at_once_that_it_has_begun(monkeypatch, capsys) -> None:
     said = []
 

@@ -32,6 +32,12 @@ def test_a_part_is_measured_once_for_each_of_its_settings(tmp_path) -> None:
     assert (tmp_path / "new" / "command.json").is_file()
 
 
+def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match="out must be a folder that can be written"):
+        KeptParts(tmp_path / "file")
+
+
 def test_rows_of_other_code_are_measured_again(tmp_path, monkeypatch) -> None:
     """Of another commit, or of other changes to the same one."""
     code = {"commit": "one", "clean": True}

@@ -48,7 +48,7 @@ class Ensemble:
     def __post_init__(self) -> None:
         for runs in (self.runs, self.network_runs or self.runs):
             if len(runs) < 1:
-                raise SystemExit(f"runs must be at least 1, got {len(runs)}")
+                raise SystemExit(f"runs must be at least 1, got {runs.stop - runs.start}")
             if runs.start < 0:
                 raise SystemExit(f"seed must be at least 0, got {runs.start}")
         least = {"jobs": self.jobs, "threads": self.threads, "evaluations": self.evaluations, "workers": self.workers}

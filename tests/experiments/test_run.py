@@ -51,6 +51,7 @@ def test_list_says_what_is_missing(monkeypatch):
         ({"tasks": ("quad",), "methods": "cma"}, r"methods must be some of .* got cma \(did you mean cma_es"),
         ({"tasks": ("quad",), "methods": "CMA"}, r"methods must be some of .* got CMA \(did you mean cma_es"),
         ({"tasks": ("quad",), "runs": 0}, "runs must be at least 1, got 0"),
+        ({"tasks": ("quad",), "runs": -1, "seed": 3}, "runs must be at least 1, got -1"),
         ({"tasks": ("quad",), "jobs": -1}, "jobs must be at least 1, got -1"),
         ({"tasks": ("cnn",), "methods": "cma_es"}, "no method of this command can be run on these tasks"),
         ({"tasks": ("quad", "cnn"), "threads": 0}, "threads must be at least 1, got 0"),

@@ -6,7 +6,7 @@ a task is f(x) - f(minimum). Precisions 1e2 to 1e-8 are the targets that shares 
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -27,15 +27,22 @@ TARGETS = tuple(float(10.0**k) for k in np.linspace(2.0, -8.0, 51))
 """Precisions f - minimum, the coarsest first."""
 
 
+def check(n: Sequence[int], functions: Sequence[int], instances: Sequence[int]) -> None:
+    """ValueError for a number that the platform does not have, or if there are none."""
+    if not n or not set(n) <= set(DIMENSIONS):
+        raise ValueError(f"n must be some of {_text(DIMENSIONS)}, got {_text(n)}")
+    if not functions or not set(functions) <= set(FUNCTIONS):
+        raise ValueError(f"functions must be from 1 to {len(FUNCTIONS)}, got {_text(functions)}")
+    if min(instances, default=0) < 1:
+        raise ValueError(f"instances must be at least 1, got {_text(instances)}")
+
+
 def task(function: int, instance: int, n: int, evaluations: int) -> Task:
     """Return a function of BBOB, with uniform starts. A run ends at the finest target.
 
     ValueError for a number that the platform does not have; ImportError says what to install.
     """
-    if n not in DIMENSIONS:
-        raise ValueError(f"n must be one of {DIMENSIONS}, got {n}")
-    if function not in FUNCTIONS:
-        raise ValueError(f"function must be from 1 to {len(FUNCTIONS)}, got {function}")
+    check((n,), (function,), (instance,))
     problem = _suite(instance, n)[function - 1]
     with _in_temporary_folder() as folder:
         problem._best_parameter("print")
@@ -64,6 +71,10 @@ def task(function: int, instance: int, n: int, evaluations: int) -> Task:
         loss=loss,
         truth=Truth(error, lambda x: max(error(x) - TARGETS[-1], 0.0), precision=0.0),
     )
+
+
+def _text(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers)) or "none"
 
 
 @cache

@@ -84,7 +84,7 @@ def noise(
     Args:
         n: numbers of parameters, among 2, 3, 5, 10, 20 and 40.
         functions: of BBOB, 1 to 24.
-        instances: of every function; 11 to 15 are for tuning.
+        instances: of every function, from 1 on; 11 to 15 are for tuning.
         methods: names separated by commas, or all: ours (told of the noise), ours_untold (measures it at the start),
             cma_es, py_bobyqa.
         runs: starts for every function.
@@ -95,6 +95,10 @@ def noise(
     """
     if runs < 1 or budget < 1 or not size > 0:
         raise SystemExit(f"runs and budget must be at least 1, size positive, got {runs}, {budget} and {size:g}")
+    try:
+        bbob.check(n, functions, instances)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
     if store is not None:
         may_keep(store)
     torch.set_num_threads(1)
@@ -130,7 +134,7 @@ def rows(done: Mapping[Job, End]) -> list[list[object]]:
 def _run(job: Job) -> list[End]:
     try:
         task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
-    except (ImportError, ValueError) as error:
+    except ImportError as error:
         raise SystemExit(str(error)) from error
     generator, count = torch.Generator().manual_seed(job.run), 0
 

@@ -99,7 +99,7 @@ def optimizers(
     Args:
         n: numbers of parameters, among 2, 3, 5, 10, 20 and 40.
         functions: of BBOB, 1 to 24.
-        instances: of every function; 11 to 15 are for tuning.
+        instances: of every function, from 1 on; 11 to 15 are for tuning.
         methods: names separated by commas, or all: ours, cobyqa, py_bobyqa, lbfgs_fd, cma_es_bounded; or any that
             needs the loss alone, see `list`.
         runs: starts for every function.
@@ -111,6 +111,10 @@ def optimizers(
     """
     if runs < 1 or budget < 1 or not limit > 0:
         raise SystemExit(f"runs and budget must be at least 1, limit positive, got {runs}, {budget} and {limit:g}")
+    try:
+        bbob.check(n, functions, instances)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
     if store is not None:
         may_keep(store)
     torch.set_num_threads(1)
@@ -130,7 +134,7 @@ def optimizers(
 def _run(job: Job, limit: float) -> list[Reached]:
     try:
         task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
-    except (ImportError, ValueError) as error:
+    except ImportError as error:
         raise SystemExit(str(error)) from error
     return [reached(task, SUITE.method(job.method), job.run, limit, dict(job.settings))]
 

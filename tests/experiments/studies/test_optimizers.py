@@ -7,6 +7,7 @@ import torch
 
 from experiments.methods import METHODS
 from experiments.problems import bbob
+from experiments.studies.noise import noise
 from experiments.studies.optimizers import OURS, Job, Reached, optimizers, profiles, reached, rows, suite
 
 
@@ -90,10 +91,29 @@ def test_the_table_has_shares():
     assert len(suite(499).headers) == len(short)
 
 
-def test_what_is_not_on_the_platform_is_said(tmp_path):
-    with pytest.raises(SystemExit, match="n must be one of"):
-        optimizers(n=(4,), functions=(1,), methods="ours", out=tmp_path)
+def test_numbers_that_cannot_be(tmp_path):
     with pytest.raises(SystemExit, match="runs and budget must be at least 1"):
         optimizers(n=(2,), budget=0, out=tmp_path)
-    with pytest.raises(SystemExit, match="function must be from 1 to 24, got 25"):
-        optimizers(n=(2,), functions=(25,), methods="ours", out=tmp_path)
+
+
+@pytest.mark.parametrize("command", [optimizers, noise], ids=["optimizers", "noise"])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"n": (2, 4)}, "n must be some of 2, 3, 5, 10, 20, 40, got 2, 4"),
+        ({"n": ()}, "n must be some of 2, 3, 5, 10, 20, 40, got none"),
+        ({"functions": (25,)}, "functions must be from 1 to 24, got 25"),
+        ({"functions": ()}, "functions must be from 1 to 24, got none"),
+        ({"instances": (11, 0)}, "instances must be at least 1, got 11, 0"),
+        ({"instances": (-3,)}, "instances must be at least 1, got -3"),
+        ({"instances": ()}, "instances must be at least 1, got none"),
+    ],
+    ids=str,
+)
+def test_numbers_that_the_platform_does_not_have_are_named_before_the_first_run(
+    command, given, message, tmp_path, capsys
+):
+    with pytest.raises(SystemExit, match=f"^{message}$"):
+        command(**{"n": (2,), "functions": (1,), "instances": (11,), "budget": 1, "out": tmp_path} | given)
+    assert not capsys.readouterr().err  # no progress bar
+    assert not list(tmp_path.iterdir())

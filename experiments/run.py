@@ -7,7 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from experiments.ensembles.ensemble import Ensemble
+from experiments.ensembles.ensemble import Ensemble, not_run
+from experiments.ensembles.processes import Job
 from experiments.methods import METHODS
 from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING, NETWORKS, TASKS, chosen
@@ -58,31 +59,33 @@ def run(
     fitting, networks = (range(seed, seed + (number if runs is None else runs)) for number in (RUNS, NETWORK_RUNS))
     ensemble = Ensemble(out, fitting, preset, jobs, limit, variant, networks, threads, evaluations, workers)
     try:
-        outcomes = _run(ensemble, names, wanted)
-        _report(ensemble, names, outcomes)
+        planned = _plan(ensemble, names, wanted)
+        outcomes = ensemble.run(planned)
+        print(f"\n{len(outcomes)} of {len(planned)} runs have ended; logs are in {ensemble.folder}")
+        wrong = [*_report(ensemble, names, outcomes), *not_run(planned, outcomes)]
     except KeyboardInterrupt:
         raise SystemExit(f"\ninterrupted; the same command goes on where it was, logs are in {out}") from None
+    if wrong:
+        raise SystemExit("\n".join(wrong))
 
 
-def _run(ensemble: Ensemble, tasks: Sequence[str], methods: Sequence[str] | None) -> list[Outcome]:
+def _plan(ensemble: Ensemble, tasks: Sequence[str], methods: Sequence[str] | None) -> list[Job]:
     planned = ensemble.plan(tasks, methods)
     for job in planned:
         if job.files.outcome.exists():
             read_outcome(job.files.outcome)  # a broken one is to be named before the others are run
-    outcomes = ensemble.run(planned)
-    print(f"\n{len(outcomes)} of {len(planned)} runs have ended; logs are in {ensemble.folder}")
-    return outcomes
+    return planned
 
 
-def _report(ensemble: Ensemble, tasks: Sequence[str], outcomes: Sequence[Outcome]) -> None:
-    """Print tables; for networks also write pictures and the encoder. SystemExit names networks without a result."""
+def _report(ensemble: Ensemble, tasks: Sequence[str], outcomes: Sequence[Outcome]) -> list[str]:
+    """Print tables; for networks also write pictures and the encoder. Return a line per task without a result."""
     by_task = {name: [one for one in outcomes if one.task == name] for name in tasks}
     fitted = [name for name, mine in by_task.items() if mine and name in FITTING]
     if fitted:
         print("\n" + as_text(summarize(load(ensemble.folder, fitted))))
         quoted = shlex.quote(str(ensemble.folder))
         print(f"\nfigures: python -m experiments plot {quoted}\npage: python -m experiments report {quoted}")
-    without = []
+    without = [f"no run of {name} succeeded" for name in fitted if all(one.status == "failed" for one in by_task[name])]
     for name in [name for name, mine in by_task.items() if mine and name in NETWORKS]:
         from experiments.reports.networks import conclude  # matplotlib, which nothing else here needs
 
@@ -92,5 +95,4 @@ def _report(ensemble: Ensemble, tasks: Sequence[str], outcomes: Sequence[Outcome
             conclude(task, by_task[name], ensemble.folder)
         except SystemExit as error:  # all of its runs failed: the other tasks have results to write
             without.append(str(error))
-    if without:
-        raise SystemExit("\n".join(without))
+    return without

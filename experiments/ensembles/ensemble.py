@@ -116,6 +116,14 @@ class Ensemble:
         return [read_outcome(job.files.outcome) for job in jobs if job.files.outcome.exists()]
 
 
+def not_run(planned: Sequence[Job], outcomes: Sequence[Outcome]) -> list[str]:
+    """Return a line that counts the runs without an outcome, none if all have one; `Ensemble.run` has said why."""
+    count = len(planned) - len(outcomes)
+    if not count:
+        return []
+    return [f"{count} of {len(planned)} runs could not be run; the lines that begin with `not run` have the reasons"]
+
+
 class _Progress:
     """The bar: runs that ended, and of those that are running the share of evaluations they have used."""
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import pandas as pd
 import tyro
 
-from experiments.ensembles.ensemble import Ensemble, ordered, settings_by_method
+from experiments.ensembles.ensemble import Ensemble, not_run, ordered, settings_by_method
 from experiments.ensembles.processes import Job
 from experiments.ensembles.provenance import register
 from experiments.methods import METHODS
@@ -153,11 +153,15 @@ def robustness(
             raise SystemExit("no sweep of this command applies to these tasks and methods")
         todo = {(one.varied, one.method, job.run): job for one, many in planned for job in many}
         register(out, settings_by_method(todo.values()))
-        ensemble.run(ordered(todo.values()))
+        wanted_runs = ordered(todo.values())
+        outcomes = ensemble.run(wanted_runs)
     except ImportError as error:
         raise SystemExit(str(error)) from None
     except KeyboardInterrupt:
         raise SystemExit(f"\ninterrupted; the same command goes on where it was, logs are in {out}") from None
+    missing = not_run(wanted_runs, outcomes)
+    if not outcomes:
+        raise SystemExit("\n".join(missing))
     cells = [cell for cell, _ in planned]
     results = load(out, {cell.varied for cell in cells})
     found = {cell: _runs(results, cell, ensemble.runs) for cell in cells}
@@ -172,6 +176,8 @@ def robustness(
             path = out / f"{name}-robustness-{against}.png"
             robustness_curves.draw(name, mine, titles, against, path)
             print(path)
+    if missing:
+        raise SystemExit("\n".join(missing))
     return rows
 
 

@@ -123,6 +123,35 @@ def test_a_network_whose_runs_all_failed_does_not_hide_the_others(tmp_path, monk
     assert concluded == ["cnn", "cnn_wide"]
 
 
+def test_runs_that_could_not_be_run_are_counted_at_the_end(tmp_path, one_process, capsys, monkeypatch):
+    """The others have their table; a process that a script waits for does not end with 0."""
+
+    def load_one(name, *given):
+        if name == "quad":
+            raise RuntimeError("no light")
+        return load(name, *given)
+
+    monkeypatch.setattr("experiments.ensembles.processes._load", load_one)
+    with pytest.raises(SystemExit, match=r"^2 of 2 runs could not be run; the lines that begin with `not run`"):
+        run(("quad",), methods="cobyqa", runs=2, out=tmp_path / "new")
+    with pytest.raises(SystemExit, match=r"^2 of 4 runs could not be run"):
+        run(("quad", "box2"), methods="cobyqa", runs=2, out=tmp_path, evaluations=5)
+    printed = capsys.readouterr().out
+    assert "not run: quad cobyqa 1: RuntimeError: no light" in printed
+    assert "2 of 4 runs have ended" in printed
+    assert as_text(summarize(load_results(tmp_path))) in printed
+
+
+def test_a_task_whose_runs_all_failed_is_named_at_the_end(tmp_path, one_process, capsys, monkeypatch):
+    def fail(self, trial, settings):
+        raise ValueError("no")
+
+    monkeypatch.setattr("experiments.methods.method.Method.__call__", fail)
+    with pytest.raises(SystemExit, match=r"^no run of quad succeeded$"):
+        run(("quad",), methods="cobyqa", runs=2, out=tmp_path)
+    assert as_text(summarize(load_results(tmp_path))) in capsys.readouterr().out
+
+
 def test_a_broken_outcome_is_named_before_anything_is_run(tmp_path, one_process):
     run(("quad",), methods="cobyqa", runs=1, out=tmp_path)
     (tmp_path / "quad" / "cobyqa" / "0.json").write_text("")

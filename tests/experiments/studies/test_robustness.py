@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from experiments.ensembles import processes
+from experiments.ensembles.processes import Trouble
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.srgb import from_srgb, to_srgb
 from experiments.problems.task import uniform
@@ -286,6 +288,20 @@ def test_command(tmp_path: Path, one_process, capsys):
     assert command() == rows  # nothing is run again: seconds are the same
     with pytest.raises(SystemExit, match=r"variant = auto \(now scalar_rgb\)"):
         robustness(("box2",), methods="our_hvpa", over=("pairs=2",), runs=1, variant="scalar_rgb", out=tmp_path)
+
+
+def test_missing_runs_are_counted_at_the_end(tmp_path, one_process, monkeypatch, capsys):
+    """With the rows of the others."""
+    execute = processes._execute
+
+    def where_there_is_light(job, connection):
+        return execute(job, connection) if job.task_name in there else Trouble("no light")
+
+    monkeypatch.setattr(processes, "_execute", where_there_is_light)
+    for there in ([], ["box2 pairs=2"]):
+        with pytest.raises(SystemExit, match=rf"^{2 - len(there)} of 2 runs could not be run"):
+            robustness(("box2",), methods="our_hvpa", over=("pairs=6,2",), runs=1, evaluations=60, out=tmp_path / "new")
+        assert ("robustness.csv" in capsys.readouterr().out) == bool(there)
 
 
 @pytest.mark.parametrize("over", ["sp", "spp=", "spp=0", "jpeg=high", "noise=loud"])

@@ -56,6 +56,7 @@ def run(
     """
     names = chosen("TASK", tasks, list(TASKS))
     wanted = None if methods.strip() == "all" else chosen("methods", methods.split(","), list(METHODS))
+    catalogue.check_variant(variant, names)
     fitting, networks = (range(seed, seed + (number if runs is None else runs)) for number in (RUNS, NETWORK_RUNS))
     ensemble = Ensemble(out, fitting, preset, jobs, limit, variant, networks, threads, evaluations, workers)
     try:

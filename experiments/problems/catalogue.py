@@ -3,6 +3,7 @@
 import difflib
 import importlib
 import importlib.util
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import Any
 
 from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Preset, Task
+from torch_zerohess.adapters.mitsuba_variants import find_llvm, probe
 
 FITTING = {
     name: f"experiments.problems.tasks.{name}"
@@ -30,6 +32,8 @@ NETWORKS = {name: f"experiments.problems.tasks.{name}" for name in (*RENDERED_NE
 SIMULATED = ("throw", "cnn_throw")
 """Tasks that MuJoCo simulates."""
 TASKS = FITTING | NETWORKS
+_VARIANT = re.compile(r"(scalar|(llvm|cuda)(_ad)?)_(mono|rgb|spectral)(_polarized)?(_double)?")
+"""Names of variants, also of those that an installed Mitsuba was not built with."""
 
 
 def load(name: str, preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> Task | NetworkTask:
@@ -77,6 +81,21 @@ def _packages_of(name: str) -> Iterator[None]:
             f"task {name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'",
             name=error.name,
         ) from error
+
+
+def check_variant(variant: str, tasks: Iterable[str]) -> None:
+    """SystemExit if Mitsuba has no such variant, or if it does not work here and renders one of the tasks.
+
+    Mitsuba is loaded in a process of its own, and only where a task needs it.
+    """
+    if not (variant == "auto" or _VARIANT.fullmatch(variant)):
+        raise SystemExit(f"variant must be auto, scalar_rgb, llvm_ad_rgb or another of Mitsuba, got {variant}")
+    needed = any(name in RENDERED or name in RENDERED_NETWORKS for name in tasks)
+    if variant in ("auto", "scalar_rgb") or not needed or importlib.util.find_spec("mitsuba") is None:
+        return
+    found = probe(variant, find_llvm() if variant.startswith("llvm") else None)
+    if not found.works:
+        raise SystemExit(f"variant must be auto, scalar_rgb or one that works here, got {variant}: {found.reason}")
 
 
 def chosen(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:

@@ -14,6 +14,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from experiments.problems.catalogue import RENDERED, check_variant
 from experiments.problems.scenes.caustic import COEFFICIENTS, INDEX, basis
 from experiments.problems.scenes.meshes import Surface, grid
 from experiments.problems.scenes.parts import mi_mesh, rgb
@@ -52,6 +53,7 @@ def check_caustic(
     path = Files(folder / "caustic" / method, run).outcome
     if not path.is_file():
         raise SystemExit(f"DIR must have a run {run} of {method} on caustic that has ended; there is no {path}")
+    check_variant(variant, RENDERED)
     task, x = caustic.task(preset), torch.tensor(read_outcome(path).x, dtype=torch.float64)
     assert task.output is not None
     assert task.output.residuals is not None

@@ -95,6 +95,7 @@ def figures(
     if runs < 2 or seed < 0 or not limit > 0:
         raise SystemExit(f"runs must be at least 2, seed at least 0, limit positive, got {runs}, {seed} and {limit:g}")
     wanted = chosen("NUMBER", names or tuple(FIGURES), list(FIGURES))
+    catalogue.check_variant(variant, ())
     check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)

@@ -84,11 +84,13 @@ def gallery(
         raise SystemExit(f"run must be at least 0 and limit positive, got {run} and {limit:g}")
     if method is not None:
         (method,) = chosen("method", [method], list(METHODS))
+    names = chosen("tasks", tasks, list(FITTING))
+    catalogue.check_variant(variant, names)
     out = out or folder / "gallery"
     check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
-    shown = traces(chosen("tasks", tasks, list(FITTING)), method, run, limit, preset, variant)
+    shown = traces(names, method, run, limit, preset, variant)
     if not shown:
         raise SystemExit("no task of this command can be shown")
     for one in shown:

@@ -94,6 +94,7 @@ def gradients(
         raise SystemExit(f"step and sigma must be above 0, got {step} and {sigma}")
     torch.set_num_threads(1)
     names = catalogue.chosen("tasks", tasks, list(catalogue.RENDERED))
+    catalogue.check_variant(variant, names)
     kept, printer, found = KeptParts(out), Printer("derivatives against the truth", _HEADERS, _WIDTHS), []
     variant = resolved(variant)
     settings = {"repeats": repeats, "spp": spp, "pairs": list(pairs), "step": step, "sigma": sigma}

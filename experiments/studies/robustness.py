@@ -19,7 +19,7 @@ from experiments.ensembles.processes import Job
 from experiments.ensembles.provenance import register
 from experiments.methods import METHODS
 from experiments.methods.settings import settings as settings_of
-from experiments.problems.catalogue import FITTING, chosen
+from experiments.problems.catalogue import FITTING, check_variant, chosen
 from experiments.problems.task import Preset
 from experiments.problems.variations import Change
 from experiments.problems.variations import load as load_varied
@@ -146,6 +146,7 @@ def robustness(
     names = chosen("TASK", tasks, list(FITTING))
     wanted = chosen("methods", methods.split(","), list(METHODS))
     sweeps = dict(_sweep(one) for one in over)
+    check_variant(variant, names)
     ensemble = Ensemble(out, range(seed, seed + runs), preset, jobs, limit, variant)
     try:
         planned = [one for name in names for one in plan(ensemble, name, wanted, sweeps, evaluations)]

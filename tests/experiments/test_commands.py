@@ -162,3 +162,15 @@ def test_a_reader_that_has_enough_ends_a_command_without_a_traceback() -> None:
     assert running.returncode == 1
     assert "Traceback" not in said
     assert "BrokenPipe" not in said
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["run", "quad"], ["robustness", "box2"], ["gallery", "results"], ["figures", "7"], ["gradients"]],
+    ids=" ".join,
+)
+def test_a_variant_that_mitsuba_does_not_have_is_named(monkeypatch, tmp_path, command) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"variant must be auto, .* or another of Mitsuba, got foo"):
+        main([*command, "--variant", "foo"])
+    assert not list(tmp_path.iterdir())

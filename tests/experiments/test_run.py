@@ -7,12 +7,13 @@ import pytest
 
 from experiments.listing import list_, listing
 from experiments.methods import METHODS
-from experiments.problems.catalogue import FITTING, load
+from experiments.problems.catalogue import FITTING, check_variant, load
 from experiments.reports.ensemble_page import page
 from experiments.reports.results import load as load_results
 from experiments.reports.summary import as_text, summarize
 from experiments.run import run
 from experiments.runs.records import Outcome
+from torch_zerohess.adapters.mitsuba_variants import Probe
 
 
 def test_list_names_everything():
@@ -52,6 +53,8 @@ def test_list_says_what_is_missing(monkeypatch):
         ({"tasks": ("quad",), "methods": "CMA"}, r"methods must be some of .* got CMA \(did you mean cma_es"),
         ({"tasks": ("quad",), "runs": 0}, "runs must be at least 1, got 0"),
         ({"tasks": ("quad",), "runs": -1, "seed": 3}, "runs must be at least 1, got -1"),
+        ({"tasks": ("quad",), "variant": "foo"}, "variant must be auto, scalar_rgb, llvm_ad_rgb or .*, got foo"),
+        ({"tasks": ("quad", "mug"), "variant": "llvm_ad"}, "variant must be auto, scalar_rgb, .*, got llvm_ad"),
         ({"tasks": ("quad",), "jobs": -1}, "jobs must be at least 1, got -1"),
         ({"tasks": ("cnn",), "methods": "cma_es"}, "no method of this command can be run on these tasks"),
         ({"tasks": ("quad", "cnn"), "threads": 0}, "threads must be at least 1, got 0"),
@@ -65,6 +68,31 @@ def test_list_says_what_is_missing(monkeypatch):
 def test_wrong_arguments_are_named(arguments, message, tmp_path):
     with pytest.raises(SystemExit, match=message):
         run(arguments.pop("tasks"), out=tmp_path, **arguments)
+
+
+def test_names_of_variants():
+    for name in ("auto", "scalar_rgb", "llvm_ad_mono_polarized", "cuda_ad_spectral_double", "scalar_spectral"):
+        check_variant(name, ("quad",))
+    for name in ("", "foo", "llvm_ad", "scalar_ad_rgb", "AUTO"):
+        with pytest.raises(SystemExit, match=f"variant must be auto, .* of Mitsuba, got {name}$"):
+            check_variant(name, ("quad",))
+
+
+def test_a_variant_is_tried_before_the_first_run_where_a_task_needs_it(tmp_path, one_process, monkeypatch):
+    tried = []
+
+    def probe(variant, llvm):
+        tried.append(variant)
+        return Probe(False, "no driver")
+
+    monkeypatch.setattr("experiments.problems.catalogue.probe", probe)
+    for tasks in (("quad", "mug"), ("cnn",)):
+        with pytest.raises(SystemExit, match=r"variant must be .* that works here, got cuda_ad_rgb: no driver"):
+            run(tasks, methods="our_g", runs=1, variant="cuda_ad_rgb", out=tmp_path)
+    assert tried == ["cuda_ad_rgb"] * 2
+    assert not list(tmp_path.iterdir())
+    run(("quad",), methods="cobyqa", runs=1, variant="cuda_ad_rgb", out=tmp_path)
+    assert len(tried) == 2
 
 
 def test_names_are_taken_in_any_case(tmp_path, one_process, capsys):

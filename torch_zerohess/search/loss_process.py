@@ -1,9 +1,10 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
-Quadratics are fitted next to the minimum (`MetricQuadratics`). If a function has more minima than the process can tell
-apart, the process finds nothing better. Then quadratics begin at a random point of the box. Lower minima are often
-close to each other: while arrivals disagree, quadratics begin beside the best point every other time (monotonic basin
-hopping: Wales and Doye 1997, Leary 2000).
+Quadratics are fitted next to the minimum (`MetricQuadratics`). They begin where the steps of the process are short, or
+where a quadratic has predicted the end of a step. If a function has more minima than the process can tell apart, the
+process finds nothing better. Then quadratics begin at a random point of the box. Lower minima are often close to each
+other: while arrivals disagree, quadratics begin beside the best point every other time (monotonic basin hopping: Wales
+and Doye 1997, Leary 2000).
 """
 
 import math
@@ -18,12 +19,14 @@ from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_descent import MetricProgress, MetricQuadratics
 from torch_zerohess.search.random_points import uniform
 from torch_zerohess.search.state import Evaluated
-from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
 _NEAR = 0.1
 """Steps of the process below this length, in units of the first sigma sqrt(n),"""
 _STEPS = 2
 """this many in a row, have found a basin."""
+_FORETOLD = 0.3
+"""Or one step whose end a quadratic has predicted, with at most this error relative to the change of the loss."""
 _WIDTH = 0.3
 """First sigma of the quadratics."""
 _HOPS = (0.5, 2.0)
@@ -41,6 +44,8 @@ class LossProgress(FinishedProgress):
     local: MetricProgress | None = None
     steps: int = 0
     """Short steps of the process in a row."""
+    foretold: float = math.inf
+    """Loss that a quadratic predicts for the point that is asked for; infinite where it is not determined."""
     beside: bool = False
     """Whether the latest quadratics have begun beside the best point. Such quadratics confirm no minimum."""
 
@@ -64,11 +69,24 @@ class LossProcess(FinishedProcess[LossProgress]):
             return self.local.model_at_best(quadratics)
         return super().model_at_best(known)
 
+    def points(self, known: LossProgress, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
+        known, points = super().points(known, generator)
+        return replace(known, foretold=self._foretold(known, points)), points
+
+    def _foretold(self, known: LossProgress, points: Tensor) -> float:
+        pool = known.pool
+        if known.done or known.noisy or len(pool) < coefficients(self.settings.n):
+            return math.inf
+        quadratics = self.local.go_on(pool.points, pool.values, known.best, 1.0)
+        return self.local.predicted(quadratics, points[0])
+
     def after_process(
         self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LossProgress, Tensor]:
         """Let quadratics finish a new basin; if there is none, let them begin elsewhere or beside the best point."""
         before, count = known.best.loss, len(evaluated.needed)
+        told = float(evaluated.losses[0])
+        foretold = math.isfinite(told + before) and abs(told - known.foretold) <= _FORETOLD * abs(told - before)
         known = self.take(known, evaluated)
         known = replace(
             known,
@@ -76,6 +94,7 @@ class LossProcess(FinishedProcess[LossProgress]):
             waited=0 if known.best.loss < before else known.waited + count,
         )
         turn = known.steps >= _STEPS or known.waited >= PATIENCE * (self.settings.n + 1)
+        turn = turn or (foretold and self.is_new(known))
         if not turn or known.noisy or known.done:
             return known, evaluated.points[:0]
         if self.is_new(known):

@@ -164,6 +164,10 @@ class RegionDescent(Method[R]):
         weights = torch.ones_like(values)
         return with_true_errors(fit_values(u, values, weights), u, weights), sigma
 
+    def predicted(self, known: R, x: Tensor) -> float:
+        """Return the loss at a point [n] according to a quadratic through the nearest evaluations."""
+        return _expected(self._modelled(known)[0], x)
+
     def promise(self, known: R) -> float:
         return known.promised if _is_sound(known) else math.inf
 
@@ -217,9 +221,7 @@ class RegionDescent(Method[R]):
         step = known.sigma * (known.root @ direction)
         step = -step if float(torch.rand((), generator=generator, device="cpu")) < 0.5 else step
         x = self.settings.inside((known.lowest.point + step)[None])
-        step = x[0] - known.lowest.point
-        expected = known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))
-        return replace(known, phase="geometry", expected=expected), x
+        return replace(known, phase="geometry", expected=_expected(known, x[0])), x
 
     def _nearest(self, known: R, least: int) -> Tensor:
         """Return which evaluations are the nearest [P], the best one first; only the first `least` may be far away."""
@@ -229,6 +231,12 @@ class RegionDescent(Method[R]):
         nearest = order[: self._fitted]
         enough = torch.arange(len(nearest), device=nearest.device) < least
         return nearest[(distance[nearest] <= far) | enough]
+
+
+def _expected(known: RegionProgress, x: Tensor) -> float:
+    """Return the loss at a point [n] according to the quadratic that was fitted last."""
+    step = x - known.lowest.point
+    return known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))
 
 
 def _is_sound(known: RegionProgress) -> bool:

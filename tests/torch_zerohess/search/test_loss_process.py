@@ -38,6 +38,22 @@ def test_a_paraboloid_is_solved_to_the_last_digit(condition, seed):
     assert search.value < 1e-12 * condition
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("n", "most"), [(2, 12), (3, 17)])
+def test_quadratics_begin_as_soon_as_they_predict_a_step(n, most, seed):
+    """It takes 6 and 10 evaluations to determine one. Without them the process needs 14 to 26, and 22 to 35."""
+
+    def bowl(z):
+        return (z - 0.3).square() @ vector(1.0, 10.0, 3.0)[:n]
+
+    found = GaussianProcessSearch(torch.full((n,), 1.5).double(), sigma=1.0, bounds=(-4.0, 4.0), seed=seed)
+    while found.value > 1e-10:
+        found.tell(bowl(found.ask()))
+        begun = found.state_dict()["progress"]["finishing"]
+        assert not begun or found.evaluations > (n + 1) * (n + 2) // 2
+    assert found.evaluations <= most
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_it_follows_a_curved_valley(seed):
     def rosenbrock(z):
@@ -123,10 +139,11 @@ def test_it_ends_after_its_rounds_and_says_why():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_process_and_quadratics_take_turns(seed):
-    """Two steps of the process below 0.1 in a row, or 3 (n + 1) evaluations without something better, hand over to
-    quadratics with a sigma of at most 0.3. If quadratics have ended within 0.05 of the best point before, they begin
-    anywhere in the box, with the first sigma. They end after 5 (n + 1) evaluations without something better than they
-    have found in this turn, when they have converged, or on a plateau.
+    """Two steps of the process below 0.1 in a row, 3 (n + 1) evaluations without something better, or a step that a
+    quadratic has foretold apart from known minima, hand over to quadratics with a sigma of at most 0.3. If quadratics
+    have ended within 0.05 of the best point before, they begin anywhere in the box, with the first sigma. They end
+    after 5 (n + 1) evaluations without something better than they have found in this turn, when they have converged,
+    or on a plateau.
     """
     search = GaussianProcessSearch(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0), restarts=10**6, seed=seed)
     short = waited = 0
@@ -152,7 +169,9 @@ def test_process_and_quadratics_take_turns(seed):
             waited = 0 if search.value < lowest else waited + len(points)
             short = short + 1 if before["moved"] < 0.1 else 0
             new = float((search.x - finished).norm()) > 0.05
-            assert now["finishing"] == (short >= 2 or waited >= 9)
+            told, foretold, best = float(well(points)[0]), before["foretold"], before["best"]["loss"]
+            known = foretold < torch.inf and best < torch.inf and abs(told - foretold) <= 0.3 * abs(told - best)
+            assert now["finishing"] == (short >= 2 or waited >= 9 or (known and new))
             if now["finishing"]:
                 assert 0.0 < now["local"]["sigma"] <= 0.3 if new else now["local"]["sigma"] == 1.0
                 short = waited = 0

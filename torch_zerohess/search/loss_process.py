@@ -25,7 +25,7 @@ _NEAR = 0.1
 """Steps of the process below this length, in units of the first sigma sqrt(n),"""
 _STEPS = 2
 """this many in a row, have found a basin."""
-_FORETOLD = 0.3
+_FORETOLD = 0.1
 """Or one step whose end a quadratic has predicted, with at most this error relative to the change of the loss."""
 _WIDTH = 0.3
 """First sigma of the quadratics."""

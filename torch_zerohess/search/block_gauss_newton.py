@@ -27,6 +27,7 @@ from torch_zerohess.linalg.levenberg_marquardt import damped_steps
 from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.protocol import AskTell
+from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
@@ -74,7 +75,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         """Ask for samples along the next directions, as many as are wanted and left of the basis."""
         n, unused = self.settings.n, known.unused
         if not len(unused):
-            basis = torch.linalg.qr(torch.randn(n, n, generator=generator, device="cpu"))[0]
+            basis = orthonormal(torch.randn(n, n, generator=generator, device="cpu"))
             unused = basis.to(known.center.device)
         steps = known.sigma * math.sqrt(n) * unused[: known.wanted].double()
         lower, upper = self.settings.lower, self.settings.upper

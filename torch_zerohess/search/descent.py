@@ -11,7 +11,7 @@ from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.random_points import further_start, normal
+from torch_zerohess.search.random_points import further_start, normal, orthonormal
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.pool import Pool
@@ -214,7 +214,7 @@ class LocalQuadratics(Method[DescentProgress]):
                 for _ in range(2):  # twice is enough (Kahan)
                     block = block - spanned @ (spanned.mT @ block)
             spanned = None
-            directions, _ = torch.linalg.qr(block)
+            directions = orthonormal(block)
             lengths = normal(generator, known.center, directions.shape[1], n).norm(dim=1, keepdim=True)
             rows.append(directions.mT * lengths)
         return torch.cat(rows)[:count]

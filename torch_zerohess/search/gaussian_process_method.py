@@ -21,7 +21,7 @@ from torch_zerohess.search.candidates import farthest, is_known, least_known, lo
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.random_points import normal
+from torch_zerohess.search.random_points import normal, orthonormal
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
@@ -205,8 +205,7 @@ class ProcessMethod(Method[Q]):
     def _around(self, x: Tensor, generator: torch.Generator) -> Tensor:
         """Draw n orthogonal steps of length sqrt(n), mirrored into the box."""
         n = len(x)
-        directions, _ = torch.linalg.qr(normal(generator, x, n, n))
-        return self.settings.inside(x + math.sqrt(n) * directions.mT)
+        return self.settings.inside(x + math.sqrt(n) * orthonormal(normal(generator, x, n, n)).mT)
 
     def _drawn(self, x: Tensor, sigma: float, count: int, generator: torch.Generator) -> Tensor:
         """Draw points [count, n] from N(x, sigma^2), mirrored into the box."""

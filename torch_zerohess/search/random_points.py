@@ -18,6 +18,15 @@ def uniform(generator: torch.Generator, lower: Tensor, upper: Tensor, count: int
     return lower + (upper - lower) * unit
 
 
+def orthonormal(columns: Tensor) -> Tensor:
+    """Return an orthonormal basis of normal columns [n, k], uniformly distributed (Mezzadri 2007).
+
+    Q of a QR decomposition is not: Householder's reflections choose the signs of its first entries.
+    """
+    q, r = torch.linalg.qr(columns)
+    return q * torch.where(r.diagonal() < 0, -1.0, 1.0).to(q)
+
+
 def further_start(generator: torch.Generator, first: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """Point [n] where another round begins: anywhere in a finite box, otherwise around the first start."""
     if bool(torch.isfinite(torch.cat([lower, upper])).all()):

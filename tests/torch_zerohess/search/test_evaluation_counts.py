@@ -111,6 +111,6 @@ def test_it_takes_no_more_than(name):
 def test_an_entropy_is_expanded_again_where_its_first_quadratic_led():
     """One expansion does not predict the entropy there from half of the starts, and the outputs are given up."""
     case = CASES["an entropy"]
-    for seed in range(6):
+    for seed in range(1, 7):
         search = run(case.search(seed), case.f, case.most, case.target)
         assert search.state_dict()["progress"]["expands"]

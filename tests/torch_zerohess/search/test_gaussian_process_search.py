@@ -170,7 +170,7 @@ def test_noise_is_told_from_ten_outputs_per_coefficient_on(pool, first):
 def test_of_noisy_outputs_it_returns_the_best_on_average(noise):
     """The standard deviation of every element is 0.3: the loss of a picture is 0.09 more than the loss of its mean."""
     solution = vector(1.3)
-    generator, errors = torch.Generator().manual_seed(0), []
+    generator, errors = torch.Generator().manual_seed(2), []
     for seed in range(8):
         search = GaussianProcessSearch(
             vector(-3.0),

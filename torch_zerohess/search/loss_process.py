@@ -86,7 +86,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         """Let quadratics finish a new basin; if there is none, let them begin elsewhere or beside the best point."""
         before, count = known.best.loss, len(evaluated.needed)
         told = float(evaluated.losses[0])
-        foretold = math.isfinite(told + before) and abs(told - known.foretold) <= _FORETOLD * abs(told - before)
+        foretold = math.isfinite(told + before) and abs(told - known.foretold) < _FORETOLD * abs(told - before)
         known = self.take(known, evaluated)
         known = replace(
             known,

@@ -170,7 +170,7 @@ def test_process_and_quadratics_take_turns(seed):
             short = short + 1 if before["moved"] < 0.1 else 0
             new = float((search.x - finished).norm()) > 0.05
             told, foretold, best = float(well(points)[0]), before["foretold"], before["best"]["loss"]
-            known = foretold < torch.inf and best < torch.inf and abs(told - foretold) <= 0.1 * abs(told - best)
+            known = foretold < torch.inf and best < torch.inf and abs(told - foretold) < 0.1 * abs(told - best)
             assert now["finishing"] == (short >= 2 or waited >= 9 or (known and new))
             if now["finishing"]:
                 sigma, beside = now["local"]["sigma"], now["beside"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import torch_zerohess as zh
-from torch_zerohess.estimation import student, surrogate_term
+from torch_zerohess.estimation import student, surrogate_mean
 from truths import vector
 
 X = torch.stack([vector(0.3, -0.4), vector(0.1, 0.2), vector(0.5, 0.6)])
@@ -98,7 +98,7 @@ def minimized_in_noise():
 )
 def test_the_default_device_changes_nothing(run):
     plain = run()
-    surrogate_term._even.cache_clear()
+    surrogate_mean._even.cache_clear()
     student._gauss_legendre.cache_clear()
     torch.set_default_device("meta")
     try:

@@ -8,28 +8,28 @@ from torch import Tensor
 
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation.control import Control, Prediction
-from torch_zerohess.estimation.surrogate_term import LOOKED, MOST_STEIN, jumps, nodes, prefers_pathwise, smoothed
-from torch_zerohess.surrogates.memory import Memory
+from torch_zerohess.estimation.smoothness import known_smooth
+from torch_zerohess.estimation.surrogate_mean import nodes, smoothed
+from torch_zerohess.estimation.surrogate_term import MOST_STEIN, measure
 
 Part = Callable[[Tensor], Tensor]
 """x [B, n] -> [B, *out], differentiable."""
 
 
-def _pathwise_in_transforms(memory: Memory, center: Tensor) -> bool:
-    """Whether to choose pathwise derivatives where a transform hides the values at center [B, n].
-
-    The variances cannot be compared there. The points of the memory tell whether the surrogate jumps.
-    """
-    if center.shape[1] <= MOST_STEIN:
-        return False
-    if not (transforms.transform_active() or transforms.forward_mode_active()):
-        return True
-    if len(memory.points) < 2:
-        return True
-    with transforms.outside():
-        found = jumps(memory.surrogate, memory.points[-LOOKED:].to(center.dtype))
-    memory.pathwise = None if found is None else not found
-    return found is not True
+def _pathwise(
+    control: Control, center: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int, seed: int
+) -> int:
+    """Return how many derivatives of the surrogate's term around center [B, n] to take along its points."""
+    memory, few = control.memory, center.shape[1] <= MOST_STEIN
+    hidden = transforms.watched(center) or transforms.forward_mode_active()
+    if not (hidden and few and memory.pathwise is None):  # the variances cannot be compared in a transform
+        with transforms.outside(), transforms.random_numbers_allowed():
+            shown = [one for one in map(transforms.shown, (center, *aux)) if one is not None]
+            if len(shown) == 1 + len(aux):
+                measure(control, shown[0], shown[1:], sigma, u, order, seed)
+            elif memory.pathwise is None:
+                return 2 if known_smooth(control) else 0
+    return (0 if few else 2) if memory.pathwise is None else memory.pathwise
 
 
 def around(
@@ -79,12 +79,12 @@ def around(
     excess = predicted.excess(sigma) if outer.linear else None
     if excess is None:
         with transforms.outside(), transforms.random_numbers_allowed():
-            u = nodes(seed, memory.draws, center.shape[1], B).to(center.device)
-        if memory.pathwise is None and not (transforms.watched(center) or transforms.forward_mode_active()):
-            memory.pathwise = prefers_pathwise(control, center, aux, sigma, u, order)
-        pathwise = _pathwise_in_transforms(memory, center) if memory.pathwise is None else memory.pathwise
+            shape = (memory.draws, center.shape[1], B)
+            u = nodes(seed, *shape).to(center.device)
+            pathwise = _pathwise(control, center, aux, sigma, u, order, seed)
+            u = nodes(seed, *shape, pathwise=pathwise).to(center.device)
     else:  # the mean over all points is known from the center
-        u, pathwise = sigma.new_zeros(1, len(sigma)), True
+        u, pathwise = sigma.new_zeros(1, len(sigma)), 2
     if not fresh:
         predicted.check_head(center)
     with torch.no_grad():
@@ -101,7 +101,7 @@ def around(
 
     def expected(x: Tensor) -> tuple[Tensor, Tensor | None]:
         """F at x, and what the new evaluations tell about its fresh elements."""
-        term = smoothed(values, x, center, sigma, u, pathwise=pathwise)
+        term = smoothed(values, x, center, sigma, u, pathwise=pathwise, plain=not transforms.transform_active())
         new = None if rest is None else rest[0](x.index_select(0, part))
         return outer.corrected(term, None if new is None else spread(new), scales), new
 

@@ -106,6 +106,20 @@ def mapped_size(tensors: Sequence[Tensor]) -> int:
     return math.prod(dict(pair for one in tensors for pair in _mapped(one)).values())
 
 
+def shown(x: Tensor) -> Tensor | None:
+    """Return the values of x without a graph, of the first element wherever vmap maps over it; None if nobody may look.
+
+    To be called under `outside`.
+    """
+    functorch = torch._C._functorch
+    if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
+        return None
+    while functorch.is_functorch_wrapped_tensor(x):
+        inner = functorch.get_unwrapped(x)
+        x = inner.select(functorch.maybe_get_bdim(x), 0) if functorch.is_batchedtensor(x) else inner
+    return x.detach() if type(x) in (Tensor, torch.nn.Parameter) else None
+
+
 def different_noise_wanted(tensors: Sequence[Tensor]) -> bool:
     """Whether a vmap with randomness="different" is active that maps over none of the tensors."""
     functorch = torch._C._functorch

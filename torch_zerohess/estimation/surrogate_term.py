@@ -1,16 +1,9 @@
 """The first term of a control variate: c E h(g(x + sigma u), r), the smoothed surrogate, which takes no evaluations.
 
-The expectation is a mean over points x + sigma u. Its derivatives are either
-
-    pathwise   derivatives of h and g along the points; h and g must be smooth,
-    Stein      mean of h(g(x + sigma u), r) times the kernels of u, as for the black box itself; h and g may be rough.
-
-Where h is smooth both are unbiased. Derivatives of a surrogate that follows hard edges vary fast within a sigma: there
-Stein's sums have the smaller variance. Their error grows with the number of parameters, the pathwise one does not.
-`prefers_pathwise` measures both.
-
-The points u are a Sobol sequence with a random shift (Cranley and Patterson 1976), mapped to the normal distribution,
-and their mirror images: the mean is unbiased, and its error falls faster than the error of independent draws.
+Where h and g are smooth, its derivatives may be pathwise or by Stein's sums, see `surrogate_mean`: both are unbiased.
+With kinks, as of an absolute error, slopes are pathwise and second derivatives are not. With jumps no derivative is.
+`smoothness` tells. Derivatives of a surrogate that follows hard edges vary fast within a sigma: there Stein's sums have
+the smaller variance. Their error grows with the number of parameters, the pathwise one does not. `measure` compares.
 """
 
 import copy
@@ -23,75 +16,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.control import Control, Prediction, as_constant
+from torch_zerohess.estimation.control import Control, Prediction
+from torch_zerohess.estimation.smoothness import jumps, known_smooth, smooth_orders
 from torch_zerohess.estimation.stein import Quantity
+from torch_zerohess.estimation.surrogate_mean import nodes
+from torch_zerohess.surrogates.surrogate import outside_inference
 
-_SOBOL = 64
-"""Parameters up to which points are quasi-random; beyond them a sequence of few points is not even."""
 MOST_STEIN = 8
 """Parameters up to which Stein's sums are tried."""
-_POINTS = 1024
-"""Points of a call with few parameters, shared by the elements of its batch."""
-_FEWEST = 64
-"""Points per element at least."""
-_FEW = 32
-"""Parameters that are few."""
-_PAIRS = 2
-"""Pairs of points per element with many parameters, of which the surrogate is affine. Derivatives of a loss that is
-quadratic in an affine map are exact from one pair, and two pairs tell an error."""
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
-LOOKED = 512
+_LOOKED = 512
 """Points around the elements of a batch at which a surrogate is looked at for jumps, at most."""
-_EDGE = 1e-9
-"""Probability at which the normal quantile is cut off."""
-
-
-@functools.lru_cache(maxsize=32)
-def _even(count: int, n: int) -> Tensor:
-    return torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(count, dtype=torch.float64)
-
-
-def nodes(seed: int, count: int | None, n: int, batch: int) -> Tensor:
-    """Return normal points [2 * ceil(count / 2), n] float64: the second half mirrors the first.
-
-    Without a count they are 4 for more than 32 parameters, otherwise 1024 / batch and at least 64.
-    """
-    if count is None:
-        count = max(_POINTS // max(batch, 1), _FEWEST) if n <= _FEW else 2 * _PAIRS
-    half = (count + 1) // 2
-    generator = torch.Generator().manual_seed(seed)
-    if n > _SOBOL:
-        u = torch.randn(half, n, generator=generator, dtype=torch.float64, device="cpu")
-    else:
-        shifted = (_even(half, n) + torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")) % 1.0
-        u = torch.special.ndtri(shifted.clamp(_EDGE, 1.0 - _EDGE))
-    return torch.cat([u, -u])
-
-
-def smoothed(
-    values: Callable[[Tensor], Tensor], x: Tensor, center: Tensor, sigma: Tensor, u: Tensor, *, pathwise: bool
-) -> Tensor:
-    """Return the mean of values around x [B, n], [B, *out], in the dtype of x, with derivatives in x of every order.
-
-    Args:
-        values: [B, Q, n] -> [B, Q, *out].
-        x: [B, n], with a graph.
-        center: [B, n], where the points of Stein's sums are drawn.
-        sigma: float64 [n].
-        u: [Q, n], see `nodes`.
-        pathwise: derivatives along the points, not by Stein's sums.
-    """
-    if pathwise:
-        return values((x[:, None] + sigma * u).to(x.dtype)).mean(1).to(x.dtype)
-    with torch.no_grad():
-        fixed = values((center[:, None] + sigma * u).to(center.dtype)).double()
-        change = fixed - values(center[:, None]).double()  # of no influence on the expectation of the derivatives
-    mean, change = fixed.mean(1), change.reshape(*change.shape[:2], -1)
-    d = (x.double() - center.double()) / sigma
-    ratio = (d @ u.mT - 0.5 * (d * d).sum(1, keepdim=True)).exp()
-    moved = ((ratio - 1.0)[:, None] @ change)[:, 0] / len(u)
-    return (mean + moved.reshape(mean.shape)).to(x.dtype)
 
 
 @dataclass(frozen=True)
@@ -109,7 +45,8 @@ class SurrogateTerm:
     """float64 [n]"""
     u: Tensor
     """[Q, n], see `nodes`."""
-    pathwise: bool
+    pathwise: int
+    """Orders of derivatives along the points."""
     _predicted: Prediction = field(init=False)
 
     def __post_init__(self) -> None:
@@ -122,11 +59,14 @@ class SurrogateTerm:
     ) -> "SurrogateTerm":
         """Return the term with copies of the surrogate and of aux: a later fit or training does not change it."""
         memory = control.memory
-        u = nodes(seed, memory.draws, x.shape[1], len(x)).to(x.device)
-        if memory.pathwise is None:
-            memory.pathwise = prefers_pathwise(control, x, aux, sigma, u, order)
-        copies = [one.clone() for one in aux]
-        return cls(copy.deepcopy(memory.surrogate), control, x, copies, sigma, u, bool(memory.pathwise))
+        shape = (memory.draws, x.shape[1], len(x))
+        u = nodes(seed, *shape).to(x.device)
+        measure(control, x, aux, sigma, u, order, seed)
+        pathwise = memory.pathwise or 0
+        u = nodes(seed, *shape, pathwise=pathwise).to(x.device)
+        with outside_inference():
+            copies = [one.clone() for one in aux]
+            return cls(copy.deepcopy(memory.surrogate), control, x.clone(), copies, sigma, u, pathwise)
 
     @property
     def encoded(self) -> list[Tensor]:
@@ -177,8 +117,13 @@ class SurrogateTerm:
         if quantity == "value" or not self.pathwise:
             with torch.no_grad():
                 each = self._by_stein(quantity, v)
+        elif self.pathwise == 1:
+            each = self._from_slopes(quantity, v)
         else:
-            each = self._along_points(quantity, v)
+            try:
+                each = self._along_points(quantity, v)
+            except RuntimeError:  # an operation without a forward mode
+                each = self._in_reverse(quantity, v)
         each, half = each.detach(), len(self.u) // 2  # a module has parameters that require grad
         return 0.5 * (each[:, :half] + each[:, half:])
 
@@ -207,6 +152,41 @@ class SurrogateTerm:
         ]
         return torch.stack(parts, 3)
 
+    def _from_slopes(self, quantity: Quantity, v: Tensor | None) -> Tensor:
+        slopes, u = self._in_reverse("gradient", None), self.u[:, None]
+        if quantity == "gradient":
+            return slopes
+        if quantity == "hessian_diagonal":
+            return slopes * u / self.sigma
+        assert v is not None
+        v = v.double()[:, None, None]
+        rows, columns = slopes * (u * v / self.sigma).sum(-1, keepdim=True), (slopes * v).sum(-1, keepdim=True) * u
+        return 0.5 * (rows + columns / self.sigma)  # as a product with the symmetric Hessian
+
+    def _in_reverse(self, quantity: Quantity, v: Tensor | None) -> Tensor:
+        with torch.inference_mode(False), torch.enable_grad():
+            z = (self.x.double()[:, None] + self.sigma * self.u).to(self.x.dtype).requires_grad_()
+            values = self.control.coefficient * self._predicted(z)
+            outputs = values.reshape(*z.shape[:2], -1).unbind(2)
+
+            def gradient(of: Tensor, *, graph: bool = False) -> Tensor:
+                """[B, Q, n]"""
+                if not of.requires_grad:
+                    return torch.zeros_like(z)
+                (found,) = torch.autograd.grad(of.sum(), z, create_graph=graph, retain_graph=True, allow_unused=True)
+                return torch.zeros_like(z) if found is None else found
+
+            if quantity == "gradient":
+                return torch.stack([gradient(one) for one in outputs], 2).double()
+            found = []
+            for one in outputs:
+                slopes = gradient(one, graph=True)
+                if v is not None:
+                    found.append(gradient((slopes * v[:, None]).sum(2)))
+                else:
+                    found.append(torch.stack([gradient(slopes[..., i])[..., i] for i in range(z.shape[2])], 2))
+            return torch.stack(found, 2).double()
+
     def _along(self, x: Tensor, v: Tensor) -> Tensor:
         return _derivative(self._each, x, v.expand_as(x))
 
@@ -223,40 +203,44 @@ def _derivative(fn: Callable[[Tensor], Tensor], x: Tensor, v: Tensor) -> Tensor:
     return result
 
 
-def prefers_pathwise(
-    control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int
-) -> bool | None:
-    """Whether pathwise derivatives of the surrogate at x [B, n] vary less than Stein's sums.
+def measure(
+    control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int, seed: int
+) -> None:
+    """Choose how the term at x [B, n] is differentiated, `Memory.pathwise`.
 
-    Both are computed for a few elements of the batch, and the variances of the derivative of this order compared. The
-    answer depends on the surrogate and not on evaluations of the present call. The pathwise derivatives of a table, a
-    tree or a model outside of autograd are 0, without variance, and wrong: the answer is no. It is None where the
-    surrogate is constant wherever it was looked at: both derivatives are 0 there, and another call decides.
+    It is chosen at the first call after a fit. At the later ones a head or a surrogate of the caller's may turn out to
+    have jumps or kinks that were not met before.
+
+    Pathwise derivatives are taken as far as the losses are smooth. With few parameters these and Stein's sums are
+    computed for a few elements of the batch, and the variances of the derivative of this order compared. The pathwise
+    derivatives of a table, a tree or a model outside of autograd are 0, without variance, and wrong. The choice is left
+    open where the losses are constant wherever they were looked at: both derivatives are 0 there.
     """
-    surrogate, step = control.memory.surrogate, -(-len(x) * len(u) // LOOKED)
-    found = jumps(surrogate, (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype))
+    memory = control.memory
+    if memory.pathwise == 0 or (memory.pathwise and known_smooth(control)):
+        return
+    with torch.inference_mode(False):
+        orders = _smooth_orders(control, x, aux, sigma, u, seed)
+        if memory.pathwise and orders in (None, memory.pathwise):
+            return
+        if orders and len(sigma) <= MOST_STEIN:
+            few = [one[:_TRIED].clone() for one in (x, *aux)]
+            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u, orders)
+            quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
+            own, others = (float(one.variance(quantity).sum()) for one in (term, replace(term, pathwise=0)))
+            orders = orders if own < others else 0
+    memory.pathwise = orders
+
+
+def _smooth_orders(
+    control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, seed: int
+) -> int | None:
+    """Return how many pathwise derivatives are right, as far as is known; None where the losses are constant."""
+    memory, count = control.memory, len(x) * len(u)
+    if memory.pathwise:  # so many were right up to now: a shorter look, as the term itself is looked at
+        return smooth_orders(control, x, aux, sigma, seed, most=memory.pathwise, points=count)
+    step = -(-count // _LOOKED)
+    found = jumps(memory.surrogate, (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype))
     if found is not False:
-        return None if found is None else False
-    if len(sigma) > MOST_STEIN:
-        return True
-    few = SurrogateTerm(surrogate, control, x[:_TRIED], [one[:_TRIED] for one in aux], sigma, u, True)
-    quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
-    return float(few.variance(quantity).sum()) < float(replace(few, pathwise=False).variance(quantity).sum())
-
-
-def jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
-    """Whether outputs at points z [Q, n] differ where their derivative says that they are constant; None if they do not
-    differ.
-    """
-    with torch.inference_mode(False), torch.enable_grad():
-        at = z.clone().requires_grad_()
-        outputs = as_constant(surrogate, at).reshape(len(z), -1)
-        if bool((outputs == outputs[:1]).all()):
-            return None
-        if not outputs.requires_grad:
-            return True
-        weights = torch.arange(
-            1, 1 + outputs.shape[1], dtype=outputs.dtype, device=outputs.device
-        )  # their plain sum may be constant
-        (slope,) = torch.autograd.grad((outputs @ weights).sum(), at, allow_unused=True)
-    return slope is None or not bool(slope.any())
+        return None if found is None else 0
+    return 2 if known_smooth(control) else smooth_orders(control, x, aux, sigma, seed)

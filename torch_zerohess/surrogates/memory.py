@@ -94,8 +94,9 @@ class Memory:
         self.capacity, self.fresh, self.order, self.draws = capacity, fresh, order, draws
         self.evaluations = 0
         """Evaluations taken so far, those that are no longer kept included."""
-        self.pathwise: bool | None = None
-        """How the surrogate's term is differentiated, see `estimation.surrogate_term`; None: to be measured."""
+        self.pathwise: int | None = None
+        """Orders of pathwise derivatives of the surrogate's term, 0, 1 or 2, see `estimation.surrogate_term`; None: to
+        be measured."""
         self.lock = threading.RLock()
         """Held during a call, so that the surrogate does not change in it."""
         self._points: list[Tensor] = []
@@ -238,6 +239,8 @@ class Memory:
         self._size, self.evaluations = len(points), state["evaluations"]
         self.regression.moments = [list(one) for one in state["moments"]]
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
+        if self.pathwise is True:  # of earlier versions
+            self.pathwise = 2
         self._known = state["known"]
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
             self.surrogate.load_state_dict(state["surrogate"])

@@ -1,0 +1,208 @@
+"""How many derivatives of c h(g(z), r) along its points are right: 2, or 1 at kinks, or 0 at jumps.
+
+Torch differentiates piece by piece: of |z| the second derivative is 0 everywhere, and of a step the first one is. What
+happens between the pieces is lost. Along a segment the change of the losses is the integral of their slope, if they do
+not jump, and the change of the slope is the integral of the second derivative, if they have no kinks. Both are computed
+along segments as long as sigma, beginning at random points of the Gaussians.
+
+A quadrature has an error, too. It falls with the number of nodes. What a jump or a kink adds does not.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.estimation.control import Control, Prediction, as_constant
+from torch_zerohess.heads import SquaredError
+from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.low_rank import LowRankSurrogate
+from torch_zerohess.surrogates.process import ProcessSurrogate
+from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
+
+_SMOOTH = (AutomaticSurrogate, LinearSurrogate, ProcessSurrogate, SparseSurrogate)
+"""Exact types whose second derivatives are continuous."""
+_ROOT = math.sqrt(6.0 / 5.0)
+_INNER, _OUTER = (math.sqrt((3.0 - 2.0 * _ROOT) / 7.0), math.sqrt((3.0 + 2.0 * _ROOT) / 7.0))
+_NODES = (-_OUTER, -_INNER, _INNER, _OUTER)
+_SHARES = tuple((18.0 + sign * math.sqrt(30.0)) / 72.0 for sign in (-1, 1, 1, -1))
+"""Gauss-Legendre quadrature with four nodes on [-1, 1], and half of its weights."""
+_SEGMENTS = 32
+"""Segments, at most."""
+_COARSE, _FINE = 2, 32
+"""Panels of four nodes on a segment: on all segments, and on those that are looked at again."""
+_AGAIN = 4
+"""Segments with the largest errors, which are looked at again."""
+_TOLERANCE = 0.01
+"""Error of a change along a segment, over its mean size, that is no matter."""
+_LEFT = 0.25
+"""Share of the error that is left with more nodes, at a jump or a kink."""
+_ROUNDING = 64.0
+"""Error in units of rounding that is no matter."""
+
+
+def known_smooth(control: Control) -> bool:
+    """Whether head and surrogate are of this package, and smooth."""
+    surrogate = control.memory.surrogate
+    model = surrogate.model if type(surrogate) is LowRankSurrogate else surrogate
+    return type(model) in _SMOOTH and type(control.outer.head) in (SquaredError, type(None))
+
+
+def panels(count: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return nodes and weights [4 count] of a quadrature on [0, 1]."""
+    left = torch.arange(count, dtype=torch.float64, device=like.device)[:, None]
+    nodes = torch.tensor(_NODES, dtype=torch.float64, device=like.device)
+    shares = torch.tensor(_SHARES, dtype=torch.float64, device=like.device)
+    return ((left + 0.5 + 0.5 * nodes) / count).flatten(), shares.repeat(count) / count
+
+
+@dataclass(frozen=True)
+class _Along:
+    """Losses along segments, from t = 0 to 1 [S, T], and their derivatives in t; None: torch cannot tell them."""
+
+    values: Tensor
+    slopes: Tensor | None
+    bends: Tensor | None
+
+
+@dataclass(frozen=True)
+class _Segments:
+    """From begin [S, n] on along step [S, n], with auxiliary inputs [S, ...]."""
+
+    control: Control
+    begin: Tensor
+    step: Tensor
+    aux: Sequence[Tensor]
+    dtype: torch.dtype
+
+    def part(self, chosen: Tensor) -> "_Segments":
+        aux = [one[chosen] for one in self.aux]
+        return _Segments(self.control, self.begin[chosen], self.step[chosen], aux, self.dtype)
+
+    def along(self, t: Tensor) -> _Along:
+        z = (self.begin[:, None] + t[:, None] * self.step[:, None]).to(self.dtype).requires_grad_()
+        values = Prediction(self.control, self.control.memory.surrogate, self.aux)(z).double()
+        values = values.reshape(*z.shape[:2], -1)
+        if values.shape[2] > 1:  # one number that kinks where any of them does
+            weights = torch.randn(values.shape[2], generator=torch.Generator().manual_seed(0), device="cpu")
+            values = values * weights.to(values)
+        losses = values.sum(2)
+        slopes, bends = _gradient(losses, z, graph=True), None
+        if slopes is None:  # an operation that torch differentiates once
+            slopes = _gradient(losses, z, graph=False)
+            slopes = None if slopes is None else (slopes * self.step[:, None]).sum(2)
+        else:
+            slopes = (slopes * self.step[:, None]).sum(2)
+            bends = _gradient(slopes, z, graph=False)
+            bends = None if bends is None else (bends * self.step[:, None]).sum(2)
+        return _Along(losses.detach(), None if slopes is None else slopes.detach(), bends)
+
+
+def _gradient(values: Tensor, z: Tensor, *, graph: bool) -> Tensor | None:
+    """Return the gradient of the sum of values, zero where torch sees no dependence; None if it has no derivative."""
+    if not values.requires_grad:
+        return torch.zeros_like(z, dtype=values.dtype)
+    try:
+        (found,) = torch.autograd.grad(values.sum(), z, create_graph=graph, retain_graph=True, allow_unused=True)
+    except RuntimeError:
+        return None
+    return torch.zeros_like(z, dtype=values.dtype) if found is None else found.to(values.dtype)
+
+
+def smooth_orders(
+    control: Control,
+    x: Tensor,
+    aux: Sequence[Tensor],
+    sigma: Tensor,
+    seed: int,
+    *,
+    most: int = 2,
+    points: int = 1024,
+) -> int | None:
+    """Return how many derivatives along the points around x [B, n] are right; None where all losses are equal.
+
+    Args:
+        control: head and memory.
+        x: [B, n].
+        aux: [B, ...] each, of the head.
+        sigma: float64 [n].
+        seed: of the segments.
+        most: derivatives that are asked for.
+        points: at which losses are computed, about.
+    """
+    t, weights = panels(_COARSE, sigma)
+    count = max(1, min(_SEGMENTS, points // (len(t) + 2)))
+    generator = torch.Generator().manual_seed(seed)
+    shape = (2, count, x.shape[1])
+    begin, step = torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu").to(x.device)
+    step = step / step.norm(dim=1, keepdim=True)
+    turn = int(torch.randint(len(x), (), generator=generator, device="cpu"))
+    element = (turn + torch.arange(count, device=x.device) * max(1, len(x) // count)) % len(x)
+    with torch.inference_mode(False), torch.enable_grad():
+        segments = _Segments(
+            control,
+            x.detach()[element].double() + sigma * begin,
+            sigma * step,
+            [one.detach()[element] for one in aux],
+            x.dtype,
+        )
+        ends = torch.tensor([0.0, 1.0], dtype=t.dtype, device=t.device)
+        found = segments.along(torch.cat([ends, t]))
+        if bool((found.values == found.values[:1, :1]).all()):
+            return None
+        relative = float((segments.begin / segments.step).abs().nan_to_num(0.0).min(1).values.max())
+        tolerance = _TOLERANCE + _ROUNDING * torch.finfo(x.dtype).eps * relative
+        for order, read in enumerate((lambda one: (one.values, one.slopes), lambda one: (one.slopes, one.bends))):
+            if order >= most or not _holds(segments, read, found, t, weights, tolerance):
+                return min(order, most)
+    return 2
+
+
+def _holds(
+    segments: _Segments, read: Callable[[_Along], Any], found: _Along, t: Tensor, weights: Tensor, tolerance: float
+) -> bool:
+    """Whether the changes of a quantity along the segments are the integrals of its derivative."""
+    quantity, derivative = read(found)
+    if derivative is None:
+        return False
+    errors, sizes = _errors(quantity, derivative, weights)
+    rounding = _ROUNDING * torch.finfo(segments.dtype).eps * float(quantity.abs().nan_to_num().max())
+    least = tolerance * float(sizes.mean()) + rounding
+    worst = errors.argsort(descending=True)[:_AGAIN]
+    if float(errors[worst[0]]) <= least:
+        return True
+    t, weights = panels(_FINE, t)
+    ends = torch.tensor([0.0, 1.0], dtype=t.dtype, device=t.device)
+    quantity, derivative = read(segments.part(worst).along(torch.cat([ends, t])))
+    left, _ = _errors(quantity, derivative, weights)
+    return not (float(left.max()) > least and float(left.sum()) > _LEFT * float(errors[worst].sum()))
+
+
+def _errors(quantity: Tensor, derivative: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return errors of the integrals [S], and the sizes of the changes; 0 for what is not finite."""
+    change = quantity[:, 1] - quantity[:, 0]
+    sizes = torch.maximum(change.abs(), derivative[:, 2:].abs() @ weights)
+    errors = (change - derivative[:, 2:] @ weights).abs()
+    return errors.nan_to_num(0.0, 0.0, 0.0), sizes.nan_to_num(0.0, 0.0, 0.0)
+
+
+def jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
+    """Whether outputs at points z [Q, n] differ where their derivative says that they are constant; None if they do not
+    differ.
+    """
+    with torch.inference_mode(False), torch.enable_grad():
+        at = z.clone().requires_grad_()
+        outputs = as_constant(surrogate, at).reshape(len(z), -1)
+        if bool((outputs == outputs[:1]).all()):
+            return None
+        if not outputs.requires_grad:
+            return True
+        weights = torch.arange(
+            1, 1 + outputs.shape[1], dtype=outputs.dtype, device=outputs.device
+        )  # their plain sum may be constant
+        (slope,) = torch.autograd.grad((outputs @ weights).sum(), at, allow_unused=True)
+    return slope is None or not bool(slope.any())

@@ -113,8 +113,8 @@ def _linearized(values: Callable[[Tensor], Tensor], z: Tensor, step: Tensor, pla
         with torch.enable_grad():
             at = z.detach().requires_grad_()
             losses = values(at)
-        if losses.shape == z.shape[:2]:
-            (slopes,) = torch.autograd.grad(losses.sum(), at)
+            slopes = torch.autograd.grad(losses.sum(), at)[0] if losses.shape == z.shape[:2] else None
+        if slopes is not None:
             return losses.detach(), (slopes.double() @ step[..., None])[..., 0]
     fixed, pull = torch.func.vjp(values, z)  # type: ignore[misc]
     _, push = torch.func.vjp(  # type: ignore[misc]

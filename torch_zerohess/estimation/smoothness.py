@@ -3,7 +3,7 @@
 Torch differentiates piece by piece: of |z| the second derivative is 0 everywhere, and of a step the first one is. What
 happens between the pieces is lost. Along a segment the change of the losses is the integral of their slope, if they do
 not jump, and the change of the slope is the integral of the second derivative, if they have no kinks. Both are computed
-along segments as long as sigma, beginning at random points of the Gaussians.
+along random segments, about as long as sigma in every direction.
 
 A quadrature has an error, too. It falls with the number of nodes. What a jump or a kink adds does not.
 """
@@ -33,8 +33,8 @@ _SHARES = tuple((18.0 + sign * math.sqrt(30.0)) / 72.0 for sign in (-1, 1, 1, -1
 """Gauss-Legendre quadrature with four nodes on [-1, 1], and half of its weights."""
 _SEGMENTS = 32
 """Segments, at most."""
-_COARSE, _FINE = 2, 32
-"""Panels of four nodes on a segment: on all segments, and on those that are looked at again."""
+_COARSE, _FINE = 2, (32, 128)
+"""Panels of four nodes on a segment: on all segments, and on those that are looked at again, twice."""
 _AGAIN = 4
 """Segments with the largest errors, which are looked at again."""
 _TOLERANCE = 0.01
@@ -138,27 +138,25 @@ def smooth_orders(
     count = max(1, min(_SEGMENTS, points // (len(t) + 2)))
     generator = torch.Generator().manual_seed(seed)
     shape = (2, count, x.shape[1])
-    begin, step = torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu").to(x.device)
-    step = step / step.norm(dim=1, keepdim=True)
+    middle, step = torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu").to(x.device)
     turn = int(torch.randint(len(x), (), generator=generator, device="cpu"))
     element = (turn + torch.arange(count, device=x.device) * max(1, len(x) // count)) % len(x)
     with torch.inference_mode(False), torch.enable_grad():
         segments = _Segments(
             control,
-            x.detach()[element].double() + sigma * begin,
+            x.detach()[element].double() + sigma * (middle - 0.5 * step),
             sigma * step,
             [one.detach()[element] for one in aux],
             x.dtype,
         )
-        ends = torch.tensor([0.0, 1.0], dtype=t.dtype, device=t.device)
-        found = segments.along(torch.cat([ends, t]))
+        found = segments.along(torch.cat([t.new_tensor([0.0, 1.0]), t]))
         if bool((found.values == found.values[:1, :1]).all()):
             return None
-        relative = float((segments.begin / segments.step).abs().nan_to_num(0.0).min(1).values.max())
-        tolerance = _TOLERANCE + _ROUNDING * torch.finfo(x.dtype).eps * relative
+        far = float((x.abs() / sigma).max())  # points are rounded, too
+        tolerance = _TOLERANCE + _ROUNDING * torch.finfo(x.dtype).eps * far
         for order, read in enumerate((lambda one: (one.values, one.slopes), lambda one: (one.slopes, one.bends))):
-            if order >= most or not _holds(segments, read, found, t, weights, tolerance):
-                return min(order, most)
+            if order == most or not _holds(segments, read, found, t, weights, tolerance):
+                return order
     return 2
 
 
@@ -172,14 +170,17 @@ def _holds(
     errors, sizes = _errors(quantity, derivative, weights)
     rounding = _ROUNDING * torch.finfo(segments.dtype).eps * float(quantity.abs().nan_to_num().max())
     least = tolerance * float(sizes.mean()) + rounding
-    worst = errors.argsort(descending=True)[:_AGAIN]
-    if float(errors[worst[0]]) <= least:
-        return True
-    t, weights = panels(_FINE, t)
-    ends = torch.tensor([0.0, 1.0], dtype=t.dtype, device=t.device)
-    quantity, derivative = read(segments.part(worst).along(torch.cat([ends, t])))
-    left, _ = _errors(quantity, derivative, weights)
-    return not (float(left.max()) > least and float(left.sum()) > _LEFT * float(errors[worst].sum()))
+    for count in _FINE:
+        if float(errors.max()) <= least:
+            return True
+        worst = errors.argsort(descending=True)[:_AGAIN]
+        segments, before = segments.part(worst), float(errors[worst].sum())
+        t, weights = panels(count, t)
+        quantity, derivative = read(segments.along(torch.cat([t.new_tensor([0.0, 1.0]), t])))
+        errors, _ = _errors(quantity, derivative, weights)
+        if float(errors.sum()) <= _LEFT * before:
+            return True
+    return float(errors.max()) <= least
 
 
 def _errors(quantity: Tensor, derivative: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

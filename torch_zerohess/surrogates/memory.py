@@ -34,11 +34,15 @@ class Memory:
         F(x, r) = c E h(g(x + sigma u), r)  +  E[ h(f(x + sigma u), r) - c h(g(x + sigma u), r) ].
 
     The first term takes no evaluations; its derivatives come from h and g. The second term is estimated from the
-    evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g, provided that
-    h(g(z), r) is differentiable in z (once for gradients, and with a continuous derivative for Hessians). If the
-    derivative of g is zero everywhere (a tree, a table) or unknown to torch (NumPy), Stein's identity differentiates
-    the first term, and the estimate stays unbiased. A bad g costs variance, and c falls to zero. A `Smoothing` with a
-    fixed seed draws other samples at every call that adds evaluations: g would explain the old samples too well.
+    evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g. A bad g costs
+    variance, and c falls to zero. A `Smoothing` with a fixed seed draws other samples at every call that adds
+    evaluations: g would explain the old samples too well.
+
+    Torch differentiates the first term as far as h(g(z), r) is smooth in z, and Stein's identity does the rest: the
+    second derivatives where slopes jump (an absolute error, ReLUs), and all of them where values jump (a threshold, a
+    tree, a table) or torch knows no derivative (NumPy). A head or a surrogate of yours is tested for kinks and jumps at
+    every call, along up to 32 random segments. Kinks that are so rare that no segment meets them stay unseen in that
+    call.
 
     Args:
         surrogate: an object with `fit(points [P, n], outputs [P, *out])` and a differentiable
@@ -54,8 +58,8 @@ class Memory:
             Under `vmap` each element is a batch of its own: all of them get new evaluations, unless there are none.
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
-        draws: points per element at which the surrogate's term is evaluated. None: 4 for more than 32 parameters,
-            otherwise 1024 / B and at least 64. An affine surrogate under `heads.SquaredError` needs none in a layer:
+        draws: points per element at which the surrogate's term is evaluated. None: 4 for more than 32 parameters, or 64
+            with kinks or jumps; for fewer parameters 1024 / B and at least 64. An affine surrogate under `heads.SquaredError` needs none in a layer:
             the expectation is known.
 
     Raises:

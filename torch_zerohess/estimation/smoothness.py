@@ -91,26 +91,24 @@ class _Segments:
             weights = torch.randn(values.shape[2], generator=torch.Generator().manual_seed(0), device="cpu")
             values = values * weights.to(values)
         losses = values.sum(2)
-        slopes, bends = _gradient(losses, z, graph=True), None
-        if slopes is None:  # an operation that torch differentiates once
-            slopes = _gradient(losses, z, graph=False)
-            slopes = None if slopes is None else (slopes * self.step[:, None]).sum(2)
-        else:
-            slopes = (slopes * self.step[:, None]).sum(2)
-            bends = _gradient(slopes, z, graph=False)
-            bends = None if bends is None else (bends * self.step[:, None]).sum(2)
-        return _Along(losses.detach(), None if slopes is None else slopes.detach(), bends)
+        slopes, bends = self._slope(losses, z, graph=True), None
+        if slopes is not None:
+            bends = self._slope(slopes, z, graph=False)
+            slopes = slopes.detach()
+        return _Along(losses.detach(), slopes, bends)
 
+    def _slope(self, values: Tensor, z: Tensor, *, graph: bool) -> Tensor | None:
+        """Return the derivative of values [S, T] along the segments; None if torch has none.
 
-def _gradient(values: Tensor, z: Tensor, *, graph: bool) -> Tensor | None:
-    """Return the gradient of the sum of values, zero where torch sees no dependence; None if it has no derivative."""
-    if not values.requires_grad:
-        return torch.zeros_like(z, dtype=values.dtype)
-    try:
-        (found,) = torch.autograd.grad(values.sum(), z, create_graph=graph, retain_graph=True, allow_unused=True)
-    except RuntimeError:
-        return None
-    return torch.zeros_like(z, dtype=values.dtype) if found is None else found.to(values.dtype)
+        It is zero where torch sees no dependence.
+        """
+        if not values.requires_grad:
+            return torch.zeros_like(values)
+        try:
+            (found,) = torch.autograd.grad(values.sum(), z, create_graph=graph, allow_unused=True)
+        except RuntimeError:
+            return None
+        return torch.zeros_like(values) if found is None else (found * self.step[:, None]).sum(2)
 
 
 def smooth_orders(

@@ -58,9 +58,9 @@ class Memory:
             Under `vmap` each element is a batch of its own: all of them get new evaluations, unless there are none.
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
-        draws: points per element at which the surrogate's term is evaluated. None: 4 for more than 32 parameters, or 64
-            with kinks or jumps; for fewer parameters 1024 / B and at least 64. An affine surrogate under `heads.SquaredError` needs none in a layer:
-            the expectation is known.
+        draws: points per element at which the surrogate's term is evaluated. None: for more than 32 parameters 4, or 64
+            with kinks or jumps; for fewer 1024 / B and at least 64. An affine surrogate under `heads.SquaredError`
+            needs none in a layer: the expectation is known.
 
     Raises:
         TypeError, ValueError: an argument is not as described.
@@ -243,8 +243,8 @@ class Memory:
         self._size, self.evaluations = len(points), state["evaluations"]
         self.regression.moments = [list(one) for one in state["moments"]]
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
-        if self.pathwise is True:  # of earlier versions
-            self.pathwise = 2
+        if isinstance(self.pathwise, bool):  # of earlier versions
+            self.pathwise = 2 * self.pathwise
         self._known = state["known"]
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
             self.surrogate.load_state_dict(state["surrogate"])

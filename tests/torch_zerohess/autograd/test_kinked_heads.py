@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 import torch_zerohess as zh
+from torch_zerohess.estimation.surrogate_mean import nodes
 from truths import deviation
 
 SIGMA, REFERENCE = 0.3, 0.5
@@ -250,13 +251,24 @@ class Square(torch.autograd.Function):
         return result
 
 
+class Refusing(torch.autograd.Function):
+    """The identity, without a derivative."""
+
+    @staticmethod
+    def forward(context: Any, t: Tensor) -> Tensor:
+        return t.clone()
+
+    @staticmethod
+    def backward(context: Any, change: Tensor) -> Tensor:
+        raise RuntimeError("there is no second derivative")
+
+
 class Once(Square):
     """Without a second derivative."""
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(context: Any, change: Tensor) -> Tensor:
-        result: Tensor = 2.0 * change * context.saved_tensors[0]
+        result: Tensor = Refusing.apply(2.0 * change * context.saved_tensors[0])
         return result
 
 
@@ -275,6 +287,8 @@ def test_operations_without_a_forward_mode(door: str, function: Any, n: int) -> 
         box((x + SIGMA * torch.randn_like(x)).requires_grad_(), r)
     exact = derivatives(lambda y: truth("square", identity, y), x, v)
     close([derivatives(lambda y: box(y, r), x, v) for _ in range(20)], exact)
+    if n == 20:
+        assert memory.pathwise == (2 if function is Square else 1)
     one = zh.estimate(identity, x, smoothing, r, head=lambda y, r: loss(y - r).mean(1), memory=memory)
     assert bool(one.hessian().isfinite().all())
 
@@ -291,3 +305,28 @@ def test_without_gradients(inference: bool) -> None:
         assert bool(one.hessian().isfinite().all())
     assert memory.pathwise == 1
     close(values, derivatives(lambda y: truth("absolute", identity, y), x, v)[:1])
+
+
+def test_rounding_is_no_kink() -> None:
+    """Of a loss that is nearly affine, in float32, around points far from zero."""
+    torch.manual_seed(0)
+    memory = zh.Memory(Fixed(identity))
+    smoothing = zh.Smoothing(sigma=SIGMA, samples=2)
+    box = zh.BlackBox(identity, smoothing, head=lambda y: (y + 1e-6 * y.square()).sum(1), memory=memory)
+    for _ in range(4):
+        box((100.0 + torch.randn(4, 12)).requires_grad_())
+    assert memory.pathwise == 2
+
+
+def test_with_kinks_an_element_has_more_points() -> None:
+    assert [len(nodes(0, None, 40, 8, pathwise=one)) for one in (0, 1, 2)] == [64, 64, 4]
+    assert len(nodes(0, 12, 40, 8, pathwise=1)) == 12
+
+
+def test_a_state_of_an_earlier_version() -> None:
+    memory, again = zh.Memory(), zh.Memory()
+    layer(identity, "square", memory, 2)
+    for before, after in ((True, 2), (False, 0), (None, None), (1, 1)):
+        again.load_state_dict({**memory.state_dict(), "pathwise": before})
+        assert again.pathwise == after
+        assert type(again.pathwise) is type(after)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.smoothness import panels
+from torch_zerohess.precision import without_autocast
 
 _SOBOL = 64
 """Parameters up to which points are quasi-random; beyond them a sequence of few points is not even."""
@@ -110,7 +111,7 @@ def _from_slopes(
 def _linearized(values: Callable[[Tensor], Tensor], z: Tensor, step: Tensor, plain: bool) -> tuple[Tensor, Tensor]:
     """Return values [B, Q, *out] at z [B, Q, n], and their derivatives along step [B, n]: their graph ends at step."""
     if plain:  # of one number per point, any operation that has a gradient will do
-        with torch.enable_grad():
+        with torch.enable_grad(), without_autocast(z.device):
             at = z.detach().requires_grad_()
             losses = values(at)
             slopes = torch.autograd.grad(losses.sum(), at)[0] if losses.shape == z.shape[:2] else None

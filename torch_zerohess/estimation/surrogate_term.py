@@ -20,6 +20,7 @@ from torch_zerohess.estimation.control import Control, Prediction
 from torch_zerohess.estimation.smoothness import jumps, known_smooth, smooth_orders
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.surrogate_mean import nodes
+from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.surrogate import outside_inference
 
 MOST_STEIN = 8
@@ -164,7 +165,7 @@ class SurrogateTerm:
         return 0.5 * (rows + columns / self.sigma)  # as a product with the symmetric Hessian
 
     def _in_reverse(self, quantity: Quantity, v: Tensor | None) -> Tensor:
-        with torch.inference_mode(False), torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad(), without_autocast(self.x.device):
             z = (self.x.double()[:, None] + self.sigma * self.u).to(self.x.dtype).requires_grad_()
             values = self.control.coefficient * self._predicted(z)
             outputs = values.reshape(*z.shape[:2], -1).unbind(2)
@@ -219,7 +220,7 @@ def measure(
     memory = control.memory
     if memory.pathwise == 0 or (memory.pathwise and known_smooth(control)):
         return
-    with torch.inference_mode(False):
+    with torch.inference_mode(False), without_autocast(x.device):  # which would round derivatives, too
         orders = _smooth_orders(control, x, aux, sigma, u, seed)
         if memory.pathwise and orders in (None, memory.pathwise):
             return

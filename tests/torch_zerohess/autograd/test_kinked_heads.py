@@ -330,3 +330,35 @@ def test_a_state_of_an_earlier_version() -> None:
         again.load_state_dict({**memory.state_dict(), "pathwise": before})
         assert again.pathwise == after
         assert type(again.pathwise) is type(after)
+
+
+class Product(torch.nn.Module):
+    """A surrogate with a product of matrices."""
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        self.map = torch.linalg.lstsq(points, outputs).solution
+
+    def forward(self, z: Tensor) -> Tensor:
+        return z @ self.map
+
+
+@pytest.mark.parametrize("n", [2, 12])
+@pytest.mark.parametrize("name", ["absolute", "square"])
+def test_autocast_does_not_round_slopes(name: str, n: int) -> None:
+    found = []
+    for autocast in (False, True):
+        torch.manual_seed(0)
+        memory = zh.Memory(Product())
+        smoothing = zh.Smoothing(sigma=SIGMA, samples=2, seed=0)
+        box = zh.BlackBox(identity, smoothing, head=head(name), memory=memory, value="smoothed")
+        x, r, v = (one.float() for one in point(n))
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            for _ in range(4):
+                y = x.clone().requires_grad_()
+                value = box(y + SIGMA * torch.randn_like(y), r)
+            one = zh.estimate(identity, x, smoothing, r, head=head(name), memory=memory).hvp(v)
+        (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
+        (product,) = torch.autograd.grad(gradient, y, v)
+        found.append((memory.pathwise, value.detach(), gradient.detach(), product, one))
+    assert found[0][0] == found[1][0]
+    assert all(torch.equal(first, second) for first, second in zip(found[0][1:], found[1][1:], strict=True))

@@ -1,5 +1,7 @@
 """Layers over closed forms, every kind of sampling, and what tests of layers have in common."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -30,6 +32,19 @@ def close(got: Tensor, expected: Tensor) -> None:
     assert got.dtype == expected.dtype
     # Rounding only; sums have about a hundred terms.
     torch.testing.assert_close(got, expected, rtol=1e-11, atol=1e-11 * (1 + float(expected.abs().max())))
+
+
+class Fixed:
+    """A surrogate that is never fitted."""
+
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        self.function = function
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        pass
+
+    def __call__(self, z: Tensor) -> Tensor:
+        return self.function(z)
 
 
 def leaf(x: Tensor = X) -> Tensor:

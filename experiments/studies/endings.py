@@ -23,11 +23,13 @@ from experiments.reports.tables import table
 METHODS = ("restarts=0", "default", "cobyqa", "py_bobyqa")
 HEADERS = ("function", "parameters", "box", *METHODS, "ratio", "worst ratio", "error left", "error of cobyqa", "runs")
 _SIGMA = 2.0
+"""Size of the first region: sigma of ours, the radius of the rivals."""
 _BOX = 5.0
 """Half the width of the box around 0."""
 _EXAMPLES = 20
 """Of the logistic regression, per parameter."""
 _MOST = 5_000
+"""Evaluations of a search, at most."""
 
 Function = Callable[[Tensor], Tensor]
 

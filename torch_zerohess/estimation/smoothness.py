@@ -38,11 +38,11 @@ _COARSE, _FINE = 2, (32, 128)
 _AGAIN = 4
 """Segments with the largest errors, which are looked at again."""
 _TOLERANCE = 0.01
-"""Error of a change along a segment, over its mean size, that is no matter."""
+"""Error of a change along a segment, over the mean size of the changes, up to which the change counts as right."""
 _LEFT = 0.25
-"""Share of the error that is left with more nodes, at a jump or a kink."""
+"""Share of the error that more nodes leave at least, where there is a jump or a kink."""
 _ROUNDING = 64.0
-"""Error in units of rounding that is no matter."""
+"""The same in units of rounding."""
 
 
 def known_smooth(control: Control) -> bool:

@@ -74,6 +74,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         return replace(known, foretold=self._foretold(known, points)), points
 
     def _foretold(self, known: LossProgress, points: Tensor) -> float:
+        """Return the loss that a quadratic predicts at the first of the points; infinity if it is not determined."""
         pool = known.pool
         if known.done or known.noisy or len(pool) < coefficients(self.settings.n):
             return math.inf

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from layers import Fixed
 from torch import Tensor
 
 import torch_zerohess as zh
@@ -79,19 +80,6 @@ def derivatives(function: Callable[[Tensor], Tensor], x: Tensor, v: Tensor) -> l
     (gradient,) = torch.autograd.grad(value.sum(), y, create_graph=True)
     (product,) = torch.autograd.grad(gradient, y, v)
     return [one.detach() for one in (value, gradient, product)]
-
-
-class Fixed:
-    """A surrogate that is never fitted."""
-
-    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
-        self.function = function
-
-    def fit(self, points: Tensor, outputs: Tensor) -> None:
-        pass
-
-    def __call__(self, z: Tensor) -> Tensor:
-        return self.function(z)
 
 
 def layer(fn: Any, name: str, memory: zh.Memory, n: int) -> zh.BlackBox:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from layers import Fixed
 from torch import Tensor, nn
 
 import torch_zerohess as zh
@@ -27,19 +28,6 @@ def truth(x: Tensor, r: Tensor) -> Tensor:
     phase, power = x @ FREQUENCIES.mT, (SIGMA * FREQUENCIES).square().sum(1)
     square = 0.5 * (1.0 - torch.cos(2.0 * phase) * torch.exp(-2.0 * power))
     return (square - 2.0 * r * torch.sin(phase) * torch.exp(-0.5 * power) + r * r).mean(1)
-
-
-class Fixed:
-    """A surrogate that is never fitted."""
-
-    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
-        self.function = function
-
-    def fit(self, points: Tensor, outputs: Tensor) -> None:
-        pass
-
-    def __call__(self, z: Tensor) -> Tensor:
-        return self.function(z)
 
 
 class Untrained(nn.Module):

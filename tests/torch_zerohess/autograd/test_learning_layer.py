@@ -42,6 +42,7 @@ def test_forward_mode_before_the_surrogate_was_measured() -> None:
         dual = torch.autograd.forward_ad.make_dual(x, torch.ones(1))
         tangent = torch.autograd.forward_ad.unpack_dual(box(dual)).tangent
     torch.testing.assert_close(tangent, torch.tensor(0.6), atol=0.1, rtol=0)
+    assert box.memory.pathwise is None  # the next call without tangents measures
 
 
 @pytest.mark.parametrize(

@@ -35,8 +35,8 @@ _SEGMENTS = 32
 """Segments, at most."""
 _COARSE, _FINE = 2, (32, 128)
 """Panels of four nodes on a segment: on all segments, and on those that are looked at again, twice."""
-_AGAIN = 4
-"""Segments with the largest errors, which are looked at again."""
+_AGAIN = 8
+"""Of so many segments one is looked at again: those with the largest errors."""
 _TOLERANCE = 0.01
 """Error of a change along a segment, over the mean size of the changes, up to which the change counts as right."""
 _LEFT = 0.25
@@ -62,11 +62,15 @@ def panels(count: int, like: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Along:
-    """Losses along segments, from t = 0 to 1 [S, T], and their derivatives in t; None: torch cannot tell them."""
+    """Losses along segments, from t = 0 to 1 [S, T], and their derivatives in t; None: not asked, or torch has none."""
 
     values: Tensor
     slopes: Tensor | None
     bends: Tensor | None
+
+    def pair(self, order: int) -> tuple[Any, Any]:
+        """Return the derivative of this order, and the next one."""
+        return (self.values, self.slopes) if order == 0 else (self.slopes, self.bends)
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ class _Segments:
         aux = [one[chosen] for one in self.aux]
         return _Segments(self.control, self.begin[chosen], self.step[chosen], aux, self.dtype)
 
-    def along(self, t: Tensor) -> _Along:
+    def along(self, t: Tensor, derivatives: int) -> _Along:
         z = (self.begin[:, None] + t[:, None] * self.step[:, None]).to(self.dtype).requires_grad_()
         values = Prediction(self.control, self.control.memory.surrogate, self.aux)(z).double()
         values = values.reshape(*z.shape[:2], -1)
@@ -91,8 +95,8 @@ class _Segments:
             weights = torch.randn(values.shape[2], generator=torch.Generator().manual_seed(0), device="cpu")
             values = values * weights.to(values)
         losses = values.sum(2)
-        slopes, bends = self._slope(losses, z, graph=True), None
-        if slopes is not None:
+        slopes, bends = self._slope(losses, z, graph=derivatives > 1), None
+        if slopes is not None and derivatives > 1:
             bends = self._slope(slopes, z, graph=False)
             slopes = slopes.detach()
         return _Along(losses.detach(), slopes, bends)
@@ -133,7 +137,8 @@ def smooth_orders(
         points: at which losses are computed, about.
     """
     t, weights = panels(_COARSE, sigma)
-    count = max(1, min(_SEGMENTS, points // (len(t) + 2)))
+    coarse, fine = (4 * panel + 2 for panel in (_COARSE, _FINE[0]))
+    count = max(1, min(_SEGMENTS, points // (coarse + fine // _AGAIN)))
     generator = torch.Generator().manual_seed(seed)
     shape = (2, count, x.shape[1])
     middle, step = torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu").to(x.device)
@@ -147,22 +152,20 @@ def smooth_orders(
             [one.detach()[element] for one in aux],
             x.dtype,
         )
-        found = segments.along(torch.cat([t.new_tensor([0.0, 1.0]), t]))
+        found = segments.along(torch.cat([t.new_tensor([0.0, 1.0]), t]), most)
         if bool((found.values == found.values[:1, :1]).all()):
             return None
         far = float((x.abs() / sigma).max())  # points are rounded, too
         tolerance = _TOLERANCE + _ROUNDING * torch.finfo(x.dtype).eps * far
-        for order, read in enumerate((lambda one: (one.values, one.slopes), lambda one: (one.slopes, one.bends))):
-            if order == most or not _holds(segments, read, found, t, weights, tolerance):
+        for order in range(most):
+            if not _holds(segments, order, found, weights, tolerance):
                 return order
-    return 2
+    return most
 
 
-def _holds(
-    segments: _Segments, read: Callable[[_Along], Any], found: _Along, t: Tensor, weights: Tensor, tolerance: float
-) -> bool:
-    """Whether the changes of a quantity along the segments are the integrals of its derivative."""
-    quantity, derivative = read(found)
+def _holds(segments: _Segments, order: int, found: _Along, weights: Tensor, tolerance: float) -> bool:
+    """Whether the changes of the derivative of this order along the segments are the integrals of the next one."""
+    quantity, derivative = found.pair(order)
     if derivative is None:
         return False
     errors, sizes = _errors(quantity, derivative, weights)
@@ -171,10 +174,10 @@ def _holds(
     for count in _FINE:
         if float(errors.max()) <= least:
             return True
-        worst = errors.argsort(descending=True)[:_AGAIN]
+        worst = errors.argsort(descending=True)[: -(-len(errors) // _AGAIN)]
         segments, before = segments.part(worst), float(errors[worst].sum())
-        t, weights = panels(count, t)
-        quantity, derivative = read(segments.along(torch.cat([t.new_tensor([0.0, 1.0]), t])))
+        t, weights = panels(count, weights)
+        quantity, derivative = segments.along(torch.cat([t.new_tensor([0.0, 1.0]), t]), order + 1).pair(order)
         errors, _ = _errors(quantity, derivative, weights)
         if float(errors.sum()) <= _LEFT * before:
             return True

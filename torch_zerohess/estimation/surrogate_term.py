@@ -27,6 +27,8 @@ MOST_STEIN = 8
 """Parameters up to which Stein's sums are tried."""
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
+_SHORTER = 4
+"""Points of the term per point at which a surrogate is looked at for jumps and kinks once more, at least."""
 _LOOKED = 512
 """Points around the elements of a batch at which a surrogate is looked at for jumps, at most."""
 
@@ -239,7 +241,7 @@ def _smooth_orders(
     """Return how many pathwise derivatives are right, as far as is known; None where the losses are constant."""
     memory, count = control.memory, len(x) * len(u)
     if memory.pathwise:  # so many were right up to now: a shorter look, as the term itself is looked at
-        return smooth_orders(control, x, aux, sigma, seed, most=memory.pathwise, points=count)
+        return smooth_orders(control, x, aux, sigma, seed, most=memory.pathwise, points=count // _SHORTER)
     step = -(-count // _LOOKED)
     found = jumps(memory.surrogate, (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype))
     if found is not False:

@@ -195,6 +195,27 @@ def test_kinks_that_are_met_later() -> None:
     assert memory.pathwise == 1
 
 
+def test_a_later_look_takes_fewer_points_than_the_term() -> None:
+    torch.manual_seed(0)
+    memory, count = zh.Memory(), 0
+    plain = layer(identity, "absolute", memory, 2)
+
+    def counted(y: Tensor, r: Tensor) -> Tensor:
+        nonlocal count
+        count += len(y)
+        return head("absolute")(y, r)
+
+    box = zh.BlackBox(identity, plain.smoothing, head=counted, memory=memory).eval()
+    x, r, _ = point(2)
+    counts = []
+    for memory.pathwise in (1, 0):  # with 0, nothing is looked at
+        count = 0
+        box(x.clone().requires_grad_(), r)
+        counts.append(count)
+    looked, term = counts[0] - counts[1], counts[1]
+    assert 0 < looked < 0.5 * term
+
+
 def test_one_memory_and_two_heads() -> None:
     torch.manual_seed(0)
     memory = zh.Memory()

@@ -410,6 +410,7 @@ def test_a_total_plateau_is_said(bounds):
     fit = zh.minimize(lambda z: torch.ones(len(z)), zeros(3), sigma=0.1, seed=0, bounds=bounds, max_evaluations=40)
     assert not fit.success
     assert fit.message.endswith(f"all {fit.evaluations} values are equal: enlarge sigma")
+    assert torch.equal(fit.x, zeros(3)), "no other point is better"
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -276,7 +276,7 @@ class Running:
         if self._last is not None:
             return Belief(self._last.x, self._last.value, self._last.error)
         search = self.search
-        if not self.noise and search.evaluations and self.record.requested is None:
+        if not self.noise and search.evaluations and self.record.requested is None and not self.record.flat:
             return Belief(search.x, search.value, 0.0)
         points, losses = self.record.keeping(search.untouched, search.x)  # with what was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):

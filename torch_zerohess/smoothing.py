@@ -42,8 +42,8 @@ class Smoothing:
             smoothed value for every n: in one dimension the smoothed value of x^2 is x^2 + 2 sigma^2 instead of
             x^2 + sigma^2.
         antithetic: use every perturbation with both signs.
-        baseline: subtracted from f. "center" is f(x); "mean" the mean of all other draws, which costs no evaluation;
-            "none" nothing. It changes the variance, by orders of magnitude, and not the expectation. With sampler
+        baseline: subtracted from f. "center" is f(x); "mean" the mean of all other draws; "none" nothing. Neither of
+            these needs f(x), which is evaluated beside them if value="center". It changes the variance, by orders of magnitude, and not the expectation. With sampler
             "sobol" the draws are scrambles, and samples must be even for "mean".
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
             directions (proposals "aggregate" and "gaussian").

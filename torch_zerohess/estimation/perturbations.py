@@ -63,7 +63,7 @@ def perturb(x: Tensor, smoothing: Smoothing, seed: int, keep: bool, center: bool
         if not bool((farthest < limits.max).all()):
             check_finite(x)
             raise _out_of_range(x, sigma, farthest)
-    if least < _FAR_ABOVE * limits.eps * largest:
+    if least < _FAR_ABOVE * max(limits.eps * largest, limits.smallest_normal * limits.eps):
         _check_rounding(x, sigma)
     points, stein = family(smoothing).draw(x, sigma, smoothing, seed, keep, center)
     return Perturbations(points, stein, sigma)

@@ -27,6 +27,8 @@ MOST_STEIN = 8
 """Parameters up to which Stein's sums are tried."""
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
+_REPEATS = 8
+"""Means over other points, which tell the variance of one."""
 _SHORTER = 4
 """Points of the term per point at which a surrogate is looked at for jumps and kinks once more, at least."""
 _LOOKED = 512
@@ -50,6 +52,8 @@ class SurrogateTerm:
     """[Q, n], see `nodes`."""
     pathwise: int
     """Orders of derivatives along the points."""
+    seed: int
+    """Of the points of other means, see `variance`."""
     _predicted: Prediction = field(init=False)
 
     def __post_init__(self) -> None:
@@ -69,7 +73,7 @@ class SurrogateTerm:
         u = nodes(seed, *shape, pathwise=pathwise).to(x.device)
         with outside_inference():
             copies = [one.clone() for one in aux]
-            return cls(copy.deepcopy(memory.surrogate), control, x.clone(), copies, sigma, u, pathwise)
+            return cls(copy.deepcopy(memory.surrogate), control, x.clone(), copies, sigma, u, pathwise, seed)
 
     @property
     def encoded(self) -> list[Tensor]:
@@ -81,10 +85,19 @@ class SurrogateTerm:
         return self.hessian() if quantity == "hessian" else self._pairs(quantity, v).mean(1)
 
     def variance(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
-        """Return the variance of `mean`, from the spread of the pairs as if independent: usually too large."""
-        if quantity == "hessian":
-            return torch.stack([self.variance("hvp", unit.expand_as(self.x)) for unit in self._units], 3)
-        pairs = self._pairs(quantity, v)
+        """Return the variance of `mean`, from means over other points: the points of one mean are not independent."""
+        count, batch = self.u.shape[0], len(self.x)
+        seeds = torch.Generator().manual_seed(self.seed)
+        means = []
+        for _ in range(_REPEATS):
+            seed = int(torch.randint(2**62, (), generator=seeds, device="cpu"))
+            u = nodes(seed, count, self.u.shape[1], batch).to(self.u.device)
+            means.append(replace(self, u=u).mean(quantity, v))
+        return torch.stack(means).var(0)
+
+    def variance_of_pairs(self, quantity: Quantity) -> Tensor:
+        """Return the variance of `mean` as if its pairs were independent: usually too large."""
+        pairs = self._pairs(quantity, None)
         return pairs.var(1) / pairs.shape[1]
 
     def spread(self, error: Tensor, degrees: Tensor, quantity: Quantity, v: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -96,7 +109,7 @@ class SurrogateTerm:
             quantity: which.
             v: [B, n], the vector of the "hvp".
         """
-        own = len(self.u) // 2 - 1
+        own = _REPEATS - 1
         mine = self.variance(quantity, v).sqrt()
         whole = torch.hypot(error, mine)
         unit = torch.where(whole > 0, whole, 1.0)
@@ -228,9 +241,9 @@ def measure(
             return
         if orders and len(sigma) <= MOST_STEIN:
             few = [one[:_TRIED].clone() for one in (x, *aux)]
-            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u, orders)
+            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u, orders, seed)
             quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
-            own, others = (float(one.variance(quantity).sum()) for one in (term, replace(term, pathwise=0)))
+            own, others = (float(one.variance_of_pairs(quantity).sum()) for one in (term, replace(term, pathwise=0)))
             orders = orders if own < others else 0
     memory.pathwise = orders
 

@@ -147,6 +147,17 @@ def test_the_standard_error_counts_both_terms() -> None:
         torch.testing.assert_close((low + high) / 2, of(got, quantity))
 
 
+def test_the_standard_error_of_a_surrogate_is_the_deviation_over_seeds() -> None:
+    """Its points are even: their spread within one estimate says little about the error of their mean."""
+    memory = Whole(Model(image), draws=64)
+    memory.pathwise = 2
+    found = [estimated(memory, first + k, batch=1) for first in SEEDS for k in range(4)]
+    for quantity in ("value", "gradient", "hessian_diagonal"):
+        deviations = torch.stack([of(one, quantity) for one in found]).std(0)
+        errors = torch.stack([one.standard_error(quantity) for one in found]).square().mean(0).sqrt()
+        assert bool(((errors / deviations - 1.0).abs() < 0.4).all()), quantity
+
+
 def test_the_value_at_the_center_is_the_head_of_the_output_there() -> None:
     memory = Whole(SURROGATES["bad"])
     got = estimated(memory, 0, batch=3, value="center")

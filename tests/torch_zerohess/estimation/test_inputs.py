@@ -337,6 +337,11 @@ def test_sigma_below_the_rounding_of_x(dtype: torch.dtype, sigma: float, hint: s
             call()
 
 
+def test_sigma_below_the_smallest_number() -> None:
+    with pytest.raises(ValueError, match=r"sigma is below the rounding of x: .* x = 0\.0, sigma = 1e-46"):
+        estimate(f, torch.zeros(2), S.replace(sigma=1e-46))
+
+
 @settings(deadline=None, derandomize=True, max_examples=150)
 @given(
     sigma=st.floats(),

@@ -42,9 +42,10 @@ class Smoothing:
             smoothed value for every n: in one dimension the smoothed value of x^2 is x^2 + 2 sigma^2 instead of
             x^2 + sigma^2.
         antithetic: use every perturbation with both signs.
-        baseline: subtracted from f. "center" is f(x); "mean" the mean of all other draws; "none" nothing. Neither of
-            these needs f(x), which is evaluated beside them if value="center". It changes the variance, by orders of magnitude, and not the expectation. With sampler
-            "sobol" the draws are scrambles, and samples must be even for "mean".
+        baseline: subtracted from f. "center" is f(x); "mean" the mean of all other draws; "none" nothing. "mean" and
+            "none" do not need f(x); it is evaluated beside them if value="center". The baseline changes the variance,
+            by orders of magnitude, and not the expectation. With sampler "sobol" the draws are scrambles, and samples
+            must be even for "mean".
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the

@@ -60,7 +60,7 @@ class Minimum:
             that tell the derivatives.
         evaluations: how many there were.
         points: [evaluations, n], where, in order.
-        values: [evaluations], float64, the losses there.
+        values: [evaluations], float64, the losses there; NaN where an output is not finite.
         history: `points` and `values` as a list of `Observation`.
         noise: standard deviation of repeated losses at one point, as it was given or measured at x0; 0 without noise.
         success: whether the target was reached, or the search has found x to be a minimum, possibly a local one. After

@@ -169,7 +169,9 @@ class Running:
 
     def ending(self, *, arrived: bool) -> Status:
         """Return the status when the search ends by itself: a small region is no evidence in noise and in doubt."""
-        return "solved" if arrived and not self.record.flat and not self.noise and not self.doubt else "stalled"
+        if not arrived or self.noise or self.record.flat or not torch.equal(self._best().x, self.search.x):
+            return "stalled"
+        return "stalled" if self.doubt else "solved"
 
     def reaches(self, target: float) -> bool:
         """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.
@@ -178,7 +180,7 @@ class Running:
         """
         if self._last is not None:
             return self._last.value <= target
-        value, decided = self.search.value, self._decided
+        value, decided = self.search.value if self.noise else self._best().value, self._decided
         if decided is not None:
             value = float(self.record.told[1][decided.evaluations :].nan_to_num(nan=torch.inf).min())
         return value <= target - _LUCK * (self.noise or 0.0)
@@ -238,6 +240,7 @@ class Running:
                 arrived=search.solved,
                 success=success,
                 measuring=self._least + 1 if self._unmeasured else 0,
+                failed=int((~torch.isfinite(losses)).sum()),
             ),
             engine=search.engine,
             success=success,
@@ -276,12 +279,13 @@ class Running:
         if self._last is not None:
             return Belief(self._last.x, self._last.value, self._last.error)
         search = self.search
-        if not self.noise and search.evaluations and self.record.requested is None and not self.record.flat:
-            return Belief(search.x, search.value, 0.0)
         points, losses = self.record.keeping(search.untouched, search.x)  # with what was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):
             return self._believed(self.evaluations)
-        return lowest(points, losses, search.x)
+        found = lowest(points, losses, search.x)
+        of_search = search.evaluations and self.record.requested is None and not self.record.flat
+        # What the search takes for the best may be a prediction, where fn varies as if it was noisy.
+        return Belief(search.x, found.value, 0.0) if of_search and search.value == found.value else found
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""

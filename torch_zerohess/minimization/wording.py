@@ -18,6 +18,7 @@ def worded(
     arrived: bool,
     success: bool,
     measuring: int = 0,
+    failed: int = 0,
 ) -> str:
     """Return the message of a result.
 
@@ -30,6 +31,7 @@ def worded(
         arrived: whether the search has arrived at x.
         success: of the result.
         measuring: evaluations with which noise would have been measured; 0 if it was, or was given.
+        failed: evaluations whose values are not finite.
     """
     cut = status in ("budget", "time")
     if equal and status != "target":
@@ -40,6 +42,8 @@ def worded(
         message += "; the search had arrived at x, a minimum at least of its surroundings"
     if measuring:
         message += f"; noise was not measured: give noise, or max_evaluations of at least {measuring}"
+    if failed:
+        message += f"; {failed} values or outputs are not finite, and were left out"
     return message + _on_untouched(untouched)
 
 

@@ -291,14 +291,14 @@ class ProcessMethod(Method[Q]):
 
         deviation: of repeated outputs at one point; 0 if it is not known.
 
-        An output that is not finite is replaced by the output with the highest loss. A loss alone is too little
-        evidence to tell noise from ripples: it counts as noisy only if `noise` is given.
+        An output that is not finite is replaced by the output with the highest loss, and is no evidence of noise. A
+        loss alone is too little evidence to tell noise from ripples: it counts as noisy only if `noise` is given.
         """
-        worst = outputs[int(known.pool.values.argmax())]
-        points = torch.cat([known.pool.points, known.holes])
-        outputs = torch.cat([outputs, worst.expand(len(known.holes), -1)])
-        noises = NOISES + HIGH_NOISES if self.tells_noise(known) else NOISES
-        process = GaussianProcess.fit(points, outputs, noises, deviation or None)
+        pool, holes, noises = known.pool, known.holes, NOISES + HIGH_NOISES if self.tells_noise(known) else NOISES
+        if len(holes) and noises != NOISES and not self.settings.noise:
+            noises = noises if GaussianProcess.fit(pool.points, outputs, noises).noise >= HIGH_NOISES[0] else NOISES
+        outputs = torch.cat([outputs, outputs[int(pool.values.argmax())].expand(len(holes), -1)])
+        process = GaussianProcess.fit(torch.cat([pool.points, holes]), outputs, noises, deviation or None)
         noisy = self.settings.noise > 0.0 or process.noise >= HIGH_NOISES[0]
         best = known.record if known.noisy and not noisy else known.best
         return replace(known, noisy=noisy, best=best), process

@@ -256,12 +256,12 @@ class AskTell(ABC, Generic[P]):
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.after(self._state.progress, evaluated, generator), generator)
-        self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.losses
+        self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.usable
 
     def losses(self, values: Any) -> Tensor:
         """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""
         values = converted(values, self.unit.device)
-        return self._evaluated(values, self.unit.expand(len(values) if values.ndim else 0, -1)).losses
+        return self._evaluated(values, self.unit.expand(len(values) if values.ndim else 0, -1)).usable
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a search with the same settings needs to go on exactly as this one would.

@@ -169,6 +169,11 @@ class Evaluated:
         return finite if self.outputs is None else finite & torch.isfinite(self.outputs).all(1)
 
     @property
+    def usable(self) -> Tensor:
+        """The losses [K]; NaN where a loss ignores numbers of the output that are not finite: no model can."""
+        return torch.where(self.finite | ~torch.isfinite(self.losses), self.losses, math.nan)
+
+    @property
     def needed(self) -> "Evaluated":
         """The points that the method itself asked for."""
         return self.those(slice(len(self) - self.extra)) if self.extra else self

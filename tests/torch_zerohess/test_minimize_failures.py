@@ -1,0 +1,84 @@
+"""Functions that fail at some points, or are rough: the result is the lowest loss that was evaluated, and says so."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_zerohess as zh
+
+TIMES = torch.arange(20, dtype=torch.float64) / 10.0
+
+
+def curve(x: Tensor) -> Tensor:
+    return x[0] * torch.exp(-x[1] * TIMES)
+
+
+DATA = curve(torch.tensor([1.7, 0.9], dtype=torch.float64))
+
+
+def squares(output: Tensor) -> Tensor:
+    return (output - DATA).square().sum()
+
+
+def failing(x: Tensor) -> Tensor:
+    """At a fifth of all points, always the same ones."""
+    return torch.full_like(TIMES, math.nan) if int(abs(float(x[0]) * 1e6)) % 10 in (3, 5) else curve(x)
+
+
+def rough(x: Tensor) -> Tensor:
+    """The same at each call, and as different from point to point as noise."""
+    mixed = [round(abs(float(one)) * 1e9) for one in x]
+    generator = torch.Generator().manual_seed((mixed[0] * 7919 + mixed[1]) % 2**31)
+    return curve(x) + 0.3 * torch.randn(len(TIMES), generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_failures_are_no_noise(seed: int) -> None:
+    settings = {"sigma": 0.8, "bounds": (0.01, 4.0), "loss": squares, "seed": seed}
+    fit = zh.minimize(failing, [1.0, 0.2], vectorized=False, max_evaluations=60, **settings)
+    assert fit.engine == "gaussian_process"
+    assert fit.value == float(squares(failing(fit.x))) == float(fit.values.nan_to_num(math.inf).min()) < 1e-12
+    count = int(fit.values.isnan().sum())
+    assert f"; {count} values or outputs are not finite, and were left out" in fit.message
+    search = zh.optim.TrustRegion([1.0, 0.2], **settings)
+    while search.evaluations < 60 and not search.done:
+        search.tell(torch.stack([failing(one) for one in search.ask()]))
+    assert search.value == float(squares(failing(search.x))) < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("noise", [None, 0.0])
+def test_a_rough_function_has_the_lowest_loss_that_was_evaluated(seed: int, noise: float | None) -> None:
+    settings = {"sigma": 1.0, "bounds": (0.0, 3.0), "loss": squares, "vectorized": False, "seed": seed, "noise": noise}
+    fit = zh.minimize(rough, [0.2, 2.0], max_evaluations=100, **settings)
+    assert fit.value == float(squares(rough(fit.x))) == float(fit.values.min())
+    assert not fit.success, "a random low value is no minimum"
+    again = zh.minimize(rough, [0.2, 2.0], max_evaluations=100, target=fit.value, **settings)
+    assert again.status == "target"
+    assert float(again.values[-1]) == again.value == fit.value
+
+
+@pytest.mark.parametrize("restarts", [None, 0])
+def test_outputs_that_are_not_finite_have_no_loss(restarts: int | None) -> None:
+    """The loss ignores a number that is missing; the search, which models it, cannot."""
+    data = torch.tensor([0.3, -0.5, 0.1, 1.3], dtype=torch.float64)
+
+    def output(x: Tensor) -> Tensor:
+        y = torch.stack([x[0], x[1], x[0] ** 2, x[1] ** 2 - x[0] + 1.35])
+        return torch.where((x[0] < 0.5) & (torch.arange(4) == 2), math.nan, y)
+
+    fit = zh.minimize(
+        output,
+        torch.tensor([1.0, 2.0], dtype=torch.float64),
+        sigma=1.0,
+        loss=lambda y: (y - data).nan_to_num(0.0).square().sum(),
+        vectorized=False,
+        seed=0,
+        max_evaluations=100,
+        restarts=restarts,
+    )
+    assert torch.equal(fit.values.isnan(), fit.points[:, 0] < 0.5)
+    assert fit.value == float(fit.values.nan_to_num(math.inf).min())
+    assert f"; {int(fit.values.isnan().sum())} values or outputs are not finite, and were left out" in fit.message

@@ -46,8 +46,8 @@ class Program(Closing):
     are an error of the next call, if they are there when it begins. A server ends when its standard input
     does. A server that ended or took too long is started again by the next call.
 
-    A run fails if it ends with a code other than 0, takes too long, or writes no number. With on_failure="nan" all
-    points of the run have NaN as their values, in the shape of earlier outputs. Before the first output the shape is
+    A run fails if it ends with a code other than 0, takes too long, or writes no number, or fewer or more of them than
+    before. With on_failure="nan" all points of the run have NaN as their values, in the shape of earlier outputs. Before the first output the shape is
     not known, and each point gets one NaN: if outputs are tensors, call the program at a point where it works first.
     `on_nonfinite` of a layer says how it treats a NaN; `minimize` avoids the point.
 
@@ -99,7 +99,9 @@ class Program(Closing):
             raise ValueError(f"on_failure must be 'raise' or 'nan', got {on_failure!r}")
         self.command, self.server, self.format = command, server, format
         self.timeout = None if timeout is None else checked_number("timeout", timeout, above=0.0)
-        self.on_failure, self._shape = on_failure, torch.Size()
+        self.on_failure = on_failure
+        self._shape: torch.Size | None = None
+        """Of the values of a point; None if there are none yet."""
         self.last_failure: str | None = None
         """Message of the last run that failed, with what it wrote to the standard error; in worker processes theirs."""
         self.folder, self.environment = folder, _checked_environment(environment)
@@ -138,40 +140,31 @@ class Program(Closing):
             raise ValueError(
                 f"x must be points [K, n], got {list(x.shape)}: a Program takes many, leave vectorized=True"
             )
+        if len(x) and self.on_failure == "raise":
+            self._shape = None  # of this call; where runs may fail, it is also known from earlier ones
         if callable(self.command):
             if aux:
                 raise ValueError(f"aux must be empty for a command that is a function of x, got {len(aux)} tensors")
             if not len(x):
-                return _missing((0, *self._shape))
+                return _missing((0, *(self._shape or ())))
             found: dict[int, Tensor | None] = {}
             try:
                 for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
-                    run = functools.partial(self._run, _found(self.command(one), self.folder, self.environment), b"", 1)
-                    found[k] = self._unless_failed(run, one)
+                    command = _found(self.command(one), self.folder, self.environment)
+                    found[k] = self._unless_failed(functools.partial(self._run, command, b"", 1), one)
             except BaseException as error:  # Ctrl-C, too
                 keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
                 raise
-            shapes = {k: one.shape for k, one in found.items() if one is not None}
-            _check_shapes(shapes, x)
-            self._shape = next(iter(shapes.values()), self._shape)
-            return torch.stack([_missing(self._shape) if one is None else one for one in found.values()])
+            return torch.stack([_missing(self._shape or ()) if one is None else one for one in found.values()])
         request = self._request(x, aux)
         answer = self._serve if self.server else functools.partial(self._run, self.command)
         values = self._unless_failed(functools.partial(answer, request, len(x)), x)
-        if values is None:
-            return _missing((*x.shape[:-1], *self._shape))
-        if values.shape[:1] != x.shape[:1]:
-            raise ValueError(
-                f"the program must write one value per point, a list of {len(x)} for points {list(x.shape)}, got "
-                f"{list(values.shape)}"
-            )
-        self._shape = values.shape[x.dim() - 1 :]
-        return values
+        return _missing((*x.shape[:-1], *(self._shape or ()))) if values is None else values
 
     def _unless_failed(self, run: Callable[[], Tensor], x: Tensor) -> Tensor | None:
         """Return the values of a run at x; None if it fails and that is no error. The message names the first point."""
         try:
-            return run()
+            return self._checked(run(), x)
         except (RuntimeError, TimeoutError, ValueError) as error:
             points = x.reshape(-1, x.shape[-1])
             more = f" and {len(points) - 1} more" if len(points) > 1 else ""
@@ -180,6 +173,22 @@ class Program(Closing):
                 raise
             self.last_failure = str(error)
             return None
+
+    def _checked(self, values: Tensor, x: Tensor) -> Tensor:
+        """Return the values of a run at x [..., n]; ValueError if they are not [..., *out] as before."""
+        batch, shape = x.shape[:-1], values.shape[x.dim() - 1 :]
+        if values.shape[: len(batch)] != batch:
+            raise ValueError(
+                f"the program must write one value per point, a list of {len(x)} for points {list(x.shape)}, got "
+                f"{list(values.shape)}"
+            )
+        if not values.numel() and len(x):
+            raise ValueError(f"the program must write numbers, got {list(values.shape)}")
+        if self._shape is not None and shape != self._shape:
+            before, now = list(self._shape), list(shape)
+            raise ValueError(f"the program must write values of one shape, {before} as before, got {now}")
+        self._shape = shape
+        return values
 
     def _serve(self, request: bytes, points: int) -> Tensor:
         assert not callable(self.command)
@@ -274,17 +283,6 @@ class Program(Closing):
 
 def _missing(shape: Sequence[int]) -> Tensor:
     return torch.full(tuple(shape), torch.nan, dtype=torch.float64, device="cpu")
-
-
-def _check_shapes(shapes: Mapping[int, torch.Size], x: Tensor) -> None:
-    """Raise ValueError for values of two shapes, by the number of their points x [K, n]."""
-    first = next(iter(shapes), 0)
-    for k, shape in shapes.items():
-        if shape != shapes[first]:
-            raise ValueError(
-                f"the program must write values of one shape, got {list(shapes[first])} at the point "
-                f"[{numbers(x[first])}] and {list(shape)} at the point [{numbers(x[k])}]"
-            )
 
 
 def _checked_environment(environment: Any) -> dict[str, str] | None:

@@ -280,9 +280,28 @@ def test_a_command_is_made_when_its_run_begins(tmp_path):
 
 def test_values_of_two_shapes_are_named_with_their_points():
     program = Program(lambda point: ["echo", "[1, 2]" if point[0] < 0.2 else "[1, 2, 3]"])
-    message = r"one shape, got \[2\] at the point \[0\.1, 0\.2\] and \[3\] at the point \[0\.333333, 0\.4\]"
+    message = r"at the point \[0\.333333, 0\.4\]: .* values of one shape, \[2\] as before, got \[3\]"
     with pytest.raises(ValueError, match=message):
         program(Z)
+    assert program(Z[1:]).shape[1:] == (3,), "another call may have another shape"
+
+
+@pytest.mark.parametrize("left", [0, 2])
+def test_an_output_that_is_cut_off_is_a_failure(left: int) -> None:
+    """The program ends without an error."""
+
+    def command(point: torch.Tensor) -> list[str]:
+        return ["echo", *["1.5"] * (3 if point[0] < 0.2 else left)]
+
+    def read(output: bytes) -> list[float]:
+        return [float(one) for one in output.split()]
+
+    program = Program(command, format=read, on_failure="nan")
+    for points in (Z, Z[1:]):  # also where no run of the call has worked
+        assert program(points)[-1].isnan().tolist() == [True] * 3
+    assert "at the point [0.333333, 0.4]" in program.last_failure
+    with pytest.raises(ValueError, match=r"at the point \[0\.333333, 0\.4\]: the program must write"):
+        Program(command, format=read)(Z)
 
 
 def test_a_search_goes_on_after_a_run_that_failed():

@@ -300,6 +300,9 @@ def test_an_output_that_is_cut_off_is_a_failure(left: int) -> None:
     for points in (Z, Z[1:]):  # also where no run of the call has worked
         assert program(points)[-1].isnan().tolist() == [True] * 3
     assert "at the point [0.333333, 0.4]" in program.last_failure
+    if not left:
+        first = Program(command, format=read, on_failure="nan")(Z[1:])
+        assert first.isnan().tolist() == [True]
     with pytest.raises(ValueError, match=r"at the point \[0\.333333, 0\.4\]: the program must write"):
         Program(command, format=read)(Z)
 

@@ -22,6 +22,11 @@ def picture(z):
     return (z.sum(1)[:, None, None, None] * torch.arange(48 * 64 * 3).reshape(48, 64, 3)).cos()
 
 
+def with_numbers(z):
+    """[K, n] -> [K, 2] and numbers of the points [K, 2]: two results."""
+    return z.sin()[:, :2], torch.arange(len(z)).repeat(2, 1).mT.double()
+
+
 def points(count: int, n: int = 3) -> torch.Tensor:
     return torch.rand(count, n, generator=torch.Generator().manual_seed(count), dtype=torch.float64)
 

@@ -80,7 +80,15 @@ def as_tensor(result: Any) -> Tensor:
 
 
 def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tensor:
-    """Return values [K, *out] of points [K, n], or raise TypeError or ValueError if they cannot be that."""
+    """Return values [K, *out] of points [K, n], or raise TypeError or ValueError if they cannot be that.
+
+    A batch whose values are a tuple of tensors is several results, as `(image, info)`, and no list of points.
+    """
+    if vectorized and isinstance(result, tuple) and any(getattr(one, "ndim", 0) > 0 for one in result):
+        raise TypeError(
+            f"fn must return one tensor [K, *out], got a tuple of {len(result)}: return one of them, or join them "
+            "along dimension 1"
+        )
     values = as_tensor(result)
     if values.requires_grad:
         raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")

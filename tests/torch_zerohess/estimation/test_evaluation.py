@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate, sparse_jacobian
 from torch_zerohess.estimation.coefficients import mean_of_others
-from torch_zerohess.evaluators.values import as_tensor
+from torch_zerohess.evaluators.values import as_tensor, checked_values
 from truths import spread, vector
 
 S = Smoothing(sigma=0.5, samples=8, proposal="gaussian", seed=1)
@@ -273,7 +273,7 @@ def test_lists_of_arrays_are_one_array(recwarn) -> None:
 
 ROWS = {
     "list": lambda z: [torch.stack([one.sum(), one[0].square()]) for one in z],
-    "tuple": lambda z: tuple(torch.stack([one.sum(), one[0].square()]) for one in z),
+    "tuple of tuples of numbers": lambda z: tuple((float(one.sum()), float(one[0]) ** 2) for one in z),
     "list of lists of numbers": lambda z: [[one.sum(), one[0].square()] for one in z],
     "list of lists of tensors": lambda z: [[one.sum()[None], one[:1].square()] for one in z],
     "float32 before float64": lambda z: [
@@ -290,6 +290,19 @@ def test_a_list_of_rows_is_stacked(rows: Callable[[Tensor], Any]) -> None:
         got = estimate(rows, X, S).gradient
     same = estimate(lambda z: torch.stack([z.sum(1), z[:, 0].square()], 1), X, S).gradient
     torch.testing.assert_close(got.reshape(same.shape), same, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [2, 17])
+@pytest.mark.parametrize("second", [np.ones(17), torch.ones(17, 2), None, 3.0], ids=["array", "tensor", "None", "3.0"])
+def test_several_results_of_a_batch_are_refused(second: Any, count: int) -> None:
+    """As many results as points, too; a function of one point may return a tuple, and one of a batch a list."""
+    z = torch.rand(count, 2, dtype=torch.float64)
+    with pytest.raises(TypeError, match=r"^fn must return one tensor \[K, \*out\], got a tuple of 2: return one"):
+        checked_values((f(z), second), z)
+    assert checked_values([f(one[None]) for one in z], z).shape == (count, 1)
+    assert checked_values(tuple(f(one[None])[0] for one in z), z).shape == (count,)
+    got = estimate(lambda one: (one.sum()[None], one[:1].square()), X, S, vectorized=False).value
+    torch.testing.assert_close(got, torch.stack([X.sum()[None], X[:1].square()]))
 
 
 @pytest.mark.parametrize("kind", [torch.ones, np.ones])

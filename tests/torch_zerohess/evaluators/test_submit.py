@@ -9,6 +9,7 @@ import torch
 from black_boxes import points
 
 import torch_zerohess as zh
+from torch_zerohess.estimation.evaluation import BlackBoxCall
 from torch_zerohess.evaluators import Executor, Inline, ProcessPool
 from truths import vector
 
@@ -50,6 +51,16 @@ def test_the_bits_of_calls_that_wait(evaluator):
 
 def expected_with(aux):
     return black_boxes.waves(points(len(aux)), aux)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_two_results_of_a_batch_are_no_points(evaluator, count):
+    message = r"^fn must return one tensor \[K, \*out\], got a tuple of 2: return one"
+    future = evaluator.submit(black_boxes.with_numbers, points(count))
+    with pytest.raises(TypeError, match=message):
+        future.result()
+    with pytest.raises(TypeError, match=message):
+        BlackBoxCall(black_boxes.with_numbers, evaluator=evaluator)(points(count), [])
 
 
 def test_an_evaluator_in_this_process_records_nothing():

@@ -17,6 +17,11 @@ from torch import Tensor
 class Jacobian(Protocol):
     """J [M, N] of M outputs by N parameters. Vectors may have another precision than J."""
 
+    @property
+    def outputs(self) -> int:
+        """M."""
+        ...
+
     def gram(self) -> Tensor:
         """Return J J^T [M, M]."""
         ...
@@ -41,6 +46,10 @@ class Rows:
     rows: Tensor
     """[M, N]"""
 
+    @property
+    def outputs(self) -> int:
+        return len(self.rows)
+
     def gram(self) -> Tensor:
         return self.rows @ self.rows.mT
 
@@ -62,6 +71,10 @@ class OuterProducts:
     """Of the outputs at the result of the product [B, n, p]."""
     inputs: Tensor
     """[B, q]"""
+
+    @property
+    def outputs(self) -> int:
+        return self.slopes.shape[:2].numel()
 
     def gram(self) -> Tensor:
         flat = self.slopes.flatten(0, 1)
@@ -88,6 +101,10 @@ class Blocks:
     parts: Sequence[Jacobian]
     sizes: Sequence[int]
     """Parameters of each."""
+
+    @property
+    def outputs(self) -> int:
+        return self.parts[0].outputs
 
     def gram(self) -> Tensor:
         return torch.stack([one.gram() for one in self.parts]).sum(0)

@@ -117,7 +117,13 @@ class Model:
         operator = self._operators[0]
         if self._jacobian is None:
             return Rows(white_box_jacobian(operator))
-        return self._jacobian.products(operator.inputs)
+        J, numbers = self._jacobian.products(operator.inputs), sum(one.numel() for one in operator.through)
+        if J.outputs != numbers:
+            raise ValueError(
+                f"SampleJacobian must have the inputs of the same batch: its Jacobian has {J.outputs} rows "
+                f"({len(self._jacobian.inputs)} samples), and y has {numbers} numbers"
+            )
+        return J
 
     def longest_move(self, s: Tensor) -> float:
         """Return how far a step s [N] moves the input [n] of a black box, for the element that moves farthest."""

@@ -40,6 +40,24 @@ def dense(net: nn.Module) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return J, A, g.flatten(), y
 
 
+@pytest.mark.parametrize("hidden", [False, True], ids=["linear", "with a hidden layer"])
+@pytest.mark.parametrize("samples", [slice(4), slice(1), [*range(5), *range(5)]], ids=["4", "1", "10"])
+def test_a_jacobian_of_another_batch_is_refused(samples: slice | list[int], hidden: bool) -> None:
+    net = network() if hidden else nn.Linear(4, 2).double()
+    layer = zh.BlackBox(lambda z: z.square(), zh.Smoothing(sigma=0.3), head=zh.heads.SquaredError())
+    settings = {"curvature": "gauss_newton", "solver": "dual", "modification": "abs", "damping": 1e-3, "adapt": False}
+    optimizer = zh.optim.NewtonCG(net.parameters(), radius=0.5, **settings)  # type: ignore[arg-type]
+
+    def closure() -> tuple[Tensor, Tensor, SampleJacobian]:
+        y = net(IMAGES)
+        return layer(y, torch.zeros(5, 2)).mean(), y, SampleJacobian(net, IMAGES[samples])
+
+    count = len(IMAGES[samples])
+    message = rf"its Jacobian has {2 * count} rows \({count} samples\), and y has 10 numbers$"
+    with pytest.raises(ValueError, match=rf"^SampleJacobian must have the inputs of the same batch: {message}"):
+        optimizer.step(closure)
+
+
 def flat(net: nn.Module) -> Tensor:
     return torch.cat([one.detach().flatten() for one in net.parameters()])
 

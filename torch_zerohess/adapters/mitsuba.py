@@ -91,6 +91,8 @@ class MitsubaScene:
         ModuleNotFoundError: Mitsuba is not installed.
     """
 
+    takes_batches = True
+
     def __init__(
         self,
         description: Description,

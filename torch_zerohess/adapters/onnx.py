@@ -54,6 +54,8 @@ class OnnxFunction:
             free dimensions beside the first, or a constant has a value that an input of integers cannot hold.
     """
 
+    takes_batches = True
+
     def __init__(
         self,
         model: Any,

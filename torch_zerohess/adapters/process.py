@@ -59,8 +59,7 @@ class Program(Closing):
             to `folder`.
         server: whether the program answers many requests.
         format: see above.
-        timeout: seconds per point, after which the program ends, with the programs that it started; None for no
-            limit.
+        timeout: seconds per point, after which the program ends, with the programs that it started; None: no limit.
         folder: where the program runs; here if None.
         environment: variables added to the environment of this process. A PATH among them finds the program, too.
             Relative folders in it are relative to `folder`.
@@ -78,6 +77,8 @@ class Program(Closing):
         >>> Program([sys.executable, "-c", sums])(torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
         tensor([3., 7.], dtype=torch.float64)
     """
+
+    takes_batches = True
 
     def __init__(
         self,
@@ -157,9 +158,8 @@ class Program(Closing):
                 keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
                 raise
             return torch.stack([_missing(self._shape or ()) if one is None else one for one in found.values()])
-        request = self._request(x, aux)
         answer = self._serve if self.server else functools.partial(self._run, self.command)
-        values = self._unless_failed(functools.partial(answer, request, len(x)), x)
+        values = self._unless_failed(functools.partial(answer, self._request(x, aux), len(x)), x)
         return _missing((*x.shape[:-1], *(self._shape or ()))) if values is None else values
 
     def _unless_failed(self, run: Callable[[], Tensor], x: Tensor) -> Tensor | None:

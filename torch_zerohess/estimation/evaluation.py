@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, check_evaluator
+from torch_zerohess.estimation.advice import add_advice
 from torch_zerohess.estimation.coefficients import baseline_of, coefficients_of, share_of
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
@@ -78,9 +79,8 @@ class BlackBoxCall:
                 result = self.evaluator(fn, points, *aux)
         except (IndexError, RuntimeError, TypeError, ValueError) as error:
             raised = isinstance(self.evaluator, Inline) or isinstance(error.__cause__, RemoteTraceback)
-            if raised and self.vectorized and not self.answered and hasattr(error, "add_note"):  # Python 3.11
-                size = list(points.shape)
-                error.add_note(f"fn was called with a batch {size}; if it takes one point, pass vectorized=False")
+            if raised and self.vectorized and not self.answered:
+                add_advice(error, self.fn, points, aux)
             raise
         values = checked_values(result, points, self.vectorized)
         object.__setattr__(self, "answered", True)

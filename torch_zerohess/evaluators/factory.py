@@ -44,6 +44,11 @@ class Factory:
     def __repr__(self) -> str:
         return f"Factory({getattr(self.make, '__name__', self.make)})"
 
+    @property
+    def takes_batches(self) -> bool:
+        """Whether `make` is a class whose black boxes take batches by construction."""
+        return bool(getattr(self.make, "takes_batches", False))
+
     def build(self) -> Callable[..., Any]:
         """Return the black box of this process; the first call makes it."""
         with self._lock:

@@ -12,6 +12,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+from torch_zerohess.adapters.mitsuba import MitsubaScene
+from torch_zerohess.adapters.onnx import OnnxFunction
+from torch_zerohess.adapters.process import Program
+from torch_zerohess.evaluators import Factory
 from truths import spread, vector
 
 S = Smoothing(sigma=0.5, samples=3, seed=1)
@@ -192,6 +196,49 @@ def test_an_error_of_the_first_batch_says_that_it_was_one(of_one_point, error: t
     with pytest.raises(error) as raised:
         estimate(lambda z: of_one_point(z[None].expand(4, 2)), X, S, vectorized=False)
     assert not hasattr(raised.value, "__notes__")
+
+
+CALLED = "fn was called as fn(points [7, 2]"
+
+
+class Batches:
+    """A black box that takes batches by construction, and fails."""
+
+    takes_batches = True
+
+    def __init__(self, error: type[Exception] = ValueError) -> None:
+        self.error = error
+
+    def __call__(self, z: Tensor, *aux: Tensor) -> Tensor:
+        raise self.error("no such scene")
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+@pytest.mark.parametrize(
+    ("fn", "aux", "notes"),
+    [
+        (lambda z: torch.autograd.grad(z.square().sum(), z)[0], [], ["fn is called under torch.no_grad(): compute"]),
+        (lambda z: f(z), [torch.ones(3)], [f"{CALLED}, aux [7, 3])"]),
+        (lambda z, y, w: f(z), [torch.ones(3)], [f"{CALLED}, aux [7, 3])"]),
+        (lambda z, y: f(z), [], [f"{CALLED})"]),
+        (lambda z: (lambda a, b: a)(*z), [], [f"{CALLED}); if it takes one point, pass vectorized=False"]),
+        (Batches(), [], []),
+        (Batches(TypeError).__call__, [], []),
+        (Factory(Batches), [], []),
+    ],
+    ids=["derivatives", "no aux", "two aux", "one aux", "inside", "batches", "method", "factory"],
+)
+def test_the_note_says_how_fn_was_called(fn, aux: list[Tensor], notes: list[str]) -> None:
+    with pytest.raises((TypeError, RuntimeError, ValueError)) as raised:
+        BlackBox(fn, S)(X.clone().requires_grad_(), *aux)
+    found = getattr(raised.value, "__notes__", [])
+    assert len(found) == len(notes)
+    for note, start in zip(found, notes, strict=True):
+        assert note == start or (start.endswith("compute") and note.startswith(start))
+
+
+def test_ready_black_boxes_take_batches() -> None:
+    assert all(one.takes_batches for one in (MitsubaScene, OnnxFunction, Program))
 
 
 def test_an_error_of_a_later_batch_has_no_note() -> None:

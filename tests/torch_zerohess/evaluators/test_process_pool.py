@@ -218,6 +218,12 @@ def test_an_error_of_the_first_batch_in_a_worker_has_a_note(pool):
     assert "if it takes one point, pass vectorized=False" in raised.value.__notes__[0]
 
 
+def test_an_error_of_values_in_a_worker_has_no_note(pool):
+    with pytest.raises(TypeError, match="got a tuple of 2") as raised:
+        zh.estimate(black_boxes.with_numbers, vector(0.1, 0.2), S, evaluator=pool)
+    assert not hasattr(raised.value, "__notes__")
+
+
 def test_points_that_end_the_process_are_lost_and_only_they(pool):
     z = torch.tensor([[0.1, 0.2], [0.7, 0.0], [0.3, 0.4]])
     values = pool(black_boxes.aborting, z)

@@ -1,0 +1,40 @@
+"""Notes on an error of the first call of a black box: how it was called, where that may be the reason."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from torch import Tensor
+
+
+def add_advice(error: Exception, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> None:
+    """Add a note to an error that fn raised when it was called for a batch of points [K, n]; before Python 3.11 none.
+
+    A class of black boxes with the attribute `takes_batches` gets none: its errors are no sign of a function of one
+    point. Neither does an error that says what fn must return.
+    """
+    text = str(error)
+    by_construction = getattr(getattr(fn, "__self__", fn), "takes_batches", False)
+    if by_construction or text.startswith("fn must return") or not hasattr(error, "add_note"):
+        return
+    if "does not require grad" in text:
+        error.add_note(
+            "fn is called under torch.no_grad(): compute what needs derivatives inside under torch.enable_grad()"
+        )
+        return
+    note = f"fn was called with a batch {list(points.shape)}"
+    if isinstance(error, TypeError) and "positional argument" in text:
+        given = [f"points {list(points.shape)}", *(f"aux {list(one.shape)}" for one in aux)]
+        note = f"fn was called as fn({', '.join(given)})"
+    error.add_note(note + ("; if it takes one point, pass vectorized=False" if _takes(fn, 1 + len(aux)) else ""))
+
+
+def _takes(fn: Callable[..., Any], count: int) -> bool:
+    """Whether fn takes so many arguments; True if nothing is known about it."""
+    try:
+        inspect.signature(fn).bind(*range(count))
+    except TypeError:
+        return False
+    except ValueError:  # some functions that are written in C
+        pass
+    return True

@@ -43,6 +43,15 @@ def check_evaluator(value: Any) -> None:
         raise TypeError(f"evaluator must be an object, got the class {value.__name__}: write {value.__name__}(...)")
 
 
+def check_head(value: Any) -> None:
+    """Raise TypeError for a head that cannot be called, or a class in place of an object."""
+    if not callable(value):
+        raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {value!r}")
+    if isinstance(value, type):
+        name = value.__name__
+        raise TypeError(f"head must be made first, head={name}(), got the class {name}")
+
+
 def check_state(state: Any, like: Mapping[str, Any], what: str) -> None:
     """Raise TypeError for a state that is no dictionary, KeyError for one that lacks what `like` has.
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_number
+from torch_zerohess.arguments import check_head, checked_number
 
 __all__ = ["LocalEntropy", "SquaredError"]
 
@@ -69,8 +69,7 @@ class LocalEntropy:
     temperature: float = 0.1
 
     def __post_init__(self) -> None:
-        if not callable(self.head):
-            raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {self.head!r}")
+        check_head(self.head)
         if isinstance(self.head, LocalEntropy):
             raise TypeError(f"head must give losses, not be a LocalEntropy itself, got {self.head!r}")
         checked_number("temperature", self.temperature, above=0.0, below=math.inf)

@@ -8,14 +8,14 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool, check_evaluator
+from torch_zerohess.arguments import check_bool, check_evaluator, check_head
 from torch_zerohess.estimation.advice import add_advice
 from torch_zerohess.estimation.coefficients import baseline_of, coefficients_of, share_of
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.expansion import Expansion
-from torch_zerohess.estimation.head import Head, apply_head, checked_head
+from torch_zerohess.estimation.head import Head, apply_head
 from torch_zerohess.estimation.inputs import all_finite, check_finite, times_changed
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
@@ -63,7 +63,8 @@ class BlackBoxCall:
             check_evaluator(self.evaluator)
         check_bool(vectorized=self.vectorized)
         object.__setattr__(self, "outer", outer_of(self.head))
-        checked_head(self.outer.head)
+        if self.outer.head is not None:
+            check_head(self.outer.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
         rule = self.on_nonfinite

@@ -6,7 +6,6 @@ expanded views, whichever takes fewer calls.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,13 +18,6 @@ _ALONE = (
     "but only derivatives with respect to x are made: call requires_grad_(False) or detach() first, put trainable "
     "parts behind a layer without a head, or work under torch.no_grad()"
 )
-
-
-def checked_head(head: Any) -> Head | None:
-    """Return the head, or raise TypeError if it cannot be called."""
-    if head is not None and not callable(head):
-        raise TypeError(f"head must be callable, (outputs [K, *out], *aux) -> [K], got {head!r}")
-    return head
 
 
 def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:

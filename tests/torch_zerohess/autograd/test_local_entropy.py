@@ -89,6 +89,16 @@ def test_wrong_arguments_say_so() -> None:
         zh.heads.LocalEntropy(3)
 
 
+def test_a_class_of_heads_is_no_head() -> None:
+    message = r"^head must be made first, head=SquaredError\(\), got the class SquaredError$"
+    with pytest.raises(TypeError, match=message):
+        zh.heads.LocalEntropy(zh.heads.SquaredError)
+    with pytest.raises(TypeError, match=message):
+        zh.BlackBox(identity, zh.Smoothing(sigma=0.5), head=zh.heads.SquaredError)
+    with pytest.raises(TypeError, match="got the class LocalEntropy"):
+        zh.BlackBox(identity, zh.Smoothing(sigma=0.5), head=zh.heads.LocalEntropy)
+
+
 def test_tempered_losses_never_overflow() -> None:
     losses, scales = (torch.tensor([row], dtype=torch.float64) for row in ([0.0, 1.0, 1e9], [1e-30, 1.0]))
     assert bool(torch.isfinite(Entropy(square, 0.1).inner(losses, scales)).all())

@@ -161,13 +161,14 @@ def _work(connection: Connection) -> None:
 
 def _execute(job: Job, connection: Connection) -> Message:
     last = 0.0
+    held: Preparation | Record | None = None
 
     def watch(progress: Preparation | Record) -> None:
-        nonlocal last
-        now = time.monotonic()
+        nonlocal last, held
+        now, held = time.monotonic(), progress
         if now - last > _PROGRESS:
             connection.send(progress)
-            last = now
+            last, held = now, None
 
     try:
         task = _load(job.task, job.preset, job.variant, job.threads) if isinstance(job.task, str) else job.task
@@ -176,7 +177,7 @@ def _execute(job: Job, connection: Connection) -> Message:
             task = spread(task, *_carrier(job.workers, job.task, job.preset, job.variant, job.threads))
         method = METHODS[job.method] if isinstance(job.method, str) else job.method
         method.load()
-        return attempt(
+        outcome = attempt(
             task,
             method.name,
             job.run,
@@ -190,6 +191,9 @@ def _execute(job: Job, connection: Connection) -> Message:
         )
     except Exception as error:
         return Trouble(f"{type(error).__name__}: {error}")
+    if held is not None:  # how far it came
+        connection.send(held)
+    return outcome
 
 
 @lru_cache(maxsize=1)  # a scene that stays loaded slows down the next

@@ -248,6 +248,15 @@ def test_network_tasks_are_run_in_the_same_plan(tmp_path, one_process, capsys):
     assert (tmp_path / "bump" / "shift" / "0.pt").exists()
 
 
+def test_the_last_progress_is_where_the_run_ended(tmp_path, one_process, capsys):
+    one = ensemble(tmp_path, 1)
+    assert [outcome.status for outcome in one.run(one.plan([TASK], [HALVE]))] == ["finished"]
+    log = rows(Files(tmp_path / TASK.name / "halve", 0).log)
+    error = 100 * log[-1].image_error / log[0].image_error
+    assert error < 0.1
+    assert f"bowl halve 0: error {error:.3g} %" in capsys.readouterr().err.rsplit("\r", 1)[-1]
+
+
 def test_the_first_progress_of_a_network_is_that_of_its_images(tmp_path, one_process, capsys):
     one = Ensemble(tmp_path, range(1))
     one.run(one.plan([type(BUMP)(SIZE)], [SHIFT]))  # none of them is rendered yet

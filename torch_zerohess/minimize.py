@@ -93,7 +93,7 @@ def minimize(
             does not depend on their number. Most steps are single points: give a `batch`, too, so that all workers
             have work. A point that no process survives has the value NaN. LostEvaluationError if no point has a value.
         callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
-        verbose: whether to write a line to stderr every second.
+        verbose: whether to write a line to stderr every second, and one at the end.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this. In noise a single value is too uncertain: the search
             ends when a value lies below the target by twice the noise, or when its last decision finds it reached.

@@ -465,6 +465,15 @@ def test_verbose_says_how_far_it_is(monkeypatch, capsys):
     assert "10 evaluations, value " in capsys.readouterr().err
 
 
+def test_verbose_says_how_a_short_search_ended(capsys):
+    fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=10, verbose=True)
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"10 evaluations, value {fit.value:.6g}, sigma ")
+    assert last.endswith(" s")
+    zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=10)
+    assert capsys.readouterr().err == ""
+
+
 @pytest.mark.parametrize("resumed", [7, 12, 16])
 def test_fewer_evaluations_than_were_spent(resumed, tmp_path):
     settings = {"sigma": 2.0, "seed": 0, "checkpoint": tmp_path / "search.pt"}

@@ -41,7 +41,7 @@ class Running:
         most: evaluations that there may be.
         path: of the file, or None.
         limits: settings by name that end the search by itself, as the caller gave them.
-        verbose: whether to write a line to stderr every second.
+        verbose: whether to write a line to stderr every second, and one at the end.
     """
 
     def __init__(
@@ -211,10 +211,9 @@ class Running:
             return
         self._written = time.monotonic()
         decided = None if self._decided is None else vars(self._decided)
-        own = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
-        own |= {"unmeasured": self._unmeasured, "limits": self._limits}
-        search = {"search": self.search.state_dict(), "version": VERSION}
-        self._file.write({**own, **search, **self.record.state_dict()})
+        own: dict[str, Any] = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
+        own |= {"unmeasured": self._unmeasured, "limits": self._limits, "version": VERSION}
+        self._file.write({**own, "search": self.search.state_dict(), **self.record.state_dict()})
 
     def minimum(self, status: Status, message: str) -> Minimum:
         """Return the result."""
@@ -223,6 +222,8 @@ class Running:
         around = quadratic_at(x, search, points, losses, self.noise or 0.0)
         equal = self.evaluations if self.record.flat and len(search.unit) < self.evaluations else 0
         why = "" if self.noise else self.doubt
+        if self._verbose:
+            self._say(value)
         success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
         return Minimum(
             x=x,
@@ -310,7 +311,10 @@ class Running:
         now = time.monotonic()
         if self._verbose and now - self._said >= _PAUSE:
             self._said = now
-            said = f"{self.evaluations} evaluations, value {self._best().value:.6g}, sigma {self.search.sigma:.3g}"
-            print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)
+            self._say(self._best().value)
         if now - self._written >= _PAUSE:
             self.write()
+
+    def _say(self, value: float) -> None:
+        said = f"{self.evaluations} evaluations, value {value:.6g}, sigma {self.search.sigma:.3g}"
+        print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)

@@ -79,7 +79,7 @@ class Smoothing:
     scrambles: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sigma", _checked_sigma(self.sigma))
+        object.__setattr__(self, "sigma", checked_sigma(self.sigma))
         for name, least in (("samples", 1), ("order", 1), ("scrambles", 1)):
             number = getattr(self, name)
             if number is not None or name in ("samples", "order"):  # as integers of Python, for `state_dict`
@@ -284,17 +284,18 @@ def _numbers(given: Any) -> Tensor:
     return torch.as_tensor(given, dtype=torch.float64, device="cpu") if real else tensor
 
 
-def _checked_sigma(sigma: Any) -> float | Tensor:
+def checked_sigma(sigma: Any, name: str = "sigma") -> float | Tensor:
+    """Return a number, or a copy [n] in float64. TypeError if sigma is neither, ValueError if it is out of range."""
     if isinstance(sigma, Tensor) and sigma.requires_grad:
-        raise ValueError("sigma must not require grad: pass sigma.detach()")
+        raise ValueError(f"{name} must not require grad: pass {name}.detach()")
     try:
         values = sigma if isinstance(sigma, Tensor) else _numbers(sigma)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"sigma must be a positive number or a tensor [n], got {sigma!r}") from error
+        raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}") from error
     if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:
-        raise TypeError(f"sigma must be a positive number or a tensor [n], got {sigma!r}")
+        raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}")
     values = values.detach().double().clone()
     wrong = values[~(torch.isfinite(values) & (values > 0))]
     if len(wrong):
-        raise ValueError(f"sigma must be positive and finite, got {float(wrong.flatten()[0])}")
+        raise ValueError(f"{name} must be positive and finite, got {float(wrong.flatten()[0])}")
     return float(values) if values.dim() == 0 else values

@@ -124,7 +124,7 @@ def _train(
     sigma = zh.LinearSigma(layer, *trial.task.sigma, steps=max(1, int(ANNEALED * steps)))
 
     def annealed_step(images: Tensor, share: float) -> tuple[float, float]:
-        current = sigma.sigma
+        current = float(sigma.sigma)
         loss = step(images)
         sigma.step()
         return current, loss

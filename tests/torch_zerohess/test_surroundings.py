@@ -166,9 +166,6 @@ def test_newton_cg_leaves_parameters_as_they_were_when_it_fails():
 def test_settings_that_cannot_work_say_so():
     with pytest.raises(ValueError, match="no weight left at 1024 parameters"):
         zh.estimate(f, torch.zeros(1024), S.replace(proposal="uniform"))
-    layer = zh.BlackBox(f, S.replace(sigma=vector(0.1, 2.0)))
-    with pytest.raises(ValueError, match="one sigma for all"):
-        zh.LinearSigma(layer, 1.0, 0.1, steps=3)
 
 
 @pytest.mark.parametrize("default", [torch.float32, torch.float64])

@@ -1,14 +1,14 @@
 """Sigma annealing with the interface of a learning-rate schedule."""
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 
-from torch_zerohess.arguments import check_state, checked_integer, checked_number
+from torch_zerohess.arguments import check_state, checked_integer
 from torch_zerohess.autograd.blackbox import BlackBox
 from torch_zerohess.autograd.sparse_layer import SparseBlackBox
+from torch_zerohess.smoothing import checked_sigma
 
 
 class LinearSigma:
@@ -19,7 +19,8 @@ class LinearSigma:
 
     Args:
         module_or_modules: a `BlackBox` or `SparseBlackBox`, a module that contains some, or several of either.
-        start, end: sigma in units of the black box's input, positive.
+        start, end: sigma in units of the black box's input, positive: numbers, or tensors [n], one sigma per parameter.
+            Each parameter goes from its own start to its own end; a number beside a tensor is that of all parameters.
         steps: number of `step()` calls from start to end, at least 1.
         hold: number of `step()` calls before that.
 
@@ -33,20 +34,19 @@ class LinearSigma:
     """
 
     def __init__(
-        self, module_or_modules: nn.Module | Iterable[nn.Module], start: float, end: float, steps: int, hold: int = 0
+        self,
+        module_or_modules: nn.Module | Iterable[nn.Module],
+        start: float | Tensor,
+        end: float | Tensor,
+        steps: int,
+        hold: int = 0,
     ) -> None:
         self._layers = _layers_of(module_or_modules)
-        for one in self._layers:
-            if not isinstance(one.smoothing.sigma, float):
-                raise ValueError(
-                    f"module_or_modules must have one sigma for all parameters, got {one.smoothing.sigma}: scale the "
-                    "parameters of the black box instead"
-                )
         self._take({"start": start, "end": end, "steps": steps, "hold": hold, "count": 0})
 
     @property
-    def sigma(self) -> float:
-        """The current sigma."""
+    def sigma(self) -> float | Tensor:
+        """The current sigma, a number or float64 [n]."""
         share = min(max(self.count - self.hold, 0) / self.steps, 1.0)
         return (1.0 - share) * self.start + share * self.end  # without rounding at both ends
 
@@ -65,11 +65,25 @@ class LinearSigma:
         self._take(state)
 
     def _take(self, state: Mapping[str, Any]) -> None:
-        start, end = (checked_number(name, state[name], above=0.0, below=math.inf) for name in ("start", "end"))
+        start, end = (checked_sigma(state[name], name) for name in ("start", "end"))
+        if isinstance(start, Tensor) and isinstance(end, Tensor):
+            if len(end) != len(start):
+                raise ValueError(f"end must have one sigma per parameter, as start has {len(start)}, got {len(end)}")
+            end = end.to(start.device)
+        self._check_lengths(start, end)
         steps = checked_integer("steps", state["steps"], 1)
         hold, count = (checked_integer(name, state[name], 0) for name in ("hold", "count"))
         self.start, self.end, self.steps, self.hold, self.count = start, end, steps, hold, count
         self._apply()
+
+    def _check_lengths(self, start: float | Tensor, end: float | Tensor) -> None:
+        """Raise ValueError for a layer with another number of sigmas."""
+        name, longer = ("start", start) if isinstance(start, Tensor) or isinstance(end, float) else ("end", end)
+        for one in self._layers:
+            now = one.smoothing.sigma
+            if isinstance(now, Tensor) and not (isinstance(longer, Tensor) and len(longer) == len(now)):
+                got = f"got {len(longer)}" if isinstance(longer, Tensor) else f"got the number {longer}"
+                raise ValueError(f"{name} must have one sigma per parameter, as a layer has {len(now)}, {got}")
 
     def _apply(self) -> None:
         for one in self._layers:

@@ -1,10 +1,13 @@
 """The sigma schedule: its values step by step, and resuming."""
 
+import io
+
 import numpy as np
 import pytest
 import torch
 
 import torch_zerohess as zh
+from truths import vector
 
 
 def test_linear_sigma():
@@ -38,6 +41,55 @@ def test_linear_sigma():
     for nothing in ([], 5, torch.nn.Linear(1, 1)):
         with pytest.raises(TypeError, match=r"module_or_modules must .*got"):
             zh.LinearSigma(nothing, 1.0, 0.5, steps=2)
+
+
+def test_one_sigma_per_parameter():
+    """From start to end, element by element; a number stands for all of them."""
+    layers = [zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=sigma)) for sigma in (9.0, vector(3.0, 4.0))]
+    start, end = torch.tensor([1.0, 0.7]), [0.2, 0.1]
+    schedule = zh.LinearSigma(layers, start, end, steps=3, hold=1)
+    start *= 100  # it is the caller's
+    for share in (0.0, 0.0, 1 / 3, 2 / 3, 1.0, 1.0):
+        expected = (1 - share) * torch.tensor([1.0, 0.7]).double() + share * vector(*end)
+        for layer in layers:
+            assert layer.smoothing.sigma.dtype == torch.float64
+            torch.testing.assert_close(layer.smoothing.sigma, expected, rtol=1e-15, atol=0.0)
+        schedule.step()
+    assert torch.equal(schedule.sigma, vector(*end))
+    schedule.count = 2
+    resumed = zh.LinearSigma(layers, vector(5.0, 5.0), 1.0, steps=1)
+    assert torch.equal(resumed.sigma, vector(5.0, 5.0))
+    resumed.step()
+    assert torch.equal(layers[0].smoothing.sigma, vector(1.0, 1.0))
+    file = io.BytesIO()
+    torch.save(schedule.state_dict(), file)
+    file.seek(0)
+    resumed.load_state_dict(torch.load(file))
+    assert torch.equal(layers[0].smoothing.sigma, schedule.sigma)
+    assert float(layers[0](torch.zeros(1, 2, requires_grad=True)).detach()) == 0.0
+
+
+def test_sigmas_of_wrong_sizes_and_values():
+    alone = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=9.0))
+    layer = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=vector(3.0, 4.0)))
+    two = vector(1.0, 2.0)
+    wrong = [
+        (alone, two, vector(1.0, 2.0, 3.0), "end must have one sigma per parameter, as start has 2, got 3"),
+        (layer, 1.0, 0.5, r"start must have one sigma per parameter, as a layer has 2, got the number 1\.0"),
+        (layer, vector(1.0, 2.0, 3.0), 0.5, "start must have one sigma per parameter, as a layer has 2, got 3"),
+        (layer, 0.5, vector(1.0, 2.0, 3.0), "end must have one sigma per parameter, as a layer has 2, got 3"),
+        (alone, vector(1.0, -2.0), two, r"start must be positive and finite, got -2\.0"),
+        (alone, two, vector(1.0, float("inf")), "end must be positive and finite, got inf"),
+        (alone, two, two.clone().requires_grad_(), r"end must not require grad: pass end\.detach\(\)"),
+    ]
+    for module, start, end, message in wrong:
+        with pytest.raises(ValueError, match=f"^{message}$"):
+            zh.LinearSigma(module, start, end, steps=2)
+    for start in (torch.ones(2, 2), torch.ones(0), torch.ones(2, dtype=torch.bool)):
+        with pytest.raises(TypeError, match=r"^start must be a positive number or a tensor \[n\], got"):
+            zh.LinearSigma(alone, start, 1.0, steps=2)
+    assert alone.smoothing.sigma == 9.0
+    assert torch.equal(layer.smoothing.sigma, vector(3.0, 4.0))
 
 
 def test_a_state_with_wrong_numbers_changes_nothing():

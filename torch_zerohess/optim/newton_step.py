@@ -1,6 +1,7 @@
 """A step that minimises a quadratic model in a trust region, and its test: shared by `Newton` and `NewtonCG`."""
 
 import math
+import traceback
 from abc import abstractmethod
 from typing import Any
 
@@ -9,7 +10,16 @@ from torch import Tensor
 
 from torch_zerohess.linalg.step import Step
 from torch_zerohess.optim import processes
-from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr, parts_of
+from torch_zerohess.optim.second_order import (
+    CALLS_BACKWARD,
+    TRIALS,
+    Closure,
+    Loss,
+    Model,
+    SecondOrder,
+    checked_lr,
+    parts_of,
+)
 
 _ROUNDING = 10.0
 """Smallest predicted decrease that can be tested, in units of rounding of the loss."""
@@ -74,12 +84,30 @@ class NewtonStep(SecondOrder):
         self._add(s)
         try:
             with torch.no_grad():
-                there = parts_of(closure())[0].mean().to(s.device)
+                there = parts_of(_without_backward(closure))[0].mean().to(s.device)
             actual = float(loss) - float(processes.mean(there) if self._distributed else there)
         finally:
             if not 0.0 < actual < math.inf:
                 self._restore(before)
         return actual
+
+
+def _without_backward(closure: Closure) -> Loss:
+    """Return what the closure does; RuntimeError with the reason if it takes the derivatives of its loss.
+
+    `backward` keeps the graph of the first call if it was asked to, and finds none here.
+    """
+    try:
+        return closure()
+    except RuntimeError as error:
+        if "does not require grad and does not have a grad_fn" in str(error) and _in_backward(error):
+            raise RuntimeError(CALLS_BACKWARD) from error
+        raise
+
+
+def _in_backward(error: RuntimeError) -> bool:
+    """Whether an error was raised in `Tensor.backward` or `torch.autograd.backward`."""
+    return any(frame.name == "backward" for frame in traceback.extract_tb(error.__traceback__))
 
 
 def _next_radius(ratio: float, length: float, radius: float) -> float:

@@ -29,6 +29,8 @@ _OUTSIDE = 1e-4
 """Part of a gradient that may come from elsewhere than the inputs of black boxes, for the dual solve: rounding."""
 _INDEFINITE = 100.0
 """Negative eigenvalue of a curvature that is more than rounding, over the largest magnitude times the rounding."""
+CALLS_BACKWARD = "closure must return the loss without calling backward: the step itself takes the derivatives"
+"""What is wrong with a closure as for the optimizers of torch."""
 TRIALS = 10
 """Evaluations of one step at most; it is shortened after each one at which the loss is not finite."""
 
@@ -232,9 +234,7 @@ class SecondOrder(Optimizer):
                 of_parts = [CurvatureOperator(one, self._parameters, mode=curvature, through=through) for one in parts]
             except RuntimeError as error:
                 if "backward through the graph a second time" in str(error):
-                    raise RuntimeError(
-                        "closure must return the loss without calling backward: the graph of the loss is freed by it"
-                    ) from error
+                    raise RuntimeError(CALLS_BACKWARD) from error
                 raise
             if self._distributed:
                 processes.check_equal(self._parameters, len(parts))

@@ -1,5 +1,7 @@
 """The quadratic model of a loss that the second-order optimizers share."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -59,6 +61,30 @@ def test_a_closure_that_calls_backward_is_told_not_to(kind: type) -> None:
         optimizer.step(closure)
     assert torch.equal(p.detach(), vector(1.0, 2.0))
     assert dict(optimizer.state) == {}
+
+
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton])
+@pytest.mark.parametrize("kept", ["create_graph", "retain_graph"])
+def test_a_closure_whose_backward_keeps_the_graph_is_told_so(kind: type, kept: str) -> None:
+    p = torch.nn.Parameter(vector(1.0, 2.0))
+    optimizer = kind([p])
+
+    def closure() -> torch.Tensor:
+        loss = (p**4).sum()
+        loss.backward(**{kept: True})
+        return loss
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns of create_graph
+        with pytest.raises(RuntimeError, match=r"^closure must return the loss without calling backward"):
+            optimizer.step(closure)
+    assert torch.equal(p.detach(), vector(1.0, 2.0))
+
+    def with_slopes() -> torch.Tensor:
+        return torch.autograd.grad((p**4).sum(), p, create_graph=True)[0].square().sum()
+
+    with pytest.raises(RuntimeError, match=r"^element 0 of tensors does not require grad"):
+        optimizer.step(with_slopes)
 
 
 @pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])

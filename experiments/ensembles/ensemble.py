@@ -65,11 +65,14 @@ class Ensemble:
         """Return all jobs in the order of `ordered`.
 
         methods: None takes all that apply. A method that does not apply to a task, or lacks a package, is left out with
-        a line that says so. Settings that differ from earlier runs in the folder are refused.
+        a line that says so. Settings that differ from earlier runs in the folder are refused, and folders of a task or
+        method that cannot be written.
         """
         jobs = [job for task in tasks for job in self._jobs(task, methods)]
         if not jobs:
             raise SystemExit("no method of this command can be run on these tasks")
+        for folder in dict.fromkeys(job.files.folder for job in jobs):
+            check_folder(folder)
         register(self.folder, settings_by_method(jobs))
         return ordered(jobs)
 

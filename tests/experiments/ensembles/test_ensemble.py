@@ -105,6 +105,16 @@ def test_other_settings_are_refused(results):
         ensemble(results[0]).plan([replace(TASK, evaluations=401)], [HALVE])
 
 
+@pytest.mark.parametrize("file", [TASK.name, f"{TASK.name}/halve"])
+def test_a_file_in_place_of_a_folder_is_refused_before_the_runs(tmp_path, file):
+    path = tmp_path / file
+    path.parent.mkdir(exist_ok=True)
+    path.touch()
+    with pytest.raises(SystemExit, match=rf"^out must be a folder .*, got {tmp_path}/bowl/halve: Not a directory$"):
+        ensemble(tmp_path).plan([TASK], [SEARCH, HALVE] if file != TASK.name else [HALVE])
+    assert not (tmp_path / "command.json").exists()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

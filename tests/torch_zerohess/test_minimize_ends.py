@@ -632,3 +632,18 @@ def test_the_border_of_a_region_that_fails_is_no_minimum_that_rounds_confirm(see
     fit = zh.minimize(f, zeros(2), sigma=0.5, max_evaluations=200, vectorized=False, seed=seed)
     assert fit.status == "budget"
     assert "fails next to x" in fit.message
+
+
+@pytest.mark.parametrize("seed", [4, 9])
+def test_before_a_wall_of_failures_nothing_is_solved(seed):
+    """The loss falls towards the wall, and the last steps are too long for failures within 0.02 sigma."""
+    wanted = torch.tensor([0.3, -0.5, 0.1, 1.3]).double()
+
+    def fn(x):
+        y = torch.stack([x[0], x[1], x[0] ** 2, x[1] ** 2 - x[0] + 1.35])
+        return y if x[0] >= 0.5 else y * math.nan
+
+    settings = {"loss": lambda y: (y - wanted).square().sum(), "vectorized": False, "restarts": 0, "seed": seed}
+    found = zh.minimize(fn, [1.0, 2.0], sigma=1.0, **settings)
+    assert (found.status, found.success) == ("stalled", False)
+    assert "fails next to x" in found.message

@@ -1,5 +1,7 @@
 """Why x may be no minimum: the black box falls without end, or it jumps, fails, is constant or has a cusp at x."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -7,6 +9,9 @@ from torch_zerohess.surrogates.plateau import is_plateau
 
 _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 """Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
+_FAILED = 0.07
+"""Distance, root mean square over the parameters in units of sigma, up to which a failure is next to x: before a wall
+of failures a search ends at a region of 0.01 sigma, and its last steps are several times as long."""
 
 _PLATEAU = (1e-3, 0.3)
 """Distances, root mean square over the parameters in units of sigma, between which equal values are a plateau: nearer
@@ -55,6 +60,8 @@ def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor)
     if not len(finite):
         return False
     distance, range_ = ((points - x) / unit).norm(dim=1), finite.max() - finite.min()
+    if not bool(torch.isfinite(losses[distance <= _FAILED * math.sqrt(len(x))]).all()):
+        return True
     return not all(bool((losses[distance <= near] - value <= part * range_).all()) for near, part in _NEXT)
 
 

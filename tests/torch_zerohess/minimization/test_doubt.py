@@ -18,7 +18,8 @@ from truths import vector
         (1e-2, 0.05, False),  # a kink
         (0.1, 0.9, False),
         (1e-6, math.nan, True),
-        (1e-2, math.nan, True),
+        (0.05, math.nan, True),  # a failure counts farther away
+        (0.05, 0.5, False),
         (0.1, math.nan, False),
     ],
 )
@@ -27,6 +28,14 @@ def test_a_jump_is_large_for_its_distance(distance: float, value: float, expecte
     x, unit = vector(3.0), vector(2.0)
     points = x + unit * torch.tensor([[0.0], [distance], [5.0]]).double()
     assert jumps(points, vector(0.0, value, 1.0), x, 0.0, unit) is expected
+
+
+@pytest.mark.parametrize(("failed", "expected"), [(0.06, True), (0.08, False)])
+def test_failures_are_next_to_x_by_their_distance_per_parameter(failed: float, expected: bool) -> None:
+    """In 100 parameters; at 0.06 sigma along each of them the distance is 0.6 sigma."""
+    x = torch.zeros(100).double()
+    points = torch.stack([x, x + failed, x + 5.0])
+    assert jumps(points, vector(0.0, math.nan, 1.0), x, 0.0, torch.ones_like(x)) is expected
 
 
 def test_without_a_finite_value_nothing_is_known() -> None:

@@ -74,7 +74,8 @@ def minimize(
         fn: [K, n] -> [K] or [K, 1], the loss; or, with `loss`, -> [K, *out], an image or another output. NumPy and
             anything else that cannot be differentiated is fine.
         x0: start [n]: a tensor, a NumPy array, a list or a tuple. Integers become float64.
-        sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution.
+        sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution. One that is wider
+            than the bounds of a parameter are apart counts as their distance.
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
             there is one, give it: each evaluation then tells as many equations as the output has numbers. It may have
             kinks, as a sum of magnitudes or a norm. A point with a number that is not finite in its output has failed,

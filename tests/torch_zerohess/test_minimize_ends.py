@@ -647,3 +647,22 @@ def test_before_a_wall_of_failures_nothing_is_solved(seed):
     found = zh.minimize(fn, [1.0, 2.0], sigma=1.0, **settings)
     assert (found.status, found.success) == ("stalled", False)
     assert "fails next to x" in found.message
+
+
+@pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
+def test_a_box_far_narrower_than_sigma_is_searched(engine):
+    """A rate in [0, 1e-8] and an amplitude in [0, 1e7]: sigma is 1 for both."""
+    t = torch.linspace(0, 5, 30).double()
+
+    def decay(p):
+        return p[1] / 1e6 * torch.exp(-1e9 * p[0] * t)
+
+    wanted = decay(torch.tensor([1.7e-9, 3.2e6]).double())
+    settings = {"bounds": ([0, 0], [1e-8, 1e7]), "loss": lambda y: (y - wanted).square().sum(), "engine": engine}
+    settings |= {"vectorized": False, "seed": 0}
+    found = zh.minimize(decay, [0.6e-9, 1e6], sigma=1.0, max_evaluations=100, **settings)
+    assert not found.success
+    assert abs(float(found.x[0]) - 1.7e-9) < 1e-9
+    found = zh.minimize(decay, [0.6e-9, 1e6], sigma=[1.0, 1e6], max_evaluations=200, restarts=0, **settings)
+    assert found.success
+    assert found.x.tolist() == pytest.approx([1.7e-9, 3.2e6], rel=1e-3)

@@ -32,7 +32,7 @@ class AskTell(ABC, Generic[P]):
     Args:
         x0: start [n], within the bounds: a tensor, float32 or float64, a NumPy array, a list or a tuple.
         sigma: smoothing at the start, in units of the parameters: of the order of the distance to the solution.
-            One value, or one per parameter [n] where they have different units.
+            One value, or one per parameter [n] where they have different units; at most the width of its bounds.
         bounds: lower and upper, numbers or [n], None for no bound on a side; or a list of n pairs; or
             `scipy.optimize.Bounds`. No point outside of them is ever asked for.
         loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch: `.double()`

@@ -20,7 +20,7 @@ class Space:
     start: Tensor
     """x0 [n], in the type of the parameters."""
     unit: Tensor
-    """The first sigma of every parameter [n], float64."""
+    """The first sigma of every parameter [n], float64; at most the distance between its bounds."""
     lower: Tensor
     """Bounds [n] in the type of the parameters; infinite where there are none."""
     upper: Tensor
@@ -29,7 +29,9 @@ class Space:
     def checked(cls, x0: Tensor, sigma: float | Tensor | Sequence[float], bounds: Bounds | None) -> "Space":
         """Check what a caller gave. ValueError for a wrong shape or type, or a number out of range."""
         lower, upper = _bounds(bounds, x0)
-        return cls(x0.detach().clamp(lower, upper), _unit(sigma, x0), lower, upper)
+        width, unit = upper.double() - lower.double(), _unit(sigma, x0)
+        unit = torch.where(width > 0, unit.minimum(width), unit)  # a wider one would make all of the box one point
+        return cls(x0.detach().clamp(lower, upper), unit, lower, upper)
 
     def check_state(self, state: Mapping[str, Any]) -> None:
         """Raise ValueError for the state of a search with other parameters, another sigma or other bounds."""

@@ -37,7 +37,7 @@ class TrustRegion(AskTell[Any]):
     Args:
         x0: start [n], float32 or float64, within the bounds.
         sigma: smoothing at the start, in units of the parameters: of the order of the distance to the solution.
-            One value, or one per parameter [n] where they have different units.
+            One value, or one per parameter [n] where they have different units; at most the width of its bounds.
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch: `.double()`
             networks in it. None if the black box returns the loss.

@@ -150,6 +150,18 @@ def test_bounds_are_kept_to_the_last_bit(dtype):
     assert at_bounds > 500
 
 
+def test_sigma_is_at_most_the_distance_between_the_bounds():
+    """Otherwise the whole box would be within the tolerance, and every point of it an arrival."""
+    start, bounds = torch.tensor([0.5e-8, 2.0, 7.0]).double(), ([0.0, 0.0, None], [1e-8, 8.0, 9.0])
+    wide, fitting = (Descent(start, sigma=sigma, bounds=bounds, seed=0) for sigma in (3.0, vector(1e-8, 3.0, 3.0)))
+    assert wide.unit.tolist() == [1e-8, 3.0, 3.0]
+
+    def f(z):
+        return ((z - vector(0.2e-8, 1.0, 1.0)) / vector(1e-8, 1.0, 1.0)).square().sum(1)
+
+    assert torch.equal(points_of(wide, f, 30), points_of(fitting, f, 30))
+
+
 def test_asking_for_fewer():
     search, other = Descent(zeros(5), sigma=1.0, seed=0), Descent(zeros(5), sigma=1.0, seed=0)
     every = search.ask()

@@ -666,3 +666,22 @@ def test_a_box_far_narrower_than_sigma_is_searched(engine):
     found = zh.minimize(decay, [0.6e-9, 1e6], sigma=[1.0, 1e6], max_evaluations=200, restarts=0, **settings)
     assert found.success
     assert found.x.tolist() == pytest.approx([1.7e-9, 3.2e6], rel=1e-3)
+
+
+@pytest.mark.parametrize("loss", [None, lambda y: y.square().sum()])
+def test_every_engine_says_that_a_minimum_may_not_be_unique(loss):
+    """a b exp(-c t) determines the product of a and b alone."""
+    t = torch.linspace(0, 5, 30).double()
+
+    def missed(p):
+        y = p[:, :1] * p[:, 1:2] * torch.exp(-p[:, 2:] * t) - 6.0 * torch.exp(-0.5 * t)
+        return y.square().sum(1) if loss is None else y
+
+    def said(**settings):
+        found = zh.minimize(missed, [1.0, 1.0, 1.0], sigma=1.0, loss=loss, seed=0, **settings)
+        assert found.success
+        return found.message
+
+    box = {"bounds": ([0.1] * 3, [8, 8, 3]), "restarts": 0}
+    assert said(**box).endswith("along some direction the loss hardly changes: the minimum may not be unique")
+    assert said().endswith("the minimum is not unique")

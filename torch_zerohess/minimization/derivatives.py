@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torch_zerohess.search.trust_region import TrustRegion
@@ -13,6 +14,9 @@ _FITTED = 40
 """Parameters up to which a quadratic is fitted to all evaluations at the end."""
 _RELIABLE, _MORE_RELIABLE = 0.1, 1e-3
 """Largest relative standard error of its Hessian with which it replaces a model of the loss, and one of the output."""
+_FLAT, _LEVEL = 1e-6, 1e-3
+"""Curvature and slope along a direction, in units of sigma and over the largest curvature, of a loss that hardly
+changes along it: at a bound there may be a slope."""
 
 
 class Derivatives(NamedTuple):
@@ -35,6 +39,24 @@ def quadratic_at(x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor,
     slope, bend = model.full_errors()
     errors = {"gradient": (slope / unit).to(x), "hessian_diagonal": (bend / unit.square()).to(x)}
     return Derivatives(gradient, hessian, errors, unit.to(x))
+
+
+def is_flat(found: Derivatives, unit: Tensor) -> bool:
+    """Whether the loss hardly changes along some direction, as far as the evaluations determine all curvatures.
+
+    Args:
+        found: the quadratic around x.
+        unit: sigma of every parameter [n].
+    """
+    gradient, hessian, errors = found.gradient, found.hessian, found.standard_errors
+    if gradient is None or hessian is None or errors is None or not 1 < len(unit) <= _FITTED:
+        return False
+    bent, slope = hessian.to(unit) * unit[:, None] * unit, gradient.to(unit) * unit
+    if not bool(torch.isfinite(errors["hessian_diagonal"]).all() and torch.isfinite(bent).all()):
+        return False
+    curvatures, directions = torch.linalg.eigh(bent)
+    largest = float(curvatures[-1])
+    return bool(((curvatures.abs() < _FLAT * largest) & ((slope @ directions).abs() <= _LEVEL * largest)).any())
 
 
 def _model(

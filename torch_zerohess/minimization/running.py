@@ -13,7 +13,7 @@ from torch_zerohess.arguments import check_state
 from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.checkpoint import Checkpoint, check_limits
 from torch_zerohess.minimization.decision import Decision, decide
-from torch_zerohess.minimization.derivatives import quadratic_at
+from torch_zerohess.minimization.derivatives import is_flat, quadratic_at
 from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.first_batch import evaluate_first_batch
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
@@ -240,6 +240,7 @@ class Running:
                 search.untouched,
                 arrived=search.solved,
                 success=success,
+                flat=not self.noise and search.untouched is None and is_flat(around, search.unit),
                 measuring=self._least + 1 if self._unmeasured else 0,
                 failed=int((~torch.isfinite(losses)).sum()),
             ),

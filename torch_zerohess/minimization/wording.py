@@ -17,6 +17,7 @@ def worded(
     *,
     arrived: bool,
     success: bool,
+    flat: bool = False,
     measuring: int = 0,
     failed: int = 0,
 ) -> str:
@@ -30,6 +31,7 @@ def worded(
         untouched: which parameters no output was found to depend on, bools [n]; or None.
         arrived: whether the search has arrived at x.
         success: of the result.
+        flat: whether the loss hardly changes along some direction.
         measuring: evaluations with which noise would have been measured; 0 if it was, or was given.
         failed: evaluations whose values are not finite.
     """
@@ -40,6 +42,8 @@ def worded(
         message += f"; {doubt}"
     if success and cut:
         message += "; the search had arrived at x, a minimum at least of its surroundings"
+    if flat and success and status != "target" and "not unique" not in message:
+        message += "; along some direction the loss hardly changes: the minimum may not be unique"
     if measuring:
         message += f"; noise was not measured: give noise, or max_evaluations of at least {measuring}"
     if failed:

@@ -13,3 +13,15 @@ def test_a_message_names_a_few_parameters():
 
     assert said(untouched) == "used up; 3 of 4 parameters (0, 2, 3) were not found to change any output, and stay"
     assert said(~untouched & untouched) == said(None) == "used up"
+
+
+def test_a_minimum_that_may_not_be_unique_is_said_once():
+    def said(message, status="solved", *, success=True):
+        return worded(message, status, 0, "", None, arrived=True, success=success, flat=True)
+
+    words = "; along some direction the loss hardly changes: the minimum may not be unique"
+    assert said("arrived") == "arrived" + words
+    known = "arrived at points with the loss at x: the minimum is not unique"
+    assert said(known) == known
+    assert said("reached", "target") == "reached"
+    assert said("used up", "callback", success=False) == "used up"

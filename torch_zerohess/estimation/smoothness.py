@@ -43,6 +43,8 @@ _LEFT = 0.25
 """Share of the error that more nodes leave at least, where there is a jump or a kink."""
 _ROUNDING = 64.0
 """The same in units of rounding."""
+_REPEATED = 64
+"""Points at which a surrogate of the caller's is called twice, at most."""
 
 
 def known_smooth(control: Control) -> bool:
@@ -190,6 +192,26 @@ def _errors(quantity: Tensor, derivative: Tensor, weights: Tensor) -> tuple[Tens
     sizes = torch.maximum(change.abs(), derivative[:, 2:].abs() @ weights)
     errors = (change - derivative[:, 2:] @ weights).abs()
     return errors.nan_to_num(0.0, 0.0, 0.0), sizes.nan_to_num(0.0, 0.0, 0.0)
+
+
+def check_repeats(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> None:
+    """Raise ValueError for a surrogate of the caller's whose outputs at the same points [Q, n] differ.
+
+    It draws random numbers in evaluation mode, too: noise that no standard error has.
+    """
+    if type(surrogate) in (*_SMOOTH, LowRankSurrogate):
+        return
+    with torch.no_grad():
+        first, second = (as_constant(surrogate, z[:_REPEATED].clone()) for _ in range(2))
+    if first.shape != second.shape or not first.is_floating_point():
+        return
+    apart = (first - second).abs().nan_to_num()
+    if bool((apart > math.sqrt(torch.finfo(first.dtype).eps) * first.abs().nan_to_num().max()).any()):
+        one, other = (float(outputs.flatten()[apart.argmax()]) for outputs in (first, second))
+        raise ValueError(
+            f"surrogate must give the same outputs for the same points, got outputs that differ: {one:.6g} and "
+            f"{other:.6g}; torch.nn.functional.dropout draws in evaluation mode, too, unless it is told not to"
+        )
 
 
 def jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:

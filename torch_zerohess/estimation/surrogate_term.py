@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.control import Control, Prediction
-from torch_zerohess.estimation.smoothness import jumps, known_smooth, smooth_orders
+from torch_zerohess.estimation.smoothness import check_repeats, jumps, known_smooth, smooth_orders
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.surrogate_mean import nodes
 from torch_zerohess.precision import without_autocast
@@ -256,7 +256,9 @@ def _smooth_orders(
     if memory.pathwise:  # so many were right up to now: a shorter look, as the term itself is looked at
         return smooth_orders(control, x, aux, sigma, seed, most=memory.pathwise, points=count // _SHORTER)
     step = -(-count // _LOOKED)
-    found = jumps(memory.surrogate, (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype))
+    looked = (x[:, None] + sigma * u).flatten(0, 1)[::step].to(x.dtype)
+    check_repeats(memory.surrogate, looked)
+    found = jumps(memory.surrogate, looked)
     if found is not False:
         return None if found is None else 0
     return 2 if known_smooth(control) else smooth_orders(control, x, aux, sigma, seed)

@@ -51,6 +51,8 @@ class Memory:
             affine map of hundreds of parameters is sparse where its outputs depend on few of them each. The layer gives
             the parameters of a module no gradient. Do not call the module in another thread during a call of the layer.
             It calls a module in evaluation mode, whatever its mode is, and leaves mode and buffers as they are.
+            ValueError at the first call after a fit if outputs at the same points differ, as behind a dropout by
+            `torch.nn.functional`, which draws in evaluation mode, too.
         capacity: evaluations that are kept, at least 8. Beyond it, of points that are close to each other the older are
             dropped. Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.

@@ -212,6 +212,51 @@ def test_a_table_is_told_wherever_it_jumps(n: int, numpy: bool) -> None:
     assert abs(float(late.mean()) - 2.0 / math.sqrt(2.0 * math.pi)) < 5.0 * error < 0.05
 
 
+class Drawing(nn.Module):
+    """With a dropout that evaluation mode does not end."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        return nn.functional.dropout(render(z), 0.1)
+
+
+@pytest.mark.parametrize("door", ["layer", "freeze", "estimate"])
+@pytest.mark.parametrize("surrogate", [Drawing(), Fixed(lambda z: render(z) + 1e-3 * torch.randn(3).to(z))])
+def test_a_surrogate_that_draws_in_evaluation_mode_is_refused(surrogate: Any, door: str) -> None:
+    memory, (x, r) = remembering(surrogate), point()
+    doors = {
+        "layer": lambda: layer(memory)(x, r),
+        "freeze": lambda: layer(memory).freeze(x, r),
+        "estimate": lambda: zh.estimate(render, x, zh.Smoothing(sigma=SIGMA, samples=8), memory=memory),
+    }
+    with pytest.raises(ValueError, match="surrogate must give the same outputs for the same points, got outputs that"):
+        doors[door]()
+
+
+@pytest.mark.parametrize(
+    "returned", [lambda z: render(z) * (1.0 + 1e-12 * torch.rand(1).double()), lambda z: render(z).int()]
+)
+def test_roundings_and_integers_of_a_surrogate_are_no_draws(returned: Callable[[Tensor], Tensor]) -> None:
+    """Sums of several threads, and of a GPU, are rounded anew at every call."""
+    memory, (x, r) = remembering(Fixed(returned)), point()
+    assert bool(torch.isfinite(layer(memory)(x, r)).all())
+
+
+def test_a_surrogate_is_called_twice_at_few_points_after_a_fit_alone() -> None:
+    counts = []
+
+    def counted(z: Tensor) -> Tensor:
+        counts.append(len(z))
+        return render(z)
+
+    memory, (x, r) = remembering(Fixed(counted), draws=64), point()
+    called = layer(memory).eval()
+    called(x, r)
+    assert counts.count(64) == 2
+    counts.clear()
+    called(x, r)
+    assert 64 not in counts
+
+
 def test_a_surrogate_that_is_constant_so_far_is_looked_at_again() -> None:
     torch.manual_seed(0)
     memory = zh.Memory(Fixed(lambda z: z[:, 0].clamp(min=0.0).square()), fresh=0)

@@ -582,7 +582,7 @@ def test_minus_infinity_beside_x_is_no_minimum(bounds, most):
     settings = {"sigma": 0.5, "seed": 0, "bounds": bounds, "max_evaluations": most}
     fit = zh.minimize(fn, zeros(1) + 0.2, **settings)
     assert not fit.success
-    assert fit.message.endswith("the loss seems unbounded below, and x is no minimum: check its sign, or give bounds")
+    assert "the loss seems unbounded below, and x is no minimum: check its sign, or give bounds" in fit.message
     assert zh.minimize(lambda z: fn(z, -0.5), zeros(1) + 0.2, **settings).success
 
 

@@ -41,7 +41,7 @@ def test_failures_are_no_noise(seed: int) -> None:
     assert fit.engine == "gaussian_process"
     assert fit.value == float(squares(failing(fit.x))) == float(fit.values.nan_to_num(math.inf).min()) < 1e-12
     count = int(fit.values.isnan().sum())
-    assert f"; {count} values or outputs are not finite, and were left out" in fit.message
+    assert f"; values or outputs that are not finite, and were left out: {count}" in fit.message
     search = zh.optim.TrustRegion([1.0, 0.2], **settings)
     while search.evaluations < 60 and not search.done:
         search.tell(torch.stack([failing(one) for one in search.ask()]))
@@ -81,4 +81,4 @@ def test_outputs_that_are_not_finite_have_no_loss(restarts: int | None) -> None:
     )
     assert torch.equal(fit.values.isnan(), fit.points[:, 0] < 0.5)
     assert fit.value == float(fit.values.nan_to_num(math.inf).min())
-    assert f"; {int(fit.values.isnan().sum())} values or outputs are not finite, and were left out" in fit.message
+    assert f"; values or outputs that are not finite, and were left out: {int(fit.values.isnan().sum())}" in fit.message

@@ -169,9 +169,8 @@ class Running:
 
     def ending(self, *, arrived: bool) -> Status:
         """Return the status when the search ends by itself: a small region is no evidence in noise and in doubt."""
-        if not arrived or self.noise or self.record.flat or not torch.equal(self._best().x, self.search.x):
-            return "stalled"
-        return "stalled" if self.doubt else "solved"
+        elsewhere = not torch.equal(self._best().x, self.search.x)
+        return "stalled" if not arrived or self.noise or self.record.flat or elsewhere or self.doubt else "solved"
 
     def reaches(self, target: float) -> bool:
         """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.

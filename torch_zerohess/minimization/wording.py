@@ -47,7 +47,7 @@ def worded(
     if measuring:
         message += f"; noise was not measured: give noise, or max_evaluations of at least {measuring}"
     if failed:
-        message += f"; {failed} values or outputs are not finite, and were left out"
+        message += f"; values or outputs that are not finite, and were left out: {failed}"
     return message + _on_untouched(untouched)
 
 

@@ -30,7 +30,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.adapters.mitsuba_film import resize
-from torch_zerohess.adapters.mitsuba_parameters import Parameter, Transform, Value, plain
+from torch_zerohess.adapters.mitsuba_parameters import Parameter, plain
+from torch_zerohess.adapters.mitsuba_transforms import Transform
+from torch_zerohess.adapters.mitsuba_values import Value
 from torch_zerohess.adapters.mitsuba_variants import select_variant
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators.process_identity import own_seed

@@ -38,6 +38,17 @@ class Parameter(Protocol):
         """Look the parameter up in a scene that has its names."""
 
 
+def assign(values: Any, name: str, value: Any) -> None:
+    """Give an entry its value, so that the normals of a mesh depend on the values alone.
+
+    Mitsuba recomputes the normals of a mesh whose vertices change, unless its normals change too. To scalar variants an
+    equal value is no change.
+    """
+    values[name] = value
+    if name.endswith((POSITIONS, NORMALS)):
+        values.set_dirty(name)
+
+
 def elements(mi: Any, x: Any, n: int) -> list[Any]:
     """Dr.Jit numbers of a Dr.Jit array x [n]."""
     import drjit

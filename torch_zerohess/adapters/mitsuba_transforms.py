@@ -12,6 +12,7 @@ from torch_zerohess.adapters.mitsuba_parameters import (
     POSITIONS,
     Range,
     Vector,
+    assign,
     elements,
     is_list,
     plain,
@@ -135,12 +136,12 @@ class _Mesh:
             if numbers:
                 matrix = np.array(pose.matrix, np.float64).reshape(4, 4)
                 moved = array @ matrix[:3, :3].T + (0.0 if directions else matrix[:3, 3])
-                values[name] = type(values[name])(moved.astype(np.float32).ravel())
+                assign(values, name, type(values[name])(moved.astype(np.float32).ravel()))
             else:
                 import drjit
 
                 kind = self._mi.Vector3f if directions else self._mi.Point3f
-                values[name] = drjit.ravel(pose @ kind(array.T.astype(np.float32)))
+                assign(values, name, drjit.ravel(pose @ kind(array.T.astype(np.float32))))
 
 
 def _vectors(name: str, vectors: Any) -> list[list[float]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torch_zerohess.adapters.mitsuba_parameters import Range, elements, plain, ranges
+from torch_zerohess.adapters.mitsuba_parameters import Range, assign, elements, plain, ranges
 from torch_zerohess.arguments import checked_number
 
 _ACCEPTED: tuple[tuple[tuple[str, ...], Range], ...] = (
@@ -22,6 +22,9 @@ _ACCEPTED: tuple[tuple[tuple[str, ...], Range], ...] = (
 @dataclass(frozen=True)
 class Value:
     """A number, a colour, a texture or vertices: anything `mitsuba.traverse` lists that is made of real numbers.
+
+    Mitsuba recomputes the normals of a mesh from the `vertex_positions` that it is given, also at x0: the mesh is then
+    smooth where its file had other normals. Normals that are a `Value` of their own are not recomputed.
 
     Args:
         name: of a value, or several that share it.
@@ -92,7 +95,7 @@ class Numbers:
             new = [self._unit * one for one in x] * (size // len(x))
             new = new if size > 1 else new[0]
         for name, kind in zip(self.names, self._kinds, strict=True):
-            values[name] = kind(new)
+            assign(values, name, kind(new))
 
     def _attached(self, x: Any, size: int) -> Any:
         """Elements from a Dr.Jit array x [n]."""

@@ -36,6 +36,21 @@ def things(mi):
     }
 
 
+POSITIONS, NORMALS = "triangle.vertex_positions", "triangle.vertex_normals"
+
+
+def shaded(mi):
+    """The triangle of `things` with normals along z, which is not perpendicular to its plane."""
+    vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
+    surface = vertices, np.tile([[0.0, 0.0, 1.0]], (3, 1)), np.array([[0, 1, 2]], np.uint32)
+    return {**things(mi), "triangle": mi_mesh(mi, "triangle", surface, {"type": "diffuse"})}
+
+
+def triangle_normals(scene):
+    """Those that the next render has."""
+    return np.array(scene.mi.traverse(scene.scene)[NORMALS], float).reshape(3, 3)
+
+
 @pytest.fixture(params=VARIANTS)
 def variant(request) -> str:
     return request.param
@@ -104,6 +119,17 @@ def test_vertices_move_and_turn_and_normals_turn(variant) -> None:
     centre = np.array([0.5, 1.0, 0.5])  # of the box from (0, 0, 0) to (1, 2, 1)
     np.testing.assert_allclose(vertices, (before[0] - centre) @ turn.T + centre + [3, 0, 0], atol=1e-6)
     np.testing.assert_allclose(normals, before[1] @ turn.T, atol=1e-6)
+
+
+@pytest.mark.parametrize("parameters", [[Transform(POSITIONS, move=((1, 0, 0),))], [Value(POSITIONS), Value(NORMALS)]])
+def test_normals_that_are_given_stay(variant, parameters) -> None:
+    """Wherever the vertices were before: to a scalar variant equal normals are no change."""
+    scene = MitsubaScene(shaded, parameters, variant=variant, threads=1)
+    for step in (0.0, 1.0, 2.0, 0.0):
+        x = scene.x0.clone()
+        x[0] += step
+        scene.set(x)
+        np.testing.assert_allclose(triangle_normals(scene), [[0, 0, 1]] * 3, atol=1e-6)
 
 
 def test_labels_bounds_and_start() -> None:
@@ -185,6 +211,14 @@ def test_elements_of_a_texture_are_where_they_belong(variant) -> None:
     image = scene(x[None])[0].double()
     expected = x.reshape(2, 2, 3).flip(0).repeat_interleave(2, 0).repeat_interleave(2, 1)
     torch.testing.assert_close(image, expected, atol=1e-4, rtol=1e-5)
+
+
+def test_normals_depend_on_the_vertices_that_are_given(variant) -> None:
+    """Also at the start, where a scalar variant sees no change: those of the plane of (1, 0, 0) and (0, 2, 1)."""
+    scene = MitsubaScene(shaded, [Value(POSITIONS)], variant=variant, threads=1)
+    for step in (0.0, 1.0, 0.0):
+        scene.set(scene.x0 + step)
+        np.testing.assert_allclose(triangle_normals(scene), [[0, -(0.2**0.5), 0.8**0.5]] * 3, atol=1e-6)
 
 
 def test_several_names_share_a_value() -> None:

@@ -19,6 +19,7 @@ Example: where is the ball, and how bright is it? The points are [K, 3]: two len
 import copy
 import difflib
 import os
+import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -148,7 +149,8 @@ class MitsubaScene:
         start = torch.tensor([value for one in self.parameters for value in one.x0], dtype=torch.float64, device="cpu")
         self.x0 = start.clamp(*self.bounds)
         """[n], the scene as it was loaded, or the nearest within the bounds."""
-        self.values.keep([name for one in self.parameters for name in one.names])
+        self.values.update()  # forgets which entries were read: those that go would be looked up later
+        self.values.keep([rf"{re.escape(name)}\Z" for one in self.parameters for name in one.names])
         self._calls = seed
         self._lock = threading.RLock()  # from the writing of a point to the end of its render
 

@@ -132,6 +132,19 @@ def test_normals_that_are_given_stay(variant, parameters) -> None:
         np.testing.assert_allclose(triangle_normals(scene), [[0, 0, 1]] * 3, atol=1e-6)
 
 
+def test_a_mesh_without_normals_moves(variant, tmp_path: Path) -> None:
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+
+    def flat(mi):
+        mesh = {"type": "obj", "filename": str(tmp_path / "flat.obj"), "face_normals": True}
+        return {"type": "scene", "sensor": camera(mi), "triangle": mesh}
+
+    scene = MitsubaScene(flat, [Transform(POSITIONS, move=((1, 2, 3),))], variant=variant, threads=1)
+    scene.set(torch.ones(1).double())
+    vertices = np.array(scene.values[POSITIONS], float).reshape(3, 3)
+    np.testing.assert_allclose(vertices, [[1, 2, 3], [2, 2, 3], [1, 3, 3]], atol=1e-6)
+
+
 def test_labels_bounds_and_start() -> None:
     pose = Transform("ball.to_world", move=((1, 0, 0),), turn=((0, 1, 0),), bounds=((-2, 3), (-1, 1)))
     scene = scalar(things, [pose, Transform("bead.to_world", move=((0, 1, 0),))])
@@ -219,6 +232,18 @@ def test_normals_depend_on_the_vertices_that_are_given(variant) -> None:
     for step in (0.0, 1.0, 0.0):
         scene.set(scene.x0 + step)
         np.testing.assert_allclose(triangle_normals(scene), [[0, -(0.2**0.5), 0.8**0.5]] * 3, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ball (1)", "ball+", "ball[0]", "b|a", "b*", r"b\d"])
+def test_names_are_no_patterns(name) -> None:
+    def scene(mi):
+        return {"type": "scene", "sensor": camera(mi), name: {"type": "sphere"}, "ball": {"type": "sphere"}}
+
+    pose = f"{name}.to_world"
+    found = scalar(scene, [Transform(pose, move=((1, 0, 0),))])
+    assert list(found.values.keys()) == [pose]
+    found.set(torch.ones(1).double())
+    np.testing.assert_allclose(np.array(found.values[pose].matrix, float).reshape(4, 4)[0, 3], 1.0)
 
 
 def test_several_names_share_a_value() -> None:

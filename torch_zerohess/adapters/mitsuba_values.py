@@ -26,6 +26,9 @@ class Value:
     Mitsuba recomputes the normals of a mesh from the `vertex_positions` that it is given, also at x0: the mesh is then
     smooth where its file had other normals. Normals that are a `Value` of their own are not recomputed.
 
+    Describe a bitmap of 8 or 16 bits with `"format": "variant"`. Mitsuba otherwise keeps 8 bits as integers, which are
+    refused, and rounds 16 bits to half precision.
+
     Args:
         name: of a value, or several that share it.
         bounds: of x, a pair for all or one for each; None takes what the scene accepts, such as 0 to 1 for a
@@ -53,7 +56,10 @@ class Value:
             if "Transform" in type(values[name]).__name__:
                 raise ValueError(f"Value is for numbers, but {name} is a transform: take Transform")
             if np.array(values[name]).dtype.kind != "f":
-                raise ValueError(f"Value is for real numbers, but {name} is a {type(values[name]).__name__}")
+                raise ValueError(
+                    f"Value is for real numbers, but {name} is a {type(values[name]).__name__}"
+                    + ': describe the bitmap with "format": "variant"' * name.endswith(".data")
+                )
         shapes = {name: np.array(values[name]).size for name in self.names}
         if len(set(shapes.values())) > 1:
             raise ValueError(f"names that share a value must have the same size, got {shapes}")

@@ -234,6 +234,22 @@ def test_normals_depend_on_the_vertices_that_are_given(variant) -> None:
         np.testing.assert_allclose(triangle_normals(scene), [[0, -(0.2**0.5), 0.8**0.5]] * 3, atol=1e-6)
 
 
+def test_textures_of_few_bits() -> None:
+    def painted(**form):
+        def scene(mi):
+            picture = mi.Bitmap(np.tile(np.array([0, 51, 255], np.uint8), (2, 2, 1)))
+            texture = {"type": "bitmap", "bitmap": picture, "raw": True, **form}
+            return {**plane(mi), "plane": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}}
+
+        return scene
+
+    values = [Value("plane.bsdf.reflectance.data")]
+    with pytest.raises(ValueError, match='data is a TensorXu8: describe the bitmap with "format": "variant"'):
+        scalar(painted(), values)
+    scene = scalar(painted(format="variant"), values)
+    torch.testing.assert_close(scene.x0.float(), torch.tensor([0.0, 0.2, 1.0]).repeat(4))
+
+
 @pytest.mark.parametrize("name", ["ball (1)", "ball+", "ball[0]", "b|a", "b*", r"b\d"])
 def test_names_are_no_patterns(name) -> None:
     def scene(mi):

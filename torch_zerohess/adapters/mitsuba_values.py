@@ -15,8 +15,14 @@ _ACCEPTED: tuple[tuple[tuple[str, ...], Range], ...] = (
     (("alpha", "alpha_u", "alpha_v", "roughness"), (1e-4, 1.0)),
     (("radiance", "intensity", "irradiance", "sigma_t", "scale"), (0.0, math.inf)),
     (("x_fov",), (1e-3, 179.0)),
+    (("base_color", "metallic", "specular", "spec_tint", "spec_trans", "clearcoat", "clearcoat_gloss"), (0.0, 1.0)),
+    (("sheen", "sheen_tint", "flatness", "anisotropic"), (0.0, 1.0)),
+    (("diff_trans",), (0.0, 2.0)),
 )
 """Ranges outside of which Mitsuba renders nonsense or stops, by what the name of a value ends with."""
+
+_OF_TEXTURES = "value", "data", "color0", "color1"
+"""Ends of the names of textures, after the name of what the texture is for."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,7 @@ class Numbers:
         self.labels = [first] if self.n == 1 else [f"{first}[{i}]" for i in range(self.n)]
         flat = now.reshape(-1) / value.unit
         self.x0 = [float(flat.mean())] if self.n == 1 else flat.tolist()
-        takes = [accepted(name) for name in self.names]
+        takes = [accepted(name, values) for name in self.names]
         ends = max(one for one, _ in takes) / value.unit, min(one for _, one in takes) / value.unit
         low, high = min(ends), max(ends)
         self.limits = ranges(first, (low, high) if value.bounds is None else value.bounds, self.n)
@@ -112,9 +118,12 @@ class Numbers:
         return self._unit * x if size == 1 or size > 4 else [self._unit * one for one in elements(self._mi, x, size)]
 
 
-def accepted(name: str) -> Range:
+def accepted(name: str, values: Any) -> Range:
     """Range of what Mitsuba takes for a value, from its name; infinite where nothing is known."""
-    words = [word for word in name.split(".") if word not in ("value", "data")]
+    words = name.split(".")
+    if words[-1] == "data" and ".".join([*words[:-1], "scale"]) in values:  # an environment map, named as one likes
+        return 0.0, math.inf
+    words = [word for word in words if word not in _OF_TEXTURES]
     for endings, limits in _ACCEPTED:
         if words and any(words[-1] == ending or words[-1].endswith("_" + ending) for ending in endings):
             return limits

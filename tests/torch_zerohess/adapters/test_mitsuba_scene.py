@@ -505,6 +505,55 @@ def test_bounds_of_names_that_share_a_value_are_those_that_all_accept() -> None:
         assert (lower.tolist(), upper.tolist()) == ([0.0] * 3, [1.0] * 3)
 
 
+PRINCIPLED = ("metallic", "spec_tint", "spec_trans", "clearcoat", "clearcoat_gloss", "sheen", "sheen_tint", "flatness")
+CHECKERS = {"type": "checkerboard", "color0": rgb(0.1, 0.1, 0.1), "color1": rgb(0.2, 0.2, 0.2)}
+
+
+@pytest.mark.parametrize(
+    ("thing", "names", "limits"),
+    [
+        (
+            {"bsdf": {"type": "principled"}},
+            ("bsdf.specular", *(f"bsdf.{one}.value" for one in ("base_color", "anisotropic", *PRINCIPLED))),
+            (0.0, 1.0),
+        ),
+        ({"bsdf": {"type": "principledthin"}}, ("bsdf.diff_trans.value",), (0.0, 2.0)),
+        (
+            {"bsdf": {"type": "diffuse", "reflectance": CHECKERS}},
+            ("bsdf.reflectance.color0.value", "bsdf.reflectance.color1.value"),
+            (0.0, 1.0),
+        ),
+        (
+            {"emitter": {"type": "area", "radiance": CHECKERS}},
+            ("emitter.radiance.color0.value", "emitter.radiance.color1.value"),
+            (0.0, math.inf),
+        ),
+        (
+            {"bsdf": {"type": "bumpmap", "nested": {"type": "diffuse"}, "texture": CHECKERS}},
+            ("bsdf.nested_texture.color0.value",),
+            (-math.inf, math.inf),
+        ),
+    ],
+)
+def test_bounds_are_what_the_scene_accepts(thing, names, limits) -> None:
+    def scene(mi):
+        return {**plane(mi), "plane": {"type": "rectangle", **thing}}
+
+    for name in names:
+        found = scalar(scene, [Value(f"plane.{name}", elements=1)], depth=2)
+        assert tuple(side.item() for side in found.bounds) == limits
+        found(torch.tensor([one for one in limits if math.isfinite(one)]).reshape(-1, 1))  # whose pixels are finite
+
+
+def test_an_environment_map_is_not_negative() -> None:
+    def scene(mi):
+        sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}
+        return {"type": "scene", "sensor": camera(mi), "mine": sky}
+
+    found = scalar(scene, [Value("mine.data", elements=1)])
+    assert tuple(side.item() for side in found.bounds) == (0.0, math.inf)
+
+
 # What is wrong
 
 

@@ -38,7 +38,8 @@ from experiments.runs.outputs import check_folder
 from experiments.runs.records import Record
 from experiments.runs.trial import LIMIT, Trial
 
-METHOD = "gaussian_process"
+METHOD, WIDER = "gaussian_process", "auto"
+"""The recommended method, and the one where it does not apply."""
 OWN = {
     **dict.fromkeys(("quad", "box10", "dense", "brdf", "discs", "hexagon"), "descent"),
     **dict.fromkeys(("texture", "texture100", "texture317", "poster", "caustic", "caustic64"), "local"),
@@ -122,13 +123,18 @@ def traces(
         except ImportError as error:
             bar.write(str(error))
             continue
-        solver = METHODS[method or OWN.get(name, METHOD)]
+        solver = METHODS[method] if method else recommended(task)
         seen, reason = look(task, task.start(run)), solver.unusable(task)
         if seen is None or reason:
             bar.write(f"{name} is left out: {reason or 'it has no picture'}")
             continue
         shown.append((trace(task, solver, run, limit, _watch(bar)), seen))
     return shown
+
+
+def recommended(task: Task) -> Method:
+    own = METHODS[OWN.get(task.name, METHOD)]
+    return METHODS[WIDER] if own.name == METHOD and own.unusable(task) else own
 
 
 def trace(

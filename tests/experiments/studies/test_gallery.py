@@ -8,7 +8,6 @@ import small
 import torch
 from PIL import Image, ImageSequence
 
-from experiments.methods import METHODS
 from experiments.problems import catalogue
 from experiments.problems.rendered import Setting, rendered
 from experiments.problems.task import Task
@@ -27,7 +26,7 @@ from experiments.reports.animation import (
     together,
 )
 from experiments.runs.records import Outcome, Record
-from experiments.studies.gallery import METHOD, OWN, gallery, trace
+from experiments.studies.gallery import gallery, recommended, trace, traces
 from truths import vector
 
 ENDED = Outcome("t", "m", 0, "stopped", "", 1.0, 1.0, 10, 0, [])
@@ -48,7 +47,13 @@ def pixel(image, x, y):
 
 @pytest.mark.parametrize("name", catalogue.FITTING)
 def test_the_recommended_method_can_be_used(name):
-    assert METHODS[OWN.get(name, METHOD)].unusable(catalogue.fitting(name)) is None
+    assert recommended(catalogue.fitting(name)).unusable(catalogue.fitting(name)) is None
+
+
+def test_a_task_without_a_box_is_shown(monkeypatch):
+    monkeypatch.setattr(catalogue, "fitting", lambda *_: replace(small.TASK, evaluations=20))
+    ((found, _),) = traces([small.TASK.name], None, 0, 60.0, "fast", "auto")
+    assert (found.method, found.outcome.status) == ("auto", "finished")
 
 
 def test_a_trace_has_a_point_for_every_row():

@@ -49,8 +49,8 @@ class Smoothing:
         sampler: "random" independent draws; "sobol" scrambled Sobol points; "orthogonal" blocks of orthogonal
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
-            perturbations: every call uses the same ones, whatever the number of threads. With a `Memory` they also
-            depend on the number of evaluations that it has taken.
+            perturbations: every call uses the same ones, whatever the number of threads. With a `Memory`, and with an
+            earlier `SparseJacobian`, they also depend on the number of evaluations that it has taken.
         scrambles: independent scrambles of sampler "sobol", a divisor of samples. Fewer ones have a smaller error, and
             a standard error with fewer degrees of freedom. None: the largest of 1, 2, 4 and 8 that divides samples; 4
             and 8 only with at least 8 points in each scramble, 8 only if no setting is "auto".
@@ -233,7 +233,7 @@ class Smoothing:
     def drawn_seed(self, taken: int = 0) -> int:
         """Return the seed of a call; from torch's global generator if `seed` is None.
 
-        taken: evaluations that a memory has taken before the call.
+        taken: evaluations that a memory, or an earlier sparse Jacobian, has taken before the call.
         """
         if self.seed is None:
             return int(torch.randint(2**63 - 1, (), device="cpu"))

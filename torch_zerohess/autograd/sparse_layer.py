@@ -14,7 +14,7 @@ from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.precision import without_autocast
-from torch_zerohess.smoothing import Smoothing, check_smoothing, following_seed, settings_of, smoothing_of
+from torch_zerohess.smoothing import Smoothing, check_smoothing, settings_of, smoothing_of
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_grid, checked_rate
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
@@ -34,8 +34,10 @@ class SparseBlackBox(nn.Module):
     Inside of `torch.func` transforms, `torch.compile` and `torch.jit.trace` it raises RuntimeError. `BlackBox` serves
     the first two.
 
-    Each element begins with the latest Jacobian, of the element before it or of the call before. So a seed repeats the
-    samples, not the derivatives, and a state_dict does not keep what was found.
+    Each element begins with the latest Jacobian, of the element before it or of the call before. Its samples are
+    others, also with a fixed seed: `explained` and `standard_error` need samples that the latest Jacobian has not seen.
+    So a call that is repeated has other derivatives. A new layer with the same seed repeats those of the first calls. A
+    state_dict does not keep what was found.
 
     Args:
         fn: [K, n] -> [K, *out], an output of at least two numbers. It gets detached, contiguous tensors.
@@ -106,16 +108,16 @@ class SparseBlackBox(nn.Module):
 
     def _jacobians(self, points: Tensor, shape: Sequence[int]) -> list[SparseJacobian]:
         """Return the Jacobian at every point [B, n] of outputs of a shape; each begins with what was found last."""
-        seed, call = self.smoothing.drawn_seed(), self.call
+        call = self.call
         known = self.jacobians[-1] if self.jacobians else None
         if known is not None and (known.n, tuple(known.shape)) != (points.shape[1], tuple(shape)):
             known = None
         found: list[SparseJacobian] = []
-        for b, point in enumerate(points):
+        for point in points:
             known = sparse_jacobian(
                 call.fn,
                 point,
-                self.smoothing.replace(seed=following_seed(seed, b)),
+                self.smoothing,
                 previous=known,
                 vectorized=call.vectorized,
                 evaluator=call.evaluator,

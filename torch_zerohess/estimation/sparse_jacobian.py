@@ -58,7 +58,8 @@ def sparse_jacobian(
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
             evidence, which helps where outputs depend on patches of parameters.
         previous: an earlier Jacobian of the same shape, at an x nearby. Its support is tried first, and its slopes
-            are the prior; held-out samples say how much they count.
+            are the prior; held-out samples say how much they count. None of its own samples is drawn again: with a
+            fixed seed the samples also depend on its `total_evaluations`.
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
         on_nonfinite: "raise", "drop", or a number that replaces NaN and infinities.
@@ -96,19 +97,21 @@ def sparse_jacobian(
     check_samples(smoothing.samples, settings.keep)
     call = BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite)
     work = working(x)
-    u, changes, weights, shape, evaluations = _sampled(call, work, smoothing)
+    taken = previous.total_evaluations if isinstance(previous, SparseJacobian) else 0
+    u, changes, weights, shape, evaluations = _sampled(call, work, smoothing, smoothing.drawn_seed(taken))
     check_samples(len(u), settings.keep)
     _check_weights(weights, smoothing, settings.keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)
     earlier = None if previous is None else _checked(previous, len(x), shape).to(work).times(sigma)
     with without_autocast(work.device):
         found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
-    return replace(found.times(1.0 / sigma), evaluations=evaluations)
+    return replace(found.times(1.0 / sigma), evaluations=evaluations, total_evaluations=taken + evaluations)
 
 
-def _sampled(call: BlackBoxCall, x: Tensor, smoothing: Smoothing) -> tuple[Tensor, Tensor, Tensor, torch.Size, int]:
+def _sampled(
+    call: BlackBoxCall, x: Tensor, smoothing: Smoothing, seed: int
+) -> tuple[Tensor, Tensor, Tensor, torch.Size, int]:
     """Return perturbations [S, n] in units of sigma, changes [S, m], weights [S], the shape [*out], evaluations."""
-    seed = smoothing.drawn_seed()
     perturbations = perturb(x[None], smoothing, seed, keep=True)
     stein = perturbations.stein
     assert isinstance(stein, LikelihoodRatio)

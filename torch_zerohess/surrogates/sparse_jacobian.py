@@ -42,6 +42,8 @@ class SparseJacobian:
     """The same for the Jacobian of least norm, which has n entries per row, from the same samples."""
     evaluations: int = 0
     """Of the black box, for this Jacobian."""
+    total_evaluations: int = 0
+    """For this Jacobian and the earlier ones that it began with."""
     _entries: tuple[SparseRows, SparseRows] = field(init=False, repr=False)
     """The entries that are used, by rows and by columns."""
 

@@ -124,6 +124,26 @@ def test_an_earlier_jacobian_helps_and_is_in_the_same_units():
     assert float((both.dense().view(N, N) - truth).norm()) < 0.7 * float((alone.dense().view(N, N) - truth).norm())
 
 
+def test_an_earlier_jacobian_is_not_fitted_to_its_own_samples_again():
+    seen = []
+
+    def seeing(z):
+        seen.append(z)
+        return scaled(z)
+
+    x = torch.zeros(N).double()
+    first = zh.sparse_jacobian(seeing, x, smoothing())
+    second = zh.sparse_jacobian(seeing, x, smoothing(), previous=first)
+    for _ in range(2):
+        zh.sparse_jacobian(seeing, x, smoothing(), previous=second)
+    zh.sparse_jacobian(seeing, x, smoothing())
+    assert (first.total_evaluations, second.total_evaluations, second.evaluations) == (60, 120, 60)
+    assert torch.equal(seen[0], seen[4])  # a seed gives the same bits
+    assert torch.equal(seen[2], seen[3])
+    for k, other in ((0, 1), (0, 2), (1, 2)):
+        assert float((seen[k][:, None] - seen[other]).abs().amax(2).min()) > 0.0
+
+
 def test_pixels_that_are_not_finite():
     def hole(z):
         return torch.where((z[:, :1] > 0.2)[:, :, None], math.nan, scaled(z))

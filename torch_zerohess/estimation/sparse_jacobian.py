@@ -42,8 +42,8 @@ def sparse_jacobian(
     times n for the same error. Memory is O(m keep + n), m numbers per output, besides the points and the outputs.
 
     `explained` of the result says how much of the change of held-out outputs is predicted, with the support found
-    anew without them; `explained_dense` the same for the Jacobian of least norm. If the first is not larger, outputs
-    depend on many parameters each, or there are too few samples.
+    anew without them; `explained_dense` the same for the Jacobian of least norm, which knows nothing of `previous`. If
+    the first is not larger, outputs depend on many parameters each, or there are too few samples.
 
     Args:
         fn: [K, n] -> [K, *out], an image or another output of at least two numbers. Outputs [h, w] and
@@ -93,7 +93,7 @@ def sparse_jacobian(
             f"proposal must be 'aggregate', 'gaussian' or 'uniform', which perturb all parameters by what a weight "
             f"corrects, got {smoothing.proposal!r}"
         )
-    settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True)
+    settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True, compared=True)
     check_samples(smoothing.samples, settings.keep)
     call = BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite)
     work = working(x)

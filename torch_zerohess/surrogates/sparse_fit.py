@@ -59,6 +59,10 @@ class SparseSettings:
     robust: bool = True
     """Whether standard errors hold if samples differ in variance, which takes 1 to 5 % longer. Otherwise they are for
     tests of whether slopes are 0."""
+    compared: bool = False
+    """Whether the Jacobian of least norm is measured also where previous slopes are known; otherwise the share that it
+    explained before is kept. It takes a system of as many equations as samples, or parameters if these are fewer, for
+    each part that is held out."""
 
     @classmethod
     def checked(cls, n: int, *, keep: int | None, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
@@ -141,6 +145,7 @@ def _validated(
     before = replace(previous, **rows)
     fold = torch.arange(len(u), device=u.device) % _FOLDS
     choices = _RIDGES[:3] if first else _RIDGES
+    compared = first or settings.compared
     rests, total, dense = [0.0] * len(choices), 0.0, 0.0
     for number in range(_FOLDS if first else _HELD):
         kept, held = fold != number, fold == number
@@ -155,12 +160,13 @@ def _validated(
         for k, values in enumerate(slopes_by_ridges(*train, index, used, before, choices)):
             rests[k] += float((e - predicted(index, values, v)).square().sum())
         total += float(e.square().sum())
-        if first:
+        if compared:
             dense += float((e - _least_norm(*train, v)).square().sum())
     best = min(range(len(choices)), key=lambda k: rests[k])
     if total == 0.0:
         return choices[best], 0.0, 0.0
-    return choices[best], 1.0 - rests[best] / total, 1.0 - dense / total if first else 0.0
+    explained_dense = 1.0 - dense / total if compared else previous.explained_dense
+    return choices[best], 1.0 - rests[best] / total, explained_dense
 
 
 def _fitted(

@@ -39,7 +39,8 @@ class SparseJacobian:
     explained: float = 0.0
     """Share of the change of held-out outputs that is predicted: 1 is all of it, 0 or less is nothing."""
     explained_dense: float = 0.0
-    """The same for the Jacobian of least norm, which has n entries per row, from the same samples."""
+    """The same for the Jacobian of least norm, which has n entries per row, from the same samples. A search measures it
+    with its first Jacobian, and keeps that share."""
     evaluations: int = 0
     """Of the black box, for this Jacobian."""
     total_evaluations: int = 0

@@ -144,6 +144,16 @@ def test_an_earlier_jacobian_is_not_fitted_to_its_own_samples_again():
         assert float((seen[k][:, None] - seen[other]).abs().amax(2).min()) > 0.0
 
 
+def test_a_dense_map_is_noticed_also_by_later_jacobians():
+    """80 outputs of all 100 parameters. Three quarters of 40 or 80 samples predict 30 or 60 % of the others."""
+    A, x = normal(80, N, seed=1) / 10, torch.zeros(N).double()
+    first = zh.sparse_jacobian(lambda z: z @ A.mT, x, smoothing(40))
+    later = zh.sparse_jacobian(lambda z: z @ A.mT, x, smoothing(80), previous=first)
+    for J, share in ((first, 0.3), (later, 0.6)):
+        assert J.explained < 0.1
+        assert J.explained_dense == pytest.approx(share, abs=0.1)
+
+
 def test_pixels_that_are_not_finite():
     def hole(z):
         return torch.where((z[:, :1] > 0.2)[:, :, None], math.nan, scaled(z))

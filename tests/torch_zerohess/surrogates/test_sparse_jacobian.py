@@ -154,10 +154,10 @@ def test_a_dense_map_is_not_explained():
     assert J.explained_dense == pytest.approx(24 / 300, abs=0.06)
 
 
-def explained_by_least_norm(u, d):
-    """Share of the change of each fourth of the samples that the others predict, by singular values."""
+def explained_by_least_norm(u, d, parts=4):
+    """Share of the change of each fourth of the samples, or of some, that the others predict, by singular values."""
     rest, fold = torch.zeros(2).double(), torch.arange(len(u)) % 4
-    for number in range(4):
+    for number in range(parts):
         kept, held = fold != number, fold == number
         v, e = u[held] - u[kept].mean(0), d[held] - d[kept].mean(0)
         U, s, V = torch.linalg.svd(u[kept] - u[kept].mean(0), full_matrices=False)
@@ -178,6 +178,17 @@ def test_a_dense_map_is_explained_as_singular_values_explain_it(dtype, K, n):
     d = (u @ A + 0.05 * u.square() @ B).float().double()
     J = fit_sparse(u.to(dtype), d.to(dtype), torch.Size([70]), SparseSettings(16))
     assert J.explained_dense == pytest.approx(explained_by_least_norm(u, d), abs=1e-4)
+
+
+def test_a_dense_map_is_explained_also_where_slopes_are_known():
+    """By two of the four parts. A search does not need it: it keeps the share that the first fit has measured."""
+    A, u = normal(40, 70), normal(64, 40, seed=1)
+    d = u @ A + 0.1 * normal(64, 70, seed=2)
+    first = fit_sparse(u, d, torch.Size([70]), SparseSettings(16))
+    again = fit_sparse(u, d, torch.Size([70]), SparseSettings(16, compared=True), first)
+    assert again.explained_dense == pytest.approx(explained_by_least_norm(u, d, parts=2), abs=1e-4)
+    kept = fit_sparse(u, d, torch.Size([70]), SparseSettings(16), first)
+    assert 0.9 < kept.explained_dense == first.explained_dense != again.explained_dense
 
 
 def test_held_out_samples_are_not_used():

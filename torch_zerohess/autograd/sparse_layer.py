@@ -41,8 +41,8 @@ class SparseBlackBox(nn.Module):
 
     Args:
         fn: [K, n] -> [K, *out], an output of at least two numbers. It gets detached, contiguous tensors.
-        smoothing: how to sample around each element of the batch; its evaluations per element are 2 * samples, or
-            samples without antithetic pairs, besides f(x).
+        smoothing: how to sample around each element of the batch, see `sparse_jacobian`; its evaluations per element
+            are 2 * samples, or samples without antithetic pairs, besides f(x).
         keep, rate, grid: see `sparse_jacobian`.
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.

@@ -49,8 +49,10 @@ def sparse_jacobian(
         fn: [K, n] -> [K, *out], an image or another output of at least two numbers. Outputs [h, w] and
             [h, w, channels] are images, whose neighbouring pixels share evidence.
         x: [n], float32 or float64.
-        smoothing: how to sample; proposal "aggregate", "gaussian" or "uniform". An antithetic pair is one sample, of
-            which even orders of fn are gone. The baseline is not used: a constant is part of the regression.
+        smoothing: how to sample; proposal "aggregate", "gaussian" or "uniform", sampler "random" or "orthogonal". For
+            sampler "auto" it is "orthogonal" where `estimate` takes Sobol points. In many dimensions their coordinates
+            are correlated, as if outputs depended on further parameters. An antithetic pair is one sample, of which
+            even orders of fn are gone. The baseline is not used: a constant is part of the regression.
         keep: parameters per output, at most; 16 if None, or n if that is less.
         rate: of false discoveries among the pairs of output and parameter that are found in a round; there are three.
             A pair that is false gets a small slope. Fewer than 1 / rate pairs count only if each of
@@ -69,8 +71,7 @@ def sparse_jacobian(
     than a few dimensions.
 
     `standard_error` of the result allows for residuals whose variance depends on the perturbation, as it does for
-    curved and for noisy fn. With few samples and strong curvature it is too small. With sampler "sobol" it is too
-    large, because these samples fill space more evenly.
+    curved and for noisy fn. With few samples and strong curvature it is too small.
 
     Source: screening by correlation (Fan and Lv 2008), false discoveries by decoys (Barber and Candes 2015), standard
     errors of samples of different variance (HC3, MacKinnon and White 1985).
@@ -87,12 +88,7 @@ def sparse_jacobian(
     x = checked_input(x).detach()
     if x.ndim != 1:
         raise ValueError(f"x must be one point [n], got {list(x.shape)}")
-    smoothing = smoothing.resolved(len(x))
-    if smoothing.proposal in ("optimal", "fr22"):
-        raise ValueError(
-            f"proposal must be 'aggregate', 'gaussian' or 'uniform', which perturb all parameters by what a weight "
-            f"corrects, got {smoothing.proposal!r}"
-        )
+    smoothing = _resolved(smoothing, len(x))
     settings = replace(SparseSettings.checked(len(x), keep=keep, rate=rate, grid=grid), prune=True, compared=True)
     check_samples(smoothing.samples, settings.keep)
     call = BlackBoxCall(fn, vectorized, evaluator, "smoothed", on_nonfinite)
@@ -106,6 +102,24 @@ def sparse_jacobian(
     with without_autocast(work.device):
         found = fit_sparse(u.to(work), changes.to(work), shape, settings, earlier, weights.to(work))
     return replace(found.times(1.0 / sigma), evaluations=evaluations, total_evaluations=taken + evaluations)
+
+
+def _resolved(smoothing: Smoothing, n: int) -> Smoothing:
+    """Return the settings without "auto"; ValueError for samples that do not tell a sparse Jacobian."""
+    if smoothing.sampler == "auto" and smoothing.resolved(n).sampler == "sobol":
+        smoothing = smoothing.replace(sampler="orthogonal")
+    smoothing = smoothing.resolved(n)
+    if smoothing.proposal in ("optimal", "fr22"):
+        raise ValueError(
+            f"proposal must be 'aggregate', 'gaussian' or 'uniform', which perturb all parameters by what a weight "
+            f"corrects, got {smoothing.proposal!r}"
+        )
+    if smoothing.sampler == "sobol":
+        raise ValueError(
+            "sampler must be 'random', 'orthogonal' or 'auto', got 'sobol': in many dimensions the coordinates of "
+            "Sobol points are correlated, as if outputs depended on further parameters"
+        )
+    return smoothing
 
 
 def _sampled(

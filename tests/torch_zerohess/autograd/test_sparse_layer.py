@@ -199,6 +199,8 @@ def test_what_it_refuses():
     layer = zh.SparseBlackBox(blurred, SMOOTHING)
     with pytest.raises(ValueError, match="for one number use estimate"):
         zh.SparseBlackBox(lambda z: z.sum(1), SMOOTHING)(x)
+    with pytest.raises(ValueError, match="sampler must be 'random', 'orthogonal' or 'auto', got 'sobol'"):
+        zh.SparseBlackBox(blurred, SMOOTHING.replace(sampler="sobol"))(x)
     with pytest.raises(RuntimeError, match="use BlackBox"):
         torch.func.grad(lambda z: layer(z).sum())(X)
     with pytest.raises(RuntimeError, match="use BlackBox"):

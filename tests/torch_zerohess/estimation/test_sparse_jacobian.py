@@ -154,6 +154,28 @@ def test_a_dense_map_is_noticed_also_by_later_jacobians():
         assert J.explained_dense == pytest.approx(share, abs=0.1)
 
 
+@pytest.mark.parametrize(("n", "samples", "order"), [(60, 512, 1), (30, 300, 2), (3, 40, 1), (1, 40, 2)])
+def test_automatic_samples_keep_the_rate_where_others_are_sobol_points(n, samples, order):
+    """Each output depends on one parameter. Of 60 parameters 1 to 7 % of the entries are false, with Sobol points 15 %.
+
+    With hundreds of samples the standard errors are right. With Sobol points they are up to twice as large.
+    """
+    settings = zh.Smoothing.auto(sigma=0.5, samples=samples, order=order)
+    assert settings.resolved(n).sampler == "sobol"
+    own, every, scores = 0, 0, []
+    for seed in range(4):
+        J = zh.sparse_jacobian(
+            lambda z: (z + 0.5 * z**3).repeat(1, 2), torch.zeros(n).double(), settings.replace(seed=seed)
+        )
+        true = J.found & (J.index == torch.arange(n).repeat(2)[:, None])
+        own, every = own + int(true.sum()), every + int(J.found.sum())
+        scores.append(((J.values - 1.375) / J.standard_error)[true])
+    assert own == 8 * n
+    assert every - own <= 0.1 * every
+    if samples > 100:
+        assert float(torch.cat(scores).std()) == pytest.approx(1.0, abs=0.2)
+
+
 def test_pixels_that_are_not_finite():
     def hole(z):
         return torch.where((z[:, :1] > 0.2)[:, :, None], math.nan, scaled(z))
@@ -176,6 +198,7 @@ def test_one_point_at_a_time():
         ({"x": torch.zeros(2, N)}, r"x must be one point \[n\], got \[2, 100\]"),
         ({"smoothing": smoothing(12)}, r"samples must be at least 18 to fit 16 parameters per output \(keep\), got 12"),
         ({"smoothing": smoothing(proposal="fr22", order=1)}, "proposal must be .* got 'fr22'"),
+        ({"smoothing": smoothing(sampler="sobol")}, "sampler must be 'random', 'orthogonal' or 'auto', got 'sobol'"),
         ({"keep": 101}, "keep must be between 1 and the number of parameters, 100, got 101"),
         ({"grid": (5, 5)}, r"grid must be rows and columns \(and channels\) of 100 parameters, got \(5, 5\)"),
         (

@@ -36,7 +36,8 @@ class Newton(NewtonStep):
         radius: of the trust region, in units of the parameters; the initial one with `adapt`.
         curvature: "exact", or "gauss_newton" for J^T H J of the black boxes behind a network.
         modification: "shift" or "abs".
-        adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`.
+        adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`. Give False for a loss whose
+            values have noise.
         max_radius: the radius never grows beyond it.
         lr: factor from 0 to 1 on every step, which the schedulers of `torch.optim.lr_scheduler` change.
         distributed: whether all processes of `torch.distributed` make the step together, see `NewtonCG`.

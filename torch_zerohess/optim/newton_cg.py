@@ -49,7 +49,8 @@ class NewtonCG(NewtonStep):
         iterations: conjugate-gradient products per step, at most.
         tolerance: relative residual at which conjugate gradients stop.
         damping: added to the diagonal of H.
-        adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`.
+        adapt: whether to test the step and adapt the radius, see `newton_step.NewtonStep`. Give False for a loss whose
+            values have noise.
         max_radius: the radius never grows beyond it.
         noise: how far residual and curvature must differ from zero, if there are several losses. It is the number of
             standard deviations in `steihaug.noise_level`. 0 takes the mean of the losses for exact, and so does solver

@@ -23,16 +23,23 @@ from torch_zerohess.optim.second_order import (
 
 _ROUNDING = 10.0
 """Smallest predicted decrease that can be tested, in units of rounding of the loss."""
+_LEAST = 1e-8
+"""Least radius that tests lead to, in units of the first one."""
 
 
 class NewtonStep(SecondOrder):
     """Steps to the minimum of a quadratic model inside |s| <= radius, with or without a test.
 
     With `adapt` the closure is called again, without derivatives, up to ten times if the loss is not finite. A step
-    that does not lower the loss is taken back, and the radius follows the ratio of actual to predicted decrease
-    (Nocedal and Wright, algorithm 4.1). Where the predicted decrease is within the rounding of the loss no step is
-    taken, and the radius stays. The length compared with the radius is the length of the step times `lr`, so the radius
-    does not grow while `lr` is below 1. Without `adapt` every step is taken, as suits a loss over small batches.
+    that raises the loss is taken back, and the radius follows the ratio of actual to predicted decrease (Nocedal and
+    Wright, algorithm 4.1). The radius does not fall below 1e-8 of the first one. A step to exactly the same loss, as on
+    a plateau, is taken. If the loss still descends along it at its end, the radius doubles, up to the first one; if it
+    ascends, the radius is halved. Where the predicted decrease is within the rounding of the loss
+    no step is taken, and the radius stays. The length compared with the radius is the length of the step times `lr`, so
+    the radius does not grow while `lr` is below 1.
+
+    Without `adapt` every step is taken, as suits a loss whose values have noise: over small batches, or of a layer with
+    `value="smoothed"`. A test of such values near a minimum shrinks the radius for good.
     """
 
     exit: str | None = None
@@ -53,7 +60,7 @@ class NewtonStep(SecondOrder):
         model = self._model(closure, separate=group.get("noise", 0.0) > 0.0 and group.get("solver") != "dual")
         if not model.finite:
             raise ValueError(f"the loss ({float(model.loss)}) or its gradient is not finite; no step was taken")
-        radius = group["radius"]
+        radius = self._radius(model, group)
         s, decrease, self.exit = self._minimise(model, radius, group)
         if not math.isfinite(decrease) or not bool(torch.isfinite(s).all()):
             raise ValueError("the curvature of the loss is not finite; no step was taken")
@@ -70,7 +77,7 @@ class NewtonStep(SecondOrder):
                 return model.loss  # converged: the test would compare rounding errors, and shrink the radius for good
             actual = self._try(scale * s, closure, model.loss)
             if math.isfinite(actual):
-                group["radius"] = min(_next_radius(actual / predicted, length, radius), group["max_radius"])
+                self._adapt(actual / predicted, scale * s, length, radius)
                 return model.loss
             radius = length
         raise ValueError(
@@ -78,8 +85,39 @@ class NewtonStep(SecondOrder):
             "no step was taken"
         )
 
+    def _radius(self, model: Model, group: dict[str, Any]) -> float:
+        """Return the radius; after a step to the same loss the gradient at its end tells whether it was too long.
+
+        Otherwise steps could go to and fro between two points of the same loss without end.
+        """
+        radius: float = group["radius"]
+        level = self._get("level") if group["adapt"] else None
+        if level is None:
+            return radius
+        slope = float(model.gradient.dot(level))
+        if slope > 0.0:
+            return self._bounded(0.5 * radius)
+        if slope < 0.0:
+            most = min(self.defaults["radius"], group["max_radius"])
+            return min(_next_radius(1.0, float(level.norm()), radius), max(radius, most))
+        return radius
+
+    def _adapt(self, ratio: float, s: Tensor, length: float, radius: float) -> None:
+        """Set the radius after a step s [N] in a region of this radius; keep the step if it led to the same loss."""
+        group = self.param_groups[0]
+        if ratio == 0.0:
+            self._set("level", s)
+        else:
+            self._forget("level")
+            radius = self._bounded(_next_radius(ratio, length, radius))
+        group["radius"] = min(radius, group["max_radius"])
+
+    def _bounded(self, radius: float) -> float:
+        """Return a radius that is not below 1e-8 of the first one, unless it was before."""
+        return max(radius, min(self.param_groups[0]["radius"], _LEAST * self.defaults["radius"]))
+
     def _try(self, s: Tensor, closure: Closure, loss: Tensor) -> float:
-        """Move by s [N] and return by how much the loss fell; if it did not fall, take the move back."""
+        """Move by s [N] and return by how much the loss fell; if it rose or is not finite, take the move back."""
         before, actual = self._copy(), math.nan
         self._add(s)
         try:
@@ -87,7 +125,7 @@ class NewtonStep(SecondOrder):
                 there = parts_of(_without_backward(closure))[0].mean().to(s.device)
             actual = float(loss) - float(processes.mean(there) if self._distributed else there)
         finally:
-            if not 0.0 < actual < math.inf:
+            if not 0.0 <= actual < math.inf:
                 self._restore(before)
         return actual
 

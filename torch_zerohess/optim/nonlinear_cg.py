@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
-from torch_zerohess.linalg.flat import flattened, split_like
 from torch_zerohess.optim import processes
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr
 
@@ -169,14 +168,3 @@ class NonlinearCG(SecondOrder):
             raise ValueError(f"hvp must return a tensor of shape {list(d.shape)}, got {shape}")
         image = result.detach().double()
         return processes.mean(image) if self._distributed else image
-
-    def _get(self, name: str) -> Tensor | None:
-        """Return a vector of the state, [N] float64, or None where a parameter has none."""
-        parts = [self.state[one].get(name) for one in self._parameters]
-        if any(part is None for part in parts):
-            return None
-        return flattened(parts).double()
-
-    def _set(self, name: str, vector: Tensor) -> None:
-        for one, part in zip(self._parameters, split_like(vector, self._parameters), strict=True):
-            self.state[one][name] = part.to(one.dtype)

@@ -252,6 +252,23 @@ class SecondOrder(Optimizer):
         """Put the parameters back, to the last bit."""
         overwrite(self._parameters, place)
 
+    def _get(self, name: str) -> Tensor | None:
+        """Return a vector of the state, [N] float64, or None where a parameter has none."""
+        parts = [self.state.get(one, {}).get(name) for one in self._parameters]
+        if any(part is None for part in parts):
+            return None
+        return flattened(parts).double()
+
+    def _set(self, name: str, vector: Tensor) -> None:
+        """Keep a vector [N] in the state, in the types of the parameters."""
+        for one, part in zip(self._parameters, split_like(vector, self._parameters), strict=True):
+            self.state[one][name] = part.to(one.dtype)
+
+    def _forget(self, name: str) -> None:
+        """Remove a vector from the state."""
+        for one in self._parameters:
+            self.state.get(one, {}).pop(name, None)
+
 
 def parts_of(result: Loss) -> tuple[Tensor, Tensor | Sequence[Tensor] | None, SampleJacobian | None]:
     """Return the loss, the tensors at which the white box ends, and their Jacobian, as far as the closure gave them."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.adapters.server import GRACE, Server, end_program, ended, late, shown
-from torch_zerohess.arguments import check_tensors, checked_number
+from torch_zerohess.arguments import check_bool, check_tensors, checked_number
 from torch_zerohess.evaluators.batch import numbers
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing
@@ -95,6 +95,7 @@ class Program(Closing):
             raise ValueError(f"command must be a list, the program and its arguments, or a function, got {command!r}")
         if format not in ("json", "npy") and not callable(format):
             raise ValueError(f"format must be 'json', 'npy' or a function of bytes, got {format!r}")
+        check_bool(server=server)
         if server and (callable(command) or callable(format)):
             raise ValueError("server=True needs a command that is a list, and format 'json' or 'npy'")
         if on_failure not in ("raise", "nan"):

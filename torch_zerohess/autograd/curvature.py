@@ -9,13 +9,14 @@ The supplement of Wang, Fischer and Ritschel (2025, section E) calls the second 
 term in the curvature of the network, hence "approximately" in the source.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.autograd.graph import Node
 
+from torch_zerohess.arguments import check_tensors
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.autograd.transforms import made_by
@@ -37,6 +38,7 @@ class CurvatureOperator:
             between `inputs` and `outputs` if None.
 
     Raises:
+        TypeError: `outputs`, or one of `inputs` or `through`, is no tensor.
         ValueError: `outputs` has no graph or more than one element; nothing to go through was found, one black box
             stands behind another, or the loss is not computed from `through`.
 
@@ -59,10 +61,12 @@ class CurvatureOperator:
             raise ValueError(f"mode must be 'exact' or 'gauss_newton', got {mode!r}")
         if mode == "exact" and through is not None:
             raise ValueError("through goes with mode 'gauss_newton'; 'exact' differentiates everything")
+        if not isinstance(outputs, Tensor):
+            raise TypeError(f"outputs must be the loss, a tensor, got {type(outputs).__name__}")
         if outputs.numel() != 1 or not outputs.requires_grad:
             graph = "no graph" if not outputs.requires_grad else f"shape {list(outputs.shape)}"
             raise ValueError(f"outputs must be a loss of one element with a graph, got one with {graph}")
-        self._inputs = _listed(inputs)
+        self._inputs = _listed("inputs", inputs)
         if not self._inputs or not all(one.requires_grad for one in self._inputs):
             raise ValueError("inputs must be tensors that require grad")
         self.mode = mode
@@ -71,16 +75,21 @@ class CurvatureOperator:
         self.dtype, self.device = self._inputs[0].dtype, self._inputs[0].device
         if mode == "exact":
             self._through = self._inputs
-            self._slopes = _grad([outputs], self._inputs, None, create_graph=True)
+            found = _derivatives([outputs], self._inputs, None, create_graph=True)
+            self._slopes = _or_zeros(found, self._inputs)
             self.gradient = flattened([one.detach() for one in self._slopes])
         else:
-            self._through = black_box_inputs(outputs) if through is None else _listed(through)
+            self._through = black_box_inputs(outputs) if through is None else _listed("through", through)
             self._check_path(outputs)
             self._slopes = _grad([outputs], self._through, None, create_graph=True)
-            self.gradient = flattened(_grad([outputs], self._inputs, None))
+            found = _derivatives([outputs], self._inputs, None)
+            self.gradient = flattened(_or_zeros(found, self._inputs))
+        self.depends = any(one is not None for one in found)
 
     gradient: Tensor
     """Gradient of the loss, [N]."""
+    depends: bool
+    """Whether the loss is computed from any of the parameters."""
 
     def _check_path(self, outputs: Tensor) -> None:
         """Raise ValueError if the loss does not go through any of the tensors at which the white box ends."""
@@ -166,7 +175,7 @@ def hvp(
         >>> hvp((w**3).sum(), w, torch.tensor([0.0, 1.0]))
         tensor([ 0., 12.])
     """
-    parts, vectors = _listed(inputs), _listed(v)
+    parts, vectors = _listed("inputs", inputs), _listed("v", v)
     if [one.shape for one in parts] != [one.shape for one in vectors]:
         raise ValueError(
             f"v must have the shapes of inputs, {[list(one.shape) for one in parts]}, "
@@ -234,24 +243,33 @@ def _edge(tensor: Tensor) -> tuple[object, int]:
     return edge.node, edge.output_nr
 
 
-def _listed(tensors: Tensor | Sequence[Tensor]) -> list[Tensor]:
-    return [tensors] if isinstance(tensors, Tensor) else list(tensors)
+def _listed(name: str, tensors: Tensor | Sequence[Tensor]) -> list[Tensor]:
+    parts = list(tensors) if isinstance(tensors, Iterable) and not isinstance(tensors, Tensor) else [tensors]
+    check_tensors(**{name: parts})
+    return parts
 
 
 def _grad(
     outputs: Sequence[Tensor], inputs: Sequence[Tensor], vectors: Sequence[Tensor] | None, *, create_graph: bool = False
 ) -> list[Tensor]:
     """Vector-Jacobian product that keeps the graph and gives zeros where nothing depends."""
+    return _or_zeros(_derivatives(outputs, inputs, vectors, create_graph=create_graph), inputs)
+
+
+def _or_zeros(found: Sequence[Tensor | None], inputs: Sequence[Tensor]) -> list[Tensor]:
+    return [torch.zeros_like(one) if d is None else d for d, one in zip(found, inputs, strict=True)]
+
+
+def _derivatives(
+    outputs: Sequence[Tensor], inputs: Sequence[Tensor], vectors: Sequence[Tensor] | None, *, create_graph: bool = False
+) -> Sequence[Tensor | None]:
+    """Vector-Jacobian product that keeps the graph, with None where nothing depends."""
     pairs = [
         (output, None if vectors is None else vectors[index])
         for index, output in enumerate(outputs)
         if output.requires_grad
     ]
     if not pairs:
-        return [torch.zeros_like(one) for one in inputs]
+        return [None] * len(inputs)
     chosen, weights = zip(*pairs, strict=True)
-    return list(
-        torch.autograd.grad(
-            chosen, inputs, weights, retain_graph=True, create_graph=create_graph, materialize_grads=True
-        )
-    )
+    return torch.autograd.grad(chosen, inputs, weights, retain_graph=True, create_graph=create_graph, allow_unused=True)

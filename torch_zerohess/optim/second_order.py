@@ -185,6 +185,8 @@ class SecondOrder(Optimizer):
         for one in self._parameters:
             if one.is_complex():
                 raise TypeError(f"params must be real, got {one.dtype}: optimize torch.view_as_real of a parameter")
+        if not any(one.numel() for one in self._parameters):
+            raise ValueError("params must have at least one number, got empty tensors")
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Refuse a second group of parameters, because the quadratic model has one Hessian, and settings in a group."""
@@ -236,6 +238,11 @@ class SecondOrder(Optimizer):
                 if "backward through the graph a second time" in str(error):
                     raise RuntimeError(CALLS_BACKWARD) from error
                 raise
+            if not any(one.depends for one in of_parts):
+                raise ValueError(
+                    "closure must return a loss that depends on params, got one with a graph in which none of them is: "
+                    "give the optimizer the parameters of the network that the closure calls"
+                )
             if self._distributed:
                 processes.check_equal(self._parameters, len(parts))
             return Model(losses, of_parts, self._output_modification, jacobian, self._distributed)

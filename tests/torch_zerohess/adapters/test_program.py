@@ -444,6 +444,7 @@ def test_python_ends_where_a_server_still_runs(tmp_path):
         (lambda: python(ANSWER, environment="A"), TypeError, "environment must be a mapping of names to text, got 'A'"),
         (lambda: python(ANSWER, environment={"A": 1}), TypeError, "must map names to text, got 'A': 1"),
         (lambda: python(ANSWER, folder="/no/such/folder"), FileNotFoundError, "folder must be a folder that exists"),
+        (lambda: python(ANSWER, server=3), TypeError, "server must be True or False, got 3"),
         (lambda: Program([sys.executable, "-c", 3.0]), TypeError, r"got 3\.0 in it: write str\(3\.0\)"),
         (lambda: python("print([1.0])")(Z), ValueError, r"one value per point, a list of 2 .*, got \[1\]"),
         (lambda: python(ANSWER)([[1.0]]), TypeError, "x must be a tensor, got list"),

@@ -198,3 +198,19 @@ def test_a_loss_that_is_not_computed_from_through_is_refused(through):
     with pytest.raises(ValueError, match=r"no tensor of \[\[4, 2\]\] is on the path to the loss"):
         zh.CurvatureOperator(y.square().sum(), list(net.parameters()), mode="gauss_newton", through=other)
     zh.CurvatureOperator(y.square().sum(), list(net.parameters()), mode="gauss_newton", through=[other, y])
+
+
+def test_what_is_no_tensor_is_refused():
+    x = torch.tensor([1.0, 2.0], requires_grad=True)
+    for call, message in (
+        (lambda: zh.CurvatureOperator(3.0, x), "outputs must be the loss, a tensor, got float"),
+        (lambda: zh.CurvatureOperator((x.sum(), x), x), "outputs must be the loss, a tensor, got tuple"),
+        (lambda: zh.CurvatureOperator(x.sum(), 3.0), "inputs must be a tensor, got float"),
+        (lambda: zh.CurvatureOperator(x.sum(), [x, 3.0]), "inputs must be a tensor, got float"),
+        (lambda: zh.CurvatureOperator(x.sum(), x, mode="gauss_newton", through=3.0), "through must be a tensor, got"),
+        (lambda: zh.hvp(x.sum(), x, 3.0), "v must be a tensor, got float"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            call()
+    layers = torch.nn.Linear(2, 1)
+    assert zh.CurvatureOperator(layers(x).sum(), layers.parameters()).shape == (3, 3)

@@ -232,3 +232,30 @@ def test_settings_of_numpy_are_saved_as_numbers(make, settings: tuple[str, ...],
     torch.save(make([p], **given).state_dict(), tmp_path / "state.pt")
     group = torch.load(tmp_path / "state.pt", weights_only=True)["param_groups"][0]
     assert all(group[name] == one for name, one in given.items())
+
+
+ALL = pytest.mark.parametrize("make", [zh.optim.Newton, zh.optim.NewtonCG, zh.optim.NonlinearCG])
+
+
+@pytest.mark.parametrize("curvature", ["exact", "gauss_newton"])
+@ALL
+def test_a_loss_of_another_network_is_refused(make, curvature: str) -> None:
+    own, other = torch.nn.Linear(3, 2), torch.nn.Linear(3, 2)
+    layer = zh.BlackBox(lambda z: z.square().sum(1), zh.Smoothing(sigma=0.1))
+    before = [one.detach().clone() for one in own.parameters()]
+    optimizer = make(own.parameters(), curvature=curvature)
+    with pytest.raises(ValueError, match="a loss that depends on params, got one with a graph in which none of them"):
+        optimizer.step(lambda: layer(other(torch.ones(3, 3))).mean())
+    assert all(torch.equal(one, was) for one, was in zip(own.parameters(), before, strict=True))
+    both, bias = make([*own.parameters(), *other.parameters()], curvature=curvature), other.bias.detach().clone()
+    both.step(lambda: layer(other(torch.ones(3, 3))).mean())  # some parameters may have no part in it
+    assert not torch.equal(other.bias.detach(), bias)
+
+
+@ALL
+def test_parameters_without_a_number_are_refused(make) -> None:
+    with pytest.raises(ValueError, match="params must have at least one number, got empty tensors"):
+        make([torch.zeros(0, requires_grad=True)])
+    x = vector(1.0).requires_grad_()
+    make([torch.zeros(0, dtype=x.dtype, requires_grad=True), x]).step(lambda: x.square().sum())
+    assert abs(float(x.detach())) < 1e-6

@@ -26,16 +26,17 @@ class NewtonTargets:
 
     For losses l of outputs y [B, n] with gradient g and Hessian H of every element,
 
-        t = y - (H + relative_damping * h I)^-1 g,    h = mean of |diagonal of H|
+        t = y - (H + relative_damping * h I)^-1 g,    h = mean of the diagonal of H
 
     `0.5 * (network(images) - t).square().sum(1)` has the gradient of l where H is the identity. Any first-order
     optimizer of the weights then trains as if the loss were well-conditioned in y. Convergence no longer depends on the
     condition of the black box. For a batch much smaller than the weights this needs no curvature of the network.
 
-    Up to 16 outputs H is formed, and the magnitudes of its eigenvalues are used. For more outputs the system is solved
-    by conjugate gradients on Hessian-vector products, and h is |v^T H v| / n with random signs v (Hutchinson 1989). The
-    preconditioner is one matrix: column i is from the Hessian over h of element i modulo B. It is made again when the
-    solution takes too many iterations. An affine black box with a quadratic loss takes one.
+    Up to 16 outputs H is formed. |H|, with the magnitudes of its eigenvalues, takes its place in t and in h. For more
+    outputs the system is solved by conjugate gradients on Hessian-vector products, and h is |v^T H v| / n with random
+    signs v (Hutchinson 1989). The preconditioner is one matrix: column i is from the Hessian over h of element i modulo
+    B. It is made again when the solution takes too many iterations. An affine black box with a quadratic loss takes
+    one.
 
     Every call checks by two more backward passes, of first and of second order, that no loss depends on the outputs of
     another element.

@@ -59,6 +59,16 @@ def test_negative_curvature_is_descended():
     assert bool((many(NewtonTargets()(many, start)) < many(start)).all())
 
 
+def test_the_damping_of_few_outputs_is_relative_to_the_magnitudes_of_the_eigenvalues():
+    """H = [[1, 2], [2, 1]], whose diagonal has the mean 1, has the eigenvalues 3 and -1: |H| = [[2, 1], [1, 2]]."""
+    losses = lambda y: 0.5 * y.square().sum(1) + 2 * y.prod(1)  # noqa: E731
+    y = torch.tensor([[0.5, 0.1]], dtype=torch.float64)
+    h = torch.tensor([[2.0, 1.0], [1.0, 2.0]], dtype=torch.float64) + 0.25 * 2.0 * torch.eye(2, dtype=torch.float64)
+    g = grad(lambda p: losses(p[None])[0])(y[0])
+    found = NewtonTargets(relative_damping=0.25)(losses, y)
+    torch.testing.assert_close(found, y - torch.linalg.solve(h, g))
+
+
 def test_steps_are_at_most_the_radius():
     _, minima, losses = quadratics(5)
     found = NewtonTargets(relative_damping=1e-12, output_radius=0.25)(losses, torch.zeros(3, 5, dtype=torch.float64))

@@ -1,9 +1,10 @@
 """A Gaussian process of the output that Gauss-Newton finishes: `GaussianProcessSearch` where there is a loss.
 
-Gauss-Newton interpolates outputs next to the minimum (`OutputGaussNewton`). If its steps do not keep their promise, as
-where outputs jump, the process goes on alone. Gauss-Newton begins again once its first step promises more than an
-evaluation of the process has gained in the meantime. On a plateau with ripples each step of the process finds something
-a little better. Where nothing much better comes, the process looks where it knows least.
+Gauss-Newton interpolates outputs next to the minimum (`OutputGaussNewton`). Where it promises much after the first
+samples, as for smooth outputs, it begins at once. If its steps do not keep their promise, as where outputs jump, the
+process goes on alone. Gauss-Newton begins again once its first step promises more than an evaluation of the process has
+gained in the meantime. On a plateau with ripples each step of the process finds something a little better. Where
+nothing much better comes, the process looks where it knows least.
 """
 
 import math
@@ -26,6 +27,9 @@ _PATIENCE = 2
 """Rejected steps in a row of Gauss-Newton after which the process goes on, if none before them was good."""
 _WORTH = 0.1
 """Part of the loss that the first step of Gauss-Newton must promise to take away."""
+_WORTH_EARLY = 0.3
+"""The same right after the first samples. Where outputs have nothing in common, as images of objects that do not
+overlap, an affine output promises to fade the object out: up to a quarter."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""
 
@@ -41,6 +45,9 @@ class OutputProcessProgress(FinishedProgress):
     """Times that it has looked elsewhere since then; each time it waits twice as long."""
     looking: bool = False
     """Whether it looks where it knows least, because nothing much better was found."""
+    early: bool = False
+    """Whether Gauss-Newton began right after the first samples. Its turn then ends with its first step if that is
+    rejected."""
     due: str = ""
     """Why the process has arrived; empty if it has not."""
     alone: int = 0
@@ -82,7 +89,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
     ) -> tuple[OutputProcessProgress, Tensor]:
         """Let Gauss-Newton finish a new basin; where nothing much better comes, look elsewhere."""
         before, count = known.best.loss, len(evaluated.needed)
-        known = self.take(replace(known, due=""), evaluated)
+        known = self.take(replace(known, due="", early=False), evaluated)
         now = known.best.loss
         better = now < before - _BETTER * abs(before)
         known = replace(
@@ -93,10 +100,11 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             alone=known.alone + count,
         )
         turn = bool(known.due) or known.waited >= PATIENCE * (self.settings.n + 1)
+        early = bool(known.finished.isinf().all()) and len(known.pool) > self.settings.n and not self.settings.noise
         if not known.noisy and not known.done:
-            if turn and self.is_new(known):
-                known = replace(known, finished=known.best.point)
-                known, points = self._begun_newton(known, _WORTH * abs(now), generator)
+            if (turn or early) and self.is_new(known):
+                known = replace(known, finished=known.best.point, early=early)
+                known, points = self._begun_newton(known, (_WORTH_EARLY if early else _WORTH) * abs(now), generator)
             elif self.tells_noise(known) and self._is_due(known):
                 known, points = self._begun_newton(known, max(known.alone_from - now, 0.0) / known.alone, generator)
             if known.finishing:
@@ -110,6 +118,8 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         assert known.local is not None
         now, points = self.local.next(known.local, evaluated, generator)
         known = replace(self.told(known, now, evaluated), lost=now.lost)
+        if known.early and now.rejected and not now.kept:
+            return replace(known, finishing=False, waited=0, local=None), points
         if not now.done and not now.failed:
             return known, points
         best = known.best.point

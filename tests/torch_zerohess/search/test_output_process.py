@@ -42,11 +42,47 @@ def test_it_arrives_at_the_last_digit_of_a_smooth_output(seed):
 
 
 def test_the_process_alone_does_not(monkeypatch):
-    monkeypatch.setattr("torch_zerohess.search.output_process._WORTH", float("inf"))
+    for name in ("_WORTH", "_WORTH_EARLY"):
+        monkeypatch.setattr(f"torch_zerohess.search.output_process.{name}", float("inf"))
     found = search()
     while not found.done and found.evaluations < 150:
         found.tell(swing(found.ask()))
     assert found.value > 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_begins_right_after_the_first_samples_where_it_promises_much(seed):
+    """Four evaluations tell an affine output; the region of the first step is a quarter of the way to the minimum."""
+    matrix, solution = normal(3, 12, seed=seed), vector(1.25, 0.8, 1.2)
+    found = search(lambda x: x @ matrix, solution, seed=seed)
+    while not found.done and found.value > 1e-20:
+        found.tell(found.ask() @ matrix)
+        assert finishing(found)
+    assert found.evaluations <= 11
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_does_not_begin_early_where_outputs_have_nothing_in_common(seed):
+    """Each output is a single 1 at another place: an affine output promises to fade it out."""
+
+    def spot(x):
+        cell = (x * 40.0).long() @ torch.tensor([1, 200])
+        return torch.nn.functional.one_hot(cell, 200 * 200).double()
+
+    found = search(spot, vector(2.0, 2.5), seed=seed)
+    found.tell(spot(found.ask()))
+    assert not finishing(found)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_rejected_step_ends_its_early_turn(seed):
+    """The output is affine in the first samples, and far higher at the end of the first step."""
+    matrix = normal(3, 12, seed=seed)
+    found = search(lambda x: x @ matrix, vector(1.25, 0.8, 1.2), seed=seed)
+    found.tell(found.ask() @ matrix)
+    assert finishing(found)
+    found.tell(found.ask() @ matrix + 30.0)
+    assert not finishing(found)
 
 
 def test_it_promises_what_gauss_newton_promises_in_its_turn_and_nothing_before():

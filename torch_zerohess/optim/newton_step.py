@@ -34,9 +34,9 @@ class NewtonStep(SecondOrder):
     that raises the loss is taken back, and the radius follows the ratio of actual to predicted decrease (Nocedal and
     Wright, algorithm 4.1). The radius does not fall below 1e-8 of the first one. A step to exactly the same loss, as on
     a plateau, is taken. If the loss still descends along it at its end, the radius doubles, up to the first one; if it
-    ascends, the radius is halved. Where the predicted decrease is within the rounding of the loss
-    no step is taken, and the radius stays. The length compared with the radius is the length of the step times `lr`, so
-    the radius does not grow while `lr` is below 1.
+    ascends, the radius is halved. Where the predicted decrease is within the rounding of the loss no step is taken, and
+    the radius stays. The length compared with the radius is the length of the step times `lr`, so the radius does not
+    grow while `lr` is below 1.
 
     Without `adapt` every step is taken, as suits a loss whose values have noise: over small batches, or of a layer with
     `value="smoothed"`. A test of such values near a minimum shrinks the radius for good.

@@ -3,6 +3,7 @@
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,9 +25,13 @@ _LOOK = 0.05
 class Ray(Ahead):
     """Calls the black box in actors of Ray, on one machine or many, one chunk per actor and call.
 
-    An actor holds the black box from call to call. An actor that ends, with its process or its machine, is restarted by
-    Ray, which makes the black box again, and its points are tried again, by it or by another. What becomes of points
-    that failed too often: see `ProcessPool`. An exception of the black box is raised here, also SystemExit.
+    An actor holds the black box from call to call. An actor that ends, with its process or its machine, is replaced by
+    a new one, which makes the black box again. Its points are tried again, by the new one or by another. What becomes
+    of points that failed too often: see `ProcessPool`. An exception of the black box is raised here, also SystemExit.
+
+    An actor that cannot start, as on a machine without this package, is tried again as often as points are, and then
+    given up with a warning. A call without any actor left raises RuntimeError; the next call tries all of them again.
+    An actor for which the cluster has no room is waited for.
 
     A program that has called `ray.init(...)` has chosen its cluster. Otherwise the address in the environment variable
     RAY_ADDRESS is used, and without one a Ray of this machine alone, which ends with `close()`.
@@ -36,7 +41,7 @@ class Ray(Ahead):
 
     Args:
         actors: number of actors; as many as the cluster has cores if None.
-        retries: further tries of a chunk, and then of its points, after one that failed.
+        retries: further tries of a chunk, and then of its points, after one that failed; also of the start of an actor.
         **options: of the actors, such as `num_cpus=1`, `num_gpus=0.5`, `resources={"render": 1}`, `runtime_env`, see
             `ray.actor.ActorClass.options`.
 
@@ -55,15 +60,17 @@ class Ray(Ahead):
             raise ModuleNotFoundError("ray is not installed; pip install ray", name="ray") from error
         self._ray: Any = ray
         self.count, self.retries = actors, retries
-        self.options = {"num_cpus": 1, "max_restarts": -1, "max_task_retries": 0} | options
+        self.options = {"num_cpus": 1, "max_restarts": 0, "max_task_retries": 0} | options
         self.actors: list[Any] = []
         """Handles of the actors."""
-        self._starting: dict[Any, Any] = {}
-        """Actors that have ended and start again, by what says that they have."""
+        self._starting: dict[Any, tuple[Any, int]] = {}
+        """Actors that start, by what says that they have, and how many before them could not, one after the other."""
         self._idle: list[Any] = []
         self._busy: dict[Any, tuple[Any, Chunk, Job]] = {}
         """What actors evaluate, by the reference to its values."""
         self._own = False
+        self._wanted = 0
+        """Number of actors, before any was given up."""
         super().__init__()
 
     def __repr__(self) -> str:
@@ -79,13 +86,16 @@ class Ray(Ahead):
 
     def _sent(self, fn: Callable[..., Any]) -> Any:
         self._connect()
-        self._staff()
+        self._wanted = self.count or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
         return self._ray.put(fn)
 
     def _batch(self, points: Tensor) -> Batch:
-        return Batch(points, self.retries, len(self.actors))
+        return Batch(points, self.retries, self._wanted)
 
     def _round(self, jobs: Sequence[Job]) -> None:
+        if not self.actors:
+            for _ in range(self._wanted):
+                self._start(0)
         for actor in list(self._idle):
             job = next((job for job in jobs if job.waiting), None)
             if job is None:
@@ -100,13 +110,13 @@ class Ray(Ahead):
         for one in done:
             if one in self._busy:
                 actor, chunk, job = self._busy.pop(one)
-                alive = self._answered(one, chunk, job.batch)
+                if self._answered(one, chunk, job.batch):
+                    self._idle.append(actor)
+                else:
+                    self._remove(actor)
+                    self._start(0)
             else:
-                actor, alive = self._started(one)
-            if alive:
-                self._idle.append(actor)
-            else:  # until it has restarted, it would refuse points
-                self._starting[actor.ready.options(max_task_retries=-1).remote()] = actor
+                self._started(one)
 
     def _give_up(self, jobs: Sequence[Job]) -> None:
         for one, (actor, _, job) in list(self._busy.items()):
@@ -126,12 +136,6 @@ class Ray(Ahead):
         self._ray.init(address="local", include_dashboard=False, num_cpus=self.count, runtime_env=environment)
         self._own = True
 
-    def _staff(self) -> None:
-        if not self.actors:
-            count = self.count or max(1, int(self._ray.cluster_resources().get("CPU", 1)))
-            self.actors = [self._new() for _ in range(count)]
-            self._idle = list(self.actors)
-
     def _answered(self, one: Any, chunk: Chunk, batch: Batch) -> bool:
         """Treat what became of a chunk; False if its actor has ended."""
         errors = self._ray.exceptions
@@ -149,19 +153,32 @@ class Ray(Ahead):
             return False
         return True
 
-    def _started(self, one: Any) -> tuple[Any, bool]:
-        """Return an actor that has started again, or a new one in its place, and whether it has."""
-        actor = self._starting.pop(one)
+    def _start(self, failures: int) -> None:
+        actor = self._ray.remote(Actor).options(**self.options).remote()
+        self.actors.append(actor)
+        self._starting[actor.ready.options(max_task_retries=0).remote()] = actor, failures
+
+    def _remove(self, actor: Any) -> None:
+        self._ray.kill(actor)  # which Ray may be about to restart, if it was told to
+        self.actors.remove(actor)
+
+    def _started(self, one: Any) -> None:
+        """Let an actor that has started work. Start one in place of an actor that could not, or give it up."""
+        actor, failures = self._starting.pop(one)
         try:
             self._ray.get(one)
-        except self._ray.exceptions.RayError:
-            new = self._new()
-            self.actors[self.actors.index(actor)] = new
-            return new, False
-        return actor, True
-
-    def _new(self) -> Any:
-        return self._ray.remote(Actor).options(**self.options).remote()
+        except self._ray.exceptions.RayError as error:
+            self._remove(actor)
+            if failures < self.retries:
+                self._start(failures + 1)
+                return
+            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[-1]}"
+            if not self.actors:
+                raise RuntimeError(f"no actor of Ray can start: {reason}") from error
+            left = f"{len(self.actors)} of {self._wanted} are left"
+            warnings.warn(f"an actor of Ray cannot start, {left}: {reason}", RuntimeWarning, stacklevel=2)
+        else:
+            self._idle.append(actor)
 
 
 class Actor:

@@ -1,5 +1,7 @@
 """Actors on a cluster: the same bits, also when an actor ends in the middle of a batch."""
 
+import os
+import sys
 import warnings
 
 import black_boxes
@@ -68,6 +70,49 @@ def test_errors_that_ray_cannot_send_are_raised_as_by_a_pool_of_processes(actors
     with pytest.raises(SystemExit, match="done"):
         actors(black_boxes.leaving, Z)
     assert actors.lost == {}
+
+
+def without_package(folder, failures):
+    """Return options of actors that cannot import this package, as often as there are failures."""
+    for number in range(failures):
+        (folder / f"failure-{number}").touch()
+    (folder / "sitecustomize.py").write_text(  # paths would not do: Ray puts the folder of the caller before them
+        f"""
+import pathlib, sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        for one in pathlib.Path({str(folder)!r}).glob("failure-*") if name == "torch_zerohess" else ():
+            try:
+                one.unlink()
+            except FileNotFoundError:  # another actor was faster
+                continue
+            raise ImportError("the wheel is missing")
+
+sys.meta_path.insert(0, Missing())
+"""
+    )
+    path = os.pathsep.join([str(folder), *(one or os.getcwd() for one in sys.path)])
+    return {"num_cpus": 0, "runtime_env": {"env_vars": {"PYTHONPATH": path}}}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_actors_that_cannot_start_are_an_error(actors, tmp_path):
+    with Ray(1, retries=1, **without_package(tmp_path, 2)) as missing:
+        with pytest.raises(RuntimeError, match=r"^no actor of Ray can start: .*the wheel is missing$"):
+            missing(black_boxes.waves, Z)
+        assert torch.equal(missing(black_boxes.waves, Z), black_boxes.waves(Z))  # it was installed meanwhile
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_an_actor_that_cannot_start_is_given_up(actors, tmp_path):
+    def called(evaluator):
+        while len(evaluator.actors) != 1:  # the other one may be faster
+            assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
+
+    given_up = r"an actor of Ray cannot start, 1 of 2 are left: .*the wheel is missing"
+    with Ray(2, retries=0, **without_package(tmp_path, 1)) as missing, pytest.warns(RuntimeWarning, match=given_up):
+        called(missing)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -188,6 +188,7 @@ class BlackBox(nn.Module):
                 self.smoothing.sigma_vector(center.shape[1], center.device),
                 seed,
                 self.smoothing.order,
+                lambda count: opaque.nodes(self._handle, seed, count, center, aux),
                 lambda part, its_aux: self._estimated(part, its_aux, zero),
                 value=self.call.value,
                 zero=zero,

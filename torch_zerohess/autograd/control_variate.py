@@ -9,16 +9,14 @@ from torch import Tensor
 from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation.control import Control, Prediction
 from torch_zerohess.estimation.smoothness import known_smooth
-from torch_zerohess.estimation.surrogate_mean import nodes, smoothed
+from torch_zerohess.estimation.surrogate_mean import per_element, smoothed
 from torch_zerohess.estimation.surrogate_term import MOST_STEIN, measure
 
 Part = Callable[[Tensor], Tensor]
 """x [B, n] -> [B, *out], differentiable."""
 
 
-def _pathwise(
-    control: Control, center: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int, seed: int
-) -> int:
+def _pathwise(control: Control, center: Tensor, aux: Sequence[Tensor], sigma: Tensor, order: int, seed: int) -> int:
     """Return how many derivatives of the surrogate's term around center [B, n] to take along its points."""
     memory, few = control.memory, center.shape[1] <= MOST_STEIN
     hidden = transforms.watched(center) or transforms.forward_mode_active()
@@ -26,7 +24,7 @@ def _pathwise(
         with transforms.outside(), transforms.random_numbers_allowed():
             shown = [one for one in map(transforms.shown, (center, *aux)) if one is not None]
             if len(shown) == 1 + len(aux):
-                measure(control, shown[0], shown[1:], sigma, u, order, seed)
+                measure(control, shown[0], shown[1:], sigma, order, seed)
             elif memory.pathwise is None:
                 return 2 if known_smooth(control) else 0
     return (0 if few else 2) if memory.pathwise is None else memory.pathwise
@@ -40,6 +38,7 @@ def around(
     sigma: Tensor,
     seed: int,
     order: int,
+    nodes: Callable[[int], Tensor],
     estimated: Callable[[Tensor, list[Tensor]], tuple[Part, Tensor]],
     *,
     value: str,
@@ -53,8 +52,9 @@ def around(
         center: [B, n].
         aux: [B, ...] each.
         sigma: float64 [n].
-        seed: of the points of the surrogate's term and of the choice of fresh elements.
+        seed: of the choice of fresh elements, and of how the surrogate's term is differentiated.
         order: highest derivative that is wanted.
+        nodes: points per element -> points u [B, Q, n] of the surrogate's term, see `surrogate_mean.nodes`.
         estimated: evaluates around a part of the batch, with its aux, and returns the estimate of the residual, and
             its constants, see `Outer.kept`.
         value: "center" or "smoothed", see `BlackBox`.
@@ -78,13 +78,10 @@ def around(
         predicted = Prediction(control, surrogate, aux)
     excess = predicted.excess(sigma) if outer.linear else None
     if excess is None:
-        with transforms.outside(), transforms.random_numbers_allowed():
-            shape = (memory.draws, center.shape[1], B)
-            u = nodes(seed, *shape).to(center.device)
-            pathwise = _pathwise(control, center, aux, sigma, u, order, seed)
-            u = nodes(seed, *shape, pathwise=pathwise).to(center.device)
+        pathwise = _pathwise(control, center, aux, sigma, order, seed)
+        u = nodes(per_element(memory.draws, center.shape[1], B, pathwise=pathwise))
     else:  # the mean over all points is known from the center
-        u, pathwise = sigma.new_zeros(1, len(sigma)), 2
+        u, pathwise = sigma.new_zeros(1, 1, len(sigma)), 2
     if not fresh:
         predicted.check_head(center)
     with torch.no_grad():

@@ -19,6 +19,7 @@ from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.stein import Layout
+from torch_zerohess.estimation.surrogate_mean import nodes as nodes_of
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory
 
@@ -84,6 +85,16 @@ def empty(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
     return nothing[(..., *[None] * len(shape))].expand(*nothing.shape, *shape)
 
 
+def nodes(handle: int, seed: int, count: int, x: Tensor, aux: list[Tensor]) -> Tensor:
+    """Return `surrogate_mean.nodes` for x [B, n]; each point that vmap maps over gets its own."""
+    if not transforms.transform_active():
+        with transforms.random_numbers_allowed():
+            return nodes_of(seed, count, x.shape[1], len(x)).to(x.device)
+    x = noise_checked(handle, x, aux)
+    result: Tensor = torch.ops.torch_zerohess.nodes(handle, seed, count, x, aux)
+    return result
+
+
 _owners: "weakref.WeakValueDictionary[int, Owner]" = weakref.WeakValueDictionary()
 _handles = itertools.count()
 
@@ -139,6 +150,12 @@ def _evaluate_center(handle: int, records: bool, x: Tensor, aux: list[Tensor]) -
         return expand_center(_owner(handle), x, aux)
 
 
+@torch.library.custom_op("torch_zerohess::nodes", mutates_args=())
+def _nodes(handle: int, seed: int, count: int, x: Tensor, aux: list[Tensor]) -> Tensor:
+    with transforms.random_numbers_allowed():
+        return nodes_of(seed, count, x.shape[1], len(x)).to(x.device)
+
+
 def _layout(handle: int, K: int, keep: bool, x: Tensor, aux: list[Tensor]) -> list[Layout]:
     owner = _owner(handle)
     smoothing = owner.smoothing if keep else owner.smoothing.resolved(int(x.shape[1]))
@@ -190,13 +207,17 @@ def _mapped(info: Any, in_dims: Any, x: Tensor, aux: list[Tensor]) -> tuple[Tens
     return fold(x, in_dims[-2]), [fold(one, dim) for one, dim in zip(aux, in_dims[-1], strict=True)]
 
 
-@_evaluate.register_vmap
-def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, records: bool, x: Tensor, aux: list[Tensor]) -> Any:
+def _check_randomness(info: Any, handle: int) -> None:
     if info.randomness == "same" and _owner(handle).smoothing.seed is None:
         raise ValueError(
             "vmap(randomness='same') over a black box: its noise is independent for each point of a batch; use "
             "randomness='different', or give Smoothing a seed"
         )
+
+
+@_evaluate.register_vmap
+def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, records: bool, x: Tensor, aux: list[Tensor]) -> Any:
+    _check_randomness(info, handle)
     folded, others = _mapped(info, in_dims, x, aux)
     results = _evaluate(handle, K, keep, records, folded, others)
     batched = [one.batched for one in _layout(handle, K, keep, folded, others)]  # after it: the shape is known by now
@@ -204,6 +225,13 @@ def _(info: Any, in_dims: Any, handle: int, K: int, keep: bool, records: bool, x
         one.unflatten(0, (info.batch_size, -1)) if each else one for one, each in zip(results, batched, strict=True)
     ]
     return unfolded, [0 if each else None for each in batched]
+
+
+@_nodes.register_vmap
+def _(info: Any, in_dims: Any, handle: int, seed: int, count: int, x: Tensor, aux: list[Tensor]) -> Any:
+    _check_randomness(info, handle)
+    folded, others = _mapped(info, in_dims, x, aux)
+    return _nodes(handle, seed, count, folded, others).unflatten(0, (info.batch_size, -1)), 0
 
 
 @_evaluate_center.register_vmap

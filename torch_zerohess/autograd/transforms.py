@@ -114,9 +114,13 @@ def shown(x: Tensor) -> Tensor | None:
     functorch = torch._C._functorch
     if torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0:
         return None
+    mapped = []
     while functorch.is_functorch_wrapped_tensor(x):
-        inner = functorch.get_unwrapped(x)
-        x = inner.select(functorch.maybe_get_bdim(x), 0) if functorch.is_batchedtensor(x) else inner
+        if functorch.is_batchedtensor(x):
+            mapped.append(functorch.maybe_get_bdim(x))
+        x = functorch.get_unwrapped(x)
+    for dim in reversed(mapped):  # each counts the dimensions that the vmap around it leaves
+        x = x.select(dim, 0)
     return x.detach() if type(x) in (Tensor, torch.nn.Parameter) else None
 
 

@@ -6,7 +6,8 @@ Up to some order, 0, 1 or 2, its derivatives are pathwise:
     Stein      mean of the highest pathwise derivative, or of the losses, times the kernels of u, as for the black box.
 
 The points u are a Sobol sequence with a random shift (Cranley and Patterson 1976), mapped to the normal distribution,
-and their mirror images: the mean is unbiased, and its error falls faster than the error of independent draws.
+and their mirror images: the mean is unbiased, and its error falls faster than the error of independent draws. Each
+element of a batch has a shift of its own, so that the errors of the elements are independent.
 """
 
 import functools
@@ -21,7 +22,7 @@ from torch_zerohess.precision import without_autocast
 _SOBOL = 64
 """Parameters up to which points are quasi-random; beyond them a sequence of few points is not even."""
 _POINTS = 1024
-"""Points of a call with few parameters, shared by the elements of its batch."""
+"""Points of a call with few parameters, over all elements of its batch."""
 _FEWEST = 64
 """Points per element at least."""
 _FEW = 32
@@ -38,22 +39,28 @@ def _even(count: int, n: int) -> Tensor:
     return torch.quasirandom.SobolEngine(n, scramble=True, seed=0).draw(count, dtype=torch.float64)
 
 
-def nodes(seed: int, count: int | None, n: int, batch: int, *, pathwise: int = 2) -> Tensor:
-    """Return normal points [2 * ceil(count / 2), n] float64: the second half mirrors the first.
+def per_element(draws: int | None, n: int, batch: int, *, pathwise: int) -> int:
+    """Return how many points an element has: `draws` of the memory.
 
-    Without a count they are 1024 / batch and at least 64 up to 32 parameters. For more parameters they are 4 if all
+    Without it they are 1024 / batch and at least 64 up to 32 parameters. For more parameters they are 4 if all
     derivatives are pathwise, and 64 if not.
     """
-    if count is None:
-        count = max(_POINTS // max(batch, 1), _FEWEST) if n <= _FEW else 2 * _PAIRS if pathwise == 2 else _FEWEST
+    if draws is not None:
+        return draws
+    return max(_POINTS // max(batch, 1), _FEWEST) if n <= _FEW else 2 * _PAIRS if pathwise == 2 else _FEWEST
+
+
+def nodes(seed: int, count: int, n: int, batch: int) -> Tensor:
+    """Return normal points [batch, 2 * ceil(count / 2), n] float64: the second half mirrors the first."""
     half = (count + 1) // 2
     generator = torch.Generator().manual_seed(seed)
     if n > _SOBOL:
-        u = torch.randn(half, n, generator=generator, dtype=torch.float64, device="cpu")
+        normal = torch.randn(batch, half, n, generator=generator, dtype=torch.float32, device="cpu")  # the faster ones
+        u = normal.double()
     else:
-        shifted = (_even(half, n) + torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")) % 1.0
-        u = torch.special.ndtri(shifted.clamp(_EDGE, 1.0 - _EDGE))
-    return torch.cat([u, -u])
+        shifts = torch.rand(batch, 1, n, generator=generator, dtype=torch.float64, device="cpu")
+        u = torch.special.ndtri(((_even(half, n) + shifts) % 1.0).clamp(_EDGE, 1.0 - _EDGE))
+    return torch.cat([u, -u], 1)
 
 
 def smoothed(
@@ -73,7 +80,7 @@ def smoothed(
         x: [B, n], with a graph.
         center: [B, n], where the points of Stein's sums are drawn.
         sigma: float64 [n].
-        u: [Q, n], see `nodes`.
+        u: [B, Q, n], see `nodes`.
         pathwise: orders of derivatives along the points; those of higher order are by Stein's sums.
         plain: no transform of `torch.func` is active.
     """
@@ -86,8 +93,8 @@ def smoothed(
         change = fixed - values(center[:, None]).double()  # of no influence on the expectation of the derivatives
     mean, change = fixed.mean(1), change.reshape(*change.shape[:2], -1)
     d = (x.double() - center.double()) / sigma
-    ratio = (d @ u.mT - 0.5 * (d * d).sum(1, keepdim=True)).exp()
-    moved = ((ratio - 1.0)[:, None] @ change)[:, 0] / len(u)
+    ratio = ((u @ d[..., None])[..., 0] - 0.5 * (d * d).sum(1, keepdim=True)).exp()
+    moved = ((ratio - 1.0)[:, None] @ change)[:, 0] / u.shape[1]
     return (mean + moved.reshape(mean.shape)).to(x.dtype)
 
 
@@ -103,7 +110,7 @@ def _from_slopes(
     fixed, along = _linearized(values, z, step, plain=plain)
     d = step / sigma
     t, weights = panels(2, sigma)
-    ratios = (t * (d @ u.mT)[..., None] - 0.5 * t * t * (d * d).sum(1)[:, None, None]).exp() @ weights
+    ratios = (t * (u @ d[..., None]) - 0.5 * t * t * (d * d).sum(1)[:, None, None]).exp() @ weights
     mean = fixed.double() + along.double() * ratios.reshape(*ratios.shape, *[1] * (along.dim() - 2))
     return mean.mean(1).to(x.dtype)
 

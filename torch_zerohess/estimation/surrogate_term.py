@@ -19,7 +19,7 @@ from torch import Tensor
 from torch_zerohess.estimation.control import Control, Prediction
 from torch_zerohess.estimation.smoothness import check_repeats, jumps, known_smooth, smooth_orders
 from torch_zerohess.estimation.stein import Quantity
-from torch_zerohess.estimation.surrogate_mean import nodes
+from torch_zerohess.estimation.surrogate_mean import nodes, per_element
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.surrogate import outside_inference
 
@@ -49,7 +49,7 @@ class SurrogateTerm:
     sigma: Tensor
     """float64 [n]"""
     u: Tensor
-    """[Q, n], see `nodes`."""
+    """[B, Q, n], see `nodes`."""
     pathwise: int
     """Orders of derivatives along the points."""
     seed: int
@@ -65,12 +65,10 @@ class SurrogateTerm:
         cls, control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, seed: int, order: int
     ) -> "SurrogateTerm":
         """Return the term with copies of the surrogate and of aux: a later fit or training does not change it."""
-        memory = control.memory
-        shape = (memory.draws, x.shape[1], len(x))
-        u = nodes(seed, *shape).to(x.device)
-        measure(control, x, aux, sigma, u, order, seed)
+        memory, (B, n) = control.memory, x.shape
+        measure(control, x, aux, sigma, order, seed)
         pathwise = memory.pathwise or 0
-        u = nodes(seed, *shape, pathwise=pathwise).to(x.device)
+        u = nodes(seed, per_element(memory.draws, n, B, pathwise=pathwise), n, B).to(x.device)
         with outside_inference():
             copies = [one.clone() for one in aux]
             return cls(copy.deepcopy(memory.surrogate), control, x.clone(), copies, sigma, u, pathwise, seed)
@@ -86,12 +84,12 @@ class SurrogateTerm:
 
     def variance(self, quantity: Quantity, v: Tensor | None = None) -> Tensor:
         """Return the variance of `mean`, from means over other points: the points of one mean are not independent."""
-        count, batch = self.u.shape[0], len(self.x)
+        B, count, n = self.u.shape
         seeds = torch.Generator().manual_seed(self.seed)
         means = []
         for _ in range(_REPEATS):
             seed = int(torch.randint(2**62, (), generator=seeds, device="cpu"))
-            u = nodes(seed, count, self.u.shape[1], batch).to(self.u.device)
+            u = nodes(seed, count, n, B).to(self.u.device)
             means.append(replace(self, u=u).mean(quantity, v))
         return torch.stack(means).var(0)
 
@@ -140,11 +138,11 @@ class SurrogateTerm:
                 each = self._along_points(quantity, v)
             except RuntimeError:  # an operation without a forward mode
                 each = self._in_reverse(quantity, v)
-        each, half = each.detach(), len(self.u) // 2  # a module has parameters that require grad
+        each, half = each.detach(), self.u.shape[1] // 2  # a module has parameters that require grad
         return 0.5 * (each[:, :half] + each[:, half:])
 
     def _by_stein(self, quantity: Quantity, v: Tensor | None) -> Tensor:
-        values, u = self._each(self.x.double()), self.u[:, None]
+        values, u = self._each(self.x.double()), self.u[:, :, None]
         if quantity == "value":
             return values
         center = self._predicted(self.x[:, None]).double()
@@ -169,7 +167,7 @@ class SurrogateTerm:
         return torch.stack(parts, 3)
 
     def _from_slopes(self, quantity: Quantity, v: Tensor | None) -> Tensor:
-        slopes, u = self._in_reverse("gradient", None), self.u[:, None]
+        slopes, u = self._in_reverse("gradient", None), self.u[:, :, None]
         if quantity == "gradient":
             return slopes
         if quantity == "hessian_diagonal":
@@ -219,9 +217,7 @@ def _derivative(fn: Callable[[Tensor], Tensor], x: Tensor, v: Tensor) -> Tensor:
     return result
 
 
-def measure(
-    control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, order: int, seed: int
-) -> None:
+def measure(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, order: int, seed: int) -> None:
     """Choose how the term at x [B, n] is differentiated, `Memory.pathwise`.
 
     It is chosen at the first call after a fit. At the later ones a head or a surrogate of the caller's may turn out to
@@ -232,16 +228,17 @@ def measure(
     derivatives of a table, a tree or a model outside of autograd are 0, without variance, and wrong. The choice is left
     open where the losses are constant wherever they were looked at: both derivatives are 0 there.
     """
-    memory = control.memory
+    memory, (B, n) = control.memory, x.shape
     if memory.pathwise == 0 or (memory.pathwise and known_smooth(control)):
         return
     with torch.inference_mode(False), without_autocast(x.device):  # which would round derivatives, too
+        u = nodes(seed, per_element(memory.draws, n, B, pathwise=2), n, B).to(x.device)
         orders = _smooth_orders(control, x, aux, sigma, u, seed)
         if memory.pathwise and orders in (None, memory.pathwise):
             return
         if orders and len(sigma) <= MOST_STEIN:
             few = [one[:_TRIED].clone() for one in (x, *aux)]
-            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u, orders, seed)
+            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u[:_TRIED], orders, seed)
             quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
             own, others = (float(one.variance_of_pairs(quantity).sum()) for one in (term, replace(term, pathwise=0)))
             orders = orders if own < others else 0
@@ -252,7 +249,7 @@ def _smooth_orders(
     control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, u: Tensor, seed: int
 ) -> int | None:
     """Return how many pathwise derivatives are right, as far as is known; None where the losses are constant."""
-    memory, count = control.memory, len(x) * len(u)
+    memory, count = control.memory, u.shape[:2].numel()
     if memory.pathwise:  # so many were right up to now: a shorter look, as the term itself is looked at
         return smooth_orders(control, x, aux, sigma, seed, most=memory.pathwise, points=count // _SHORTER)
     step = -(-count // _LOOKED)

@@ -15,7 +15,7 @@ from layers import Fixed
 from torch import Tensor
 
 import torch_zerohess as zh
-from torch_zerohess.estimation.surrogate_mean import nodes
+from torch_zerohess.estimation.surrogate_mean import per_element
 from truths import deviation
 
 SIGMA, REFERENCE = 0.3, 0.5
@@ -328,8 +328,8 @@ def test_rounding_is_no_kink() -> None:
 
 
 def test_with_kinks_an_element_has_more_points() -> None:
-    assert [len(nodes(0, None, 40, 8, pathwise=one)) for one in (0, 1, 2)] == [64, 64, 4]
-    assert len(nodes(0, 12, 40, 8, pathwise=1)) == 12
+    assert [per_element(None, 40, 8, pathwise=one) for one in (0, 1, 2)] == [64, 64, 4]
+    assert per_element(12, 40, 8, pathwise=1) == 12
 
 
 def test_a_state_of_an_earlier_version() -> None:

@@ -90,7 +90,7 @@ def test_unbiased_for_every_surrogate(name: str, pathwise: int) -> None:
         values.append(value.detach())
         gradients.append(gradient.detach())
     for sampled, expected in ((values, F), (gradients, g), (bends, h)):
-        # One number per call: the elements of a batch share the points of the surrogate's term.
+        # One number per call: which elements are evaluated depends on the others.
         each = torch.stack(sampled).unflatten(1, (copies, len(x))).mean(1)
         z = (each.mean(0) - expected.detach()) / (each.std(0) / math.sqrt(len(each)))
         assert float(z.abs().max()) < 5, "of 20 numbers; false alarms: 1 in 10 000"

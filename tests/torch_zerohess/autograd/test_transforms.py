@@ -67,6 +67,18 @@ def test_wrapped_tensors_are_looked_into_at_every_level() -> None:
     assert answers(transforms.derivative_wanted, lambda fn: torch.func.vmap(fn)(leaf[None])) == [True]
 
 
+def test_the_first_element_of_nested_maps_is_shown() -> None:
+    x, found = torch.arange(24.0).view(2, 3, 4), []
+
+    def fn(one: Tensor) -> Tensor:
+        with transforms.outside():
+            found.append(transforms.shown(one))
+        return one
+
+    torch.func.vmap(torch.func.vmap(fn, in_dims=1))(x)  # [3]
+    assert torch.equal(found[0], x[0, :, 0])
+
+
 def test_forward_mode_is_seen_where_there_is_a_tangent() -> None:
     with forward_ad.dual_level():
         assert transforms.forward_mode_active()

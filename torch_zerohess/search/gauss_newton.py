@@ -19,7 +19,7 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
-_SHRINKING = 0.4
+SHRINKING = 0.4
 """Factor of the radius where no step lowers the loss."""
 _INNER = 0.99
 """Length of a step, over the radius, below which the radius did not shorten it."""
@@ -119,10 +119,13 @@ class GaussNewton(Method[Q]):
             evaluated = evaluated.those(slice(1, None))
         return self.renewed(known, evaluated)
 
+    def radii(self, known: Q) -> Tensor:
+        """Return the lengths of the steps that are tried [k]."""
+        return known.center.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
+
     def trials(self, known: Q) -> Tensor:
         """Return the ends of steps of all lengths [k, n]."""
-        radii = known.center.new_tensor(LENGTHS) * known.radius * math.sqrt(self.settings.n)
-        points = known.center + self.steps(known, radii)
+        points = known.center + self.steps(known, self.radii(known))
         return points.clamp(self.settings.lower, self.settings.upper)
 
     def taken(self, known: Q, evaluated: Evaluated) -> Q:
@@ -136,7 +139,7 @@ class GaussNewton(Method[Q]):
             loss, radius = float(evaluated.losses[k]), float(step.norm()) / math.sqrt(self.settings.n)
             known = self.moved(replace(known, center=point, loss=loss, radius=radius, output=output), step, change)
         else:
-            known = replace(known, radius=_SHRINKING * known.radius)
+            known = replace(known, radius=SHRINKING * known.radius)
         if known.radius < self.settings.tolerance:
             known = self.arrived(known)
         return replace(known, sigma=self.distance(known.radius))

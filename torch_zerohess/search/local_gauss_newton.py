@@ -36,7 +36,9 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         x0: start [n], float32 or float64, within the bounds.
         sigma: length over which the output changes, in units of the parameters; one value, or one per parameter [n].
         loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch. It should be
-            convex, as a mean of squares is: directions in which it bends downwards count as straight.
+            convex, as a mean of squares is: directions in which it bends downwards count as straight. It may have
+            kinks, as a mean of magnitudes has, and Huber's loss nearly has. Steps there minimise the loss of the
+            linear outputs, which calls it some hundred times per step.
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
             evidence, which helps where outputs depend on patches of parameters. None: they lie in no order.

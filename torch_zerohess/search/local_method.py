@@ -3,11 +3,14 @@
 The start and a few dozen samples of all parameters at once tell a sparse Jacobian of the smoothed output, row by row
 (`surrogates.sparse_fit`). It takes about s log n samples for s parameters per row, where a dense Jacobian takes n.
 
-An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths then minimise
-the model g J s + s J^T H J s / 2 by conjugate gradients, where g and H are gradient and Hessian of the loss after the
-output; see `gauss_newton`. Steps and hops move only the parameters that some output was found to depend on, see
+An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths follow, see
+`local_steps` and `gauss_newton`. Steps and hops move only the parameters that some output was found to depend on, see
 `surrogates.sparse_evidence`. If the output at the end of the step was predicted well, the next steps use the same J.
 Sigma is a share of the radius.
+
+At a kink of the loss all steps may fail, although the search has not arrived. So it arrives there only where the loss
+of linear outputs promises next to nothing, or has its minimum within the region. Where it promises nothing, no step is
+tried: after samples as near as samples get the search has arrived.
 
 Where steps hardly lower the loss, the search hops: it goes on from a random point close by, with the J that it has. It
 stays with what the hop leads to if the loss is lower there. Otherwise it returns: to another hop if it had arrived,
@@ -23,9 +26,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
-from torch_zerohess.linalg.krylov import krylov_steps
-from torch_zerohess.search.gauss_newton import GaussNewton
+from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
 from torch_zerohess.search.local_progress import LocalProgress
+from torch_zerohess.search.local_steps import LocalSteps, derivatives, local_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
@@ -51,8 +54,11 @@ LOCAL_TOLERANCE = 5e-4
 """Radius, in units of sigma, at which the search has arrived, if the caller says nothing."""
 _FOUND = 0.3
 """Share of the entries that must be of parameters that were found, before steps follow, or else more samples."""
-_ITERATIONS = 100
-"""Products of the Hessian for a step."""
+_NOTHING, _LITTLE = 1e-8, 1e-5
+"""Decrease that the loss of linear outputs promises, over the loss: so small that no step is tried, and so small that
+a search whose steps are below the tolerance has arrived."""
+_INSIDE = 0.5
+"""Length of the step to the minimum of that loss, over the longest one, up to which the region contains the minimum."""
 _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
@@ -103,6 +109,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
     def __init__(self, settings: Settings, own: LocalSettings) -> None:
         super().__init__(settings)
         self.own, self.radius = own, own.radius
+        self._last: tuple[LocalProgress, Tensor, LocalSteps] | None = None  # progress, lengths and steps
 
     def begun(self) -> LocalProgress:
         start = self.settings.start
@@ -163,13 +170,38 @@ class LocalMethod(GaussNewton[LocalProgress]):
             known = replace(known, radius=max(1.0, known.radius))
         return replace(known, phase="trial")
 
+    def asked(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
+        """Ask for what the phase says; for no steps where the loss of linear outputs promises nothing."""
+        if known.phase == "trial":
+            promised = self._solved(known, self.radii(known)).promised
+            if promised is not None and promised <= _NOTHING * abs(known.loss):
+                known = self._at_kink(known)
+        return (known, known.center[None][:0]) if known.done else super().asked(known, generator)
+
     def steps(self, known: LocalProgress, radii: Tensor) -> Tensor:
-        """Solve the model by conjugate gradients, over the parameters that no bound holds."""
-        gradient, product = self._derivatives(known)
-        lower, upper, x = self.settings.lower, self.settings.upper, known.center
-        held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-        free = (~held).to(gradient)
-        return krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
+        """Solve the model, see `local_steps`."""
+        return self._solved(known, radii).steps
+
+    def _solved(self, known: LocalProgress, radii: Tensor) -> LocalSteps:
+        last, settings = self._last, self.settings
+        if last is not None and last[0] is known and torch.equal(last[1], radii):
+            return last[2]
+        assert known.jacobian is not None
+        assert settings.loss is not None
+        box = settings.lower - known.center, settings.upper - known.center
+        found = local_steps(settings.loss, known.output.view(known.shape), known.jacobian, radii, *box)
+        self._last = known, radii, found
+        return found
+
+    def _at_kink(self, known: LocalProgress) -> LocalProgress:
+        """Sample as near as samples get, then arrive. Where the Jacobian does not predict, shrink the radius."""
+        own, radius, near = self.own, SHRINKING * known.radius, known.sigma <= self.own.least_sigma
+        if known.predicts and not near:
+            radius = min(radius, own.least_sigma / own.share)
+        known = replace(known, radius=radius, phase="sample")
+        if (known.predicts and near) or radius < self.settings.tolerance:
+            known = self.arrived(known)
+        return replace(known, sigma=self.distance(known.radius))
 
     def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Take the best step; double the samples after a small gain, and halve them after a large one; or hop."""
@@ -196,11 +228,19 @@ class LocalMethod(GaussNewton[LocalProgress]):
         """End, hop, or begin again with the first radius where the Jacobian does not predict."""
         if known.failed:
             return self._returned(known)
-        if not known.predicts:
+        if not (known.predicts and self._is_minimum(known)):
             return super().arrived(known)
         end = Best(known.center, known.loss, known.sigma)
         known = super().arrived(agreeing(arriving(known, end), end, self.settings.tolerance))
         return known if known.done else self._hopping(replace(known, finished=True))
+
+    def _is_minimum(self, known: LocalProgress) -> bool:
+        """Whether the loss of linear outputs promises next to nothing in the region, or has its minimum inside."""
+        longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
+        found = self._solved(known, known.center.new_tensor([longest]))
+        if found.promised is None or found.promised <= _LITTLE * abs(known.loss):
+            return True
+        return float(found.steps.norm()) <= _INSIDE * longest
 
     def _stalled(self, known: LocalProgress) -> LocalProgress:
         """Hop, or return from a hop; go on where neither may help."""
@@ -244,7 +284,13 @@ class LocalMethod(GaussNewton[LocalProgress]):
 
     def promise(self, known: LocalProgress) -> float:
         """Return the promise of a step; it is infinite while a hop has led to nothing better."""
-        return super().promise(known) if known.predicts and not known.failed else math.inf
+        if not known.predicts or known.failed or known.phase != "trial":
+            return math.inf
+        found = self._solved(known, self.radii(known))
+        if found.promised is None:
+            return super().promise(known)
+        longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
+        return found.promised if float(found.steps[-1].norm()) <= _INSIDE * longest else math.inf
 
     def untouched(self, known: LocalProgress) -> Tensor | None:
         """Return the parameters that no output was found to depend on, if some were found."""
@@ -265,9 +311,6 @@ class LocalMethod(GaussNewton[LocalProgress]):
 
     def _derivatives(self, known: LocalProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
-        jacobian = known.jacobian
-        assert jacobian is not None
+        assert known.jacobian is not None
         assert self.settings.loss is not None
-        loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
-        gradient = jacobian.rmatvec(loss.slope)
-        return gradient, lambda v: jacobian.rmatvec(loss.product(jacobian.matvec(v)))
+        return derivatives(loss_curvature(self.settings.loss, known.output.view(known.shape)), known.jacobian)

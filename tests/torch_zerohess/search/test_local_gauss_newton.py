@@ -369,3 +369,85 @@ def test_minimize_takes_it():
 def test_three_parameters_may_all_count_for_an_output():
     search = zh.optim.LocalGaussNewton(torch.zeros(3), sigma=0.1, loss=lambda y: y.square().mean())
     assert search.ask().shape == (33, 3)  # the start and its samples
+
+
+def thrice(x):
+    """Three pixels of each texel."""
+    return torch.cat([image(x), image(x), image(x)], 1)
+
+
+TARGETS = normal(3 * SIDE, SIDE, seed=2)
+MEDIANS = TARGETS.view(3, N).median(0).values
+LEAST = float((thrice(MEDIANS[None])[0] - TARGETS).abs().mean())
+
+
+def magnitudes(y):
+    """The mean of magnitudes, which is least where each texel is the median of its three targets."""
+    return (y - TARGETS).abs().mean()
+
+
+def test_a_mean_of_magnitudes_falls_to_zero_in_as_many_evaluations_as_a_mean_of_squares():
+    truth = normal(N)
+    loss = lambda y: (y - blur(truth[None])[0]).abs().mean()  # noqa: E731
+    search = run(search_for(blur, truth, loss=loss, grid=(SIDE, SIDE)), blur, 150)
+    assert search.value < 1e-3 * float(loss(blur(torch.zeros(1, N).double())[0]))
+
+
+def test_the_minimum_of_a_mean_of_magnitudes_is_found_and_confirmed():
+    """Three rounds arrive there. Where nothing is promised no step is tried: no point is evaluated twice."""
+    seen = []
+    fit = zh.minimize(
+        lambda x: seen.append(x) or thrice(x),
+        torch.zeros(N).double(),
+        sigma=1.0,
+        loss=magnitudes,
+        engine="local",
+        seed=0,
+        max_evaluations=600,
+    )
+    assert fit.success
+    assert fit.message == "3 rounds in a row have arrived at x"
+    assert fit.evaluations < 400
+    assert fit.value < LEAST + 0.01 * (float(magnitudes(0.0 * TARGETS)) - LEAST)
+    assert len(torch.cat(seen).unique(dim=0)) == fit.evaluations - 1  # the start, to look for noise
+
+
+def kinked(x, size=1.0):
+    """The progress of a search at x [N], with samples nearby and a Jacobian that is exact times `size`."""
+    search = search_for(thrice, normal(N), loss=magnitudes)
+    search.tell(thrice(search.ask()))
+    known = search._state.progress
+    every = torch.arange(N).repeat(3)[:, None]
+    exact = SparseJacobian(every, size * torch.ones(3 * N, 1), torch.zeros(3 * N, 1), N, known.shape, explained=1.0)
+    output = thrice(x[None])[0]
+    loss = float(magnitudes(output))
+    known = replace(known, jacobian=exact, center=x, output=output.flatten(), loss=loss, sigma=0.03)
+    return search._method, replace(known, radius=1e-4, phase="trial")
+
+
+@pytest.mark.parametrize(("away", "size", "agreed"), [(0.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 1e-3, 1)])
+def test_short_steps_at_a_kink_are_an_arrival_where_the_loss_of_linear_outputs_promises_nothing(away, size, agreed):
+    """Half a unit beside the minimum the loss falls along the whole step; next to not, where outputs hardly change."""
+    method, known = kinked(MEDIANS + away, size)
+    known = replace(known, best=replace(known.best, point=known.center, loss=known.loss))
+    after = method.arrived(known)
+    assert after.agreed == agreed
+    assert (after.arrived is not None) == (agreed == 1)
+
+
+def test_at_a_kink_nearer_samples_are_asked_for_before_it_arrives():
+    method, known = kinked(MEDIANS)
+    generator = torch.Generator().manual_seed(0)
+    wide = replace(known, sigma=0.35, radius=1.0)
+    nearer, points = method.asked(wide, generator)
+    assert (nearer.phase, nearer.rounds, len(points)) == ("sample", 0, 32)
+    assert nearer.sigma == pytest.approx(0.03)
+    assert method.asked(replace(known, radius=0.05), generator)[0].rounds == 1
+
+
+def test_the_promise_at_a_kink_is_the_decrease_of_the_loss_of_linear_outputs():
+    """Within the longest step; a minimum farther away promises an unknown decrease."""
+    method, known = kinked(MEDIANS + 0.01)
+    assert method.promise(known) == math.inf
+    known = replace(known, radius=0.1)
+    assert method.promise(known) == pytest.approx(known.loss - LEAST, rel=0.02)

@@ -1,0 +1,89 @@
+"""Steps of several lengths by a sparse Jacobian J: to the minimum of a quadratic, or of the loss of linear outputs.
+
+The quadratic is g J s + s J^T H J s / 2, with gradient g and Hessian H of the loss after the output. It is wrong at a
+kink of the loss, and where the curvature of the loss changes along a step: the loss of the output + J s says so,
+without an evaluation of the black box. There this loss itself is minimised (`smoothed_minimum`), within the longest
+step. It is convex if the loss is, so the shorter steps lead along the same line.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.krylov import krylov_steps
+from torch_zerohess.linalg.smoothed_newton import LinearOutputs, smoothed_minimum
+from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+
+_ITERATIONS = 100
+"""Products of the Hessian for a step."""
+_EXPANDED, _ROUNDED = 0.5, 1e-12
+"""Error of the quadratic's promise, over the promise and over the loss, with which its steps are taken."""
+
+Loss = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class LocalSteps:
+    """Steps [k, n], and how far the longest one lowers the loss of linear outputs.
+
+    None where a quadratic holds that is curved along this step.
+    """
+
+    steps: Tensor
+    promised: float | None = None
+
+
+def derivatives(expanded: LossCurvature, jacobian: SparseJacobian) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Return the gradient [n] of a loss that is expanded at the output, and the product with its Hessian J^T H J."""
+    gradient = jacobian.rmatvec(expanded.slope)
+    return gradient, lambda v: jacobian.rmatvec(expanded.product(jacobian.matvec(v)))
+
+
+def local_steps(
+    loss: Loss, output: Tensor, jacobian: SparseJacobian, radii: Tensor, lower: Tensor, upper: Tensor
+) -> LocalSteps:
+    """Return a step within each of the radii [k], the longest one last.
+
+    Args:
+        loss: of an output.
+        output: at the center [*out], float64.
+        jacobian: there.
+        radii: in rising order.
+        lower: bounds of steps [n], at most 0.
+        upper: at least 0.
+    """
+    gradient, product = derivatives(loss_curvature(loss, output), jacobian)
+    # Parameters that a bound holds stay.
+    free = (~(((lower >= 0) & (gradient > 0)) | ((upper <= 0) & (gradient < 0)))).to(gradient)
+    steps = krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
+
+    def valued(y: Tensor) -> tuple[float, Tensor]:
+        with torch.enable_grad():
+            y = y.detach().requires_grad_(True)
+            value = loss(y.view(output.shape))
+            (slope,) = torch.autograd.grad(value, y)
+        return float(value.detach()), torch.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0)
+
+    rows, columns = jacobian.entries
+    outputs = LinearOutputs(
+        valued, output.flatten(), lambda s: rows.times(s[None])[0], lambda w: columns.times(w[None])[0]
+    )
+    before = outputs.value(torch.zeros_like(gradient))
+    down, bent = steps @ gradient, torch.stack([s @ product(s) for s in steps])
+    if all(_holds(outputs, before, s, float(one)) for s, one in zip(steps, -(down + 0.5 * bent), strict=True)):
+        straight = float(bent[-1]) <= -_ROUNDED * float(down[-1])
+        return LocalSteps(steps, -float(down[-1]) if straight else None)
+    longest = float(radii[-1])
+    widths = jacobian.values.to(radii).square().sum(1).sqrt() * (longest / math.sqrt(jacobian.n))
+    start = min(steps.clamp(lower, upper), key=outputs.value)
+    end, promised = smoothed_minimum(outputs, widths, longest, lower, upper, start)
+    return LocalSteps(radii[:, None] / longest * end, promised)
+
+
+def _holds(outputs: LinearOutputs, before: float, s: Tensor, promised: float) -> bool:
+    """Whether the quadratic promises at s [n] about what the loss of linear outputs does."""
+    return not abs(before - outputs.value(s) - promised) > _EXPANDED * promised + _ROUNDED * abs(before)

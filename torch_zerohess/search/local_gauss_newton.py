@@ -27,6 +27,9 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     Where its steps hardly lower the loss, it hops to a random point close by, at 0.3 sigma per parameter, and goes on
     from there. It stays with what it finds if the loss is lower, and returns otherwise.
 
+    It averages no noise: it takes each output for true, and further evaluations do not lower the error. With several
+    evaluations per parameter of a noisy function `Descent` finds lower losses.
+
     Only parameters that some output was found to depend on are moved. The others stay where they are, and `untouched`
     names them. Of the parameters found in a batch, at most 0.5 % have no effect, by expectation. A parameter with a
     weak effect counts as untouched until there is enough evidence. Samples perturb all parameters. So no sample is the

@@ -174,7 +174,7 @@ def improbability(lengths: Tensor) -> Tensor:
 
 def distances(a: Tensor, b: Tensor) -> Tensor:
     """Distances [A, B] of points a [A, n] and b [B, n], with derivatives of every order that a kernel may multiply."""
-    middle = b.detach().mean(0)
+    middle = b.detach().sum(0) / max(len(b), 1)  # without points, too
     a, b = a - middle, b - middle
     squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
     rounding = squares.detach().clamp(max=0.0)  # to be positive without a derivative of its own

@@ -31,6 +31,14 @@ def test_it_is_certain_at_the_data_and_not_far_away() -> None:
     assert float(found.uncertainty(points[:1] + 100.0)) > 0.9 * found.variance
 
 
+def test_where_nothing_is_explained_derivatives_are_finite() -> None:
+    points, outputs = data()
+    found = InducedProcess.condition(points, outputs, gaussian, 1e3)
+    x = points[:3].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(found(x).sum(), x)
+    torch.testing.assert_close(slope, torch.zeros_like(slope), atol=0.02, rtol=0)
+
+
 def test_duplicates_are_not_chosen_twice() -> None:
     points, outputs = data()
     once = InducedProcess.condition(points, outputs, gaussian, 1e-3)

@@ -62,6 +62,22 @@ def test_samples_have_the_same_bits(proposal: int, dtype: torch.dtype) -> None:
             assert bool(((made[2].cpu() - weights).abs() <= bound * weights).all())
 
 
+@pytest.mark.parametrize("antithetic", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("B", "S", "n", "M"), [(2, 300, 3, 1), (1, 7, 5000, 3), (2, 3, 40, 6)])
+def test_sums_of_rows_drawn_again_are_the_same(B: int, S: int, n: int, M: int, dtype: torch.dtype, antithetic: bool):
+    for proposal in range(5):
+        recipe = (proposals.pick_rows(3, 0, B * S, n, proposal), spread(B * n, -1.0, 1.0).view(B, n).to(dtype))
+        settings = spread(n, 0.1, 1.0), antithetic, dtype == torch.float32
+        here = kernels.Redrawn(*recipe, *settings)
+        there = kernels.Redrawn(*(one.to(DEVICE) for one in here[:3]), *settings[1:])
+        t, a = spread(B * M * n, -1.0, 2.0).view(B, M, n), spread(B * M * here.K, -2.0, 1.0).view(B, M, here.K)
+        for function, vectors in ((kernels.project, t), (kernels.accumulate, a), (kernels.accumulate_squares, a)):
+            got = function(there, vectors.to(DEVICE))
+            same([got], [function(here, vectors)])
+            assert torch.equal(function(there, vectors.to(DEVICE)), got)
+
+
 def settings_that_there_are():
     for proposal, sampler, baseline, antithetic in itertools.product(
         ("gaussian", "aggregate", "optimal", "uniform"),

@@ -79,8 +79,7 @@ class Elementwise(Stein):
 
     def gradient(self, a: Tensor) -> Tensor:
         chosen = self.rows[:, 2] == GRADIENT_LOBE
-        result = a.new_zeros(*a.shape[:2], self.n)
-        return result.index_add_(2, self.rows[chosen, 3], (a * self.weight[:, None])[..., chosen])
+        return self._sums(a, chosen, self.rows[chosen, 3], self.n)
 
     def hvp(self, a: Tensor, v: Tensor) -> Tensor:
         return (self.hessian(a) @ v[..., None])[..., 0]
@@ -93,10 +92,19 @@ class Elementwise(Stein):
             raise ValueError(FIRST_ORDER_ERROR)
         chosen = (self.rows[:, 2] == DIAGONAL_LOBE) | (self.rows[:, 2] == OFF_DIAGONAL_LOBE)
         i, j = self.rows[chosen, 3], self.rows[chosen, 4]
+        row, column = torch.triu_indices(self.n, self.n, device=a.device)
         upper = a.new_zeros(*a.shape[:2], self.n * self.n)
-        upper = upper.index_add_(2, i * self.n + j, (a * self.weight[:, None])[..., chosen])
-        upper = upper.unflatten(2, (self.n, self.n))
+        sums = self._sums(a, chosen, i * self.n + j, len(row))
+        upper = upper.index_copy(2, row * self.n + column, sums).unflatten(2, (self.n, self.n))
         return upper + upper.triu(1).mT
+
+    def _sums(self, a: Tensor, chosen: Tensor, element: Tensor, count: int) -> Tensor:
+        """Return the sums of the chosen rows of each element, [B, M, count]; all have as many rows.
+
+        `index_add_` would add them in another order each time on a CUDA device.
+        """
+        terms = (a * self.weight[:, None])[..., chosen][..., element.argsort(stable=True)]
+        return terms.unflatten(2, (count, -1)).sum(3)
 
     def ratio(self, d: Tensor, project: Projection) -> Tensor:
         """Return the quadratic in d [B, n] whose derivatives are the kernels, [B, K]."""

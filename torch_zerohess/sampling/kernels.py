@@ -1,10 +1,10 @@
 """The operations that the C++ extension speeds up, each beside its literal reference in torch.
 
-CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms` and `sample`
-go to Triton kernels. The first call on a device compares some of their numbers with the reference. If they differ, or a
-kernel fails, a warning says so and the reference is used from then on. All other tensors go to the reference, and so do
-CPU tensors without the extension. All of them draw the same bits. Their sums of n terms differ by rounding: n units in
-the last place of the sum of magnitudes at most.
+CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms`, `sample`,
+`mirror` and sums of rows that are drawn again go to Triton kernels. The first call on a device compares some of their
+numbers with the reference. If they differ, or a kernel fails, a warning says so and the reference is used from then on.
+All other tensors go to the reference, and so do CPU tensors without the extension. All of them draw the same bits.
+Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
 """
 
 import functools
@@ -157,8 +157,14 @@ def project(u: Samples, t: Tensor) -> Tensor:
         if _compiled(u) and t.shape[1] <= MANY_VECTORS:
             return torch.ops.torch_zerohess.project(u.contiguous(), t.contiguous())
         return t @ u.mT
-    if _compiled(u.x):
+    if _draws_on(u.x):
         return torch.ops.torch_zerohess.project_drawn(*u.arguments(), t.contiguous())
+    return project_drawn(*u, t)
+
+
+def project_drawn(rows: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, t: Tensor) -> Tensor:
+    """See `project`."""
+    u = Redrawn(rows, x, sigma, antithetic, single)
     result = t.new_empty(*t.shape[:2], u.K)
     for _, chunk, _, columns in u.chunks():
         result[..., columns] = t @ chunk.mT
@@ -209,10 +215,16 @@ def _upper(u: Tensor, a: Tensor) -> Tensor:
 
 def _symmetric(upper: Tensor) -> Tensor:
     """Return matrices [..., n, n] of which only the upper triangle is right, made symmetric."""
-    if _compiled(upper):
+    if _draws_on(upper):
         torch.ops.torch_zerohess.mirror(upper.flatten(0, -3))
-        return upper
-    return upper.triu() + upper.triu(1).mT
+    else:
+        mirror(upper)
+    return upper
+
+
+def mirror(matrices: Tensor) -> None:
+    """Copy the upper triangles of matrices [..., n, n] into the lower ones, in place."""
+    matrices.copy_(matrices.triu() + matrices.triu(1).mT)
 
 
 def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:
@@ -220,8 +232,16 @@ def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:
         if _compiled(u) and a.shape[1] <= MANY_VECTORS:
             return torch.ops.torch_zerohess.accumulate(u.contiguous(), a.contiguous(), squares)
         return a @ (u * u if squares else u)
-    if _compiled(u.x):
+    if _draws_on(u.x):
         return torch.ops.torch_zerohess.accumulate_drawn(*u.arguments(), a.contiguous(), squares)
+    return accumulate_drawn(*u, a, squares)
+
+
+def accumulate_drawn(
+    rows: Tensor, x: Tensor, sigma: Tensor, antithetic: bool, single: bool, a: Tensor, squares: bool
+) -> Tensor:
+    """See `accumulate` and `accumulate_squares`."""
+    u = Redrawn(rows, x, sigma, antithetic, single)
     return _total(_sums(chunk, a[..., columns], squares) for _, chunk, _, columns in u.chunks())
 
 
@@ -272,5 +292,5 @@ def _on_cuda(function: Callable[..., Any]) -> None:
 
 
 if extension.available:
-    for _function in (draw, uniforms, sample):
+    for _function in (draw, uniforms, sample, project_drawn, accumulate_drawn, mirror):
         _on_cuda(_function)

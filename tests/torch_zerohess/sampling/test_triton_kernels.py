@@ -23,7 +23,7 @@ needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, re
 
 SAME_BITS = """
 import torch, triton, triton.language as tl
-from torch_zerohess.sampling import philox, proposals, quantiles, triton_kernels
+from torch_zerohess.sampling import philox, proposals, quantiles, triton_kernels, triton_quantiles
 
 assert triton_kernels._sample.__class__.__name__ == "InterpretedFunction"
 ops = torch.ops.torch_zerohess
@@ -57,8 +57,9 @@ for first in (2**32 - 4, 2**33 - 6):  # the counter of blocks of two columns end
     assert torch.equal(got, philox.uniforms(SEEDS[3:], index, first, 19, philox.EXTRA))
     assert torch.equal(got, ops.uniforms(SEEDS[3:], index, first, 19, philox.EXTRA))
 
+triton_kernels._TILES = 2
 for proposal in range(5):
-    triton_kernels._TILE = 16 if proposal == proposals.SECOND_ORDER else 64
+    triton_kernels._TILE = 8 if proposal == proposals.SECOND_ORDER else 64
     for dtype, B, S, n, both in ((torch.float32, 2, 3, 5, True), (torch.float64, 1, 1, 18, proposal % 2 == 0)):
         x, sigma = torch.linspace(-3, 3, B * n, dtype=dtype).view(B, n), torch.linspace(1e-9, 2, n).double()
         center, keep, single = proposal != 1, proposal != 2, dtype == torch.float32
@@ -70,13 +71,29 @@ for proposal in range(5):
         bound = 2.0**-52 * (12 * n + 8 if proposal == proposals.UNIFORM else 2 * n + 9)
         assert bool(((got[3] - weights).abs() <= bound * weights).all())
 
+triton_kernels._TILE, triton_kernels._PROGRAMS = 32, 9
+for case, (made, B, n, M) in enumerate([(every, 2, 5, 1), (every, 2, 5, 3), (edges, 1, 70, 2), (every, 1, 2, 5)]):
+    single, both, S = case % 2 == 0, case != 2, len(made) // B
+    x, sigma = torch.zeros(B, n, dtype=torch.float32 if single else torch.float64), torch.ones(n).double()
+    t, a = torch.linspace(-1, 2, B * M * n).double(), torch.linspace(-2, 1, B * M * S * (1 + both)).double()
+    sums = [("project_drawn", t.view(B, M, n)), *2 * [("accumulate_drawn", a.view(B, M, -1))]]
+    for squares, (name, vectors) in enumerate(sums):
+        arguments = made, x, sigma, both, single, vectors, *([squares == 2] if squares else [])
+        got, expected = getattr(triton_kernels, name)(*arguments), getattr(ops, name)(*arguments)
+        torch.testing.assert_close(got, expected, rtol=1e-13, atol=1e-13)
+
+whole = torch.linspace(0, 1, 2 * 35 * 35).double().view(2, 35, 35).sin()
+matrices = whole.clone()
+triton_kernels.mirror(matrices)
+assert torch.equal(matrices, whole.triu() + whole.triu(1).mT)
+
 
 @triton.jit
 def all_quantiles(p, out, N: tl.constexpr):
     here = tl.arange(0, N)[None, :]
-    tl.store(out + here, triton_kernels._normal(tl.load(p + here)))
-    tl.store(out + N + here, triton_kernels._gradient_lobe(tl.load(p + here)))
-    tl.store(out + 2 * N + here, triton_kernels._hessian_lobe(tl.load(p + here)))
+    tl.store(out + here, triton_quantiles.normal(tl.load(p + here)))
+    tl.store(out + N + here, triton_quantiles.gradient_lobe(tl.load(p + here)))
+    tl.store(out + 2 * N + here, triton_quantiles.hessian_lobe(tl.load(p + here)))
 
 
 p = torch.linspace(0.001, 0.999, 151, dtype=torch.float64)
@@ -104,11 +121,16 @@ def compiled(kernel, types, **constants):
 
 
 for x, single in (("*fp64", False), ("*fp32", True)):
-    types = {"rows": "*i64", "lobes": x, "x": x, "points": x, "sigma": "*fp64", "ratios": "*fp32", "out": "*fp64"}
-    for kind in (triton_kernels.NORMAL, triton_kernels.EVERY, triton_kernels.BOX):
-        sizes = {"ROWS": 32, "BLOCK": 4}
-        compiled(triton_kernels._sample, {**types, "sums": "*fp64"}, KIND=kind, SINGLE=single, SIGNS=2, **sizes)
-    compiled(triton_kernels._lobes, {"rows": "*i64", "values": x}, SINGLE=single, ROWS=32, BLOCK=4)
+    sums = {"rows": "*i64", "lobes": x, "ratios": "*i64", "t": "*fp64", "a": "*fp64", "out": "*fp64"}
+    types = {**sums, "x": x, "points": x, "sigma": "*fp64", "out": x, "sums": "*fp64"}
+    any_kind = {"KIND": triton_kernels.ANY.value, "SINGLE": single}
+    one, many = {**any_kind, "ROWS": 1, "BLOCK": 128}, {**any_kind, "ROWS": 32, "BLOCK": 4}
+    compiled(triton_kernels._sample, types, SIGNS=2, TILES=2, **(one if single else many))
+    compiled(triton_kernels._project, sums, **(many if single else one))
+    if single:
+        compiled(triton_kernels._accumulate, sums, SQUARES=True, **one)
+    compiled(triton_kernels._lobes, {"rows": "*i64", "values": x}, SINGLE=single, ROWS=32)
+compiled(triton_kernels._mirror, {"matrices": "*fp64"}, SIDE=32)
 """
 
 
@@ -140,8 +162,8 @@ def test_every_operation_of_the_compiled_kernels_is_rounded_to_nearest(tmp_path:
 
 def test_float32_holds_what_is_compared() -> None:
     """Triton 3.6 rounds a number to float32 where float64 is compared with it."""
-    source = Path(kernels.__file__).with_name("triton_kernels.py").read_text()
-    compared = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Compare)]
+    sources = [Path(kernels.__file__).with_name(f"triton_{name}.py").read_text() for name in ("quantiles", "kernels")]
+    compared = [node for one in sources for node in ast.walk(ast.parse(one)) if isinstance(node, ast.Compare)]
     ends = [one for node in compared for one in (node.left, *node.comparators)]
     ends = [one.operand if isinstance(one, ast.UnaryOp) else one for one in ends]
     numbers = {one.value for one in ends if isinstance(one, ast.Constant) and isinstance(one.value, float)}

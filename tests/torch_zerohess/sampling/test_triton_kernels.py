@@ -71,7 +71,7 @@ for proposal in range(5):
         bound = 2.0**-52 * (12 * n + 8 if proposal == proposals.UNIFORM else 2 * n + 9)
         assert bool(((got[3] - weights).abs() <= bound * weights).all())
 
-triton_kernels._TILE, triton_kernels._PROGRAMS = 32, 9
+triton_kernels._TILE, triton_kernels._PROGRAMS = 64, 2
 for case, (made, B, n, M) in enumerate([(every, 2, 5, 1), (every, 2, 5, 3), (edges, 1, 70, 2), (every, 1, 2, 5)]):
     single, both, S = case % 2 == 0, case != 2, len(made) // B
     x, sigma = torch.zeros(B, n, dtype=torch.float32 if single else torch.float64), torch.ones(n).double()

@@ -1,7 +1,7 @@
 """The operations that the C++ extension speeds up, each beside its literal reference in torch.
 
-CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms`, `sample`,
-`mirror` and sums of rows that are drawn again go to Triton kernels. The first call on a device compares some of their
+CPU tensors go to the extension if it was built. On CUDA devices, with triton installed, `draw`, `uniforms`, `sample`
+and sums of rows that are drawn again go to Triton kernels. The first call on a device compares some of their
 numbers with the reference. If they differ, or a kernel fails, a warning says so and the reference is used from then on.
 All other tensors go to the reference, and so do CPU tensors without the extension. All of them draw the same bits.
 Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
@@ -191,6 +191,9 @@ def hessian(u: Samples, a: Tensor) -> Tensor:
             pieces = zip(u.split(rows, 1), a.split(rows, 2), strict=True)
             flat = _total(part @ (one[..., :, None] * one[..., None, :]).flatten(2) for one, part in pieces)
             result = flat.unflatten(2, (u.shape[2], u.shape[2]))
+        elif u.device.type != "cpu":  # one launch for all b and m, and one for the sum
+            half = ((0.5 * a)[..., None] * u[:, None]).mT @ u[:, None]
+            return half + half.mT
         else:
             result = _upper(u, a)
         return _symmetric(result)
@@ -200,10 +203,8 @@ def hessian(u: Samples, a: Tensor) -> Tensor:
 def _upper(u: Tensor, a: Tensor) -> Tensor:
     """Return sum_k a[b, m, k] u[b, k, i] u[b, k, j] for i <= j, and numbers below.
 
-    On the processor in strips, which is about half of the whole product; elsewhere by one launch for all b and m.
+    In strips, which is about half of the whole product.
     """
-    if u.device.type != "cpu":
-        return (a[..., None] * u[:, None]).mT @ u[:, None]
     n = u.shape[2]
     result = u.new_empty(*a.shape[:2], n, n)
     for b, m in itertools.product(range(len(u)), range(a.shape[1])):
@@ -215,16 +216,10 @@ def _upper(u: Tensor, a: Tensor) -> Tensor:
 
 def _symmetric(upper: Tensor) -> Tensor:
     """Return matrices [..., n, n] of which only the upper triangle is right, made symmetric."""
-    if _draws_on(upper):
+    if _compiled(upper):
         torch.ops.torch_zerohess.mirror(upper.flatten(0, -3))
-    else:
-        mirror(upper)
-    return upper
-
-
-def mirror(matrices: Tensor) -> None:
-    """Copy the upper triangles of matrices [..., n, n] into the lower ones, in place."""
-    matrices.copy_(matrices.triu() + matrices.triu(1).mT)
+        return upper
+    return upper.triu() + upper.triu(1).mT
 
 
 def _sums(u: Samples, a: Tensor, squares: bool) -> Tensor:
@@ -292,5 +287,5 @@ def _on_cuda(function: Callable[..., Any]) -> None:
 
 
 if extension.available:
-    for _function in (draw, uniforms, sample, project_drawn, accumulate_drawn, mirror):
+    for _function in (draw, uniforms, sample, project_drawn, accumulate_drawn):
         _on_cuda(_function)

@@ -1,6 +1,6 @@
 """Noise and its sums on a CUDA device by Triton kernels.
 
-`draw`, `uniforms`, `sample`, `project_drawn`, `accumulate_drawn` and `mirror` are those of `kernels`. Rows, uniforms,
+`draw`, `uniforms`, `sample`, `project_drawn` and `accumulate_drawn` are those of `kernels`. Rows, uniforms,
 perturbations and points have the bits of the references. Sums of n or K terms in float64 are made in another order
 than elsewhere, always the same one on a device: weights differ by (2 n + 9) 2^-52 of their size at most. For proposal
 "uniform" they are exponentials, and differ by (12 n + 8) 2^-52.
@@ -20,7 +20,6 @@ from torch_zerohess.sampling.triton_quantiles import ANY, DIAGONAL, DIMENSIONS
 
 _TILE = 1024  # numbers that a program holds: a block of columns of some rows
 _TILES = 4  # blocks of columns that a program draws one after the other
-_SIDE = 32  # rows and columns of a matrix that a program mirrors
 _PROGRAMS = 4096  # of a sum over rows, at least, if there are so many tiles
 _MANY_VECTORS = 4  # beyond this, rows that are drawn once for all vectors are faster
 _OPTIONS = {"num_warps": 4, "enable_fp_fusion": False}
@@ -159,17 +158,6 @@ def _accumulate(
     tl.store(place, tl.sum(tl.reshape(total, [ROWS, BLOCK]), 0), d < n)
 
 
-@triton.jit(do_not_specialize=["n"])
-def _mirror(matrices, n, SIDE: tl.constexpr):
-    """Copy the upper triangles of matrices [B, n, n] into the lower ones."""
-    row, column = tl.program_id(0) * SIDE, tl.program_id(1) * SIDE
-    if row <= column:
-        i, j = row + tl.arange(0, SIDE)[:, None], column + tl.arange(0, SIDE)[None, :]
-        upper = tl.load(matrices + (tl.program_id(2).to(tl.int64) * n + i) * n + j, (i < j) & (j < n), 0.0)
-        i, j = row + tl.arange(0, SIDE)[None, :], column + tl.arange(0, SIDE)[:, None]
-        tl.store(matrices + (tl.program_id(2).to(tl.int64) * n + j) * n + i, tl.trans(upper), (i < j) & (j < n))
-
-
 def _size(n: int) -> tuple[int, int]:
     """Return rows and columns of a tile."""
     block = max(4, min(_TILE, triton.next_power_of_2(n)))
@@ -276,12 +264,3 @@ def accumulate_drawn(
         with torch.cuda.device_of(a):
             _accumulate[(blocks, B * M, len(out))](*pointers, S, M, n, chunk, **constants, **_OPTIONS)
     return out.sum(0)
-
-
-def mirror(matrices: Tensor) -> None:
-    """See `kernels.mirror`."""
-    B, n, _ = matrices.shape
-    side = triton.cdiv(n, _SIDE)
-    if matrices.numel():
-        with torch.cuda.device_of(matrices):
-            _mirror[(side, side, B)](matrices, n, SIDE=_SIDE, num_warps=4)

@@ -82,11 +82,6 @@ for case, (made, B, n, M) in enumerate([(every, 2, 5, 1), (every, 2, 5, 3), (edg
         got, expected = getattr(triton_kernels, name)(*arguments), getattr(ops, name)(*arguments)
         torch.testing.assert_close(got, expected, rtol=1e-13, atol=1e-13)
 
-whole = torch.linspace(0, 1, 2 * 35 * 35).double().view(2, 35, 35).sin()
-matrices = whole.clone()
-triton_kernels.mirror(matrices)
-assert torch.equal(matrices, whole.triu() + whole.triu(1).mT)
-
 
 @triton.jit
 def all_quantiles(p, out, N: tl.constexpr):
@@ -130,7 +125,6 @@ for x, single in (("*fp64", False), ("*fp32", True)):
     if single:
         compiled(triton_kernels._accumulate, sums, SQUARES=True, **one)
     compiled(triton_kernels._lobes, {"rows": "*i64", "values": x}, SINGLE=single, ROWS=32)
-compiled(triton_kernels._mirror, {"matrices": "*fp64"}, SIDE=32)
 """
 
 

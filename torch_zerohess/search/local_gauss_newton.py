@@ -1,6 +1,6 @@
 """Gauss-Newton for outputs whose elements depend on few parameters each: thousands of parameters, few evaluations.
 
-See `search.local_method` for how it goes on.
+See `search.local_method` for how it goes on, and `search.noisy_local` in noise.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalSettings
 from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Settings
+from torch_zerohess.search.noisy_local import local_method
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -27,8 +28,9 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     Where its steps hardly lower the loss, it hops to a random point close by, at 0.3 sigma per parameter, and goes on
     from there. It stays with what it finds if the loss is lower, and returns otherwise.
 
-    It averages no noise: it takes each output for true, and further evaluations do not lower the error. With several
-    evaluations per parameter of a noisy function `Descent` finds lower losses.
+    In noise, as `noise` says, all evaluations nearby tell the Jacobian and the output at the center, so both become
+    more exact as evaluations are added. It then evaluates the center twice and samples around it per iteration, tries
+    no steps, does not hop, and does not end by itself. `value` is the loss of the output that the regression tells.
 
     Only parameters that some output was found to depend on are moved. The others stay where they are, and `untouched`
     names them. Of the parameters found in a batch, at most 0.5 % have no effect, by expectation. A parameter with a
@@ -57,6 +59,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         restarts: how often to hop after the search has arrived; 0: it does not hop at all. Where the Jacobian predicts
             less than half of the held-out change, it begins again with the first radius instead.
         tolerance: radius, in units of sigma, at which the search has arrived.
+        noise: standard deviation of repeated losses at one point, if they differ.
         seed: of the samples; from torch's global generator if None.
 
     Outputs [h, w] and [h, w, channels] are images, whose neighbouring pixels share evidence.
@@ -91,11 +94,13 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         least_sigma: float = 0.03,
         restarts: int = 10,
         tolerance: float = LOCAL_TOLERANCE,
+        noise: float = 0.0,
         seed: int | None = None,
     ) -> None:
         self._own: dict[str, Any] = {"grid": grid, "keep": keep, "samples": samples, "rate": rate}
         self._own |= {"radius": radius, "share": share, "least_sigma": least_sigma}
-        super().__init__(x0, sigma=sigma, bounds=bounds, loss=loss, restarts=restarts, tolerance=tolerance, seed=seed)
+        settings: dict[str, Any] = {"restarts": restarts, "tolerance": tolerance, "noise": noise, "seed": seed}
+        super().__init__(x0, sigma=sigma, bounds=bounds, loss=loss, **settings)
 
     @property
     def jacobian(self) -> SparseJacobian | None:
@@ -103,4 +108,4 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         return self._state.progress.jacobian
 
     def _make(self, settings: Settings) -> LocalMethod:
-        return LocalMethod(settings, LocalSettings.checked(settings, **self._own))
+        return local_method(settings, LocalSettings.checked(settings, **self._own))

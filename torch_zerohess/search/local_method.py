@@ -118,6 +118,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
             center=start,
             radius=self.radius,
             output=start.new_empty(0),
+            points=start.new_empty(0),
+            outputs=start.new_empty(0),
             samples=self.own.samples,
         )
 
@@ -150,11 +152,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
 
     def renewed(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Fit the Jacobian to samples; too few of them are drawn again."""
-        if len(known.output) == 1:
-            raise ValueError(
-                "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
-                "number: use engine='descent'"
-            )
+        known.check_outputs()
         first, told = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
         assert told.outputs is not None
         if len(told) < FEWEST_SAMPLES:

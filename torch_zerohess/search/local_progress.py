@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass, replace
 
+from torch import Tensor
+
 from torch_zerohess.search.gauss_newton import JacobianProgress
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.sparse_evidence import Evidence
@@ -37,6 +39,14 @@ class LocalProgress(JacobianProgress):
     """The search before the hop that has led here."""
     hopped: float = math.inf
     """Loss at the start of this hop."""
+    points: Tensor
+    """In noise, the latest evaluations [P, n]; otherwise none."""
+    outputs: Tensor
+    """[P, m]"""
+    variance: float = math.nan
+    """In noise, of a number of the output; NaN before the center was evaluated twice."""
+    before: Best | None = None
+    """In noise, where the last step began."""
 
     @property
     def failed(self) -> bool:
@@ -64,6 +74,14 @@ class LocalProgress(JacobianProgress):
         """Share of the entries that are of parameters that were found; 1 if there is none."""
         some, every = (0 if one is None else int(one.found.sum()) for one in (self.jacobian, self.fitted))
         return some / every if every else 1.0
+
+    def check_outputs(self) -> None:
+        """Raise ValueError for outputs of one number."""
+        if len(self.output) == 1:
+            raise ValueError(
+                "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
+                "number: use engine='descent'"
+            )
 
     def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "LocalProgress":
         """Return the progress with a new Jacobian.

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from torch_zerohess.search.descent_search import descent_method
 from torch_zerohess.search.gaussian_process_search import process_method
-from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalSettings
+from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalSettings
 from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.noisy_local import local_method
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.sparse_or_dense import FEWEST, SparseOrDense, SparseOrDenseProgress
@@ -116,7 +117,7 @@ class TrustRegion(AskTell[Any]):
             return descent_method(settings)
         tolerance = LOCAL_TOLERANCE if self._tolerance is None else settings.tolerance
         own = LocalSettings.checked(settings, grid=self._grid)
-        local = LocalMethod(replace(settings, tolerance=tolerance), own)
+        local = local_method(replace(settings, tolerance=tolerance), own)
         return local if engine == "local" else SparseOrDense(settings, local)
 
 

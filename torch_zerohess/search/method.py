@@ -61,7 +61,7 @@ class Method(ABC, Generic[P]):
     engine: ClassVar[str]
     """Name for a reader."""
     averages: ClassVar[bool] = False
-    """Whether a model of many evaluations has chosen the best point, and not a single value."""
+    """Whether a model of many evaluations chooses the best point, not a single value: always, or at the end."""
     progress: type[P]
     """Class of what it knows."""
 
@@ -97,6 +97,10 @@ class Method(ABC, Generic[P]):
     @abstractmethod
     def model_at_best(self, known: P) -> tuple[LocalModel, float] | None:
         """Return a quadratic model around the best point and its sigma, or None if too little is known there."""
+
+    def has_averaged(self, known: P) -> bool:
+        """Return whether a model of many evaluations has chosen the best point."""
+        return self.averages
 
     def promise(self, known: P) -> float:
         """Return by how much the next step lowers the loss, according to a model that holds there; or infinity."""

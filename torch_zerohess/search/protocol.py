@@ -109,7 +109,7 @@ class AskTell(ABC, Generic[P]):
     @property
     def averages(self) -> bool:
         """Whether a model of many evaluations has chosen `x`, and not a single value."""
-        return self._method.averages
+        return self._method.has_averaged(self._state.progress)
 
     @property
     def sigma(self) -> float:

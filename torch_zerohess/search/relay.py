@@ -27,6 +27,10 @@ class Relay(Method[P]):
         method, inner = self.turn(known)
         return method.model_at_best(replace(inner, best=known.best))
 
+    def has_averaged(self, known: P) -> bool:
+        method, inner = self.turn(known)
+        return method.has_averaged(inner)
+
     def promise(self, known: P) -> float:
         method, inner = self.turn(known)
         return method.promise(inner)

@@ -28,9 +28,11 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     Where its steps hardly lower the loss, it hops to a random point close by, at 0.3 sigma per parameter, and goes on
     from there. It stays with what it finds if the loss is lower, and returns otherwise.
 
-    In noise, as `noise` says, all evaluations nearby tell the Jacobian and the output at the center, so both become
-    more exact as evaluations are added. It then evaluates the center twice and samples around it per iteration, tries
-    no steps, does not hop, and does not end by itself. `value` is the loss of the output that the regression tells.
+    In noise, as `noise` says, it begins to average where the best step changes the loss by no more than noise may, or
+    where three rounds have arrived at the best point. All evaluations nearby then tell the Jacobian and the output at
+    the center, so both become more exact as evaluations are added. It evaluates the center twice and samples around it
+    per iteration. From then on it does not hop, and does not end by itself. `value` is the loss of the output that the
+    regression tells, and `averages` says whether it is.
 
     Only parameters that some output was found to depend on are moved. The others stay where they are, and `untouched`
     names them. Of the parameters found in a batch, at most 0.5 % have no effect, by expectation. A parameter with a
@@ -59,7 +61,8 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         restarts: how often to hop after the search has arrived; 0: it does not hop at all. Where the Jacobian predicts
             less than half of the held-out change, it begins again with the first radius instead.
         tolerance: radius, in units of sigma, at which the search has arrived.
-        noise: standard deviation of repeated losses at one point, if they differ.
+        noise: standard deviation of repeated losses at one point, if they differ. Above 0 it says that there is noise;
+            how much, repeated outputs tell.
         seed: of the samples; from torch's global generator if None.
 
     Outputs [h, w] and [h, w, channels] are images, whose neighbouring pixels share evidence.

@@ -62,7 +62,10 @@ _INSIDE = 0.5
 _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
-_SHARED = ("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost", "evidence")
+_SHARED = (
+    *("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost", "evidence"),
+    *("points", "outputs", "variance", "pairs"),
+)
 """What a search that returns from a hop keeps."""
 
 
@@ -93,7 +96,7 @@ class LocalSettings:
                 "engine='descent'"
             )
         sparse = SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid)
-        result = cls(replace(sparse, robust=False), **own)  # no step needs standard errors
+        result = cls(replace(sparse, robust=False), **own)  # samples have one variance
         for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
             checked_number(name, getattr(result, name), above=0.0, most=most, below=math.inf)
         check_samples(result.samples, result.sparse.keep)
@@ -252,7 +255,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         """Ask for a point close by, and samples around it."""
         return replace(
             known,
-            home=replace(known, home=None),
+            home=replace(known, home=None, points=known.points[:0], outputs=known.outputs[:0]),
             output=known.output[:0],
             loss=math.inf,
             radius=self.radius,

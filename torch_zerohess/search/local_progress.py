@@ -12,6 +12,8 @@ from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _PREDICTED = 0.5
 """Share of the held-out change from which on the end of a round is a minimum."""
+_PAIRS = 16
+"""Outputs at one point that tell the noise, at most about."""
 _ROUNDING = 1e-12
 """A hop leads to something better if it lowers the loss by more than this share of it, and of what the hop added."""
 
@@ -43,10 +45,14 @@ class LocalProgress(JacobianProgress):
     """In noise, the latest evaluations [P, n]; otherwise none."""
     outputs: Tensor
     """[P, m]"""
-    variance: float = math.nan
-    """In noise, of a number of the output; NaN before the center was evaluated twice."""
+    variance: float = 0.0
+    """In noise, of a number of the output; 0 before a point was evaluated twice."""
+    pairs: int = 0
+    """Of outputs that tell the variance, as far as they count."""
+    averaging: bool = False
+    """In noise, whether no single output is trusted any more."""
     before: Best | None = None
-    """In noise, where the last step began."""
+    """While it averages, where the last step began."""
 
     @property
     def failed(self) -> bool:
@@ -82,6 +88,11 @@ class LocalProgress(JacobianProgress):
                 "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
                 "number: use engine='descent'"
             )
+
+    def telling_noise(self, one: Tensor, other: Tensor) -> "LocalProgress":
+        """Take what two outputs [m] at one point tell about noise: a mean over all pairs, mostly the latest ones."""
+        own, pairs = 0.5 * float((one - other).square().mean()), min(self.pairs + 1, _PAIRS)
+        return replace(self, variance=own if pairs == 1 else self.variance + (own - self.variance) / pairs, pairs=pairs)
 
     def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "LocalProgress":
         """Return the progress with a new Jacobian.

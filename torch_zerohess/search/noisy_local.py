@@ -1,15 +1,17 @@
 """Gauss-Newton on a sparse Jacobian in noise: all evaluations nearby tell the Jacobian and the output at the center.
 
-No single output is trusted. An iteration evaluates the center twice, and samples around it. The sparse regression on
-all kept evaluations nearby has a constant, the output at the center. Its noise falls as evaluations are added, and so
-do the errors of the slopes. The step minimises the model and, in it, the variance of the predicted outputs: the sum of
-squares of (error of a slope times step). So it is short along directions that noise hides. At a kink of the loss the
-step is that of `local_steps`. The next regression tells what the step has achieved, and the radius follows.
+It begins as `LocalMethod` does, and takes each output for true. Samples come with the center again: two outputs at one
+point tell the noise. Where the best step changes the loss by no more than noise may, averaging begins. From then on no
+single output is trusted, and the search neither hops nor ends by itself: with further evaluations it becomes more
+exact.
 
-The two values at the center tell the noise of the outputs. What the regression leaves beyond noise is curvature. Then
-samples come nearer, as long as the change that the slopes predict exceeds the noise; below that they go apart again.
+An iteration then evaluates the center twice, and samples around it. The sparse regression on all kept evaluations
+nearby has a constant, the output at the center. Its noise falls as evaluations are added, and so do the errors of the
+slopes. A step by `step_in_noise` follows. The next regression tells what it has achieved, and the radius follows.
 
-It does not hop, and it does not end by itself: with further evaluations it becomes more exact.
+What the regression leaves beyond noise is curvature. Then samples come nearer, as long as the change that the slopes
+predict exceeds the noise. Below that, and where there is no curvature, they go apart. Curvature also moves the
+constant. Where it differs from the outputs at the center by more than noise may, these count as well.
 """
 
 import math
@@ -18,17 +20,20 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.krylov import krylov_steps
 from torch_zerohess.search.local_method import LocalMethod, LocalSettings
 from torch_zerohess.search.local_progress import LocalProgress
-from torch_zerohess.search.local_steps import local_steps
 from torch_zerohess.search.method import Settings
+from torch_zerohess.search.noisy_step import alternating, constants, step_in_noise
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.sparse_evidence import Evidence
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, fit_sparse
 
+_LUCK = 4.0
+"""Standard deviations of a loss up to which the change by the best step may be noise."""
+_AGREED = 3
+"""Rounds in a row that have arrived at the best point, after which averaging begins."""
 _REACH = 2.0
 """Distance from the center, over sigma, up to which evaluations are in the regression."""
 _KEPT, _HELD = 1024, 1 << 25
@@ -37,16 +42,18 @@ _GROWTH = 8
 """A batch has one sample for so many evaluations that are kept, or as many as the first one."""
 _NEARER = 0.7
 """Factor of sigma."""
-_CURVED = 1.1
-"""What a regression leaves, over the noise, from which on it is curvature."""
+_STRAIGHT, _CURVED = 1.02, 1.1
+"""What a regression leaves, over the noise: up to here there is no curvature, and from here on there is."""
+_MOVED = 3.0
+"""Standard errors of a mean square by which the constant must differ from the outputs at the center."""
 _GOOD, _BAD = 0.7, 0.25
 """Parts of the promised decrease above and below which the radius changes."""
 _LONGER, _SHORTER, _WIDEST = 2.0, 0.5, 2.0
 """Factors of the radius, and the largest one."""
 _WORSE = 2.0
-"""Standard errors of a loss by which it must rise before a step is undone."""
-_ITERATIONS = 100
-"""Products of the Hessian for a step."""
+"""Errors of a loss by noise by which it must rise before a step is undone."""
+_INSIDE = 0.5
+"""Length of a step, over the radius, up to which the radius did not shorten it."""
 
 
 def local_method(settings: Settings, own: LocalSettings) -> LocalMethod:
@@ -59,85 +66,186 @@ class NoisyLocalMethod(LocalMethod):
 
     averages = True
 
+    def has_averaged(self, known: LocalProgress) -> bool:
+        return known.averaging
+
     def samples(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
-        """Draw samples from N(center, sigma^2), mirrored into the bounds, after the center, twice."""
+        """Draw samples from N(center, sigma^2), mirrored into the bounds, after the center: twice when it averages."""
+        if not known.averaging:
+            after, points = super().samples(known, generator)
+            return after, torch.cat([known.center[None], points]) if len(known.output) else points
         count = max(known.samples, len(known.points) // _GROWTH)
         u = normal(generator, known.center, count, self.settings.n)
-        points = self.settings.inside(known.center + known.sigma * u)
-        return known, torch.cat([known.center.expand(2, -1), points]) if len(known.output) else points
+        return known, torch.cat([known.center.expand(2, -1), self.settings.inside(known.center + known.sigma * u)])
 
     def next(
         self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[LocalProgress, Tensor]:
-        """Fit, judge the last step, and take the next one; then ask for the center and samples."""
+        """Go on as without noise; or fit, judge the last step, take the next one, and ask for center and samples."""
+        if not known.averaging:
+            return super().next(known, evaluated, generator)
         known = known.counted(evaluated)
         if known.done:
             return known, known.center[None][:0]
         return self.asked(self.sampled(known, evaluated), generator)
 
     def asked(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
-        return self.samples(known, generator)
-
-    def started(self, evaluated: Evaluated) -> LocalProgress | None:
-        if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
-            return None
-        known = replace(self.begun(), center=evaluated.points[0], shape=evaluated.shape, evaluations=len(evaluated))
-        known = self.sampled(known, evaluated)
-        return None if known.jacobian is None else known
+        return self.samples(known, generator) if known.averaging else super().asked(known, generator)
 
     def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
-        """Keep the evaluations with finite values; the first two tell the noise of the outputs."""
-        assert evaluated.outputs is not None
+        """Keep the evaluations; the first ones, at the center, tell the noise of the outputs."""
+        known, outputs, finite = self._keeping(known, evaluated), evaluated.outputs, evaluated.finite
+        assert outputs is not None
+        if known.averaging:
+            if bool(finite[:2].all()) and len(outputs) > 1:
+                known = known.telling_noise(outputs[0], outputs[1])
+            return self._averaged(known, evaluated.those(finite), outputs[:2][finite[:2]])
         if not len(known.output):
-            first = Best(known.center, float(evaluated.losses[0]), known.sigma)
-            known = replace(known, output=evaluated.outputs[0].clone(), loss=first.loss, best=first)
-            known.check_outputs()
-        elif len(evaluated) > 1 and bool(evaluated.finite[:2].all()):
-            own = 0.5 * float((evaluated.outputs[0] - evaluated.outputs[1]).square().mean())
-            known = replace(known, variance=own if math.isnan(known.variance) else 0.5 * (own + known.variance))
-        told = evaluated.those(evaluated.finite)
-        assert told.outputs is not None
-        points = torch.cat([known.points, told.points]) if len(known.points) else told.points
-        outputs = torch.cat([known.outputs, told.outputs]) if len(known.outputs) else told.outputs
-        most = max(min(_KEPT, _HELD // (points.shape[1] + outputs.shape[1])), 2 * known.samples)
-        return self.renewed(replace(known, points=points[-most:], outputs=outputs[-most:]), told)
+            return super().sampled(known, evaluated)
+        if bool(finite[0]):
+            known = known.telling_noise(outputs[0], known.output)
+        return super().sampled(known, evaluated.those(slice(1, None)))
 
-    def renewed(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
-        """Fit the Jacobian and the output at the center; judge the last step, and take the next one."""
-        settings = self.settings
-        assert evaluated.outputs is not None
-        assert settings.loss is not None
-        near = (known.points - known.center).norm(dim=1) <= _REACH * known.sigma * math.sqrt(settings.n)
-        count = int(near.sum())
-        if count < FEWEST_SAMPLES or not len(evaluated):
-            return known
-        u, changes = self._relative(known, known.points[near], known.outputs[near])
-        fitted = fit_sparse(u, changes, known.shape, self.own.sparse)
-        evidence = known.evidence or Evidence.none(settings.n, u.device)
-        new = self._relative(known, evaluated.points, evaluated.outputs)
-        known = known.fitting(fitted, evidence.with_batch(fitted, known.fitted, *new))
-        jacobian = known.jacobian
-        assert jacobian is not None
-        left = (changes - jacobian.matvec(u).flatten(1)).double()
-        constant = left.mean(0)
-        output = known.output + known.sigma * constant
-        free = max(count - 1 - int(jacobian.found.sum()) / len(output), 1.0)
-        rest = known.sigma**2 * float((left - constant).square().sum()) / (free * len(output))
-        predicted, error, before = known.loss, settings.noise / math.sqrt(count), known.before
-        known = replace(known, output=output, loss=float(settings.loss(output.view(known.shape))))
-        if before is not None and known.loss - before.loss > _WORSE * error:
-            return self._undone(known, before)
-        sigma = self._distance(known, rest)
-        known = replace(known, radius=self._radius(known, predicted, error))
-        known = replace(known, best=Best(known.center, known.loss, known.sigma))
-        return replace(self._stepped(known), sigma=sigma)
+    def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Take the best step; or begin to average where noise hides what it achieves."""
+        known = self._keeping(known, evaluated)
+        hidden = False
+        if len(evaluated) and not known.failed:
+            change = abs(float(evaluated.losses.min()) - known.loss)
+            hidden = change < _LUCK * self._error(known, known.variance)
+        after = self._averaging(known) if hidden else super().taken(known, evaluated)
+        return self._begun(replace(after, sigma=known.sigma)) if after.averaging else after
+
+    def _hopping(self, known: LocalProgress) -> LocalProgress:
+        return self._averaging(known) if known.agreed >= _AGREED else super()._hopping(known)
+
+    def promise(self, known: LocalProgress) -> float:
+        """Return the promise of the step to the center; it is infinite if the radius has shortened the step."""
+        if not known.averaging:
+            return super().promise(known)
+        before = known.before
+        if before is None or not known.predicts or self._length(known) > _INSIDE * known.radius:
+            return math.inf
+        return before.loss - known.loss
 
     def width(self, known: LocalProgress) -> Tensor:
         """Return the length of the last step for every parameter; infinity where the Jacobian does not predict."""
-        length = math.inf
-        if known.before is not None and known.predicts:
-            length = float((known.center - known.before.point).norm()) / math.sqrt(self.settings.n)
-        return torch.full_like(known.center, length)
+        if not known.averaging:
+            return super().width(known)
+        return torch.full_like(known.center, self._length(known) if known.predicts else math.inf)
+
+    def _length(self, known: LocalProgress) -> float:
+        """Return the length of the step to the center, root mean square over the parameters."""
+        if known.before is None:
+            return math.inf
+        return float((known.center - known.before.point).norm()) / math.sqrt(self.settings.n)
+
+    def _keeping(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        """Keep the evaluations with finite values, as far as there is room."""
+        told = evaluated.those(evaluated.finite)
+        assert told.outputs is not None
+        held = max(told.points.shape[1] + told.outputs.shape[1], 1)
+        most = max(min(_KEPT, _HELD // held), 2 * self.own.samples)
+        points, outputs = told.points[:most], told.outputs[:most]
+        if len(known.points):
+            points, outputs = torch.cat([known.points, points]), torch.cat([known.outputs, outputs])
+        return replace(known, points=points[-most:], outputs=outputs[-most:])
+
+    def _error(self, known: LocalProgress, variance: float) -> float:
+        """Return the standard error of the loss at the center if the numbers of the output have a variance."""
+        assert self.settings.loss is not None
+        slope = loss_curvature(self.settings.loss, known.output.view(known.shape)).slope
+        return math.sqrt(variance) * float(slope.norm())
+
+    def _raised(self, known: LocalProgress, variance: float) -> float:
+        """Return by how much noise with a variance raises the loss of the output at the center, about."""
+        assert self.settings.loss is not None
+        output = known.output.view(known.shape)
+        noise = math.sqrt(variance) * alternating(output)
+        around = [float(self.settings.loss(one)) for one in (output + noise, output - noise)]
+        return max(0.5 * sum(around) - known.loss, 0.0)
+
+    def _averaging(self, known: LocalProgress) -> LocalProgress:
+        here = Best(known.center, known.loss, known.sigma)
+        return replace(known, averaging=True, best=here, home=None, phase="sample", samples=self.own.samples)
+
+    def _begun(self, known: LocalProgress) -> LocalProgress:
+        """Begin with the largest sigma at which the kept evaluations show no curvature, or with the one so far."""
+        sigma = 1.0
+        while sigma > known.sigma:
+            fitted, rest, count = self._regressed(replace(known, sigma=sigma), 0)
+            if count > 0.5 * self.own.samples and self._distance(fitted, rest) >= sigma:
+                return self._went_on(known, fitted, rest, count, known.outputs[:0])
+            sigma *= _NEARER
+        return known
+
+    def _averaged(self, known: LocalProgress, told: Evaluated, centers: Tensor) -> LocalProgress:
+        """Fit the Jacobian and the output at the center; judge the last step, and take the next one.
+
+        centers: outputs [k, m] of the center, up to two.
+        """
+        if not len(centers) and known.before is not None:
+            return self._undone(known, known.before)
+        if not len(told):
+            return known
+        fitted, rest, count = self._regressed(known, len(told))
+        return self._went_on(known, fitted, rest, count, centers) if count else known
+
+    def _regressed(self, known: LocalProgress, new: int) -> tuple[LocalProgress, float, float]:
+        """Return the progress with a regression, and the variance that it leaves.
+
+        Also return of how many outputs the output at the center is as exact as the mean; 0 where there are too few.
+
+        new: how many of the kept evaluations, the last ones, are new.
+        """
+        settings = self.settings
+        near = (known.points - known.center).norm(dim=1) <= _REACH * known.sigma * math.sqrt(settings.n)
+        count = int(near.sum())
+        if count < FEWEST_SAMPLES:
+            return known, 0.0, 0.0
+        u, changes = self._relative(known, known.points[near], known.outputs[near])
+        fitted = fit_sparse(u, changes, known.shape, self.own.sparse)
+        evidence = known.evidence or Evidence.none(settings.n, u.device)
+        if new >= FEWEST_SAMPLES:
+            latest = self._relative(known, known.points[-new:], known.outputs[-new:])
+            evidence = evidence.with_batch(fitted, known.fitted, *latest)
+        known = known.fitting(fitted, evidence)
+        jacobian = known.jacobian
+        assert jacobian is not None
+        predicted = jacobian.matvec(u).flatten(1).double()
+        constant, rest, counted = constants(predicted, changes - predicted, int(jacobian.found.sum()))
+        return replace(known, output=known.output + known.sigma * constant), known.sigma**2 * rest, counted
+
+    def _went_on(
+        self, known: LocalProgress, fitted: LocalProgress, rest: float, count: float, centers: Tensor
+    ) -> LocalProgress:
+        """Judge the last step by what `_regressed` has returned, and take the next one; centers: see `_averaged`."""
+        assert self.settings.loss is not None
+        output, variance = self._combined(fitted, count, centers)
+        after = replace(fitted, output=output, loss=float(self.settings.loss(output.view(known.shape))))
+        before, error = known.before, self._error(after, variance) + self._raised(after, variance)
+        if before is not None and (not math.isfinite(after.loss) or after.loss - before.loss > _WORSE * error):
+            return self._undone(after, before)
+        if not math.isfinite(after.loss):
+            return known
+        sigma, radius = self._distance(fitted, rest), self._radius(after, known.loss, error)
+        after = replace(after, radius=radius, best=Best(after.center, after.loss, after.sigma))
+        return replace(self._stepped(after), sigma=sigma)
+
+    def _combined(self, fitted: LocalProgress, count: float, centers: Tensor) -> tuple[Tensor, float]:
+        """Return the output at the center and its variance, by the regression and by outputs of the center [k, m].
+
+        Curvature moves the constant by b^2, mean square. The weights of both go with 1 / b^2 and 1 / (variance / k).
+        """
+        known, variance = fitted, fitted.variance
+        if not len(centers) or not known.pairs:
+            return known.output, variance / count
+        difference, own = centers.mean(0) - known.output, variance / len(centers)
+        moved = float(difference.square().mean()) - own - variance / count
+        if moved <= _MOVED * math.sqrt(2.0 / len(difference)) * (own + variance / count):
+            return known.output, variance / count
+        weight = moved / (moved + own)
+        return known.output + weight * difference, weight * own
 
     def _relative(self, known: LocalProgress, points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return directions from the center and changes of the output along them, in units of sigma, float32."""
@@ -154,14 +262,14 @@ class NoisyLocalMethod(LocalMethod):
             loss=before.loss,
             before=None,
             radius=_SHORTER * known.radius,
-            sigma=max(self.own.least_sigma, _NEARER * known.sigma),
+            sigma=max(self._least_sigma(known), _NEARER * known.sigma),
         )
 
     def _radius(self, known: LocalProgress, predicted: float, error: float) -> float:
         """Return the radius after what the last step has achieved.
 
         predicted: loss at its end by the model before it.
-        error: standard error of the loss at the center.
+        error: of the loss at the center, by noise.
         """
         before = known.before
         if before is None or before.loss - predicted <= error:
@@ -170,52 +278,28 @@ class NoisyLocalMethod(LocalMethod):
         longer = min(_LONGER * known.radius, _WIDEST) if achieved > _GOOD else known.radius
         return _SHORTER * known.radius if achieved < _BAD else longer
 
+    def _least_sigma(self, known: LocalProgress) -> float:
+        """Return the least sigma: below that of the caller only where the Jacobian predicts."""
+        least = min(self.settings.tolerance, self.own.least_sigma) if known.predicts else self.own.least_sigma
+        return min(least, known.sigma)
+
     def _distance(self, known: LocalProgress, rest: float) -> float:
         """Return the sigma of the next samples. rest: variance of what the regression leaves."""
         assert known.jacobian is not None
+        if not known.pairs:
+            return known.sigma
         explained = known.jacobian.explained
         told = rest * explained / max(1.0 - explained, torch.finfo(torch.float32).eps)
         if rest > _CURVED * known.variance and told > known.variance:
-            return max(self.own.least_sigma, _NEARER * known.sigma)
-        return min(1.0, known.sigma / _NEARER) if told < known.variance else known.sigma
+            return max(self._least_sigma(known), _NEARER * known.sigma)
+        wider = rest <= _STRAIGHT * known.variance or told < known.variance
+        return min(1.0, known.sigma / _NEARER) if wider else known.sigma
 
     def _stepped(self, known: LocalProgress) -> LocalProgress:
         """Go to the end of a step."""
         assert known.jacobian is not None
         assert self.settings.loss is not None
-        end = (known.center + self._step(known)).clamp(self.settings.lower, self.settings.upper)
+        end = (known.center + step_in_noise(known, self.settings)).clamp(self.settings.lower, self.settings.upper)
         output = known.output + known.jacobian.matvec(end - known.center).flatten()
         loss, before = float(self.settings.loss(output.view(known.shape))), known.best
         return replace(known, center=end, output=output, loss=loss, before=before, iterations=known.iterations + 1)
-
-    def _step(self, known: LocalProgress) -> Tensor:
-        """Return the step to the minimum of the model within the radius [n]."""
-        settings, jacobian, x, loss = self.settings, known.jacobian, known.center, self.settings.loss
-        assert jacobian is not None
-        assert loss is not None
-        output, radii = known.output.view(known.shape), x.new_tensor([known.radius * math.sqrt(settings.n)])
-        lower, upper = settings.lower - x, settings.upper - x
-        kinked = local_steps(loss, output, jacobian, radii, lower, upper)
-        if kinked.promised is not None:
-            return kinked.steps[0]
-        gradient, product = self._derivatives(known)
-        free = (~(((lower >= 0) & (gradient > 0)) | ((upper <= 0) & (gradient < 0)))).to(gradient)
-        uncertain = self._uncertain(known)
-        return krylov_steps(
-            lambda v: free * (product(free * v) + uncertain * v), free * gradient, radii, iterations=_ITERATIONS
-        )[0]
-
-    def _uncertain(self, known: LocalProgress) -> Tensor:
-        """Return the curvatures of the expected loss [n] by the errors of slopes.
-
-        They take the diagonal of the Hessian of the loss: products with signs tell it up to the other elements.
-        """
-        jacobian, loss = known.jacobian, self.settings.loss
-        assert jacobian is not None
-        assert loss is not None
-        signs = torch.ones_like(known.output)
-        signs[1::2] = -1.0
-        expanded = loss_curvature(loss, known.output.view(known.shape))
-        bent = (expanded.product(signs.view(known.shape)).flatten() * signs).clamp_min(0.0)
-        squares = bent[:, None] * (jacobian.standard_error * jacobian.found).double().square()
-        return known.center.new_zeros(self.settings.n).index_add_(0, jacobian.index.flatten(), squares.flatten())

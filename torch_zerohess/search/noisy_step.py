@@ -1,0 +1,86 @@
+"""The output at the center by a sparse Jacobian in noise, and a step that minimises the expected loss.
+
+The expected loss has the variance of the predicted outputs in it: the sum of squares of (error of a slope times step).
+So the step is short along directions that noise hides. At a kink of the loss the step is that of `local_steps`.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.krylov import krylov_steps
+from torch_zerohess.search.local_progress import LocalProgress
+from torch_zerohess.search.local_steps import derivatives, local_steps
+from torch_zerohess.search.method import Settings
+from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature
+from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+
+_CURVED = 3.0
+"""Standard errors of a sum of squares by which it must exceed noise to be curvature."""
+_ITERATIONS = 100
+"""Products of the Hessian for a step."""
+
+
+def step_in_noise(known: LocalProgress, settings: Settings) -> Tensor:
+    """Return the step from the center to the minimum of the model within the radius [n]."""
+    jacobian, x, loss = known.jacobian, known.center, settings.loss
+    assert jacobian is not None
+    assert loss is not None
+    output, radii = known.output.view(known.shape), x.new_tensor([known.radius * math.sqrt(settings.n)])
+    lower, upper = settings.lower - x, settings.upper - x
+    kinked = local_steps(loss, output, jacobian, radii, lower, upper)
+    if kinked.promised is not None:
+        return kinked.steps[0]
+    expanded = loss_curvature(loss, output)
+    gradient, product = derivatives(expanded, jacobian)
+    free = (~(((lower >= 0) & (gradient > 0)) | ((upper <= 0) & (gradient < 0)))).to(gradient)
+    own = uncertain(expanded, jacobian, output)
+
+    def bent(v: Tensor) -> Tensor:
+        return free * (product(free * v) + own * v)
+
+    return krylov_steps(bent, free * gradient, radii, iterations=_ITERATIONS)[0]
+
+
+def alternating(output: Tensor) -> Tensor:
+    """Return 1, -1, 1, ... in the shape of an output."""
+    signs = torch.ones_like(output).flatten()
+    signs[1::2] = -1.0
+    return signs.view(output.shape)
+
+
+def uncertain(expanded: LossCurvature, jacobian: SparseJacobian, output: Tensor) -> Tensor:
+    """Return the curvatures of the expected loss [n] by the errors of slopes.
+
+    They take the diagonal of the Hessian of the loss: products with signs tell it up to the other elements.
+    """
+    signs = alternating(output)
+    bent = (expanded.product(signs) * signs).flatten().clamp_min(0.0)
+    squares = bent[:, None] * (jacobian.standard_error * jacobian.found).double().square()
+    return output.new_zeros(jacobian.n).index_add_(0, jacobian.index.flatten(), squares.flatten())
+
+
+def constants(predicted: Tensor, left: Tensor, entries: int) -> tuple[Tensor, float, float]:
+    """Return what is left at the center [m], the variance of the rest, and of how many values each is a mean.
+
+    Curvature counts as a multiple of the squared prediction, where all outputs together show it. It would otherwise
+    move the constants, which are at the center what the slopes leave.
+
+    Args:
+        predicted: changes [K, m] by the slopes.
+        left: what the slopes leave of the changes [K, m].
+        entries: how many slopes there are.
+    """
+    (K, m), left = left.shape, left.double()
+    mean, square = left.mean(0), predicted.square()
+    least = torch.finfo(square.dtype).tiny
+    middle, rest = square.mean(0), left - mean
+    square = square - middle
+    length = square.square().sum(0).clamp_min(least)
+    bend = (square * rest).sum(0) / length
+    told, total, free = float((bend.square() * length).sum()), float(rest.square().sum()), max(K - 1 - entries / m, 2.0)
+    variance = (total - told) / ((free - 1.0) * m)
+    if told <= (m + _CURVED * math.sqrt(2.0 * m)) * variance:
+        return mean, total / (free * m), float(K)
+    return mean - bend * middle, variance, K / (1.0 + K * float((middle.square() / length).mean()))

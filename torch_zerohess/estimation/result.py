@@ -132,7 +132,10 @@ class Estimate:
         It is exact for normal draws. A draw is a kernel times f. Draws are nearly normal if f varies at random or in
         waves. They are skewed if the curvature of f has one sign, and more so the wider the tails of the kernel
         ("gaussian" more than "aggregate" and "optimal", the Hessian more than the gradient). With few skewed draws the
-        interval covers less: four antithetic draws of the Hessian of a parabola 0.67 instead of 0.95.
+        interval covers less: four antithetic draws of the Hessian of a parabola 0.67 instead of 0.95. With a memory a
+        draw is a kernel times f - g. If the surrogate g is good, f - g is small but for a few points far out. Few draws
+        seldom meet them, and intervals of the Hessian are too short then, although its error is far smaller than
+        without a memory.
 
         Args:
             quantity: as for `standard_error`; "value" is F(x), also where `value` is f(x).

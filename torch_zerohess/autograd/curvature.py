@@ -19,11 +19,15 @@ from torch.autograd.graph import Node
 from torch_zerohess.arguments import check_tensors
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.marker import Input
-from torch_zerohess.autograd.transforms import made_by
+from torch_zerohess.autograd.transforms import compiled, made_by
 from torch_zerohess.linalg.flat import flattened, split_like
 
 _DENSE = 10_000
 """Parameters beyond which `to_dense` refuses: the matrix would take 800 MB in float64."""
+_COMPILED = (
+    "the loss must be computed outside of torch.compile, got one with a compiled backward, which torch neither keeps "
+    "nor differentiates again: do not compile the model, nor the function that calls it"
+)
 
 
 class CurvatureOperator:
@@ -39,6 +43,7 @@ class CurvatureOperator:
 
     Raises:
         TypeError: `outputs`, or one of `inputs` or `through`, is no tensor.
+        RuntimeError: `torch.compile` made the backward that is to be differentiated.
         ValueError: `outputs` has no graph or more than one element; nothing to go through was found, one black box
             stands behind another, or the loss is not computed from `through`.
 
@@ -66,7 +71,7 @@ class CurvatureOperator:
         if outputs.numel() != 1 or not outputs.requires_grad:
             graph = "no graph" if not outputs.requires_grad else f"shape {list(outputs.shape)}"
             raise ValueError(f"outputs must be a loss of one element with a graph, got one with {graph}")
-        self._inputs = _listed("inputs", inputs)
+        self._outputs, self._inputs = outputs, _listed("inputs", inputs)
         if not self._inputs or not all(one.requires_grad for one in self._inputs):
             raise ValueError("inputs must be tensors that require grad")
         self.mode = mode
@@ -110,7 +115,7 @@ class CurvatureOperator:
             return torch.stack([self @ column for column in v.unbind(1)], 1) if v.shape[1] else v.clone()
         t = self._split(v)
         if self.mode == "exact":
-            return flattened(_grad(self._slopes, self._inputs, t))
+            return flattened(_grad(self._curved, self._inputs, t))
         return self.pull(self.output_curvature(self.output_step(v)))
 
     @property
@@ -136,12 +141,19 @@ class CurvatureOperator:
     @cached_property
     def _pulled(self) -> tuple[list[Tensor], list[Tensor]]:
         """A dummy d and J^T d, which is linear in d: its transpose by a second backward pass is J."""
+        check_twice(self._through, self._inputs)
         dummies = [torch.zeros_like(y, requires_grad=True) for y in self._through]
         return dummies, _grad(self._through, self._inputs, dummies, create_graph=True)
 
+    @cached_property
+    def _curved(self) -> list[Tensor]:
+        """The first derivatives, with a graph that torch differentiates."""
+        check_twice([self._outputs], self._through)
+        return self._slopes
+
     def output_curvature(self, t: Sequence[Tensor]) -> list[Tensor]:
         """Return (d2l/dy2) t for vectors in the shapes of the inputs of the black boxes."""
-        return _grad(self._slopes, self._through, t)
+        return _grad(self._curved, self._through, t)
 
     def pull(self, d: Sequence[Tensor]) -> Tensor:
         """Return J^T d, [N], for vectors d in the shapes of the inputs of the black boxes ("gauss_newton" only)."""
@@ -194,8 +206,8 @@ def black_box_inputs(outputs: Tensor) -> list[Tensor]:
     found = {_edge(one): one for one in _entries(outputs.grad_fn)}
     if not found:
         raise ValueError(
-            "mode 'gauss_newton' found no BlackBox layer between inputs and outputs (one that is compiled cannot be "
-            "found): name the tensors at which the white box ends in `through`"
+            "mode 'gauss_newton' found no BlackBox layer between inputs and outputs: name the tensors at which the "
+            "white box ends in `through` (a compiled layer is neither found nor differentiated twice)"
         )
     for one in found.values():
         if _entries(one.grad_fn):
@@ -225,9 +237,9 @@ def _entries(node: Node | None) -> list[Tensor]:
     return found
 
 
-def _edges_before(node: Node | None) -> set[tuple[object, int]]:
+def _edges_before(node: Node | None) -> set[tuple[Node, int]]:
     """Return all gradient edges that can be reached from a node, (node, number of its output) each."""
-    seen: set[tuple[object, int]] = set()
+    seen: set[tuple[Node, int]] = set()
     stack = [node]
     while stack:
         current = stack.pop()
@@ -238,7 +250,19 @@ def _edges_before(node: Node | None) -> set[tuple[object, int]]:
     return seen
 
 
-def _edge(tensor: Tensor) -> tuple[object, int]:
+def check_twice(outputs: Sequence[Tensor], ends: Sequence[Tensor]) -> None:
+    """Raise RuntimeError if a backward of `torch.compile` is on the way from outputs to one of the ends.
+
+    Derivatives of its result are errors of torch, or zeros where unused tensors are allowed.
+    """
+    before = {_edge(one) for one in ends if one.requires_grad}
+    for output in outputs:
+        nodes = {output.grad_fn, *(node for node, _ in _edges_before(output.grad_fn))}
+        if any(node and compiled(node) and before & _edges_before(node) for node in nodes):
+            raise RuntimeError(_COMPILED)
+
+
+def _edge(tensor: Tensor) -> tuple[Node, int]:
     edge = torch.autograd.graph.get_gradient_edge(tensor)
     return edge.node, edge.output_nr
 
@@ -272,4 +296,11 @@ def _derivatives(
     if not pairs:
         return [None] * len(inputs)
     chosen, weights = zip(*pairs, strict=True)
-    return torch.autograd.grad(chosen, inputs, weights, retain_graph=True, create_graph=create_graph, allow_unused=True)
+    try:
+        return torch.autograd.grad(
+            chosen, inputs, weights, retain_graph=True, create_graph=create_graph, allow_unused=True
+        )
+    except RuntimeError as error:
+        if "donated buffers" in str(error):  # memory that a compiled backward uses again
+            raise RuntimeError(_COMPILED) from error
+        raise

@@ -22,6 +22,7 @@ a random seed is drawn once, whatever maps over the layer |
 | real tensors in a fake kernel | `torch._subclasses.fake_tensor.unset_fake_temporarily` | none exists |
 | is a tensor a symbolic zero | `Tensor._is_zerotensor` | none exists |
 | which function made this node | `Function._backward_cls` | `Node.name()` is a string that other functions may share |
+| did `torch.compile` make this node | `CompiledFunctionBackward`, its name | every graph has a class of its own |
 """
 
 import contextlib
@@ -182,3 +183,8 @@ def is_symbolic_zero(x: Tensor) -> bool:
 def made_by(node: Node | None, function: type[torch.autograd.Function]) -> bool:
     """Whether a node of the graph is the backward of `function`."""
     return isinstance(node, function._backward_cls)
+
+
+def compiled(node: Node) -> bool:
+    """Whether a node of the graph is a backward of `torch.compile`, which has no derivative."""
+    return node.name() == "CompiledFunctionBackward"

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_tensors, checked_integer, checked_number
+from torch_zerohess.autograd.curvature import check_twice
 from torch_zerohess.linalg.magnitudes import magnitudes
 
 _DENSE = 16
@@ -73,9 +74,9 @@ class NewtonTargets:
     def __call__(self, losses: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
         """Return the targets [B, n], without a graph.
 
-        Raises TypeError for y that is no tensor, and RuntimeError in inference mode. Raises ValueError for y that is
-        not [B, n], for losses that are not [B], have no graph or depend on other elements, and for a gradient or
-        curvature that is not finite.
+        Raises TypeError for y that is no tensor, and RuntimeError in inference mode and for losses that `torch.compile`
+        computes. Raises ValueError for y that is not [B, n], for losses that are not [B], have no graph or depend on
+        other elements, and for a gradient or curvature that is not finite.
 
         Args:
             losses: outputs [B, n] -> losses [B], twice differentiable, each of its own element.
@@ -102,6 +103,7 @@ class NewtonTargets:
                 raise ValueError(
                     "losses(y) has no graph back to y: compute it from y by torch, without no_grad or detach"
                 )
+            check_twice([values], [at])
             (g,) = torch.autograd.grad(values.sum(), at, create_graph=True)
         self.losses = values.detach()
         gradient = g.detach()

@@ -19,6 +19,7 @@ from torch.autograd.graph import Node
 from torch_zerohess.arguments import check_tensors
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.marker import Input
+from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.autograd.transforms import compiled, made_by
 from torch_zerohess.linalg.flat import flattened, split_like
 
@@ -54,6 +55,7 @@ class CurvatureOperator:
         ((2, 2), tensor([6., 0.]))
     """
 
+    @never_compiled
     def __init__(
         self,
         outputs: Tensor,

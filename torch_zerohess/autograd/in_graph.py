@@ -3,12 +3,16 @@
 Importing this module loads the compiler, which takes seconds: only code that is being compiled imports it.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import limit, opaque
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 WHOLE = (limit.limited, opaque.noise_checked)
 
@@ -31,3 +35,11 @@ eager = torch.compiler.disable(
     _called, reason="the memory of a layer changes from call to call, and without one the layer needs torch 2.15"
 )
 """Calls a layer between two graphs. With fullgraph=True torch raises an error, which has the reason."""
+
+
+def _plain(function: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+    return function(*args, **kwargs)
+
+
+uncompiled = torch.compiler.disable(_plain, reason="torch does not differentiate a compiled backward again")
+"""Calls a function that takes second derivatives between two graphs, and what it calls, too."""

@@ -1,8 +1,15 @@
-"""What a layer refuses when torch traces, compiles or exports it."""
+"""What a layer refuses when torch traces, compiles or exports it, and what stays outside of compiled code."""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
 import torch
 
 from torch_zerohess.autograd import transforms
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 GRAPHS = torch.__version__ >= "2.15"
 """Whether compiled code may hold a layer. Up to torch 2.13 two calls become one, and both get the same noise. In torch
@@ -18,3 +25,17 @@ def check_traceable() -> None:
 
         if in_graph.exporting():
             raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
+
+
+def never_compiled(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Return a function that compiled code calls between two graphs, as it would be called without `torch.compile`."""
+
+    @functools.wraps(function)
+    def called(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        if torch.compiler.is_compiling():
+            from torch_zerohess.autograd.in_graph import uncompiled  # late: it loads the compiler
+
+            return uncompiled(function, *args, **kwargs)
+        return function(*args, **kwargs)
+
+    return called

@@ -7,11 +7,13 @@ from torch import Tensor, nn
 
 from torch_zerohess.arguments import check_tensors, checked_number
 from torch_zerohess.autograd.sample_jacobian import SampleJacobian
+from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.flat import add_parts
 from torch_zerohess.optim.processes import check_alone
 from torch_zerohess.precision import without_autocast
 
 
+@never_compiled
 def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative_damping: float = 0.3) -> None:
     """Change the weights so that the outputs of some inputs move, by damped least squares (Levenberg).
 

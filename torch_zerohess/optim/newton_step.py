@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.step import Step
 from torch_zerohess.optim import processes
 from torch_zerohess.optim.second_order import (
@@ -49,6 +50,7 @@ class NewtonStep(SecondOrder):
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
         """Minimise the model in the ball of the radius."""
 
+    @never_compiled
     def step(self, closure: Closure) -> Tensor:  # type: ignore[override]
         """Take one step and return the loss before it, [] without a graph.
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import check_tensors, checked_integer, checked_number
 from torch_zerohess.autograd.curvature import check_twice
+from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.magnitudes import magnitudes
 
 _DENSE = 16
@@ -71,6 +72,7 @@ class NewtonTargets:
         names = ("relative_damping", "iterations", "output_radius")
         return f"NewtonTargets({', '.join(f'{name}={getattr(self, name)}' for name in names)})"
 
+    @never_compiled
     def __call__(self, losses: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
         """Return the targets [B, n], without a graph.
 

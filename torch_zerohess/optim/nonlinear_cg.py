@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
+from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.optim import processes
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr
 
@@ -86,6 +87,7 @@ class NonlinearCG(SecondOrder):
         }
         super().__init__(params, defaults, distributed=distributed)
 
+    @never_compiled
     def step(self, closure: Closure, hvp: Product | None = None) -> Tensor:  # type: ignore[override]
         """Search along one direction and return the loss before it, [] without a graph.
 

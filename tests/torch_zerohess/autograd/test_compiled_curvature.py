@@ -8,7 +8,10 @@ from torch import Tensor, nn
 
 import torch_zerohess as zh
 
-pytestmark = pytest.mark.usefixtures("fresh_compiler")
+pytestmark = [
+    pytest.mark.usefixtures("fresh_compiler"),
+    pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf"),  # dynamo looks at it
+]
 
 COMPILED = "outside of torch.compile"
 
@@ -51,7 +54,6 @@ def test_curvature_of_a_loss_of_a_compiled_network_is_an_error() -> None:
             zh.hvp(quartic()(y).mean(), weights, v, mode=mode)
 
 
-@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("solver", ["steihaug", "dual"])
 def test_curvature_of_a_compiled_loss_behind_a_network_is_an_error(solver: str) -> None:
     network, x = model()
@@ -124,3 +126,18 @@ def test_a_compiled_network_before_samples_of_its_jacobian() -> None:
         optimizer.step(closure)
         ends.append(network.weight.detach().clone())
     torch.testing.assert_close(*ends)
+
+
+def test_products_in_compiled_code_take_the_graph_that_was_made_outside() -> None:
+    network, x = model()
+    weights = list(network.parameters())
+    v = [torch.ones_like(one) for one in weights]
+    loss = quartic()(network(x)).mean()
+
+    def products() -> tuple[list[Tensor], Tensor]:
+        operator = zh.CurvatureOperator(loss, weights)
+        return zh.hvp(loss, weights, v), operator @ torch.ones(operator.shape[0])
+
+    (parts, whole), expected = torch.compile(products, backend="aot_eager")(), products()
+    assert all(map(torch.equal, parts, expected[0]))
+    assert torch.equal(whole, expected[1])

@@ -16,6 +16,8 @@ from torch_zerohess.optim.second_order import Model
 MOST = 10_000
 """Parameters beyond which the Hessian is not formed."""
 MODIFICATIONS = ("shift", "abs")
+_ROUNDING = 1e-2
+"""Most that counts as rounding, in units of the largest: in half precision N roundings may be all there is."""
 
 
 class Newton(NewtonStep):
@@ -30,6 +32,7 @@ class Newton(NewtonStep):
       beyond its own magnitude (Dauphin et al. 2014): the safer choice for sampled Hessians.
 
     Eigenvalues within rounding of zero count as zero, and so do components of the gradient along their eigenvectors.
+    Rounding is N eps of the largest eigenvalue, and of the gradient, but at most 1 %.
 
     Args:
         params: parameters, one group, 10 000 numbers at most.
@@ -85,7 +88,7 @@ class Newton(NewtonStep):
             raise ValueError("the curvature of the loss is not finite; no step was taken")
         w, vectors = torch.linalg.eigh(hessian)
         g = model.gradient
-        a, rounding = vectors.mT @ g, len(w) * torch.finfo(self._parameters[0].dtype).eps
+        a, rounding = vectors.mT @ g, min(len(w) * torch.finfo(self._parameters[0].dtype).eps, _ROUNDING)
         w = torch.where(w.abs() <= rounding * w.abs().max(), 0.0, w)
         a = torch.where((w == 0.0) & (a.abs() <= rounding * g.norm()), 0.0, a)
         y = diagonal_step(a, w.abs() if group["modification"] == "abs" else w, radius)

@@ -137,3 +137,13 @@ def test_a_step_says_whether_the_boundary_stopped_it():
         optimizer = zh.optim.Newton([x], radius=radius)
         optimizer.step(lambda x=x: (x**2).sum())
         assert optimizer.exit == reason
+
+
+@pytest.mark.parametrize(("dtype", "n"), [(torch.bfloat16, 200), (torch.float16, 1100), (torch.float32, 1100)])
+def test_many_parameters_in_half_precision_are_not_all_within_rounding(dtype, n):
+    goal = torch.randn(n, generator=torch.Generator().manual_seed(0)).to(dtype)
+    x, curvature = torch.zeros(n, dtype=dtype, requires_grad=True), torch.linspace(1, 3, n)
+    optimizer = zh.optim.Newton([x], radius=100.0)
+    first = optimizer.step(lambda: (curvature * (x.float() - goal.float()).square()).sum())
+    last = (curvature * (x.detach().float() - goal.float()).square()).sum()
+    assert float(last) < 1e-3 * float(first)

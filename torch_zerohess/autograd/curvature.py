@@ -21,7 +21,7 @@ from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.autograd.transforms import compiled, made_by
-from torch_zerohess.linalg.flat import flattened, split_like
+from torch_zerohess.linalg.flat import flattened, split_like, widest_type
 
 _DENSE = 10_000
 """Parameters beyond which `to_dense` refuses: the matrix would take 800 MB in float64."""
@@ -36,7 +36,7 @@ class CurvatureOperator:
 
     Args:
         outputs: the loss, a tensor of one element with a graph. The graph is kept.
-        inputs: the parameters, one tensor or several, N numbers in all.
+        inputs: the parameters, one tensor or several, N numbers in all. Products are in the widest of their types.
         mode: "exact" or "gauss_newton", see the module. With "gauss_newton" only the curvature through the inputs of
             the black boxes counts: a term of the loss that reaches the parameters in another way adds none.
         through: for "gauss_newton", the tensors y at which the white box ends; the inputs of all `BlackBox` layers
@@ -79,7 +79,7 @@ class CurvatureOperator:
         self.mode = mode
         N = sum(one.numel() for one in self._inputs)
         self.shape = (N, N)
-        self.dtype, self.device = self._inputs[0].dtype, self._inputs[0].device
+        self.dtype, self.device = widest_type(self._inputs), self._inputs[0].device
         if mode == "exact":
             self._through = self._inputs
             found = _derivatives([outputs], self._inputs, None, create_graph=True)
@@ -168,7 +168,8 @@ class CurvatureOperator:
         return self @ torch.eye(self.shape[0], dtype=self.dtype, device=self.device)
 
     def _split(self, v: Tensor) -> list[Tensor]:
-        return split_like(v.detach().to(self.dtype), self._inputs)
+        parts = split_like(v.detach(), self._inputs)
+        return [part.to(one.dtype) for part, one in zip(parts, self._inputs, strict=True)]
 
 
 def hvp(

@@ -1,5 +1,6 @@
 """Several tensors as one vector: parameters, gradients, outputs."""
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -9,6 +10,11 @@ from torch import Tensor
 def flattened(tensors: Sequence[Tensor]) -> Tensor:
     """Return the numbers of tensors, N in all, one after the other: [N]."""
     return torch.cat([one.reshape(-1) for one in tensors])
+
+
+def widest_type(tensors: Sequence[Tensor]) -> torch.dtype:
+    """Return the type of their numbers as one vector."""
+    return functools.reduce(torch.promote_types, (one.dtype for one in tensors))
 
 
 def split_like(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, checked_number
+from torch_zerohess.linalg.flat import widest_type
 from torch_zerohess.linalg.step import Step
 from torch_zerohess.linalg.subproblem import diagonal_step
 from torch_zerohess.optim.newton_step import NewtonStep
@@ -88,7 +89,7 @@ class Newton(NewtonStep):
             raise ValueError("the curvature of the loss is not finite; no step was taken")
         w, vectors = torch.linalg.eigh(hessian)
         g = model.gradient
-        a, rounding = vectors.mT @ g, min(len(w) * torch.finfo(self._parameters[0].dtype).eps, _ROUNDING)
+        a, rounding = vectors.mT @ g, min(len(w) * torch.finfo(widest_type(self._parameters)).eps, _ROUNDING)
         w = torch.where(w.abs() <= rounding * w.abs().max(), 0.0, w)
         a = torch.where((w == 0.0) & (a.abs() <= rounding * g.norm()), 0.0, a)
         y = diagonal_step(a, w.abs() if group["modification"] == "abs" else w, radius)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.autograd.tracing import never_compiled
+from torch_zerohess.linalg.flat import widest_type
 from torch_zerohess.optim import processes
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr
 
@@ -164,7 +165,7 @@ class NonlinearCG(SecondOrder):
         return math.copysign(checked_lr(group) * length, -slope) * d
 
     def _given(self, hvp: Product, d: Tensor) -> Tensor:
-        result = hvp(d.to(self._parameters[0].dtype))
+        result = hvp(d.to(widest_type(self._parameters)))
         if not isinstance(result, Tensor) or result.shape != d.shape:
             shape = list(result.shape) if isinstance(result, Tensor) else type(result).__name__
             raise ValueError(f"hvp must return a tensor of shape {list(d.shape)}, got {shape}")

@@ -214,3 +214,19 @@ def test_what_is_no_tensor_is_refused():
             call()
     layers = torch.nn.Linear(2, 1)
     assert zh.CurvatureOperator(layers(x).sum(), layers.parameters()).shape == (3, 3)
+
+
+@pytest.mark.parametrize("narrow", [torch.bfloat16, torch.float16, torch.float32])
+@pytest.mark.parametrize("first", ["narrow", "wide"])
+def test_parameters_of_different_types_keep_their_digits(narrow: torch.dtype, first: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    a = torch.ones(5, dtype=narrow, requires_grad=True)
+    b, v, scale = (torch.rand(50, dtype=torch.float64, generator=generator) for _ in range(3))
+    b.requires_grad_()
+    parts = [(a, torch.ones_like(a)), (b, v)]
+    inputs, vectors = zip(*(parts if first == "narrow" else parts[::-1]), strict=True)
+    loss = (scale * b.square()).sum() + a.double().square().sum()
+    products = zh.hvp(loss, inputs, vectors)
+    torch.testing.assert_close(products[1 if first == "narrow" else 0], 2 * scale * v)
+    torch.testing.assert_close(products[0 if first == "narrow" else 1], 2 * torch.ones(5, dtype=torch.float64))
+    assert zh.CurvatureOperator(loss, inputs).dtype == torch.float64

@@ -147,3 +147,14 @@ def test_many_parameters_in_half_precision_are_not_all_within_rounding(dtype, n)
     first = optimizer.step(lambda: (curvature * (x.float() - goal.float()).square()).sum())
     last = (curvature * (x.detach().float() - goal.float()).square()).sum()
     assert float(last) < 1e-3 * float(first)
+
+
+@pytest.mark.parametrize("narrow_first", [True, False])
+def test_rounding_is_of_the_widest_type_of_the_parameters(narrow_first):
+    narrow, wide = torch.zeros(5, dtype=torch.float16), torch.zeros(20, dtype=torch.float64)
+    curvature = torch.logspace(0, 4, 20, dtype=torch.float64)
+    params = [narrow.requires_grad_(), wide.requires_grad_()]
+    optimizer = zh.optim.Newton(params if narrow_first else params[::-1], radius=100.0)
+    optimizer.step(lambda: (curvature * (wide - 1).square()).sum() + (narrow.double() - 1).square().sum())
+    torch.testing.assert_close(wide.detach(), torch.ones_like(wide))
+    assert bool((narrow == 1).all())

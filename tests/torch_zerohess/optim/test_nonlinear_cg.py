@@ -263,3 +263,17 @@ def test_errors():
         NonlinearCG([x], recompute=2.5)
     with pytest.raises(ValueError, match="one group"):
         NonlinearCG([{"params": [x]}, {"params": [torch.ones(1, requires_grad=True)]}])
+
+
+@pytest.mark.parametrize("narrow_first", [True, False])
+def test_products_of_the_caller_get_vectors_of_the_widest_type(narrow_first):
+    narrow, wide = torch.ones(2, dtype=torch.float16), torch.ones(3, dtype=torch.float64)
+    params, types = [narrow.requires_grad_(), wide.requires_grad_()], set()
+
+    def product(v):
+        types.add(v.dtype)
+        return 2 * v
+
+    optimizer = zh.optim.NonlinearCG(params if narrow_first else params[::-1])
+    optimizer.step(lambda: wide.square().sum() + narrow.double().square().sum(), hvp=product)
+    assert types == {torch.float64}

@@ -38,7 +38,8 @@ class BlackBox(nn.Module):
             Mitsuba, another program; it gets detached, contiguous tensors and is not differentiated. A module given as
             fn is not registered: its parameters are not trained through this layer.
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
-            operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample.
+            operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample,
+            and head must not change it.
             Parameters and other tensors in it are constants: they must not require grad, except under `torch.no_grad`.
             A module given as head is not registered. What is trained belongs behind a layer without a head.
             Second derivatives of a nonlinear loss there are biased by the variance of the sampled Jacobian.

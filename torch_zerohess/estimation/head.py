@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation.inputs import times_changed
 from torch_zerohess.precision import without_autocast
 
 Head = Callable[..., Tensor]
@@ -23,7 +24,8 @@ _ALONE = (
 def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
     """Return the losses [B, E] of outputs [B, E, *out] with auxiliary inputs [B, ...].
 
-    Raises ValueError, where autograd records, for a head with a tensor of its own that requires grad.
+    Raises ValueError for a head that changes an auxiliary input in place and, where autograd records, for one with a
+    tensor of its own that requires grad.
     """
     B, E = outputs.shape[:2]
     if E <= B:
@@ -36,9 +38,14 @@ def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
 
 
 def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
-    graph = any(one.requires_grad for one in (outputs, *aux))
+    graph, before = any(one.requires_grad for one in (outputs, *aux)), [times_changed(one) for one in aux]
     with without_autocast(outputs.device):
         losses = head(outputs, *aux)
+    for number, one in enumerate(aux):
+        if times_changed(one) != before[number]:
+            raise ValueError(
+                f"head must not change aux[{number}], which serves other samples and is the caller's: use a copy of it"
+            )
     if not isinstance(losses, Tensor) or not losses.is_floating_point():
         raise TypeError(f"head must return a real floating-point tensor, got {getattr(losses, 'dtype', type(losses))}")
     if losses.requires_grad and not graph:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess import Memory, Smoothing, estimate
+from torch_zerohess import BlackBox, Memory, Smoothing, estimate
 from torch_zerohess.estimation.control import _negligible
 from torch_zerohess.heads import LocalEntropy, SquaredError
 from truths import deviation, vector
@@ -353,6 +353,27 @@ def test_what_is_negligible(dtype: torch.dtype) -> None:
     expected = 16.0 * torch.finfo(dtype).eps * 1001.0 + 0.01
     torch.testing.assert_close(errors.abs(), torch.full((50, 4), expected, dtype=torch.float64))
     assert abs(float(errors.sign().mean())) < 5.0 / math.sqrt(200.0)
+
+
+@pytest.mark.parametrize("fresh", [None, 0, 16])
+def test_a_head_that_changes_its_auxiliary_inputs_is_refused(fresh: int | None) -> None:
+    """With fresh=0 the surrogate alone goes through the head."""
+    memory = None if fresh is None else Memory(fresh=fresh)
+    if memory is not None:
+        points = torch.randn(30, 3, generator=torch.Generator().manual_seed(0))
+        memory.add(points, parabolas(points))
+        memory.fit()
+    layer = BlackBox(
+        parabolas,
+        Smoothing(sigma=0.3, samples=4),
+        head=lambda y, r: (y - r.div_(2)).square().mean(1),
+        memory=memory,
+    )
+    x = torch.zeros(20, 3, requires_grad=True)
+    with pytest.raises(ValueError, match=r"head must not change aux\[0\]"):
+        layer(x, torch.ones(20, 3))
+    with torch.no_grad(), pytest.raises(ValueError, match=r"head must not change aux\[0\]"):
+        layer(x, torch.ones(20, 3))
 
 
 def test_a_head_that_changes_the_outputs_is_refused() -> None:

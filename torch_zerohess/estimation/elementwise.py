@@ -104,7 +104,7 @@ class Elementwise(Stein):
         `index_add_` would add them in another order each time on a CUDA device.
         """
         terms = (a * self.weight[:, None])[..., chosen][..., element.argsort(stable=True)]
-        return terms.unflatten(2, (count, -1)).sum(3)
+        return terms.reshape(*terms.shape[:2], count, len(element) // count).sum(3)
 
     def ratio(self, d: Tensor, project: Projection) -> Tensor:
         """Return the quadratic in d [B, n] whose derivatives are the kernels, [B, K]."""

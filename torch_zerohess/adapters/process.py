@@ -4,7 +4,6 @@ import functools
 import io
 import json
 import os
-import shutil
 import subprocess
 import threading
 import weakref
@@ -14,6 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.adapters.command import checked_environment, found_program
 from torch_zerohess.adapters.server import GRACE, Server, end_program, ended, late, shown
 from torch_zerohess.arguments import check_bool, check_tensors, checked_number
 from torch_zerohess.evaluators.batch import numbers
@@ -52,7 +52,8 @@ class Program(Closing):
     program at a point where it works first. `on_nonfinite` of a layer says how it treats a NaN; `minimize` avoids the
     point.
 
-    A `Program` can be pickled; a copy starts a program of its own.
+    A `Program` can be pickled; a copy starts a program of its own. So does a process made by a fork, as the workers of
+    a DataLoader are.
 
     Args:
         command: program and arguments, or a function that returns them for a point. A path of the program is relative
@@ -107,24 +108,31 @@ class Program(Closing):
         """Of the values of a point; None if there are none yet."""
         self.last_failure: str | None = None
         """Message of the last run that failed, with what it wrote to the standard error; in worker processes theirs."""
-        self.folder, self.environment = folder, _checked_environment(environment)
+        self.folder, self.environment = folder, checked_environment(environment)
         if folder is not None and not os.path.isdir(folder):
             raise FileNotFoundError(f"folder must be a folder that exists, got {folder!r}")
         if not callable(command):
-            _found(command, folder, self.environment)
-        self._server: Server | None = None
-        self._end: weakref.finalize[Any, Any] | None = None
-        """Ends the server: called by `close`, when nobody refers to this object any more, or when Python ends."""
-        self._asked = threading.Lock()
+            found_program(command, folder, self.environment)
+        self._forget()
 
     def __repr__(self) -> str:
         return f"Program({self.command!r}, server={self.server}, format={self.format!r})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: one for name, one in vars(self).items() if name != "_asked"} | {"_server": None, "_end": None}
+        own = ("_server", "_end", "_asked", "_process")
+        return {name: one for name, one in vars(self).items() if name not in own}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _asked=threading.Lock())
+        vars(self).update(state)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Have no server: at first, in a copy, and after a fork, where the server belongs to the other process."""
+        self._server: Server | None = None
+        self._end: weakref.finalize[Any, Any] | None = None
+        """Ends the server: called by `close`, when nobody refers to this object any more, or when Python ends."""
+        self._asked = threading.Lock()
+        self._process = os.getpid()
 
     def close(self) -> None:
         """End the server, if there is one."""
@@ -153,7 +161,7 @@ class Program(Closing):
             found: dict[int, Tensor | None] = {}
             try:
                 for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
-                    command = _found(self.command(one), self.folder, self.environment)
+                    command = found_program(self.command(one), self.folder, self.environment)
                     found[k] = self._unless_failed(functools.partial(self._run, command, b"", 1), one)
             except BaseException as error:  # Ctrl-C, too
                 keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
@@ -194,6 +202,8 @@ class Program(Closing):
 
     def _serve(self, request: bytes, points: int) -> Tensor:
         assert not callable(self.command)
+        if self._process != os.getpid():
+            self._forget()
         with self._asked:
             if self._server is not None and not self._server.alive:
                 self.close()
@@ -285,36 +295,3 @@ class Program(Closing):
 
 def _missing(shape: Sequence[int]) -> Tensor:
     return torch.full(tuple(shape), torch.nan, dtype=torch.float64, device="cpu")
-
-
-def _checked_environment(environment: Any) -> dict[str, str] | None:
-    if environment is None:
-        return None
-    if not isinstance(environment, Mapping):
-        raise TypeError(f"environment must be a mapping of names to text, got {environment!r}")
-    for name, value in environment.items():
-        if not isinstance(name, str) or not isinstance(value, str):
-            raise TypeError(f"environment must map names to text, got {name!r}: {value!r}")
-    return dict(environment)
-
-
-def _found(command: Sequence[str], folder: str | None, environment: Mapping[str, str] | None) -> Sequence[str]:
-    """Return a command whose program exists; TypeError if it is text, which a function may return by mistake.
-
-    A path of the program is relative to the folder where it runs, a name alone is looked for in the PATH that it gets.
-    So are the folders in this PATH, because the program starts from there.
-    """
-    if isinstance(command, str) or not isinstance(command, Sequence) or not command:
-        raise TypeError(f"command must return a list, the program and its arguments, got {command!r}")
-    wrong = [one for one in command if not isinstance(one, (str, bytes, os.PathLike))]
-    if wrong:
-        raise TypeError(f"command must be a list of texts and paths, got {wrong[0]!r} in it: write str({wrong[0]!r})")
-    name = os.fsdecode(command[0])
-    place = os.path.join(folder or "", name) if os.path.dirname(name) else name
-    folders = (os.environ | (environment or {})).get("PATH", os.defpath).split(os.pathsep)
-    if shutil.which(place, path=os.pathsep.join(os.path.join(folder or "", one) for one in folders)) is None:
-        raise FileNotFoundError(
-            f"command: there is no program {name!r} that could be run, see "
-            + ("PATH" if place == name else f"folder {os.fspath(folder or '')!r}")
-        )
-    return command

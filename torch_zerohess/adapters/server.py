@@ -23,6 +23,7 @@ class Server:
 
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
         self.process = process
+        self._owner = os.getpid()
         self.errors: deque[bytes] = deque(maxlen=_KEPT)
         self._exchange: threading.Thread | None = None
         self._listener = threading.Thread(target=self._listen, daemon=True)
@@ -74,7 +75,12 @@ class Server:
         return answer[0]
 
     def end(self) -> None:
-        """Close the input of the program, and kill it if it does not end. The programs that it started end with it."""
+        """Close the input of the program, and kill it if it does not end. The programs that it started end with it.
+
+        After a fork it belongs to the process that started it, and this does nothing in the other one.
+        """
+        if self._owner != os.getpid():
+            return
         self._close(self.process.stdin, self._exchange)
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(GRACE)

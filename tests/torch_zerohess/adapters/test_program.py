@@ -438,6 +438,35 @@ def test_python_ends_where_a_server_still_runs(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "2.0\n", "")
 
 
+FORKS = """
+import os, signal, sys, threading, time, torch
+from torch_zerohess.adapters.process import Program
+serve = "import os, sys, time\\nfor line in sys.stdin: time.sleep(0.2); print([os.getpid()], flush=True)"
+program, z = Program([sys.executable, "-S", "-c", serve], server=True), torch.ones(1, 2)
+first = program(z)
+for calls, busy in ((True, False), (False, False), (True, True)):
+    thread = threading.Thread(target=program, args=(z,))
+    if busy:
+        thread.start()
+        while not program._asked.locked():
+            time.sleep(0.01)
+    child = os.fork()
+    if not child:
+        signal.alarm(30)
+        if calls:
+            print(torch.equal(program(z), program(z)), torch.equal(program(z), first), flush=True)
+        sys.exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), torch.equal(program(z), first), flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_process_made_by_a_fork_has_a_server_of_its_own():
+    """Servers answer with the number of their process. A child that hangs ends by SIGALRM, with code -14."""
+    done = subprocess.run([sys.executable, "-c", FORKS], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "True False\n0 True\n0 True\nTrue False\n0 True\n"), done.stderr
+
+
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [

@@ -8,8 +8,11 @@ from torch import Tensor
 
 
 def flattened(tensors: Sequence[Tensor]) -> Tensor:
-    """Return the numbers of tensors, N in all, one after the other: [N]."""
-    return torch.cat([one.reshape(-1) for one in tensors])
+    """Return the numbers of tensors, N in all, one after the other: [N], dense.
+
+    The gradients of some embeddings are sparse.
+    """
+    return torch.cat([(one.to_dense() if one.is_sparse else one).reshape(-1) for one in tensors])
 
 
 def widest_type(tensors: Sequence[Tensor]) -> torch.dtype:

@@ -259,3 +259,43 @@ def test_parameters_without_a_number_are_refused(make) -> None:
     x = vector(1.0).requires_grad_()
     make([torch.zeros(0, dtype=x.dtype, requires_grad=True), x]).step(lambda: x.square().sum())
     assert abs(float(x.detach())) < 1e-6
+
+
+class Words(torch.nn.Module):
+    """A network [B, 3] -> [B, 2] that begins with an embedding."""
+
+    def __init__(self, sparse: bool) -> None:
+        super().__init__()
+        self.table = torch.nn.Embedding.from_pretrained(spread(10, -1.0, 1.0).view(5, 2), freeze=False, sparse=sparse)
+        self.last = torch.nn.utils.skip_init(torch.nn.Linear, 6, 2, dtype=torch.float64)
+        self.last.load_state_dict({"weight": spread(12, -0.5, 0.9).view(2, 6), "bias": vector(0.1, -0.2)})
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.last(self.table(x).sin().flatten(1))
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")  # of torch, for the dual step
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        (zh.optim.Newton, {}),
+        (zh.optim.NonlinearCG, {}),
+        (zh.optim.NewtonCG, {}),
+        (zh.optim.NewtonCG, {"curvature": "gauss_newton", "solver": "dual", "damping": 1e-3}),
+    ],
+)
+def test_embeddings_with_sparse_gradients_take_the_same_steps(kind: type, settings: dict) -> None:
+    words = torch.tensor([[0, 1, 1], [2, 0, 1]])
+    ends = []
+    for sparse in (False, True):
+        network = Words(sparse)
+        optimizer = kind(network.parameters(), **settings)
+
+        def closure(network: Words = network) -> object:
+            y = network(words)
+            loss = (y - 1.0).square().sum()
+            return (loss, y, zh.optim.SampleJacobian(network, words)) if "solver" in settings else loss
+
+        ends.append([float(optimizer.step(closure)) for _ in range(4)])
+    assert ends[0][-1] < ends[0][0]
+    assert ends[1] == pytest.approx(ends[0], rel=1e-12)

@@ -74,7 +74,7 @@ class ProcessPool(Ahead):
     Raises:
         ValueError: an argument is out of range.
         TypeError: the black box cannot be pickled; the message names the object in it.
-        RuntimeError: workers end before they evaluate anything.
+        RuntimeError: workers end before they evaluate anything, or this process may have none: it is itself a daemon.
 
     Example:
         >>> import operator, torch

@@ -22,6 +22,11 @@ class Process:
     """A worker: it starts, gets a black box, and then evaluates one chunk at a time."""
 
     def __init__(self) -> None:
+        if multiprocessing.current_process().daemon:
+            raise RuntimeError(
+                "a ProcessPool cannot start workers in a daemon of multiprocessing, such as a worker of a DataLoader: "
+                "leave evaluator=None there, or call the black box in the main process"
+            )
         context = multiprocessing.get_context("spawn")
         mine, theirs = context.Pipe()
         self.process = context.Process(target=worker.main, args=(theirs,), name="torch_zerohess worker", daemon=True)

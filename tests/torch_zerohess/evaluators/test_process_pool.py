@@ -3,6 +3,7 @@
 A worker takes seconds to start, so tests share one pool where they can.
 """
 
+import functools
 import math
 import multiprocessing
 import os
@@ -163,6 +164,18 @@ def test_a_process_that_the_black_box_forks_does_not_answer(pool):
 def test_the_black_box_may_have_processes_of_its_own(pool):
     z = points(3)
     assert torch.equal(pool(black_boxes.with_processes, z), z.sum(1))
+
+
+def collated(evaluator, rows):
+    return evaluator(black_boxes.waves, torch.stack(rows))
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_worker_of_a_data_loader_is_told_that_it_cannot_have_workers():
+    with ProcessPool(1) as pool:
+        loader = torch.utils.data.DataLoader(points(3), num_workers=1, collate_fn=functools.partial(collated, pool))
+        with pytest.raises(RuntimeError, match=r"such as a worker of a DataLoader: leave evaluator=None there"):
+            next(iter(loader))
 
 
 def test_values_of_different_shapes_are_refused(pool):

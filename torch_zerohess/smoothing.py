@@ -294,7 +294,8 @@ def checked_sigma(sigma: Any, name: str = "sigma") -> float | Tensor:
         raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}") from error
     if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:
         raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}")
-    values = values.detach().double().clone()
+    with torch.inference_mode(False):  # also if it was made or loaded in inference mode, graphs keep it
+        values = values.detach().double().clone()
     wrong = values[~(torch.isfinite(values) & (values > 0))]
     if len(wrong):
         raise ValueError(f"{name} must be positive and finite, got {float(wrong.flatten()[0])}")

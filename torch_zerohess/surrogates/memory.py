@@ -240,7 +240,8 @@ class Memory:
         It is fitted to all evaluations if the memory has dropped some that it knew.
         """
         check_state(state, self.state_dict(), "a memory")
-        points, outputs = state["points"], state["outputs"]
+        with outside_inference():  # the state may have been read in inference mode
+            points, outputs = state["points"].clone(), state["outputs"].clone()
         self._points, self._outputs = ([points], [outputs]) if len(points) else ([], [])
         self._size, self.evaluations = len(points), state["evaluations"]
         self.regression.moments = [list(one) for one in state["moments"]]

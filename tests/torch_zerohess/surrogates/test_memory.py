@@ -1,9 +1,12 @@
 """What a memory keeps, when it fits, and what it thinks of its surrogate."""
 
+import copy
+
 import pytest
 import torch
 from torch import nn
 
+import torch_zerohess as zh
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.memory import Memory
 from truths import normal
@@ -167,6 +170,24 @@ def test_what_is_kept_and_fitted_in_inference_mode_serves_calls_with_a_graph(cap
     memory.fit()
     assert not memory.points.is_inference()
     assert not memory.outputs.is_inference()
+
+
+def test_a_state_that_was_loaded_in_inference_mode_serves_calls_with_a_graph() -> None:
+    """Points, outputs and sigma are in the state."""
+    smoothing = zh.Smoothing(sigma=torch.full((3,), 0.1), samples=4, seed=0)
+    saved, *layers = (zh.BlackBox(lambda z: z.sum(1), smoothing, memory=Memory()) for _ in range(3))
+    z, gradients = normal(20, 3), []
+    saved.memory.add(z, z.sum(1))
+    saved.memory.fit()
+    for layer, inference in zip(layers, (False, True), strict=True):
+        with torch.inference_mode(inference):
+            layer.load_state_dict(copy.deepcopy(saved.state_dict()))
+        kept = layer.memory.points, layer.memory.outputs, layer.smoothing.sigma
+        assert not any(one.is_inference() for one in kept)
+        x = normal(4, 3, seed=1).requires_grad_()
+        layer(x).sum().backward()
+        gradients.append(x.grad)
+    assert torch.equal(*gradients)
 
 
 def test_a_fit_of_nothing_raises() -> None:

@@ -26,10 +26,10 @@ class Stopping:
         search = running.search
         if not running.begun:
             return ("budget", running.budget) if running.spent else None
-        if search.done:
-            return running.ending(arrived=search.solved), search.message
         if self.target is not None and running.reaches(self.target):
             return "target", f"the value is at most the target {self.target}"
+        if search.done:
+            return running.ending(arrived=search.solved), search.message
         if running.record.unbounded:
             return "stalled", UNBOUNDED
         if self.xtol is not None and bool((search.width <= self.xtol).all()):

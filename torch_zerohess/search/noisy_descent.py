@@ -135,6 +135,10 @@ class NoisyQuadratics(Method[NoisyProgress]):
         """Return further points of the region."""
         return self._drawn(known, count, generator)
 
+    def has_averaged(self, known: NoisyProgress) -> bool:
+        """Return whether a second quadratic has chosen the best point: the first one is around the start."""
+        return known.iterations > 1
+
     def model_at_best(self, known: NoisyProgress) -> tuple[LocalModel, float] | None:
         u = (known.points - known.best.point) / known.sigma
         near = u.norm(dim=1).argsort()[: self._most]

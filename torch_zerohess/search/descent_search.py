@@ -3,8 +3,9 @@
 from typing import Any
 
 from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.kinked_descent import KinkedQuadratics
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.metric_descent import MOST, MetricQuadratics
+from torch_zerohess.search.metric_descent import MOST
 from torch_zerohess.search.noisy_descent import NoisyQuadratics
 from torch_zerohess.search.output_descent import OutputDescent
 from torch_zerohess.search.protocol import AskTell
@@ -30,6 +31,9 @@ class Descent(AskTell[Any]):
       with an output in noise. On a plateau sigma grows. New samples around x are asked for where the model has
       predicted badly.
 
+    At a kink of a loss alone, slopes at up to 4 (n + 1) points around it tell whether it is a minimum: up to
+    (n + 1)(4 n + 7) evaluations, if no bound is near. If they do not tell, the search has not arrived.
+
     Where sigma is below `tolerance` (with the loss alone a millionth of it, in noise a thousandth) the search has
     arrived at a minimum, possibly a local one. In noise it has also arrived where three steps in a row are within their
     errors and the quadratic takes no more evaluations. The search then starts again, up to `restarts` times: from a
@@ -41,7 +45,8 @@ class Descent(AskTell[Any]):
     max(500, 6 n).
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
-    order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation.
+    order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation; Burke, Lewis and Overton (2005) for
+    slopes around a kink.
 
     Example:
         >>> import torch
@@ -57,10 +62,10 @@ class Descent(AskTell[Any]):
         return descent_method(settings)
 
 
-def descent_method(settings: Settings) -> LocalQuadratics | MetricQuadratics | NoisyQuadratics | OutputDescent:
+def descent_method(settings: Settings) -> LocalQuadratics | KinkedQuadratics | NoisyQuadratics | OutputDescent:
     """Return the method for an output, for a loss alone, or for a loss with noise or of many parameters."""
     if settings.loss is not None:
         return OutputDescent(settings)
     if settings.n > MOST:
         return LocalQuadratics(settings)
-    return NoisyQuadratics(settings) if settings.noise else MetricQuadratics(settings)
+    return NoisyQuadratics(settings) if settings.noise else KinkedQuadratics(settings)

@@ -79,10 +79,14 @@ class MetricProgress(RegionProgress):
     """Loss of this round above `bottom`, where it was last predicted."""
     times: int = 0
     """Predictions in a row that were right."""
+    slopes: Tensor | None = None
+    """Gradients [m, n] at random points around a kink, see `KinkedQuadratics`; None where there is none."""
+    reason: str = ""
+    """Why the round has come to it."""
 
 
 class MetricQuadratics(RegionDescent[MetricProgress]):
-    """The method of `Descent` for a loss alone without noise, of up to 40 parameters."""
+    """Descent on quadratics of a loss alone without noise; it ends at kinks, see `KinkedQuadratics`."""
 
     engine = "descent"
     progress = MetricProgress

@@ -1,0 +1,25 @@
+"""The shortest vector of a convex hull."""
+
+import torch
+
+from torch_zerohess.linalg.hull import shortest
+
+
+def test_the_shortest_vector_of_a_hull_is_a_corner_a_point_of_a_side_or_zero() -> None:
+    corner = torch.tensor([[1.0, 0.0], [2.0, 1.0], [2.0, -1.0]], dtype=torch.float64)
+    assert torch.allclose(shortest(corner), corner[0], atol=1e-9)
+    side = torch.tensor([[1.0, 3.0], [1.0, -1.0], [4.0, 0.0]], dtype=torch.float64)
+    assert torch.allclose(shortest(side), torch.tensor([1.0, 0.0], dtype=torch.float64), atol=1e-9)
+    around = torch.tensor([[1.0, 0.0], [-1.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
+    assert float(shortest(around).norm()) < 1e-9
+    assert torch.equal(shortest(corner[1:2]), corner[1])
+    assert float(shortest(torch.zeros(3, 2, dtype=torch.float64)).norm()) == 0.0
+
+
+def test_it_makes_no_acute_angle_with_what_is_shorter_along_it() -> None:
+    """The condition of optimality: v g >= |v|^2 for every vector g of the hull."""
+    generator = torch.Generator().manual_seed(0)
+    for m, n in ((4, 6), (12, 6), (40, 10)):
+        vectors = torch.randn(m, n, generator=generator, dtype=torch.float64) + 0.8
+        found = shortest(vectors)
+        assert float((vectors @ found).min()) >= float(found @ found) - 1e-3 * float(found.norm())

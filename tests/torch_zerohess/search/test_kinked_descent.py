@@ -1,0 +1,81 @@
+"""Descent on a loss with kinks."""
+
+import pytest
+import torch
+from torch import Tensor
+
+import torch_zerohess as zh
+from torch_zerohess.search.descent_search import Descent
+
+
+def kinked(seed: int, n: int, largest: bool = False):
+    """Convex; its only minimum is 0. Return the function, and its value at the start."""
+    generator = torch.Generator().manual_seed(seed)
+    matrix = torch.randn(n, n, generator=generator, dtype=torch.float64)
+    bottom = torch.rand(n, generator=generator, dtype=torch.float64) - 0.5
+
+    def f(z: Tensor) -> Tensor:
+        parts = ((z.double() - bottom) @ matrix.T).abs()
+        return parts.amax(1) if largest else parts.sum(1)
+
+    return f, float(f(torch.full((1, n), 0.9, dtype=torch.float64)))
+
+
+@pytest.mark.parametrize(
+    ("n", "largest", "seed"), [(4, False, 10), (4, False, 18), (4, True, 2), (4, True, 14), (6, False, 5)]
+)
+def test_a_kink_is_no_minimum(n, largest, seed) -> None:
+    """Quadratics of such a loss shrink the region at a kink, from which the loss falls along the kink."""
+    f, start = kinked(seed, n, largest)
+    fit = zh.minimize(f, [0.9] * n, sigma=0.5, restarts=0, seed=seed, max_evaluations=1000)
+    assert not fit.success or fit.value < 0.01 * start
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_a_kink_may_be_a_minimum(n) -> None:
+    for seed in range(3):
+        fit = zh.minimize(lambda z: (z - 0.3).abs().sum(1), [0.9] * n, sigma=0.5, restarts=0, seed=seed)
+        assert (fit.status, fit.success) == ("solved", True)
+        assert fit.value < 1e-4
+
+
+def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
+    """The evaluations end while slopes are measured."""
+    f, _ = kinked(18, 4)
+    search = Descent(torch.full((4,), 0.9), sigma=0.5, seed=18, restarts=0)
+    while search._state.progress.slopes is None:
+        search.tell(f(search.ask()))
+    search.tell(f(search.ask(limit=2)))
+    assert search.done
+    assert not search.solved
+    assert "do not tell" in search.message
+
+
+def test_a_smooth_function_is_not_searched_for_kinks() -> None:
+    """Not in a narrow valley, beside a bound, or where the loss is flat."""
+    cases = [
+        (lambda z: 100 * (z[:, 1] - z[:, 0].square()).square() + (1 - z[:, 0]).square(), {}),
+        (lambda z: (z - 0.3).square() @ torch.tensor([1.0, 1e4]).double(), {"bounds": (-1, 0.2)}),
+        (lambda z: (z - 0.3).pow(4).sum(1), {}),
+    ]
+    for f, settings in cases:
+        search = Descent(torch.full((2,), -0.5).double(), sigma=0.5, seed=0, restarts=0, **settings)
+        while not search.done:
+            search.tell(f(search.ask()))
+            assert search._state.progress.slopes is None
+
+
+def test_a_measurement_of_slopes_survives_in_a_state() -> None:
+    f, _ = kinked(18, 4)
+
+    def run(split: bool) -> Tensor:
+        search = Descent(torch.full((4,), 0.9), sigma=0.5, seed=18, restarts=0)
+        while search.evaluations < 300 and not search.done:
+            if split:
+                other = Descent(torch.full((4,), 0.9), sigma=0.5, seed=0, restarts=0)
+                other.load_state_dict(search.state_dict())
+                search = other
+            search.tell(f(search.ask(2)))
+        return search.x
+
+    assert torch.equal(run(False), run(True))

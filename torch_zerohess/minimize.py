@@ -93,7 +93,8 @@ def minimize(
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
             does not depend on their number. Most steps are single points: give a `batch`, too, so that all workers
             have work. A point that no process survives has the value NaN. LostEvaluationError if no point has a value.
-        callback: gets an `Iterate` after every batch; the search ends if it returns True, of Python, NumPy or torch.
+        callback: gets an `Iterate` after every batch, those of a decision in noise, too; the search ends if it returns
+            True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second, and one at the end.
         seed: of the samples; from torch's global generator if None.
         target: the search ends when the value is at most this. In noise a single value is too uncertain: the search
@@ -204,21 +205,25 @@ def minimize(
                 memory.add(points[numbers], values)
         return numbers, values, failure
 
-    running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, limits, verbose=verbose)
-    stopping = Stopping(target, xtol, ftol, time_limit, agrees=restarts is None)
-    end: tuple[Status, str]
     black_box = caller = "fn" if loss is None else "fn or loss"
     asked: tuple[Status, str] | None = None
+
+    def called() -> None:
+        nonlocal asked, caller
+        caller = "callback"
+        if callback is not None and _is_true(callback(running.iterate)):
+            asked = "callback", "the callback asked to end"
+        caller = black_box
+
+    running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, limits, called, verbose=verbose)
+    stopping = Stopping(target, xtol, ftol, time_limit, agrees=restarts is None)
+    end: tuple[Status, str]
     try:
         while True:
             running.look_again()
             reached = stopping.reason(running) or asked
             if reached is None:
                 running.step()
-                caller = "callback"
-                if callback is not None and _is_true(callback(running.iterate)):
-                    asked = "callback", "the callback asked to end"
-                caller = black_box
                 continue
             end = reached
             if end[0] != "time":

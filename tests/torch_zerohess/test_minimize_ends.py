@@ -635,6 +635,36 @@ def test_a_target_that_the_last_decision_finds_reached_at_the_end_of_the_search(
     assert fit.value <= 0.1
 
 
+def test_the_callback_gets_the_batches_of_a_decision() -> None:
+    """Evaluations 176 to 200 are the decision."""
+    generator, seen = torch.Generator().manual_seed(0), []
+
+    def noisy(z):
+        return (z - 0.3).square().sum(1) + 0.1 * torch.randn(len(z), generator=generator, dtype=torch.float64)
+
+    fit = zh.minimize(noisy, [0.8], sigma=0.5, max_evaluations=200, target=0.02, seed=0, callback=seen.append)
+    assert torch.equal(torch.cat([one.points for one in seen]), fit.points)
+    assert torch.equal(torch.cat([one.values for one in seen]), fit.values)
+    assert [one.evaluations for one in seen] == list(itertools.accumulate(len(one.points) for one in seen))
+
+
+def test_a_callback_that_asks_for_the_end_in_a_decision_ends_after_it() -> None:
+    """The first value is lucky by far. It calls for a decision, whose mean refutes the target."""
+    generator, calls = torch.Generator().manual_seed(0), []
+
+    def noisy(z):
+        calls.append(len(z))
+        values = z.square().sum(1) + 1.0 + 0.1 * torch.randn(len(z), generator=generator, dtype=torch.float64)
+        return values - 5.0 if len(calls) == 1 else values
+
+    fit = zh.minimize(
+        noisy, [0.8], sigma=0.5, bounds=(-1, 1), noise=0.1, target=0.5, seed=0, callback=lambda one: len(calls) > 1
+    )
+    assert (fit.status, fit.success) == ("callback", False)
+    assert fit.value > 0.5
+    assert fit.evaluations == 2 + 48
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_the_border_of_a_region_that_fails_is_no_minimum_that_rounds_confirm(seed):
     """The lowest point of the border is (0.6, 0.6). The loss goes on falling along the border from other points."""

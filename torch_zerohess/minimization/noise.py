@@ -35,21 +35,32 @@ def deviation(losses: Tensor) -> float:
     return float(finite.std()) if len(finite) > 1 else 0.0
 
 
-def noise_again(evaluate: Callable[[int], Tensor], before: Tensor, most: int) -> float | None:
-    """Evaluate a point again, up to `most` times; return the deviation of its losses, or None if they are equal.
+def noise_of_counts(
+    x: Tensor, points: Tensor, losses: Tensor, begun: int, evaluate: Callable[[Tensor], Tensor], most: int
+) -> float | None:
+    """Evaluate x again where losses are counts; return the deviation of its losses, 0 if they are equal.
+
+    None where they are no counts, or where x has not been evaluated.
 
     Args:
-        evaluate: the point so many times, [count].
-        before: its losses so far [K].
-        most: how often it may be evaluated.
+        x: [n].
+        points: all evaluations [P, n], in order.
+        losses: [P].
+        begun: number of evaluations before. Later ones are of an interrupted look, and are used again.
+        evaluate: points [K, n] -> losses [K].
+        most: how many further evaluations there may be.
     """
-    count = min(_AGAIN, most)
-    again = evaluate(count)
-    again = again[torch.isfinite(again)]
-    if not len(again) or not differs(again, before[-1]):
+    before, known = losses[:begun][(points[:begun] == x).all(1)], losses[begun:]
+    if not are_counts(losses[:begun]) or not len(before):
         return None
-    further = min(REPEATED - _AGAIN, most - count)
-    return deviation(torch.cat([before, again, evaluate(further) if further else again[:0]]))
+    again, most = known[:0], most + len(known)
+    for count in (min(_AGAIN, most), min(REPEATED, most)):
+        wanted = count - len(known)
+        known = torch.cat([known, evaluate(x.expand(wanted, -1))]) if wanted > 0 else known
+        again = known[:count][torch.isfinite(known[:count])]
+        if not len(again) or not differs(again[:_AGAIN], before[-1]):
+            return 0.0
+    return deviation(torch.cat([before, again]))
 
 
 def opening(batch: int, least: int, most: int) -> int:

@@ -17,7 +17,7 @@ from torch_zerohess.minimization.derivatives import is_flat, quadratic_at
 from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.first_batch import evaluate_first_batch
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
-from torch_zerohess.minimization.noise import REPEATED, are_counts, noise_again, opening, reserved
+from torch_zerohess.minimization.noise import REPEATED, noise_of_counts, opening, reserved
 from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.minimization.wording import budget, worded
 from torch_zerohess.search.trust_region import TrustRegion
@@ -41,6 +41,7 @@ class Running:
         most: evaluations that there may be.
         path: of the file, or None.
         limits: settings by name that end the search by itself, as the caller gave them.
+        noted: called after every batch.
         verbose: whether to write a line to stderr every second, and one at the end.
     """
 
@@ -54,13 +55,14 @@ class Running:
         most: int,
         path: Path | None,
         limits: Mapping[str, float | None],
+        noted: Callable[[], None],
         *,
         verbose: bool,
     ) -> None:
         self.noise = noise
         """Standard deviation of repeated losses; None before it is known."""
         self._make, self._batch, self._least, self._most = make, batch, least, most
-        self._limits = dict(limits)
+        self._limits, self._then = dict(limits), noted
         self._file, self._verbose = None if path is None else Checkpoint(path), verbose
         self._sure = noise is not None
         """Whether it is known, if there is no noise."""
@@ -70,6 +72,8 @@ class Running:
         self._decided: Decision | None = None
         self._deciding: tuple[int, int] | None = None
         """Evaluations before the decision that is being made, and those that it gets."""
+        self._looking: int | None = None
+        """Evaluations before x is being looked at again."""
         self.search = make(self.noise or 0.0)
         self.record = Record(call, lambda values: self.search.losses(values), self.search.x)
         if self._file is not None and self._file.exists:
@@ -130,11 +134,8 @@ class Running:
         if points is None:
             measured = self.noise is None and self.left > len(search.ask()) + 1
             self._unmeasured = self._unmeasured or (self.noise is None and not measured)
-            if measured:
-                limit = opening(self._batch, len(search.ask()), self.left)
-                points = search.ask(max(self._batch - 1, 1), limit=limit)
-            else:
-                points = search.ask(self._batch, limit=self.left)
+            limit = opening(self._batch, len(search.ask()), self.left) if measured else self.left
+            points = search.ask(max(self._batch - int(measured), 1), limit=limit)
         else:
             measured, points = self.noise is None, points[: len(search.missing)]
         if measured:
@@ -158,13 +159,11 @@ class Running:
         ends = self.search.solved or self.left <= min(reserved(self._most) + REPEATED, self._most // 4)
         if self._sure or self.noise or not (ends and self.left and self.begun) or self.record.requested is not None:
             return
-        x, (points, losses) = self.search.x[None], self.record.told
-        before = losses[(points == x).all(1)]
-        if are_counts(losses) and len(before):
-            found = noise_again(lambda count: self._evaluated(x.expand(count, -1)), before, self.left)
-            if found is not None:
-                self.noise, self.search = found, self._make(found)
-            self._unmeasured = False
+        self._looking = self.evaluations if self._looking is None else self._looking
+        found = noise_of_counts(self.search.x, *self.record.told, self._looking, self._evaluated, self.left)
+        if found:
+            self.noise, self.search = found, self._make(found)
+        self._unmeasured, self._looking = self._unmeasured and found is None, None
         self._sure = True
 
     def ending(self, *, arrived: bool) -> Status:
@@ -211,7 +210,7 @@ class Running:
         self._written = time.monotonic()
         decided = None if self._decided is None else vars(self._decided)
         own: dict[str, Any] = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
-        own |= {"unmeasured": self._unmeasured, "limits": self._limits, "version": VERSION}
+        own |= {"looking": self._looking, "unmeasured": self._unmeasured, "limits": self._limits, "version": VERSION}
         self._file.write({**own, "search": self.search.state_dict(), **self.record.state_dict()})
 
     def minimum(self, status: Status, message: str) -> Minimum:
@@ -258,7 +257,7 @@ class Running:
         self.search = self._make(self.noise or 0.0)
         self.record.load_state_dict(saved, x := self.search.x)
         self.search.load_state_dict(saved["search"])
-        self._deciding, self._sure = saved["deciding"], saved["sure"]
+        self._deciding, self._looking = saved["deciding"], saved.get("looking")
         if saved["decided"] is not None:
             self._decided = Decision(**saved["decided"] | {"x": saved["decided"]["x"].to(x)})
         self._unmeasured = saved.get("unmeasured", False) and given is None
@@ -267,7 +266,7 @@ class Running:
             self.noise, self.search, self._decided, self._deciding = given, self._make(given), None, None
         elif self.search.done:
             check_limits(self._limits, saved.get("limits", self._limits), self.search.message)
-        self._sure = self._sure or given is not None
+        self._sure = saved["sure"] or given is not None
 
     @property
     def _last(self) -> Decision | None:
@@ -314,6 +313,7 @@ class Running:
             self._say(self._best().value)
         if now - self._written >= _PAUSE:
             self.write()
+        self._then()
 
     def _say(self, value: float) -> None:
         said = f"{self.evaluations} evaluations, value {value:.6g}, sigma {self.search.sigma:.3g}"

@@ -503,3 +503,29 @@ def test_counts_that_are_missing_at_times_have_a_noise():
 
         fit = zh.minimize(fn, [-0.7, 0.9], sigma=0.7, seed=seed, max_evaluations=100)
         assert 0.0 < fit.noise < 20.0
+
+
+def test_an_interrupted_look_at_counts_goes_on(tmp_path) -> None:
+    """A look is two evaluations of x. The resumed search makes the one that is missing, and no third one."""
+
+    def fit(at: int | None, path):
+        calls = []
+
+        def fn(x):
+            if len(calls) == at and not path.exists():
+                raise KeyboardInterrupt
+            calls.append(x)
+            return ((x - 0.3) * 4).round()
+
+        settings = {"sigma": 0.5, "xtol": 0.05, "vectorized": False, "seed": 1, "max_evaluations": 60}
+        return zh.minimize(fn, [0.9], checkpoint=path, loss=lambda y: y.square().sum(), **settings)
+
+    whole = fit(None, tmp_path / "whole.pt")
+    last = whole.evaluations - 1
+    assert torch.equal(whole.points[last], whole.points[last - 1])
+    for at in (last - 1, last):
+        path = tmp_path / f"{at}.pt"
+        assert fit(at, path).status == "interrupted"
+        resumed = fit(None, path)
+        assert torch.equal(resumed.points, whole.points)
+        assert torch.equal(resumed.values, whole.values)

@@ -52,7 +52,8 @@ class Minimum:
             output and the Hessian H of the loss: second derivatives of the output are left out.
         standard_errors: of these by the names "gradient" [n] and "hessian_diagonal" [n]; None likewise. They are
             infinite where the evaluations do not determine the derivative. Without noise they are an estimate, often
-            too small: they tell neither third derivatives nor what J^T H J leaves out. In noise, and up to 40
+            too small: they tell neither third derivatives nor what J^T H J leaves out. At an active bound few
+            evaluations lie beside x, and the Hessian may be wrong by far more than its error. In noise, and up to 40
             parameters, about 95 % of derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the
             minimum is a sharp tip that few evaluations resolve. With more parameters, or with fewer than (n + 1)(n +
             2)/2 + 5 evaluations, the errors are of the search's own model, and often too small.

@@ -20,8 +20,8 @@ from torch_zerohess.search.state import LOST, Evaluated
 _BESIDE, _APART = 1e-4, ((1e-2, 1.0), (1.0, math.inf))
 """Distances over the tolerance up to which an evaluation is beside the best point, and between which it is apart; the
 second ones where there are none between the first ones."""
-_STEEP = 0.1
-"""How steeply the loss rises beside a kink, at least, over how steeply it rises apart from it."""
+_STEEP, _JUMP = 0.1, 100.0
+"""How steeply the loss rises beside a kink, over how steeply it rises apart from it, at least; and beside a jump."""
 _ROUNDING = 1e4 * torch.finfo(torch.float64).eps
 """Rise, relative to the loss, up to which it may be rounding."""
 _AROUND, _CLOSE = 1e-2, 1e-2
@@ -55,7 +55,9 @@ class KinkedQuadratics(MetricQuadratics):
         known = replace(known, evaluations=after.evaluations)
         simplex = evaluated.needed.those(slice(-n - 1, None))
         complete = len(evaluated.needed) == n + 1 + (len(_LENGTHS) if len(sampled) >= n else 0)
-        if not complete or not bool(evaluated.finite.all()):
+        if not bool(evaluated.finite.all()):  # it is a border
+            return self._arrived(known, known.reason, generator)
+        if not complete:
             return self._ended(replace(known, slopes=None), None, _UNKNOWN, generator)
         rises = simplex.losses[1:] - simplex.losses[0]
         slope = rises / (simplex.points[1:] - simplex.points[0]).diagonal()
@@ -87,7 +89,7 @@ class KinkedQuadratics(MetricQuadratics):
         if known.lowest.loss > known.best.loss or room <= max(_LENGTHS) * _AROUND * tolerance:
             return False
         apart = next(filter(None, (_steepness(known, a * tolerance, b * tolerance) for a, b in _APART)), 0.0)
-        return _steepness(known, 0.0, self._beside) > _STEEP * apart > 0.0
+        return _JUMP * apart > _steepness(known, 0.0, self._beside) > _STEEP * apart > 0.0
 
     def _measuring(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Ask for steps against the shortest vector of the hull, and for a further slope; end where it is zero."""

@@ -20,7 +20,7 @@ from torch_zerohess.sampling.triton_quantiles import ANY, DIAGONAL, DIMENSIONS
 
 _TILE = 1024  # numbers that a program holds: a block of columns of some rows
 _TILES = 4  # blocks of columns that a program draws one after the other
-_PROGRAMS = 4096  # of a sum over rows, at least, if there are so many tiles
+_PROGRAMS = 4096  # among which the tiles of a sum over rows are divided, about
 _MANY_VECTORS = 4  # beyond this, rows that are drawn once for all vectors are faster
 _OPTIONS = {"num_warps": 4, "enable_fp_fusion": False}
 

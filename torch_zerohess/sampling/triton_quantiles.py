@@ -24,7 +24,7 @@ FIRST_WEYL, SECOND_WEYL = map(tl.constexpr, philox._WEYL)
 
 @triton.jit
 def words(seed, row, block, stream):
-    """Four words for blocks [N] of one row, or of as many rows."""
+    """Four words of each block [N]. seed, row: of all blocks, or of each [N]."""
     a, b, c, d = block.to(tl.uint32), row.to(tl.uint32), (row >> 32).to(tl.uint32), (0 * block + stream).to(tl.uint32)
     first, second = seed.to(tl.uint32), (seed >> 32).to(tl.uint32)
     for _ in tl.static_range(ROUNDS):  # products of 64 bits take half as many instructions as two halves of 32
@@ -103,7 +103,7 @@ def _beyond(word):
 
 @triton.jit
 def _normal_of_word(word, ratios):
-    """In float32, wrong beyond TAIL; ratios: pairs of numbers of the table of `single`, int64 [4, 16]."""
+    """In float32; in the tail any numbers. ratios: the table of `single`, two float32 in each int64 [4, 16]."""
     beyond = _beyond(word)
     bits = tl.minimum(beyond.to(tl.float32) + 0.5, BELOW_HALF).to(tl.int32, bitcast=True)
     octave = (bits >> 23) & 15

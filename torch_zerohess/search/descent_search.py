@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from torch_zerohess.search.additive_descent import AdditiveQuadratics
 from torch_zerohess.search.descent import LocalQuadratics
-from torch_zerohess.search.kinked_descent import KinkedQuadratics
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.metric_descent import MOST
 from torch_zerohess.search.noisy_descent import NoisyQuadratics
@@ -62,10 +62,10 @@ class Descent(AskTell[Any]):
         return descent_method(settings)
 
 
-def descent_method(settings: Settings) -> LocalQuadratics | KinkedQuadratics | NoisyQuadratics | OutputDescent:
+def descent_method(settings: Settings) -> LocalQuadratics | AdditiveQuadratics | NoisyQuadratics | OutputDescent:
     """Return the method for an output, for a loss alone, or for a loss with noise or of many parameters."""
     if settings.loss is not None:
         return OutputDescent(settings)
     if settings.n > MOST:
         return LocalQuadratics(settings)
-    return NoisyQuadratics(settings) if settings.noise else KinkedQuadratics(settings)
+    return NoisyQuadratics(settings) if settings.noise else AdditiveQuadratics(settings)

@@ -36,6 +36,11 @@ class FinishedProgress(ProcessProgress):
     waited: int = 0
     """Evaluations since something better was found, or since the turn has changed."""
 
+    @property
+    def handed_over(self) -> bool:
+        """Whether it is the turn of another search than the process."""
+        return self.finishing
+
 
 F = TypeVar("F", bound=FinishedProgress)
 
@@ -60,7 +65,7 @@ class FinishedProcess(ProcessMethod[F]):
     def next(self, known: F, evaluated: Evaluated, generator: torch.Generator) -> tuple[F, Tensor]:
         after = self.after_local if known.finishing else self.after_process
         known, points = after(known, evaluated, generator)
-        return (known, points) if known.finishing else self.points(known, generator)
+        return (known, points) if known.handed_over else self.points(known, generator)
 
     def more(self, known: F, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         if known.finishing:
@@ -87,14 +92,19 @@ class FinishedProcess(ProcessMethod[F]):
         """Whether the best point is apart from the point where the local search has ended last."""
         return float((known.best.point - known.finished).norm()) > APART
 
-    def told(self, known: F, now: RegionProgress, evaluated: Evaluated) -> F:
-        """Return the progress after the local search has come to `now`. The process gets what is new to it."""
-        before = known.local
-        assert before is not None
+    def learned(self, known: F, evaluated: Evaluated) -> F:
+        """Let the process learn evaluations of another search that are apart from its own."""
         known = self.avoiding(known, evaluated.points[~evaluated.finite])
         for k in evaluated.finite.nonzero().flatten().tolist():
             if float((known.pool.points - evaluated.points[k]).norm(dim=1).min()) > APART:
                 known = self.remembered(known, evaluated.those(slice(k, k + 1)))
+        return known
+
+    def told(self, known: F, now: RegionProgress, evaluated: Evaluated) -> F:
+        """Return the progress after the local search has come to `now`. The process gets what is new to it."""
+        before = known.local
+        assert before is not None
+        known = self.learned(known, evaluated)
         best = now.best if now.best.loss <= known.best.loss else known.best
         return replace(
             known,

@@ -38,7 +38,7 @@ _WIDER = 2.0
 
 
 class KinkedQuadratics(MetricQuadratics):
-    """The method of `Descent` for a loss alone without noise, of up to 40 parameters."""
+    """Descent on quadratics that looks at kinks before it ends at them."""
 
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator

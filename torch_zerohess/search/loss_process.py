@@ -4,7 +4,8 @@ Quadratics are fitted next to the minimum (`MetricQuadratics`). They begin where
 where a quadratic has predicted the end of a step. If a function has more minima than the process can tell apart, the
 process finds nothing better. Then quadratics begin at a random point of the box. Lower minima are often close to each
 other: while arrivals disagree, quadratics begin beside the best point every other time (monotonic basin hopping: Wales
-and Doye 1997, Leary 2000).
+and Doye 1997, Leary 2000). Where the loss is a sum of functions of one parameter, the axes are searched instead
+(`AxisSearch`).
 """
 
 import math
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.axis_search import AxisLines, AxisSearch
 from torch_zerohess.search.gaussian_process_finish import PATIENCE, FinishedProcess, FinishedProgress
 from torch_zerohess.search.gaussian_process_method import APART, ROUND
 from torch_zerohess.search.method import Settings
@@ -48,6 +50,12 @@ class LossProgress(FinishedProgress):
     """Loss that a quadratic predicts for the point that is asked for; infinite where it is not determined."""
     beside: bool = False
     """Whether the latest quadratics have begun beside the best point. Such quadratics confirm no minimum."""
+    lines: AxisLines | None = None
+    """What is known along the axes; None before it is asked for."""
+
+    @property
+    def handed_over(self) -> bool:
+        return self.finishing or (self.lines is not None and self.lines.asks)
 
     def is_minimum(self, tolerance: float) -> bool:
         return self.is_solved and super().is_minimum(tolerance)
@@ -62,12 +70,24 @@ class LossProcess(FinishedProcess[LossProgress]):
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
         self.local = MetricQuadratics(replace(settings, restarts=0))
+        self._axes = AxisSearch(settings)
 
     def model_at_best(self, known: LossProgress) -> tuple[LocalModel, float] | None:
         quadratics = known.local
         if quadratics is not None and torch.equal(quadratics.best.point, known.best.point):
             return self.local.model_at_best(quadratics)
         return super().model_at_best(known)
+
+    def next(self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
+        if known.lines is None or not known.lines.asks:
+            return super().next(known, evaluated, generator)
+        known, points = self._along_axes(known, known.lines, evaluated, generator)
+        return (known, points) if len(points) else self.points(known, generator)
+
+    def more(self, known: LossProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        if known.lines is not None and known.lines.asks:
+            return self._axes.more(known.lines, count)
+        return super().more(known, points, count, generator)
 
     def points(self, known: LossProgress, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
         known, points = super().points(known, generator)
@@ -100,17 +120,36 @@ class LossProcess(FinishedProcess[LossProgress]):
             return known, evaluated.points[:0]
         if self.is_new(known):
             begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
-            quadratics, points = self.local.plan(begun, generator)
-            beside = False
-        else:
-            beside = known.arrived is not None and known.agreed == 0 and not known.beside
-            quadratics, points = self._hop(known, generator) if beside else self._elsewhere(generator)
-        return replace(known, local=quadratics, finishing=True, beside=beside, steps=0, waited=0), points
+            return _finishing(known, *self.local.plan(begun, generator))
+        if self._axes.may_begin(known.lines, several=known.arrived is not None and known.agreed == 0):
+            lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values, generator)
+            return replace(known, lines=lines, steps=0), points
+        if known.arrived is not None and known.agreed == 0 and not known.beside:
+            return _finishing(known, *self._hop(known, generator), beside=True)
+        return self._elsewhere(known, generator)
 
-    def _elsewhere(self, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
+    def _along_axes(
+        self, known: LossProgress, lines: AxisLines, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[LossProgress, Tensor]:
+        """Let the search along the axes learn; when it has ended let quadratics begin where the loss is lowest."""
+        before = known.best
+        known = self.learned(known, evaluated)
+        known = replace(known, best=before.or_lower(evaluated.those(evaluated.finite), known.sigma))
+        known = replace(known, record=known.best, evaluations=known.evaluations + len(evaluated))
+        lines, points = self._axes.next(lines, evaluated, several=known.arrived is not None and known.agreed == 0)
+        known = replace(known, lines=lines)
+        if lines.asks:
+            return known, points
+        if lines.stage == "lower":
+            return _finishing(known, *self.local.begin(lines.lowest, min(lines.spacing, 1.0), generator))
+        if lines.stage == "level":
+            return self.arrived(known, "nothing is lower along the axes"), points
+        return self._elsewhere(known, generator)
+
+    def _elsewhere(self, known: LossProgress, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
         """Let quadratics begin at a random point of the box."""
         center = uniform(generator, self.settings.lower, self.settings.upper, 1)[0]
-        return self.local.begin(center, 1.0, generator)
+        return _finishing(known, *self.local.begin(center, 1.0, generator))
 
     def _hop(self, known: LossProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let quadratics begin beside the best point."""
@@ -144,3 +183,10 @@ class LossProcess(FinishedProcess[LossProgress]):
         if known.beside or (elsewhere and not converged):
             return replace(known, agreed=0), points
         return known, points
+
+
+def _finishing(
+    known: LossProgress, quadratics: MetricProgress, points: Tensor, *, beside: bool = False
+) -> tuple[LossProgress, Tensor]:
+    """Return the progress when quadratics have begun, and their points."""
+    return replace(known, local=quadratics, finishing=True, beside=beside, steps=0, waited=0), points

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
+from torch_zerohess.search.axis_search import AxisLines
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
@@ -83,6 +84,8 @@ class MetricProgress(RegionProgress):
     """Gradients [m, n] at random points around a kink, see `KinkedQuadratics`; None where there is none."""
     reason: str = ""
     """Why the round has come to it."""
+    lines: AxisLines | None = None
+    """What is known along the axes, see `AdditiveQuadratics`; None before rounds are compared with it."""
 
 
 class MetricQuadratics(RegionDescent[MetricProgress]):
@@ -201,11 +204,19 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
             known = agreeing(known, end, settings.tolerance, None if plateau else known.values)
             known = arriving(known, end)
         known = known.ended_round(reason, 0 if last else settings.restarts)
-        if known.done:
-            return known, known.points[:0]
-        center = further_start(generator, known.first, settings.lower, settings.upper)
-        begun = self._begun(Best(center)).taking(known, "iterations", *_QUADRATIC, *_SHARED)
-        return self._started(begun, generator)
+        return (known, known.points[:0]) if known.done else self._further(known, generator)
+
+    def _further(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
+        """Start another round elsewhere."""
+        center = further_start(generator, known.first, self.settings.lower, self.settings.upper)
+        return self._round_at(known, center, 1.0, generator)
+
+    def _round_at(
+        self, known: MetricProgress, center: Tensor, sigma: float, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        """Start another round at a point [n] with this sigma."""
+        begun = replace(self._begun(Best(center)), sigma=sigma, lines=known.lines)
+        return self._started(begun.taking(known, "iterations", *_QUADRATIC, *_SHARED), generator)
 
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the lowest new loss, and all losses at the start of a round, with the quadratic that is kept."""

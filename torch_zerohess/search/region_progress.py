@@ -32,9 +32,9 @@ class RegionProgress(Progress):
     """The best point of the round."""
     first: Tensor
     """Where the search began [n]."""
-    phase: Literal["start", "axes", "trial", "geometry", "slope"] = "start"
-    """What is asked for: the start and n points, n further ones, the end of a step, a point for the model, or a slope
-    at a kink."""
+    phase: Literal["start", "axes", "trial", "geometry", "slope", "lines"] = "start"
+    """What is asked for: the start and n points, n further ones, the end of a step, a point for the model, a slope at
+    a kink, or points along the axes."""
     promised: float = 0.0
     """Decrease that the model promises at the end of the step."""
     length: float = 0.0

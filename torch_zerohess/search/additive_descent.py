@@ -48,5 +48,5 @@ class AdditiveQuadratics(KinkedQuadratics):
     def _further(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         if not len(known.points) or not self._axes.may_begin(known.lines, several=known.agreed < known.rounds):
             return super()._further(known, generator)
-        lines, points = self._axes.begin(known.lines, known.best, known.points, known.values, generator)
+        lines, points = self._axes.begin(known.lines, known.best, known.points, known.values)
         return replace(known, lines=lines, phase="lines"), points

@@ -111,9 +111,7 @@ class AxisSearch:
         """Whether there may be something lower; `several`: quadratics have arrived at several minima."""
         return self._possible and (lines is None or lines.stage in _FURTHER or (several and lines.stage == "convex"))
 
-    def begin(
-        self, lines: AxisLines | None, best: Best, points: Tensor, losses: Tensor, generator: torch.Generator
-    ) -> tuple[AxisLines, Tensor]:
+    def begin(self, lines: AxisLines | None, best: Best, points: Tensor, losses: Tensor) -> tuple[AxisLines, Tensor]:
         """Return lines and the first points [K, n], given the best point and evaluations [P, n] with losses [P]."""
         x = best.point
         if lines is not None and lines.stage in _FURTHER:  # the best point is not on the lines: place it there
@@ -123,7 +121,7 @@ class AxisSearch:
             return self._along(_crossing(lines, best))
         k = int((points - x).abs().amin(1).argmax())
         other, nothing = points[k], x.new_zeros(len(x), 0)
-        half = torch.randperm(len(x), generator=generator, device="cpu").to(x.device) % 2 == 0
+        half = torch.arange(len(x), device=x.device) % 2 == 0  # neighbours are the likeliest to act together
         exchanged = torch.stack([torch.where(half, other, x), torch.where(half, x, other)])
         lines = AxisLines(
             origin=best, other=other, other_loss=float(losses[k]), before=x, places=nothing, changes=nothing

@@ -34,6 +34,10 @@ class Descent(AskTell[Any]):
     At a kink of a loss alone, slopes at up to 4 (n + 1) points around it tell whether it is a minimum: up to
     (n + 1)(4 n + 7) evaluations, if no bound is near. If they do not tell, the search has not arrived.
 
+    After a round two evaluations tell whether a loss alone is a sum of functions of one parameter each (in a box, for
+    2 to 40 parameters). If such a sum has several minima, its lowest one is sought along all axes at once, and the next
+    round begins there: some 40 n evaluations, and 10 if it is convex.
+
     Where sigma is below `tolerance` (with the loss alone a millionth of it, in noise a thousandth) the search has
     arrived at a minimum, possibly a local one. In noise it has also arrived where three steps in a row are within their
     errors and the quadratic takes no more evaluations. The search then starts again, up to `restarts` times: from a
@@ -46,7 +50,7 @@ class Descent(AskTell[Any]):
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
     order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation; Burke, Lewis and Overton (2005) for
-    slopes around a kink.
+    slopes around a kink; Langerman, Seront and Bersini (1994) for the axes.
 
     Example:
         >>> import torch

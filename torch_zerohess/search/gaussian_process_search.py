@@ -20,7 +20,8 @@ class GaussianProcessSearch(AskTell[Any]):
       the first samples where it promises three tenths.
     - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds.
       Where the process finds nothing better, quadratics begin at a random point of the box. While arrivals disagree,
-      quadratics begin beside the best point every other time.
+      quadratics begin beside the best point every other time. Where the loss is a sum of functions of one parameter
+      each, with several minima, its axes are searched instead, as by `Descent`.
 
     One evaluation follows another, unless `ask` gets a batch. The search has arrived when three steps in a row are
     shorter than `tolerance`, or when Gauss-Newton or quadratics have ended; these go on to a millionth of the

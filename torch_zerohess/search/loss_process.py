@@ -78,7 +78,9 @@ class LossProcess(FinishedProcess[LossProgress]):
             return self.local.model_at_best(quadratics)
         return super().model_at_best(known)
 
-    def next(self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator) -> tuple[LossProgress, Tensor]:
+    def next(
+        self, known: LossProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[LossProgress, Tensor]:
         if known.lines is None or not known.lines.asks:
             return super().next(known, evaluated, generator)
         known, points = self._along_axes(known, known.lines, evaluated, generator)
@@ -122,7 +124,7 @@ class LossProcess(FinishedProcess[LossProgress]):
             begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
             return _finishing(known, *self.local.plan(begun, generator))
         if self._axes.may_begin(known.lines, several=known.arrived is not None and known.agreed == 0):
-            lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values, generator)
+            lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values)
             return replace(known, lines=lines, steps=0), points
         if known.arrived is not None and known.agreed == 0 and not known.beside:
             return _finishing(known, *self._hop(known, generator), beside=True)

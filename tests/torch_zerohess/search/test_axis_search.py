@@ -140,8 +140,22 @@ def test_a_saved_search_goes_on_along_the_axes(kind, n) -> None:
     assert again.value == search.value
 
 
+def test_a_part_of_the_axes_may_be_told() -> None:
+    """The evaluations end among them."""
+    search = Descent(start(4), sigma=2.0, bounds=BOX, seed=0)
+    while getattr(search._state.progress.lines, "stage", "") != "axes":
+        search.tell(rastrigin(search.ask()))
+    for limit in (3, 1, None):
+        search.tell(rastrigin(search.ask(limit=limit)))
+    lines = search._state.progress.lines
+    for i in range(4):
+        points = lines.origin.point.repeat(lines.places.shape[1], 1)
+        points[:, i] = lines.places[i]
+        torch.testing.assert_close(rastrigin(2.0 * points) - lines.origin.loss, lines.changes[i])
+
+
 def curvature_to_reach(target: float, x: Tensor, y: Tensor) -> float:
-    """Least second divided difference of a parabola through two points [2] whose minimum is the target, by bisection."""
+    """Least second divided difference of a parabola through two points [2] whose minimum is the target."""
     low, high = 0.0, 1e12
     for _ in range(200):
         a = 0.5 * (low + high)

@@ -129,5 +129,6 @@ def texels(x):
 
 
 def cosine_bowl(z):
-    """A wide bowl with its minimum beside 0 and a local minimum in every turn of a cosine."""
+    """A wide bowl with its minimum beside 0 and local minima in every turn of cosines along the diagonals."""
+    z = torch.stack([z[:, 0] + z[:, 1], z[:, 0] - z[:, 1]], 1) / 2**0.5
     return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)

@@ -27,7 +27,7 @@ class AdditiveQuadratics(KinkedQuadratics):
             return super().next(known, evaluated, generator)
         before = known.best
         known = replace(known.remembered(evaluated, self._capacity), lost=0)
-        lines, points = self._axes.next(lines, evaluated, several=known.agreed < known.rounds)
+        lines, points = self._axes.next(lines, evaluated, several=_are_several(known))
         known = replace(known, lines=lines)
         if lines.asks:
             return known, points
@@ -46,7 +46,12 @@ class AdditiveQuadratics(KinkedQuadratics):
         return super().more(known, points, count, generator)
 
     def _further(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
-        if not len(known.points) or not self._axes.may_begin(known.lines, several=known.agreed < known.rounds):
+        if not len(known.points) or not self._axes.may_begin(known.lines, several=_are_several(known)):
             return super()._further(known, generator)
         lines, points = self._axes.begin(known.lines, known.best, known.points, known.values)
         return replace(known, lines=lines, phase="lines"), points
+
+
+def _are_several(known: MetricProgress) -> bool:
+    """Whether rounds have arrived at several minima."""
+    return known.arrived is not None and known.agreed == 0

@@ -19,7 +19,7 @@ from torch_zerohess.search.state import Best, Evaluated
 
 _SUM = 1e-5
 """Largest difference of the two sums, over the smallest change of the loss between the points."""
-_CHORD = 8
+_CHORD = 5
 """Points on the line through two points, from which a loss of one minimum is told."""
 _PLACES = 40
 """Places on every axis until quadratics begin at the lowest ones, at a time."""
@@ -187,6 +187,8 @@ def _is_convex(lines: AxisLines, evaluated: Evaluated) -> bool:
     step = lines.other - lines.origin.point
     t = torch.cat([((evaluated.points - lines.origin.point) @ step) / (step @ step), step.new_tensor([0.0, 1.0])])
     losses = torch.cat([evaluated.losses, step.new_tensor([lines.origin.loss, lines.other_loss])])
-    order = t.argsort()
-    slopes = losses[order].diff() / t[order].diff()
-    return bool((slopes.diff() >= 0.0).all())
+    t, order = t.sort()
+    losses = losses[order]
+    part = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2]).clamp(min=torch.finfo(t.dtype).tiny)
+    between = losses[:-2] + part * (losses[2:] - losses[:-2])
+    return bool((losses[1:-1] - between <= _AS_LOW * (losses.max() - losses.min())).all())

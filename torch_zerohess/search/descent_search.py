@@ -36,7 +36,7 @@ class Descent(AskTell[Any]):
 
     After a round two evaluations tell whether a loss alone is a sum of functions of one parameter each (in a box, for
     2 to 40 parameters). If such a sum has several minima, its lowest one is sought along all axes at once, and the next
-    round begins there: some 40 n evaluations, and 10 if it is convex.
+    round begins there: some 40 n evaluations, and 7 if it is convex.
 
     Where sigma is below `tolerance` (with the loss alone a millionth of it, in noise a thousandth) the search has
     arrived at a minimum, possibly a local one. In noise it has also arrived where three steps in a row are within their

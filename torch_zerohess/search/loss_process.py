@@ -50,6 +50,8 @@ class LossProgress(FinishedProgress):
     """Loss that a quadratic predicts for the point that is asked for; infinite where it is not determined."""
     beside: bool = False
     """Whether the latest quadratics have begun beside the best point. Such quadratics confirm no minimum."""
+    several: bool = False
+    """Whether quadratics have arrived at several minima."""
     lines: AxisLines | None = None
     """What is known along the axes; None before it is asked for."""
 
@@ -123,7 +125,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         if self.is_new(known):
             begun = self.local.go_on(known.pool.points, known.pool.values, known.best, _WIDTH)
             return _finishing(known, *self.local.plan(begun, generator))
-        if self._axes.may_begin(known.lines, several=known.arrived is not None and known.agreed == 0):
+        if self._axes.may_begin(known.lines, several=known.several):
             lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values)
             return replace(known, lines=lines, steps=0), points
         if known.arrived is not None and known.agreed == 0 and not known.beside:
@@ -138,7 +140,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = self.learned(known, evaluated)
         known = replace(known, best=before.or_lower(evaluated.those(evaluated.finite), known.sigma))
         known = replace(known, record=known.best, evaluations=known.evaluations + len(evaluated))
-        lines, points = self._axes.next(lines, evaluated, several=known.arrived is not None and known.agreed == 0)
+        lines, points = self._axes.next(lines, evaluated, several=known.several)
         known = replace(known, lines=lines)
         if lines.asks:
             return known, points
@@ -182,6 +184,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         elsewhere = float((now.best.point - best.point).norm()) > APART
         end = now.best if elsewhere and converged else None
         known = self.arrived(known, "quadratics have arrived or found nothing better for a while", end)
+        known = replace(known, several=known.several or (end is not None and known.agreed == 0))
         if known.beside or (elsewhere and not converged):
             return replace(known, agreed=0), points
         return known, points

@@ -142,8 +142,9 @@ def test_process_and_quadratics_take_turns(seed):
     """Two steps of the process below 0.1 in a row, 3 (n + 1) evaluations without something better, or a step that a
     quadratic has foretold apart from known minima, hand over to quadratics with a sigma of at most 0.3. If quadratics
     have ended within 0.05 of the best point before, they begin anywhere in the box, with the first sigma, or beside the
-    best point, with a sigma of 0.15 to 0.6; the first time after two evaluations that tell that the loss is no sum. They end after 5 (n + 1) evaluations without something better than they
-    have found in this turn, when they have converged, or on a plateau.
+    best point, with a sigma of 0.15 to 0.6; the first time after two evaluations that tell that the loss is no sum.
+    They end after 5 (n + 1) evaluations without something better than they have found in this turn, when they have
+    converged, or on a plateau.
     """
     search = GaussianProcessSearch(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0), restarts=10**6, seed=seed)
     short = waited = 0

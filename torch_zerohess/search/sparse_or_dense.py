@@ -3,7 +3,8 @@
 The first batch has the points of the first batch of `Descent`, in two parts. The search goes on as `LocalGaussNewton`
 if the sparse Jacobian predicts more of the change of held-out samples than the dense Jacobian of least norm does, by
 `_MORE`. After the first part it must also predict more than `_MOST` of it. Otherwise it goes on as `Descent` with all
-evaluations, and asks for the points that `Descent` alone would ask for.
+evaluations, and asks for the points that `Descent` alone would ask for. Where the whole batch determines a dense
+Jacobian, `_DETERMINED` takes the place of these limits: what a part of the batch predicts says little of it.
 
 A few dozen samples may not tell: a support that is large, or a weak dense part beside a sparse one. So both Jacobians
 are fitted again to all evaluations each time that these have doubled, until they are twice the parameters or too many
@@ -31,6 +32,8 @@ _FIRST = 32
 """Samples of the first part, at most."""
 _MOST = 0.5
 """Share of the held-out change from which on a sparse Jacobian is chosen for good: early, or in place of descent."""
+_DETERMINED = 0.7, 0.9
+"""Shares from which on it is chosen after the first part, and after a batch of n samples, which tell a dense one."""
 _MORE = 0.1
 """Share by which one Jacobian must predict more than the other one."""
 _HELD = 1 << 25
@@ -114,7 +117,9 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         known = replace(known, evaluations=len(every), best=Best(known.points[k], float(known.losses[k])))
         start = self.local.started(every)
         sparse, dense, reason = _predicted(start)
-        if start is not None and sparse > dense + _MORE and (sparse > _MOST or not len(known.rest)):
+        whole, early = len(every) + len(known.rest), len(known.rest) > 0
+        most = _DETERMINED[0 if early else 1] if whole > self.settings.n else _MOST if early else 0.0
+        if start is not None and sparse > dense + _MORE and sparse > most:
             return self._to_local(known, start, reason, generator)
         if len(known.rest):
             return replace(known, rest=known.rest[:0]), known.rest

@@ -56,6 +56,26 @@ def test_a_dense_jacobian_costs_no_evaluation_more_than_before(n):
     assert torch.equal(torch.cat(points[0]), torch.cat(points[1]))
 
 
+def mean_of(z, reach):
+    """Every parameter and the mean of its neighbours, overlapping footprints."""
+    return sum(z.roll(k, 1) for k in range(-reach, reach + 1)) / (2 * reach + 1)
+
+
+@pytest.mark.parametrize(
+    "f", [lambda z: torch.tanh(torch.cat([z, mean_of(z, 1)], 1)), lambda z: mean_of(z, 2) + 0.3 * z]
+)
+def test_where_a_batch_determines_the_dense_jacobian_a_poor_sparse_one_is_not_taken(f):
+    """A part of the batch predicts nothing by a dense Jacobian, which all of it determines."""
+    for seed in range(3):
+        loss = square(f(torch.rand(1, 20, generator=torch.Generator().manual_seed(seed)).double())[0])
+        counts = []
+        for engine in ("auto", "descent"):
+            search = TrustRegion(torch.zeros(20).double(), sigma=1.0, loss=loss, seed=3, engine=engine)
+            first = float(loss(f(search.x[None])[0]))
+            counts.append(run(search, f, 100, 0.01 * first).evaluations)
+        assert counts[0] <= 1.2 * counts[1]
+
+
 def mixed(n):
     """A [2 n, n]: each output is a parameter and, beside it, a map of rank 5."""
     return torch.eye(n).double().repeat(2, 1) + 0.13 * normal(2 * n, 5, seed=1) @ normal(5, n, seed=2) / 5**0.5

@@ -19,6 +19,7 @@ from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.minimization.blame import blamed
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation, Status
 from torch_zerohess.minimization.running import Running
+from torch_zerohess.minimization.separate import separated
 from torch_zerohess.minimization.stopping import Stopping
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
@@ -124,7 +125,9 @@ def minimize(
             chance, x is evaluated twice again when the search arrives or is about to end. Give the noise if fn is noisy
             elsewhere but not at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth
             of `max_evaluations` (4 to 48) is kept for the end: the best candidates are evaluated again, and x is the
-            one with the lowest mean. `value` is this mean and `value_error` its standard error.
+            one with the lowest mean. `value` is this mean and `value_error` its standard error. No call of fn has a
+            point twice, because noise may be the same for all points of a call: repeated points are evaluated at once
+            only in several processes.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
             in it. The search does not read the memory: the result is the same as without one. The next `estimate`
@@ -215,7 +218,8 @@ def minimize(
             asked = "callback", "the callback asked to end"
         caller = black_box
 
-    running = Running(make, evaluated, noise, batch, smallest, max_evaluations, path, limits, called, verbose=verbose)
+    apart = separated(evaluated, call.separates)
+    running = Running(make, apart, noise, batch, smallest, max_evaluations, path, limits, called, verbose=verbose)
     stopping = Stopping(target, xtol, ftol, time_limit, agrees=restarts is None)
     end: tuple[Status, str]
     try:

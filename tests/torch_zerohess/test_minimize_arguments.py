@@ -83,7 +83,7 @@ REFUSED = [
     ),
 ]
 RETURNED = [
-    (lambda z: z, ValueError, r"fn must return one number per point if there is no loss=, got shape \[4, 2\]"),
+    (lambda z: z, ValueError, r"fn must return one number per point if there is no loss=, got shape \[3, 2\]"),
     (lambda z: z.sum(), ValueError, "fn must return one value per point"),
     (lambda z: z.sum(1) * math.nan, ValueError, "not finite at the start"),
     (lambda z: "nothing", TypeError, "must return a tensor or a NumPy array"),

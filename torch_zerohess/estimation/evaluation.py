@@ -88,6 +88,10 @@ class BlackBoxCall:
         # A copy: the black box may go on writing to what it returned.
         return _copied(values) if values.device == points.device else values.to(points.device).contiguous()
 
+    def separates(self, count: int) -> bool:
+        """Return whether each of `count` points of a batch is a call of fn of its own."""
+        return not self.vectorized or count <= max(getattr(self.evaluator, "single_points", 1), 1)
+
     def values(self, points: Tensor, aux: Sequence[Tensor], *, spare: bool = False) -> tuple[Tensor, Tensor]:
         """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
 

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.batch import MOST, Batch
 from torch_zerohess.evaluators.factory import same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
@@ -97,6 +97,11 @@ class Job:
 
 class Ahead(Closing, ABC):
     """An evaluator whose calls may overlap. A subclass says how a round goes."""
+
+    @property
+    def single_points(self) -> int:
+        """Points of a call up to which a chunk has one point."""
+        return MOST
 
     def __init__(self) -> None:
         self._function: Function | None = None

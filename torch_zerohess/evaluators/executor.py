@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
-from torch_zerohess.evaluators.batch import Batch, Chunk
+from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
@@ -57,6 +57,9 @@ class Executor(Closing):
         ...     Executor(threads)(lambda z: z.sum(1), torch.ones(2, 3))
         tensor([3., 3.])
     """
+
+    single_points = MOST
+    """Points of a call up to which a task has one point."""
 
     def __init__(self, executor: concurrent.futures.Executor) -> None:
         if not callable(getattr(executor, "submit", None)):

@@ -17,7 +17,8 @@ class Evaluator(Protocol):
     """Calls a black box on a batch of points, in any process and order; results are in the order of the points.
 
     An evaluator that gives up points, whose values are then NaN, says so in an attribute `lost`: the numbers of these
-    points in the last call, and why. One that can begin further calls before the first has ended has
+    points in the last call, and why. One that calls fn with single points has `single_points`: the largest number of
+    points of which it does so. One that can begin further calls before the first has ended has
     `submit(fn, points, *aux)`, which returns a `concurrent.futures.Future` of the values. Where a call fails whose
     first values are known, its exception carries them, see `evaluators.finished`.
     """

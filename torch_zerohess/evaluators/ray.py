@@ -76,6 +76,11 @@ class Ray(Ahead):
     def __repr__(self) -> str:
         return f"Ray(actors={self.count}, retries={self.retries}, options={self.options})"
 
+    @property
+    def single_points(self) -> int:
+        """Points of a call up to which a chunk has one point: the number of actors, 0 before it is known."""
+        return self.count or self._wanted
+
     def _end(self) -> None:
         for actor in self.actors if self._ray.is_initialized() else ():
             self._ray.kill(actor)

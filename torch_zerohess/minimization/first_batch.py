@@ -1,11 +1,14 @@
-"""The first batch of a search, with the start evaluated twice; where its values differ, as often as noise needs."""
+"""The first batch of a search, with the start evaluated twice; where its values differ, as often as noise needs.
+
+The start is repeated in a call of its own, see `separated`: noise may be the same for all points of a call.
+"""
 
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.minimization.noise import REPEATED, deviation, differs
+from torch_zerohess.minimization.noise import REPEATED, deviation, differs, is_rounding
 from torch_zerohess.minimization.record import Record
 from torch_zerohess.search.trust_region import TrustRegion
 
@@ -37,6 +40,9 @@ def evaluate_first_batch(
     every = torch.cat([every, start.repeat(count, 1)])
     values = record.values(every)
     losses = search.losses(values)
+    if is_rounding(torch.cat([values[:1], values[len(points) :]])):
+        search.tell(values[: len(points)])
+        return 0.0, search, every, torch.cat([search.told, losses[len(points) :]])
     noise = deviation(torch.cat([losses[:1], losses[len(points) :]]))
     search = make(noise)
     if torch.equal(search.ask(max(batch - 1, 1), limit=len(points)), points):

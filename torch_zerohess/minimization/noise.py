@@ -12,15 +12,28 @@ _AGAIN = 2
 """Further evaluations of x where losses are counts: one would be equal to the first too often."""
 _ROUNDING = 1e-6
 """Difference of two values, relative to them, that is rounding: renders of one seed differ by 3e-8."""
+_BATCHED = 1e-3
+"""The same for a value of a call of several points: sums in float32 are rounded in another way there."""
 _SHARE, _MOST, _LEAST = 8, 48, 4
 """The part of all evaluations that the decision at the end gets: one in so many, at most and at least so many."""
 _SIGNIFICANT = 2.0
 """Standard errors by which a mean must be below the mean of a point that is trusted, and a deviation below noise."""
 
 
-def differs(one: Tensor, other: Tensor) -> bool:
+def differs(one: Tensor, other: Tensor, rounding: float = _ROUNDING) -> bool:
     """Whether two values [*out] of one point differ by more than rounding."""
-    return float((one - other).abs().max()) > _ROUNDING * float(torch.maximum(one.abs(), other.abs()).max())
+    return float((one - other).abs().max()) > rounding * float(torch.maximum(one.abs(), other.abs()).max())
+
+
+def is_rounding(values: Tensor) -> bool:
+    """Whether values [K, *out] of one point have no noise: only the first one, of a call of several points, differs.
+
+    False for fewer than three values, which tell nothing.
+    """
+    if len(values) < 3:
+        return False
+    alone = values[1]
+    return not differs(values[0], alone, _BATCHED) and not any(differs(one, alone) for one in values[2:])
 
 
 def are_counts(losses: Tensor) -> bool:

@@ -71,8 +71,11 @@ class BlackBox(nn.Module):
 
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use
-    `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it. A layer with a memory
-    is called between graphs: fullgraph=True is an error, and so is `torch.func.grad` inside of compiled code.
+    `torch.compile(model, isolate_recompiles=True)`, or set a higher limit for torch without it. A graph serves every
+    seed and sigma, but one number of samples. With the ninth number fullgraph=True raises FailOnRecompileLimitHit.
+    Without fullgraph torch logs a warning, and the layer runs without a graph for further numbers. Either way, a higher
+    `recompile_limit` helps, isolate_recompiles does not. A layer with a memory is called between graphs: fullgraph=True
+    is an error, and so is `torch.func.grad` inside of compiled code.
     `torch.export` and `torch.jit.trace` raise RuntimeError: no file holds a black box.
 
     Example:

@@ -173,6 +173,11 @@ def _(handle: int, records: bool, x: Tensor, aux: list[Tensor]) -> Tensor:
     return x.new_empty(len(x), *_output_shape(_owner(handle), x, aux))
 
 
+@_nodes.register_fake
+def _(handle: int, seed: int, count: int, x: Tensor, aux: list[Tensor]) -> Tensor:
+    return x.new_empty(len(x), 2 * ((count + 1) // 2), x.shape[1], dtype=torch.float64)
+
+
 def _signature(n: int, aux: Sequence[Tensor]) -> tuple[int | torch.Size, ...]:
     """What the shape of one value may depend on."""
     return (int(n), *(torch.Size(map(int, one.shape[1:])) for one in aux))

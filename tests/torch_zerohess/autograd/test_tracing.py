@@ -3,6 +3,7 @@
 import pytest
 import torch
 from torch import Tensor
+from torch._dynamo.exc import FailOnRecompileLimitHit
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils.checkpoint import checkpoint
@@ -164,6 +165,13 @@ def test_operators_that_call_a_black_box(proposal: str, keep: bool) -> None:
         ops.evaluate(layer._handle, K + 1, keep, True, BATCH, [])
 
 
+@pytest.mark.parametrize("n", [N, 65])  # quasi-random nodes, and others
+@pytest.mark.parametrize("count", [4, 5])
+def test_the_operator_that_draws_nodes(count: int, n: int) -> None:
+    layer = BlackBox(F, S)
+    torch.library.opcheck(ops.nodes.default, (layer._handle, 0, count, BATCH[:, :1].expand(4, n).float(), []))
+
+
 def test_compiled_code_serves_every_seed_and_sigma() -> None:
     layer, graphs = BlackBox(F, S.replace(seed=None)), []
 
@@ -176,6 +184,29 @@ def test_compiled_code_serves_every_seed_and_sigma() -> None:
         layer.smoothing = layer.smoothing.replace(**changes)
         compiled(X.clone().requires_grad_()).backward()
     assert len(graphs) == 1
+
+
+@pytest.mark.parametrize("fullgraph", [True, False])
+def test_a_graph_serves_one_number_of_samples(fullgraph: bool) -> None:
+    """Beyond the limit of torch, here two graphs, the layer runs without one, unless fullgraph is asked for."""
+    layer, runs = BlackBox(F, S), []
+
+    def backend(graph, _):
+        return lambda *inputs: runs.append(graph) or graph(*inputs)
+
+    compiled = torch.compile(layer, fullgraph=fullgraph, backend=backend)
+    with torch._dynamo.config.patch(recompile_limit=2):
+        for samples in (6, 8, 10, 12, 6):
+            layer.smoothing = layer.smoothing.replace(samples=samples)
+            if fullgraph and samples > 8:
+                with pytest.raises(FailOnRecompileLimitHit):
+                    compiled(X.clone().requires_grad_())
+                continue
+            x = X.clone().requires_grad_()
+            (gradient,) = torch.autograd.grad(compiled(x), x)
+            torch.testing.assert_close(gradient, torch.autograd.grad(layer(x), x)[0])
+    assert len(runs) == 3
+    assert runs[0] is runs[2] is not runs[1]
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning")

@@ -16,12 +16,13 @@ from typing import Any, Generic
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_callable, check_state, checked_integer, checked_number, checked_seed
+from torch_zerohess.arguments import check_state, checked_integer, checked_number, checked_seed
 from torch_zerohess.estimation.inputs import named
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored_progress
 from torch_zerohess.search.told import as_evaluated, check_start, converted, joined
+from torch_zerohess.search.white_box import checked_loss
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.version import VERSION
 
@@ -60,7 +61,7 @@ class AskTell(ABC, Generic[P]):
         seed: int | None = None,
     ) -> None:
         x0 = checked_start(x0)
-        check_callable(loss=loss)
+        white_box = checked_loss(loss)
         restarts = checked_integer("restarts", restarts, 0)
         pool = None if pool is None else checked_integer("pool", pool, 4)
         if not 0 <= checked_number("noise", noise) < math.inf:
@@ -69,9 +70,8 @@ class AskTell(ABC, Generic[P]):
         seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_seed(seed)
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
-        self._method = self._make(Settings(start, lower, upper, loss, restarts, tolerance, float(noise), pool))
-        generator = torch.Generator()
-        generator.manual_seed(seed)
+        self._method = self._make(Settings(start, lower, upper, white_box, restarts, tolerance, float(noise), pool))
+        generator = torch.Generator().manual_seed(seed)
         self._state = self._after(*self._method.first(generator), generator)
         self._out: Tensor | None = self._state.asked[:0]
         """Points out for evaluation [K, n], None if `load_state_dict` does not know."""
@@ -234,7 +234,7 @@ class AskTell(ABC, Generic[P]):
 
         Points whose values are not finite are avoided. Raises ValueError for a wrong shape, or if the start itself has
         no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
-        raises. The search is then as before, and the same values can be told again.
+        raises, see `WhiteBox`. The search is then as before, and the same values can be told again.
         """
         values, points = converted(values, self.unit.device), self._given
         if self._out is None and which is None and not self._early:

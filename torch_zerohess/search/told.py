@@ -57,16 +57,27 @@ def as_evaluated(
         losses = [loss(one) for one in values]
     if times_changed(values) != before:
         raise ValueError("loss must not change the output that it is given, which is kept: use a copy of it")
-    if not all(isinstance(one, Tensor) for one in losses):
-        raise TypeError(f"loss must return a tensor, got {type(losses[0]).__name__}")
-    if any(one.numel() != 1 for one in losses):
-        raise ValueError(f"loss must return a scalar, got shape {list(losses[0].shape)}")
+    for one in losses:
+        _check_loss(one, list(values.shape[1:]))
     return Evaluated(
         points,
         torch.stack([one.double().reshape(()) for one in losses]),
         values.reshape(len(values), -1),
         values.shape[1:],
     )
+
+
+def _check_loss(loss: Any, shape: list[int]) -> None:
+    """Raise TypeError or ValueError for what is no loss of an output of this shape."""
+    if not isinstance(loss, Tensor):
+        raise TypeError(
+            f"loss must return a tensor, which torch differentiates, got {type(loss).__name__} for one output of shape "
+            f"{shape}"
+        )
+    if loss.numel() != 1:
+        raise ValueError(f"loss must return a scalar, got shape {list(loss.shape)} for one output of shape {shape}")
+    if loss.is_complex():
+        raise TypeError(f"loss must return a real number, got {loss.dtype}: return .real or .abs()")
 
 
 def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count: int) -> dict[int, Tensor]:

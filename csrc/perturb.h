@@ -37,8 +37,9 @@ inline Row pick(int64_t seed, int64_t index, int64_t n, int64_t proposal) {
 // Lobes of a row in place of the normal perturbations of columns first .. first + count; p_of(d) is a column's uniform.
 template <class T, class Uniform>
 inline void set_lobes(const Row& row, int64_t first, int64_t count, T* out, const Uniform& p_of) {
-  const int64_t i = row.i - first, j = row.j - first;
-  const bool has_i = i >= 0 && i < count, has_j = j >= 0 && j < count;
+  const auto holds = [&](int64_t d) { return d >= first && d - first < count; };  // d may be any number
+  const bool has_i = holds(row.i), has_j = holds(row.j);
+  const int64_t i = has_i ? row.i - first : 0, j = has_j ? row.j - first : 0;
   if (row.kind == kDiagonalLobe && has_i) out[i] = T(hessian_lobe_quantile(p_of(i)));
   if ((row.kind == kGradientLobe || row.kind == kOffDiagonalLobe) && has_i) out[i] = T(gradient_lobe_quantile(p_of(i)));
   if (row.kind == kOffDiagonalLobe && has_j) out[j] = T(gradient_lobe_quantile(p_of(j)));

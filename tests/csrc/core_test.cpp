@@ -157,6 +157,8 @@ void test_draw(bool single) {
             }
           }
         }
+        for (const int64_t far : {std::numeric_limits<int64_t>::min(), std::numeric_limits<int64_t>::max()})
+          if (kind <= kOffDiagonalLobe) EXPECT(drawn({seed, 5, kind, far, far}, n, single) == normal);
       }
     }
   }

@@ -1,45 +1,12 @@
-// Bytes as sizes, seeds, counters and numbers (NaN and infinities too) for the functions of csrc/*.h, under sanitizers.
-// Built by clang with -fsanitize=fuzzer it is a fuzzer (tests/README.md). With -DREPLAY=N it plays N random inputs.
+// Bytes as sizes, seeds, counters and numbers (NaN and infinities too) for the functions of csrc/reduce.h and of the
+// headers that it includes, under sanitizers.
 #include "../../csrc/reduce.h"
 
-#include <cstdio>
-#include <random>
+#include "fuzz.h"
 
 using namespace zerohess;
-using Numbers = std::vector<double>;
-#define EXPECT(condition) \
-  if (!(condition)) std::fprintf(stderr, "%s:%d: not %s\n", __FILE__, __LINE__, #condition), std::abort()
 
 namespace {
-
-struct Bytes {
-  const uint8_t* data;
-  size_t size;
-  bool wild = false;  // numbers of any bits were given
-  template <class T>
-  T take() {
-    T x{};
-    const size_t count = std::min(sizeof x, size);
-    if (count) std::memcpy(&x, data, count);
-    data += count, size -= count;
-    return x;
-  }
-  int64_t up_to(int64_t most) { return take<uint16_t>() % (most + 1); }
-  Numbers numbers(int64_t count) {  // in (-1, 1), but for up to four of any bits
-    Numbers out(size_t(count + 1));
-    uniforms(take<uint8_t>(), 0, kPicks, 0, (count + 1) / 2, out.data());
-    out.resize(size_t(count));
-    for (double& one : out) one = 2.0 * one - 1.0;
-    for (int64_t given = count ? up_to(4) : 0; given > 0; --given, wild = true)
-      out[size_t(up_to(count - 1))] = take<double>();
-    return out;
-  }
-};
-
-bool same(double a, double b) { return a == b || (a != a && b != b); }
-bool same(const Numbers& a, const Numbers& b) {
-  return std::equal(a.begin(), a.end(), b.begin(), b.end(), [](double p, double q) { return same(p, q); });
-}
 
 // Together, alone and in two parts the same; odd, finite and increasing, but for rounding, from least to most.
 template <class P, class Q>
@@ -96,42 +63,59 @@ Numbers drawn(const Row& row, int64_t n) {
   return Numbers(out.begin(), out.end());
 }
 
-// The points of a batch, placed in two parts, against one at a time.
-template <class T>
+// The points of a batch, placed in two parts, against one at a time. Perturbations are of type U, points of type T.
+template <class U, class X, class T>
 Numbers test_place(Bytes in) {
   const int64_t S = 1 + in.up_to(2), n = 1 + in.up_to(600), fewer = in.up_to(n), proposal = in.up_to(kSignedLobes);
   const int64_t seed = in.take<int64_t>(), cut = in.up_to(2 * S), both = in.up_to(1);
   const int64_t K = S << both, E = K + in.up_to(1);
+  const bool keep = in.up_to(3) > 0;
   const Numbers given = in.numbers(2 * n), sigma = in.numbers(n);
-  const std::vector<T> x(given.begin(), given.end());
+  const std::vector<X> x(given.begin(), given.end());
   std::vector<T> points(size_t(2 * E * n));
-  Numbers u(size_t(2 * K * n)), weights(size_t(2 * K));
-  const Batch<T, T> to{x.data(), sigma.data(), S, E, n, proposal, both == 1, points.data(), u.data(), weights.data()};
-  const auto columns = [&](int64_t r, int64_t first, int64_t count, T* buffer) {
+  Numbers u(size_t(keep ? 2 * K * n : 0)), weights(size_t(2 * K));
+  const Batch<X, T> to{x.data(), sigma.data(), S, E, n, proposal, both == 1, points.data(), keep ? u.data() : nullptr,
+                       weights.data()};
+  const auto columns = [&](int64_t r, int64_t first, int64_t count, U* buffer) {
     draw_columns(pick(seed, r, n, proposal), first, count, buffer);
     return buffer;
   };
-  place_rows<T>(to, 0, cut, columns), place_rows<T>(to, cut, 2 * S, columns);
+  place_rows<U>(to, 0, cut, columns), place_rows<U>(to, cut, 2 * S, columns);
   for (int64_t k = 0; k < 2 * K; ++k) {
     const Row row = pick(seed, k / K * S + k % K % S, n, proposal);
-    const Numbers one = drawn<T>(row, n), part = drawn<T>(row, fewer);
+    const Numbers one = drawn<U>(row, n), part = drawn<U>(row, fewer);
     EXPECT(std::equal(part.begin(), part.end(), one.begin()) && std::isfinite(weights[size_t(k)]));
     for (int64_t d = 0; d < n; ++d) {
       const double mine = k % K < S ? one[size_t(d)] : -one[size_t(d)];
       const T point = T(double(x[size_t(k / K * n + d)]) + sigma[size_t(d)] * mine);
-      EXPECT(u[size_t(k * n + d)] == mine && same(points[size_t((k / K * E + k % K) * n + d)], point));
+      EXPECT((!keep || u[size_t(k * n + d)] == mine) && same(points[size_t((k / K * E + k % K) * n + d)], point));
     }
   }
   return weights;
 }
 
-// A sum is within rounding of the exact one, and not finite where a term is not.
-template <class Term>
-void check_sum(double got, int64_t terms, bool wild, const Term& term) {
-  long double exact = 0.0, size = 0.0;
-  for (int64_t k = 0; k < terms; ++k) exact += term(k), size += std::fabs(term(k));
-  const bool near = std::fabs(got - exact) <= double(terms + 3) * 0x1p-53L * size;
-  EXPECT(wild ? std::isfinite(size) || !std::isfinite(got) : near);
+// Rows of any numbers, as an operator may get them: drawn whole, in two parts, and from given uniforms.
+Numbers test_rows(Bytes in) {
+  const int64_t n = 1 + in.up_to(600), cut = in.up_to((n - 1) / kBlock) * kBlock;
+  const int64_t many = 1 + int64_t(in.take<uint64_t>() >> 2), proposal = in.take<int8_t>();
+  const Row any{in.take<int64_t>(), in.take<int64_t>(), in.up_to(kBox), in.take<int64_t>(), in.take<int64_t>()};
+  const Row near{any.seed, any.index, any.kind, in.up_to(n + 2) - 1, in.up_to(n + 2) - 1};
+  const Row picked = pick(any.seed, any.index, many, proposal);
+  EXPECT(picked.i >= 0 && picked.i < many && picked.j >= 0 && picked.j < many);
+  EXPECT(picked.kind >= kNormal && picked.kind <= kBox);
+  Numbers p(size_t(n + 1)), wild = in.numbers(n), shaped(wild);
+  uniforms(uint64_t(any.seed), uint64_t(any.index), kDimensions, 0, (n + 1) / 2, p.data());
+  for (const Row& row : {any, near}) {
+    const Numbers whole = drawn<double>(row, n);
+    Numbers part(size_t(n - cut));
+    for (int64_t first = cut; first < n; first += kBlock)
+      draw_columns(row, first, std::min(kBlock, n - first), part.data() + first - cut);
+    shape_row(row, p.data(), n, shaped.data());
+    EXPECT(shaped == whole && std::equal(part.begin(), part.end(), whole.begin() + cut));
+    EXPECT(drawn<float>(row, n).size() == whole.size());
+    shape_row(row, wild.data(), n, shaped.data());
+  }
+  return shaped;
 }
 
 // Sums over stored rows, and bit for bit over the same rows drawn again, in two parts.
@@ -187,29 +171,10 @@ Numbers test_sums(Bytes in) {
   return H;
 }
 
-constexpr Numbers (*kTests[])(Bytes) = {test_noise, test_place<float>, test_place<double>, test_sums<float>,
-                                        test_sums<double>};
+constexpr Numbers (*kTests[])(Bytes) = {
+    test_noise, test_rows, test_place<float, float, float>, test_place<double, double, double>,
+    test_place<double, double, float>, test_sums<float>, test_sums<double>};
 
 }  // namespace
 
-extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
-  Numbers first;
-  for (int set = kBaseline; size && set <= best_instructions(); ++set) {
-    instructions = Instructions(set);
-    const Numbers got = kTests[data[0] % std::size(kTests)]({data + 1, size - 1});
-    EXPECT(set == kBaseline || same(got, first));
-    first = got;
-  }
-  return 0;
-}
-
-#ifdef REPLAY
-int main() {
-  std::mt19937 generator(0);
-  for (int run = 0; run < REPLAY; ++run) {
-    std::vector<uint8_t> bytes(generator() % 200);
-    for (uint8_t& one : bytes) one = uint8_t(generator());
-    LLVMFuzzerTestOneInput(bytes.data(), bytes.size());
-  }
-}
-#endif
+extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) { return play(kTests, data, size); }

@@ -84,7 +84,7 @@ def stability(
     wrong = [row for row in rows if row.verdict.startswith("WRONG")]
     found = searches(runs=runs, seed=seed) if runs else []
     accuracy = ["case", "quantity", "relative error", "standard errors", "seconds", "verdict"]
-    intervals = ["intervals", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
+    intervals = ["function", "intervals", "draws", "level", "value", "gradient", "Hessian", "HVP", "verdict"]
     searched = ["search on", "engine", "successes", "evaluations", "false claims", "verdict", "message"]
     parts = [
         ("", f"{len(rows) - len(wrong)} of {len(rows)} right", accuracy, _cells(rows)),

@@ -1,11 +1,12 @@
 """Optimal sampling: every element of value, gradient and Hessian has its own samples, with weights of one magnitude."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation.skewness import Shape, shape_of
 from torch_zerohess.estimation.stein import FIRST_ORDER_ERROR, Layout, Projection, Quantity, Spread, Stein, completed
 from torch_zerohess.sampling import kernels, proposals
 from torch_zerohess.sampling.proposals import DIAGONAL_LOBE, GRADIENT_LOBE, NORMAL, OFF_DIAGONAL_LOBE
@@ -142,18 +143,34 @@ class Elementwise(Stein):
         # The value of a draw is f itself: relative to the mean of the others, draws would seem to be further apart.
         used = pooled if quantity == "value" and pooled is not None else a
         y = (used * self.weight[:, None])[:, :, index].sum(3).unflatten(2, (groups, S))
-        elements = ((y - y.mean(3, keepdim=True)) ** 2).sum(3) * (S / (S - 1))
-        if quantity == "value":
-            result = elements[:, :, 0]
-        elif quantity == "gradient":
-            result = elements[:, :, 1 : 1 + self.n]
-        else:
-            i, j = torch.triu_indices(self.n, self.n, device=a.device)
-            hessian = elements.new_zeros(*elements.shape[:2], self.n, self.n)
-            hessian[:, :, i, j] = hessian[:, :, j, i] = elements[:, :, 1 + self.n :]
-            if quantity == "hvp" and v is not None:
-                terms = hessian * (v * v)[:, :, None]
-                result, squares = terms.sum(3), (terms**2).sum(3)
-                return Spread(result, torch.where(squares > 0, result**2 / squares, 1.0) * (S - 1))
-            result = hessian if quantity == "hessian" else hessian.diagonal(dim1=2, dim2=3)
-        return Spread(result, torch.full_like(result, S - 1))
+        deviations = y - y.mean(3, keepdim=True)
+        squares = (deviations**2).sum(3)
+        shape = shape_of(squares, (deviations**3).sum(3), (deviations**4).sum(3), squares.new_tensor(S))
+        elements = squares * (S / (S - 1))
+        if quantity == "hvp" and v is not None:
+            return _of_products(self._matrix(elements), Shape(*map(self._matrix, shape)), v, S)
+        chosen: Callable[[Tensor], Tensor] = {
+            "value": lambda each: each[:, :, 0],
+            "gradient": lambda each: each[:, :, 1 : 1 + self.n],
+            "hessian": self._matrix,
+            "hessian_diagonal": lambda each: self._matrix(each).diagonal(dim1=2, dim2=3),
+        }[quantity]
+        result = chosen(elements)
+        return Spread(result, torch.full_like(result, S - 1), Shape(*map(chosen, shape)))
+
+    def _matrix(self, each: Tensor) -> Tensor:
+        """Return what belongs to the sets of the Hessian, of [B, P, groups], as symmetric matrices [B, P, n, n]."""
+        i, j = torch.triu_indices(self.n, self.n, device=each.device)
+        matrix = each.new_zeros(*each.shape[:2], self.n, self.n)
+        matrix[:, :, i, j] = matrix[:, :, j, i] = each[:, :, 1 + self.n :]
+        return matrix
+
+
+def _of_products(variance: Tensor, shape: Shape, v: Tensor, S: int) -> Spread:
+    """Return the spread of the hvp [B, P, n], whose terms H_ij v_j are independent, from the spread of H."""
+    terms = variance * (v * v)[:, :, None]
+    result, squares = terms.sum(3), (terms**2).sum(3)
+    ratio = (terms / torch.where(result > 0, result, 1.0)[..., None]).sqrt() * v.sign()[:, :, None]
+    parts = shape.scaled(ratio)
+    degrees = torch.where(squares > 0, result**2 / squares, 1.0) * (S - 1)
+    return Spread(result, degrees, Shape(parts.skewness.sum(3), parts.excess.sum(3)))

@@ -151,7 +151,7 @@ def _relative_error(batches: list[Sums], of: Derivative) -> tuple[float, bool]:
     And whether g and e of an element are 0, as on a plateau; its relative error counts as 0.
     """
     g = combined(batches, lambda one: one.stein.sums(of, one.a, None)).flatten(1)
-    error, degrees = combined_spread(batches, of, None)
+    error, degrees, _ = combined_spread(batches, of, None)
     e = (error * student_factor(_ONE_SIGMA, degrees)).flatten(1)
     size = torch.maximum(g.abs(), e).amax(1, keepdim=True)
     size = torch.where(size > 0, size, 1.0)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.evaluation import ValueMode
 from torch_zerohess.estimation.inputs import all_finite, short
+from torch_zerohess.estimation.skewness import Shape, extension
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
@@ -117,25 +118,40 @@ class Estimate:
             ValueError: fewer than two independent draws (three with baseline "mean"), an unknown quantity, or an "hvp"
                 without v.
         """
-        error, _ = self._spread(quantity, self._checked(quantity, v))
+        error, _, _ = self._spread(quantity, self._checked(quantity, v))
         return self._shaped(error, f"standard error of the {quantity}")
 
     def confidence_interval(
         self, quantity: Quantity, v: Tensor | None = None, *, level: float = 0.95
     ) -> ConfidenceInterval:
-        """Interval that contains a quantity of F with a probability of `level`: estimate -+ t standard errors.
+        """Interval that contains a quantity of F with a probability of `level`.
 
-        t is the quantile of Student's distribution, with one degree of freedom less than independent draws: at 95 %
-        12.7 for two draws (sampler "sobol" has two below 32 samples), 3.2 for four, 2.1 for 16, 1.96 for many. For
-        "optimal" the draws are the samples of an element.
+        It reaches t standard errors below and above the estimate, and further on the side to which draws are skewed. t
+        is the quantile of Student's distribution, with one degree of freedom less than independent draws: at 95 % 12.7
+        for two draws (sampler "sobol" has two below 32 samples), 3.2 for four, 2.1 for 16, 1.96 for many. For "optimal"
+        the draws are the samples of an element.
 
-        It is exact for normal draws. A draw is a kernel times f. Draws are nearly normal if f varies at random or in
-        waves. They are skewed if the curvature of f has one sign, and more so the wider the tails of the kernel
-        ("gaussian" more than "aggregate" and "optimal", the Hessian more than the gradient). With few skewed draws the
-        interval covers less: four antithetic draws of the Hessian of a parabola 0.67 instead of 0.95. With a memory a
-        draw is a kernel times f - g. If the surrogate g is good, f - g is small but for a few points far out. Few draws
-        seldom meet them, and intervals of the Hessian are too short then, although its error is far smaller than
-        without a memory.
+        A draw is a kernel times f. Draws are nearly normal if f varies at random or in waves: the interval is right
+        within four points from four draws up. Draws are skewed, many small ones and a few large ones, if the curvature
+        of f has one sign, and more so the wider the tails of the kernel ("gaussian" more than "aggregate" and
+        "optimal", the Hessian more than the gradient). Where few large draws were met, the estimate and its standard
+        error are both too small. From four draws up the interval therefore reaches up to three times as far on that
+        side, see `skewness`. Few draws seldom meet large ones, and do not tell that there are any. Of 2 000 intervals
+        of 95 % for exp(x_1 + x_2) with sigma 0.3 and random antithetic pairs these shares contain the truth, the lowest
+        of all entries:
+
+        | proposal | draws | value | gradient | Hessian |
+        |---|---|---|---|---|
+        | aggregate | 4, 16, 64 | 0.92, 0.96, 0.95 | 0.92, 0.95, 0.95 | 0.68, 0.87, 0.94 |
+        | gaussian | 4, 16, 64 | 0.86, 0.93, 0.97 | 0.85, 0.92, 0.96 | 0.58, 0.76, 0.89 |
+        | optimal | 4, 16, 64 | 0.85, 0.93, 0.96 | 0.96, 0.96, 0.96 | 0.87, 0.94, 0.96 |
+
+        Intervals of 68 % cover 0.48, 0.59 and 0.64 of the Hessian ("aggregate"): they are hardly extended. With sigma
+        1, where the function grows 55 times from -2 to 2 sigma along each axis, 64 draws cover 0.90 at 95 %. All
+        samplers and baselines are counted by `python -m experiments stability`. On waves four draws with baseline
+        "mean" cover 0.85 at 68 %. With a memory a draw is a kernel times f - g. If the surrogate g is good, f - g is
+        small but for a few points far out. Few draws seldom meet them, and intervals of the Hessian are too short then,
+        although its error is far smaller than without a memory.
 
         Args:
             quantity: as for `standard_error`; "value" is F(x), also where `value` is f(x).
@@ -150,16 +166,17 @@ class Estimate:
         """
         level = checked_number("level", level, above=0.0, most=_MOST_LEVEL)
         v = self._checked(quantity, v)
-        error, degrees = self._spread(quantity, v)
-        half = error * student_factor(level, degrees)
+        error, degrees, form = self._spread(quantity, v)
+        t = student_factor(level, degrees)
+        further = extension(form, t)
         if quantity == "value":
-            middle = combined(self._batches, lambda one: one.evaluations.smoothed.reshape(half.shape))
+            middle = combined(self._batches, lambda one: one.evaluations.smoothed.reshape(error.shape))
         else:
-            t = self._in_sigma(v)
-            middle = self._in_units(combined(self._batches, lambda one: one.stein.sums(quantity, one.a, t)), quantity)
+            w = self._in_sigma(v)
+            middle = self._in_units(combined(self._batches, lambda one: one.stein.sums(quantity, one.a, w)), quantity)
         middle = self._completed(middle, quantity, v)
-        ends = (self._shaped(middle + sign * half, f"interval of the {quantity}") for sign in (-1, 1))
-        return ConfidenceInterval(*ends)
+        ends = middle - error * (t - further.clamp_max(0.0)), middle + error * (t + further.clamp_min(0.0))
+        return ConfidenceInterval(*(self._shaped(one, f"interval of the {quantity}") for one in ends))
 
     @property
     def evaluations(self) -> int:
@@ -196,13 +213,14 @@ class Estimate:
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
 
-    def _spread(self, quantity: Quantity, v: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the standard error in units of x, and its degrees of freedom; v as from `_vector`."""
-        error, degrees = combined_spread(self._batches, quantity, self._in_sigma(v))
-        error = self._in_units(error, quantity)
+    def _spread(self, quantity: Quantity, v: Tensor | None) -> tuple[Tensor, Tensor, Shape]:
+        """Return the standard error in units of x, its degrees of freedom and its shape; v as from `_vector`."""
+        own, degrees, form = combined_spread(self._batches, quantity, self._in_sigma(v))
+        own = self._in_units(own, quantity)
         if self._term is None:
-            return error, degrees
-        return self._term.spread(error, degrees, quantity, None if v is None else v[:, 0])
+            return own, degrees, form
+        error, degrees = self._term.spread(own, degrees, quantity, None if v is None else v[:, 0])
+        return error, degrees, form.scaled(own / torch.where(error > 0, error, 1.0))
 
     def _completed(self, rest: Tensor, quantity: Quantity, v: Tensor | None = None) -> Tensor:
         """Add what the surrogate of a memory explains; v as from `_vector`."""

@@ -1,12 +1,13 @@
 """Variance of Stein sums from the spread of their independent draws."""
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation.skewness import shape_of
 from torch_zerohess.estimation.stein import Quantity, Spread, Stein
 
 _CHUNK = 1 << 22  # numbers held at a time
@@ -79,15 +80,26 @@ def variance_of_draws(
     whole = stein.sums(quantity, a, v)
     divided = _Divided(stein, quantity, share, draws, v, whole[0].numel())
     if pooled is None:
-        squares = sum(((y - s * whole[:, None]) ** 2 / _positive(s)).sum(1) for s, y in divided.sums(a))
+        squares, cubes, fourth = _powers((y - s * whole[:, None]) / _positive(s).sqrt() for s, y in divided.sums(a))
     else:
-        squares = _jackknife(divided, whole, shares, pooled)
+        squares, cubes, fourth = _powers(_jackknife(divided, whole, shares, pooled))
     D = D.reshape(-1, *(1,) * (whole.dim() - 1))
-    return Spread(squares / (D - 1), (D - 1).expand_as(whole))
+    return Spread(squares / (D - 1), (D - 1).expand_as(whole), shape_of(squares, cubes, fourth, D))
 
 
-def _jackknife(divided: "_Divided", whole: Tensor, shares: Tensor, pooled: Tensor) -> Tensor:
-    """Return sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 from sums over the draws, O(D) together.
+def _powers(deviations: Iterable[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the sums of the second, third and fourth powers of deviations [B, d, ...] over the draws."""
+    second = third = fourth = torch.zeros((), device="cpu")
+    for one in deviations:
+        square = one * one
+        second = second.to(one) + square.sum(1)
+        third = third.to(one) + (square * one).sum(1)
+        fourth = fourth.to(one) + (square * square).sum(1)
+    return second, third, fourth
+
+
+def _jackknife(divided: "_Divided", whole: Tensor, shares: Tensor, pooled: Tensor) -> Iterator[Tensor]:
+    """Yield (1 - s_d) (Y - Y_d) / sqrt(s_d) of some draws, from sums over all draws, O(D) together.
 
     With f relative to its mean over all draws, alpha_d = s_d y_d, g_d = s_d mean(f over d), beta_d = s_d (sum of the
     kernel over d) / (1 - s_d) and gamma_d = beta_d g_d:
@@ -112,15 +124,12 @@ def _jackknife(divided: "_Divided", whole: Tensor, shares: Tensor, pooled: Tenso
         alphas = alphas + alpha.sum(1, keepdim=True)
         betas = betas + beta.sum(1, keepdim=True)
         gammas = gammas + (beta * g).sum(1, keepdim=True)
-    result = torch.zeros_like(whole)
     for s, alpha, beta, g in terms():
         coupled = c / (1 - s) * (gammas - beta * g + g * (betas - beta))
         if divided.quantity == "value":  # the baseline itself is part of it
             coupled = coupled - g
         without = alphas - alpha + coupled
-        squares = (without - (1 - s) * whole[:, None]) ** 2 / _positive(s)
-        result += torch.where(s > 0, squares, 0.0).sum(1)
-    return result
+        yield torch.where(s > 0, ((1 - s) * whole[:, None] - without) / _positive(s).sqrt(), 0.0)
 
 
 def _positive(s: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_zerohess.estimation.skewness import Shape
 from torch_zerohess.sampling.kernels import Samples
 from torch_zerohess.smoothing import Smoothing
 
@@ -50,6 +51,8 @@ class Spread(NamedTuple):
     variance: Tensor
     degrees: Tensor
     """Degrees of freedom of the variance, for Student's t; of its shape."""
+    shape: Shape
+    """Skewness and kurtosis."""
 
 
 class Layout(NamedTuple):

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.perturbations import draws
+from torch_zerohess.estimation.skewness import Shape
 from torch_zerohess.estimation.stein import Quantity, Stein
 
 
@@ -28,8 +29,8 @@ class Sums(NamedTuple):
         """The family of weights."""
         return self.evaluations.expansion.stein
 
-    def spread(self, quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the standard error of a sum and its degrees of freedom, in the shape of the sum.
+    def spread(self, quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor, Shape]:
+        """Return the standard error of a sum, its degrees of freedom and its shape, in the shape of the sum.
 
         t: vector of the hvp [B, P, n], in units of sigma. The squares of values from 1e-300 to 1e300 exist only
         relative to the largest of them, a power of two so that nothing is rounded.
@@ -39,11 +40,11 @@ class Sums(NamedTuple):
         pooled = self._pooled / unit if self._coupled(quantity) else None
         length = torch.ones_like(unit) if t is None else _power_of_two(t.abs().amax(2, keepdim=True))
         t = None if t is None else t / length
-        variance, degrees = self.stein.variance(
+        variance, degrees, form = self.stein.variance(
             quantity, self.a / unit, self.evaluations.share[..., 0], index, t, pooled
         )
         shape = (*unit.shape[:2], *(1,) * (variance.dim() - 2))
-        return variance.sqrt() * unit.reshape(shape) * length.reshape(shape), degrees
+        return variance.sqrt() * unit.reshape(shape) * length.reshape(shape), degrees, form
 
     def _coupled(self, quantity: Quantity) -> bool:
         """Whether the baseline makes the draws depend on each other.
@@ -69,16 +70,20 @@ def combined(batches: Sequence[Sums], of: Callable[[Sums], Tensor]) -> Tensor:
     return torch.stack([of(one) * (count / sum(rows)) for one, count in zip(batches, rows, strict=True)]).sum(0)
 
 
-def combined_spread(batches: Sequence[Sums], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the standard error of the mean over independent batches, and its degrees of freedom (Satterthwaite)."""
+def combined_spread(batches: Sequence[Sums], quantity: Quantity, t: Tensor | None) -> tuple[Tensor, Tensor, Shape]:
+    """Return standard error, degrees of freedom (Satterthwaite) and shape of the mean over independent batches."""
     rows = [one.evaluations.K for one in batches]
     error, inverse = torch.zeros((), device="cpu"), torch.zeros((), device="cpu")
+    shape = Shape(inverse, inverse)
     for one, count in zip(batches, rows, strict=True):
         share = count / sum(rows)
-        own, degrees = one.spread(quantity, t)
-        error = torch.hypot(error.to(own), own * share)  # the square of neither is formed
+        own, degrees, form = one.spread(quantity, t)
+        before, own = error.to(own), own * share
+        error = torch.hypot(before, own)  # the square of neither is formed
+        unit = torch.where(error > 0, error, 1.0)
+        shape = Shape(*(each.to(own) for each in shape)).scaled(before / unit).plus(form.scaled(own / unit))
         inverse = inverse.to(own) + share**2 / degrees  # variances go as one over the number of rows
-    return error, 1 / inverse
+    return error, 1 / inverse, shape
 
 
 def _power_of_two(size: Tensor) -> Tensor:

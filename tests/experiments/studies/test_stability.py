@@ -8,7 +8,7 @@ import pytest
 
 from experiments.problems.closed_forms import ClosedForm, PlaneWave
 from experiments.reports import result_files
-from experiments.studies.coverage import Coverage
+from experiments.studies.coverage import Coverage, _off
 from experiments.studies.coverage import _rows as _coverage_rows
 from experiments.studies.stability import _rows, stability
 from experiments.studies.stability_cases import Case, cases
@@ -16,7 +16,7 @@ from experiments.studies.stability_searches import ENDLESS, _row, hard_cases, se
 
 
 def test_every_case_of_stability_is_right(tmp_path, capsys, monkeypatch) -> None:
-    told = Coverage("aggregate, random", 16, 0.95, {"value": (0.9, 0.91)}, "right")
+    told = Coverage("wave", "aggregate, random", 16, 0.95, {"value": (0.9, 0.91)}, "right")
     monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [told])
     rows = stability(largest=1000, runs=0, out=tmp_path / "stability.json")  # a wrong row would raise SystemExit
     assert {row.verdict for row in rows} == {"right", "right: refused"}
@@ -33,7 +33,7 @@ def test_stability_keeps_its_three_tables(monkeypatch) -> None:
     monkeypatch.setattr("experiments.studies.stability.keep", lambda headers, rows, name: kept.update({name: rows}))
     case = next(case for case in cases(1) if case.name == "sigma 1e+00, float64")
     monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [case])
-    interval = Coverage("aggregate, random", 16, 0.95, {"value": (0.9, 0.91)}, "right")
+    interval = Coverage("wave", "aggregate, random", 16, 0.95, {"value": (0.9, 0.91)}, "right")
     monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: [interval])
     rows = stability(runs=0, store="extreme")
     assert [row[:2] for row in kept["extreme"]] == [[case.name, row.quantity] for row in rows]
@@ -43,7 +43,8 @@ def test_stability_keeps_its_three_tables(monkeypatch) -> None:
 
 def test_what_is_stored_is_right() -> None:
     verdicts = pd.concat([result_files.read(f"stability{part}")["verdict"] for part in ("", "_intervals", "_searches")])
-    assert set(verdicts) == {"right", "right: refused", "few or skewed draws"}
+    told = ("right", "right: refused", "few or skewed draws", "too short: ", "too long: ")
+    assert all(verdict.startswith(told) for verdict in verdicts)
 
 
 class Twice(ClosedForm):
@@ -78,7 +79,7 @@ def test_stability_notices_what_should_have_been_refused() -> None:
 
 def test_shares_of_intervals_are_told_and_judged(monkeypatch, capsys) -> None:
     shares = {"value": (0.9, 0.91), "gradient": (0.95, 0.96)}
-    rows = [Coverage("aggregate, random", 16, 0.95, shares, verdict) for verdict in ("right", "WRONG")]
+    rows = [Coverage("wave", "aggregate, random", 16, 0.95, shares, verdict) for verdict in ("right", "WRONG")]
     monkeypatch.setattr("experiments.studies.stability.coverage", lambda **_: rows)
     monkeypatch.setattr("experiments.studies.stability.cases", lambda largest: [])
     with pytest.raises(SystemExit):
@@ -88,9 +89,30 @@ def test_shares_of_intervals_are_told_and_judged(monkeypatch, capsys) -> None:
 
 def test_standard_errors_of_half_the_size_are_noticed(monkeypatch) -> None:
     settings = {"proposal": "aggregate", "sampler": "random", "baseline": "center"}
-    assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["right", "right"]
+    for name, draws in (("wave", 16), ("exponential", 64)):
+        rows = _coverage_rows(name, settings, True, draws, 0, 1000)
+        assert [row.verdict for row in rows] == ["right", "right"]
     monkeypatch.setattr("torch_zerohess.estimation.result.student_factor", lambda level, degrees: 0.5 * degrees**0)
-    assert [row.verdict for row in _coverage_rows(settings, True, 16, 0, 1000)] == ["WRONG", "WRONG"]
+    rows = _coverage_rows("wave", settings, True, 16, 0, 1000)
+    assert [row.verdict for row in rows] == ["WRONG: too short: value, gradient, hessian, hvp"] * 2
+    skewed = _coverage_rows("exponential", settings, True, 64, 0, 1000)
+    assert [row.verdict.split(":")[0] for row in skewed] == ["too short", "WRONG"]
+
+
+def test_what_is_too_short_on_skewed_draws_is_told() -> None:
+    settings = {"proposal": "aggregate", "sampler": "random", "baseline": "center"}
+    rows = _coverage_rows("exponential", settings, True, 4, 0, 1000)
+    assert [row.cells()[:4] for row in rows] == [
+        ["exponential", "aggregate, random, center, pairs", 4, level] for level in (0.68, 0.95)
+    ]
+    assert rows[1].verdict.startswith("too short: ")
+    assert "hessian" in rows[1].verdict
+
+
+def test_intervals_are_too_short_or_too_long() -> None:
+    shares = {"value": (0.90, 0.95), "gradient": (0.95, 0.999), "hessian": (0.85, 0.99), "hvp": (0.94, 0.95)}
+    assert _off(shares, 0.95, 2000) == "too short: value, hessian; too long: gradient"
+    assert _off({"value": (0.94, 0.96)}, 0.95, 2000) == ""
 
 
 @pytest.mark.parametrize(

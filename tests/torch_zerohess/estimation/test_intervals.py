@@ -6,6 +6,7 @@ own standard deviations, 3.1 points at 68 % and 1.5 at 95 %. There are about 400
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -13,7 +14,9 @@ from torch import Tensor
 
 from torch_zerohess import Estimate, Smoothing, estimate
 from torch_zerohess.estimation.adaptive import Derivative
+from torch_zerohess.estimation.skewness import Shape, extension, shape_of
 from torch_zerohess.estimation.student import student_factor
+from torch_zerohess.estimation.sums import combined_spread
 from truths import Exponential, Image, PlaneWave, Quadratic, spread, vector
 
 R = 2000
@@ -90,6 +93,83 @@ def test_intervals_of_four_draws_contain_the_truth(baseline: str, antithetic: bo
     smoothing = PLAIN.replace(samples=4, baseline=baseline, antithetic=antithetic)
     check(smoothing, ("gradient", "hessian", "hessian_diagonal"))
     check(smoothing.replace(samples=8, sampler="orthogonal"))
+
+
+GROWTH = Exponential(vector(0.3, 0.3) / SIGMA)  # exp(0.3 u_1 + 0.3 u_2): curved upwards everywhere
+
+
+def test_shapes_are_those_of_fisher() -> None:
+    x = torch.from_numpy(np.random.default_rng(0).gamma(0.7, size=(9, 5)))
+    for D in (4, 9):
+        d = x[:D] - x[:D].mean(0)
+        shape = shape_of((d**2).sum(0), (d**3).sum(0), (d**4).sum(0), torch.tensor(float(D), dtype=torch.float64))
+        skewness, kurtosis = (f(x[:D].numpy(), bias=False) for f in (stats.skew, stats.kurtosis))
+        # Of the mean, with half of the standard error of a kurtosis subtracted (SPSS prints the same error).
+        error = {4: 2.618614683, 9: 1.399707960}[D]
+        torch.testing.assert_close(shape.skewness, torch.from_numpy(skewness / math.sqrt(D)))
+        torch.testing.assert_close(shape.excess, torch.from_numpy((kurtosis - error / 2) / D))
+    none = shape_of(*(torch.ones(2),) * 3, torch.tensor(3.0))
+    assert none.skewness.tolist() == none.excess.tolist() == [0.0, 0.0]
+    same = shape_of(*(torch.zeros(2),) * 3, torch.tensor(9.0))
+    assert same.skewness.tolist() == same.excess.tolist() == [0.0, 0.0]
+
+
+def test_how_much_further_an_interval_reaches() -> None:
+    shape = Shape(vector(0.5, -0.5, 0.5, 0.5, 0.0, 3.0), vector(0.5, 0.5, 0.1, -0.2, 0.5, 20.0))
+    # 0.5 (3^2 - 1); below; confirmed to 0.1 / 0.5^2; not confirmed; symmetric; more than twice t.
+    torch.testing.assert_close(extension(shape, vector(*[3.0] * 6)), vector(4.0, -4.0, 1.6, 0.0, 0.0, 6.0))
+    assert extension(shape, vector(*[1.0] * 6)).abs().max() == 0.0
+    assert extension(shape, vector(*[0.5] * 6)).abs().max() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("proposal", "baseline"),
+    [*(("aggregate", one) for one in ("center", "mean", "none")), ("optimal", "center"), ("optimal", "mean")],
+)
+def test_intervals_reach_further_where_draws_are_skewed(proposal: str, baseline: str) -> None:
+    """Above, where few large draws are positive, and mirrored for -f and for the product with -v.
+
+    Draws of "optimal" without a baseline have nearly two values, +-f, and are not skewed.
+    """
+    smoothing = PLAIN.replace(sigma=SIGMA, proposal=proposal, baseline=baseline, seed=2)
+    x = X.expand(200, 2)
+    up, down = estimate(GROWTH, x, smoothing), estimate(lambda z: -GROWTH(z), x, smoothing)
+    for quantity in ("hessian", "hvp"):
+        v = V.abs() if quantity == "hvp" else None
+        (low, high), mirrored = up.confidence_interval(quantity, v), down.confidence_interval(quantity, v)
+        estimated = up.hessian() if v is None else up.hvp(v)
+        assert bool(((low <= estimated) & (estimated <= high)).all())
+        assert float((high - estimated).mean() / (estimated - low).mean()) > (1.03 if proposal == "optimal" else 1.15)
+        torch.testing.assert_close(mirrored, (-high, -low), rtol=1e-9, atol=1e-12)
+    low, high = up.confidence_interval("hvp", -V)
+    torch.testing.assert_close(up.confidence_interval("hvp", V), (-high, -low), rtol=1e-9, atol=1e-12)
+    error = up.standard_error("hessian")  # at one standard error skewness shifts what is missed, and adds nothing
+    t = stats.t.cdf(1.0, 15) * 2 - 1
+    low, high = up.confidence_interval("hessian", level=t)
+    torch.testing.assert_close(high - low, 2 * error, rtol=1e-6, atol=0.0)
+
+
+def test_skewed_draws_are_covered_more_often_than_by_t() -> None:
+    """The documented shares of an exponential: pairs of "aggregate"."""
+    for samples, least in ((16, 0.84), (64, 0.91)):
+        found = shares(PLAIN.replace(samples=samples), GROWTH)
+        for quantity in ("hessian", "hvp", "hessian_diagonal"):
+            assert float(found[quantity, 0.95].min()) > least
+        assert float(found["gradient", 0.95].min()) > 0.93
+        assert float(found["value", 0.95].min()) > 0.93
+
+
+def test_intervals_of_several_batches_reach_as_far_as_those_of_one() -> None:
+    """Cumulants of independent batches add."""
+    smoothing = PLAIN.replace(sigma=SIGMA, samples=16, seed=9)
+    got = estimate(GROWTH, X.expand(2, 2), smoothing, tolerance=1e-9, max_evaluations=4 * 33)
+    assert len(got._batches) == 2
+    parts = [one.spread("hessian", None) for one in got._batches]
+    error, _, shape = combined_spread(got._batches, "hessian", None)
+    torch.testing.assert_close(error, (parts[0][0] ** 2 + parts[1][0] ** 2).sqrt() / 2)
+    for power, name in ((3, "skewness"), (4, "excess")):
+        cumulants = [getattr(form, name) * own**power for own, _, form in parts]
+        torch.testing.assert_close(getattr(shape, name) * error**power, sum(cumulants) / 2**power)
 
 
 def test_where_draws_are_skewed_intervals_cover_less() -> None:

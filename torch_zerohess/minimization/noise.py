@@ -155,7 +155,8 @@ def _spread(groups: Sequence[Tensor], noise: float) -> float:
     freedom = sum(len(one) - 1 for one in groups if len(one))
     if freedom == 0:
         return noise
-    measured = math.sqrt(sum(float((one - one.mean()).square().sum()) for one in groups if len(one)) / freedom)
+    apart = [one - one[0] for one in groups if len(one)]  # exactly 0 where values are equal, as their mean is not
+    measured = math.sqrt(sum(float((one - one.mean()).square().sum()) for one in apart) / freedom)
     if measured == 0.0 or measured >= noise:
         return max(noise, measured)
     ratio, own, other = (measured / noise) ** (2 / 3), 2 / (9 * freedom), 2 / (9 * (REPEATED - 1))

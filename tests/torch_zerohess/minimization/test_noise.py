@@ -61,6 +61,16 @@ def test_few_values_do_not_shrink_the_error(evaluations):
     assert covered / 400 > 0.954 - 4 * math.sqrt(0.954 * 0.046 / 400)
 
 
+@pytest.mark.parametrize("level", [0.0, 0.1, 1e6 / 3])
+def test_values_that_are_equal_do_not_tell_the_noise(level):
+    """The mean of seven equal values 0.1 is not 0.1."""
+    constant = Counted(lambda z: torch.full((len(z),), level, dtype=torch.float64))
+    for evaluations in (14, 40):
+        _, value, error = lowest_mean(constant, torch.stack([TARGET, zeros(2)]), evaluations, 0.3)
+        assert value == pytest.approx(level)
+        assert error == 0.3 / math.sqrt(len(constant.points[-1]))
+
+
 def test_the_value_is_unbiased_and_its_error_true():
     """Over 6 runs the mean of (value - truth) / error is 0 within 5 standard errors; the luckiest draw is at -3."""
     scores = []

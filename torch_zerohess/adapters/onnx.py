@@ -40,8 +40,9 @@ class OnnxFunction:
     Args:
         model: path, bytes, `onnx.ModelProto`, or an `onnxruntime.InferenceSession`.
         parameters: names of the inputs that x fills, in this order; all that are neither constants nor aux if None.
-        constants: further inputs by name, tensors or arrays of the model's shape. Where that has a free first
-            dimension, one element is enough.
+        constants: further inputs by name, tensors or arrays of the model's shape. Where that begins with the free
+            dimension of the parameters, one element is enough: it is repeated for every point. A free first dimension
+            without a name counts as theirs, and one that the exporter of torch has named after the input.
         aux: names of the inputs that auxiliary inputs of the black box fill, in this order.
         output: name of the output; may be None if the model has one.
         threads: of onnxruntime; its own choice if None. Take 1 in worker processes.
@@ -171,11 +172,16 @@ class OnnxFunction:
             wanted = self._inputs[name].shape
             if wanted and _free(wanted[:1]):
                 one = one if one.ndim == len(wanted) else one[None]
-                one = one.expand(K, *one.shape[1:]) if len(one) == 1 else one
+                one = one.expand(K, *one.shape[1:]) if len(one) == 1 and self._is_of_points(name) else one
             feeds[name] = one
         arrays = {name: one.detach().to("cpu", self._type(name)).contiguous().numpy() for name, one in feeds.items()}
         (value,) = self.session.run_with_ort_values([self.output], {name: _value(one) for name, one in arrays.items()})
         return _tensor(value)
+
+    def _is_of_points(self, name: str) -> bool:
+        """Whether the free first dimension of a constant is that of the parameters, or may be."""
+        own, shapes = self._inputs[name].shape[0], [self._inputs[one].shape for one in (*self.parameters, *self.aux)]
+        return own is None or own == f"{name}_dynamic_axes_1" or own in [shape[0] for shape in shapes if shape]
 
     def _full(self, name: str, shape: tuple[int, ...], K: int) -> tuple[int, ...]:
         return (K, *shape) if _free(self._inputs[name].shape[:1]) else shape

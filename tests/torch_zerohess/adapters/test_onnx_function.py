@@ -54,6 +54,22 @@ def test_parameters_constants_and_auxiliary_inputs(batch):
     torch.testing.assert_close(each(Z, C), truth(Z, C))
 
 
+@pytest.mark.parametrize("lead", ["T", "K", None, "c_dynamic_axes_1"])
+def test_a_constant_is_repeated_only_along_the_dimension_of_the_points(lead):
+    """y = x times the number of rows of c: with a dimension of its own, one row stays one whatever the batch."""
+    inputs = [helper.make_tensor_value_info(*one) for one in (("x", 1, ["K", 2]), ("c", 1, [lead, 2]))]
+    nodes = [
+        helper.make_node("ReduceSum", ["c"], ["s"], keepdims=0),
+        helper.make_node("Mul", ["x", "s"], ["y"]),
+    ]
+    graph = helper.make_graph(nodes, "rows", inputs, [helper.make_tensor_value_info("y", 1, ["K", 2])])
+    rows = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+    for given in (torch.full((2,), 0.5), torch.full((1, 2), 0.5), torch.full((2, 2), 0.5)):
+        f = OnnxFunction(rows, ["x"], constants={"c": given})
+        repeated = len(Z) if lead != "T" and len(given.reshape(-1, 2)) == 1 else len(given.reshape(-1, 2))
+        torch.testing.assert_close(f(Z), repeated * Z.float())
+
+
 def test_gradient_and_hessian_are_those_of_the_module():
     """The same samples through onnxruntime and through torch."""
     f = OnnxFunction(model(), constants={"c": C[0]}, output="y")

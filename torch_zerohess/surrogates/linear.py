@@ -8,13 +8,19 @@ from torch_zerohess.surrogates.surrogate import checked, fitted
 
 _RIDGE = 1e-9
 """Added to the squares of the points, in units of their mean: enough to be solvable."""
+_UNIT = 6
+"""Spreads of parameters are of different units where they differ by more than half of this many powers of two."""
+
+_ROUNDING = 16
+"""Units of rounding by which the mean of equal numbers differs from them, at most."""
 
 
 class LinearSurrogate:
     """Affine map from parameters [n] to outputs [*out], a `Surrogate`.
 
     The slope is the least-squares slope of least norm: with fewer points than parameters the map is constant in the
-    directions that the points do not span.
+    directions that the points do not span. Parameters whose points spread eight times as far as the median of all, or
+    an eighth as far, are in other units. They are scaled by a power of two, for the norm and for rounding.
 
     Args:
         capacity: points that are used, the latest ones; at least 2.
@@ -40,10 +46,10 @@ class LinearSurrogate:
         z, y = points.double(), outputs.reshape(len(outputs), -1).double()
         self._middle, self._mean = z.mean(0), y.mean(0)
         z, y = z - self._middle, y - self._mean
-        if len(z) > z.shape[1]:
-            self._slope = _solve(z.mT @ z, z.mT @ y)
-        else:
-            self._slope = z.mT @ _solve(z @ z.mT, y)
+        unit = _units(z, self._middle)
+        z = z / unit
+        slope = _solve(z.mT @ z, z.mT @ y) if len(z) > z.shape[1] else z.mT @ _solve(z @ z.mT, y)
+        self._slope = slope / unit[:, None]
         self._squares = self._slope.square().sum(1)
 
     def __call__(self, z: Tensor) -> Tensor:
@@ -56,6 +62,17 @@ class LinearSurrogate:
         """Return the variances of the elements of an output under N(z, sigma^2), summed, for sigma [n]."""
         squares = fitted(self._squares)
         return squares @ sigma.to(squares).square()
+
+
+def _units(z: Tensor, middle: Tensor) -> Tensor:
+    """Return powers of two [n] in whose units deviations [P, n] from the middle [n] have similar sizes.
+
+    They are 1 for sizes near their median: those differ by chance. They are infinite where there is only rounding.
+    """
+    size = z.square().mean(0).sqrt()
+    moved = size > _ROUNDING * torch.finfo(z.dtype).eps * middle.abs()
+    powers = torch.log2(size / size[moved].median())
+    return torch.where(moved, 2.0 ** (_UNIT * (powers / _UNIT).round()), torch.inf)
 
 
 def _solve(square: Tensor, right: Tensor) -> Tensor:

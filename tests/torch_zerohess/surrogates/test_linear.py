@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torch_zerohess.surrogates.linear import LinearSurrogate
-from truths import normal
+from truths import normal, vector
 
 SLOPE, OFFSET = normal(6, 10, seed=1), normal(10, seed=2)
 
@@ -31,6 +31,31 @@ def test_with_fewer_points_than_parameters_the_slope_has_the_least_norm():
     middle, mean = points.mean(0), outputs.mean(0)
     expected = mean + (z - middle) @ torch.linalg.pinv(points - middle) @ (outputs - mean)
     torch.testing.assert_close(model(z), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("P", [4, 50])
+def test_parameters_may_be_of_any_units(P):
+    """Degrees, metres, and a constant: least squares and the least norm are those of equal units."""
+    points, z = normal(P, 6), normal(5, 6, seed=3)
+    equal, mixed = LinearSurrogate(), LinearSurrogate()
+    equal.fit(points, images(points))
+    for size in (64.0**-3, 1.0, 64.0**5):
+        units = size * 64.0 ** vector(0, 0, 0, 0, -5, 3)
+        mixed.fit(points * units, images(points))
+        torch.testing.assert_close(mixed(z * units), equal(z), atol=1e-9, rtol=0)
+        torch.testing.assert_close(mixed.variance(units), equal.variance(torch.ones(6)))
+
+
+@pytest.mark.parametrize(("place", "spread"), [(0.1, 1.0), (1e14 / 3, 1e-6)])
+def test_a_parameter_that_stays_has_no_slope(place, spread):
+    """The mean of seven equal numbers 0.1 is another number, whose difference must not count as a spread."""
+    points, z = normal(7, 6), normal(5, 6, seed=3)
+    points[:, 0] = z[:, 0] = 0.0
+    assert float(torch.full((7,), place, dtype=torch.float64).mean()) != place
+    model = LinearSurrogate()
+    model.fit(spread * points + place * vector(1, 0, 0, 0, 0, 0), images(points))
+    new = model(spread * z + 3.0 * place * vector(1, 0, 0, 0, 0, 0))
+    torch.testing.assert_close(new, images(z), atol=1e-6, rtol=0)
 
 
 def test_noise_is_averaged_by_least_squares():

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 _SHIFTS = (1e-8, 1e8)
-"""Range of the shift, in units of the largest curvature; eigenvalues in float32 have errors of 1e-7 in these units."""
+"""Range of the shift, in units of the largest curvature, or without any of |gradient| / radius; eigenvalues in float32
+have errors of 1e-7 in these units."""
 _BISECTIONS = 50
 """Halvings of the logarithm of that range: a shift is then known to 14 digits."""
 
@@ -17,11 +18,12 @@ def damped_steps(gradient: Tensor, hessian: Tensor, radii: Tensor) -> Tensor:
 
     Negative curvature counts as none. Eigenvectors are in float32, as a Jacobian in float32 is not more exact.
     """
-    size = float(hessian.abs().max()) or 1.0
+    bent, steep = float(hessian.abs().max()), float(gradient.norm())
+    size = bent or steep / float(radii.max()) or 1.0
     values, basis = torch.linalg.eigh((hessian / size).float())
     curvature, vectors = size * values.double().clamp_min(0.0), basis.double()
     low, high = _SHIFTS
-    shifts = low * size, high * size
+    shifts = low * size, max(high * size, steep / float(radii.min()))  # this one is enough without any curvature
     return levenberg_steps(vectors.mT @ gradient, curvature, radii, shifts, _BISECTIONS) @ vectors.mT
 
 

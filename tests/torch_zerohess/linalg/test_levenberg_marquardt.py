@@ -33,3 +33,13 @@ def test_negative_curvature_counts_as_none():
     (step,) = damped_steps(vector(1.0, 1.0), torch.diag(vector(1.0, -5.0)), vector(2.0))
     assert float(step.norm()) == pytest.approx(2.0, rel=1e-3)
     assert float(step[1]) < 0.0
+
+
+@pytest.mark.parametrize("unit", [1e-15, 1e-9, 1.0, 1e9, 1e15])
+def test_little_or_no_curvature(unit):
+    """A plane, and one that is hardly bent: steps are along the slope, and as long as the radii, in any unit."""
+    gradient, radii = unit * vector(3.0, -4.0, 0.0), vector(1e-3, 2.0)
+    expected = -radii[:, None] * vector(0.6, -0.8, 0.0)
+    for bent in (0.0, 1e-12):
+        steps = damped_steps(gradient, bent * unit * torch.eye(3).double(), radii)
+        torch.testing.assert_close(steps, expected)

@@ -22,6 +22,7 @@ from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 _ONE_SIGMA = 0.6826894921370859  # probability within one standard deviation of a normal distribution
+_ROUNDING = 64 * torch.finfo(torch.float64).eps  # of a sum, relative to the sum of the magnitudes
 _ALONE = "one batch: no tolerance was given"
 
 
@@ -148,11 +149,14 @@ def _check_memory(call: BlackBoxCall, aux: Sequence[Tensor], memory: Memory | No
 def _relative_error(batches: list[Sums], of: Derivative) -> tuple[float, bool]:
     """Largest |e| / |g| over the elements of a batch, e the half widths of intervals of one standard deviation.
 
-    And whether g and e of an element are 0, as on a plateau; its relative error counts as 0.
+    And whether g and e of an element are 0 but for rounding, as on a plateau; its relative error counts as 0.
     """
-    g = combined(batches, lambda one: one.stein.sums(of, one.a, None)).flatten(1)
+    g = combined(batches, lambda one: one.stein.sums(of, one.a, None)).flatten(2)
     error, degrees, _ = combined_spread(batches, of, None)
-    e = (error * student_factor(_ONE_SIGMA, degrees)).flatten(1)
+    e = (error * student_factor(_ONE_SIGMA, degrees)).flatten(2)
+    rounding = _ROUNDING * combined(batches, lambda one: one.a.abs().sum(2, keepdim=True))
+    told = torch.maximum(g.abs(), e) > rounding
+    g, e = (torch.where(told, one, 0.0).flatten(1) for one in (g, e))
     size = torch.maximum(g.abs(), e).amax(1, keepdim=True)
     size = torch.where(size > 0, size, 1.0)
     g, e = (g / size).norm(dim=1), (e / size).norm(dim=1)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.linear import LinearSurrogate, left_out_share
 from torch_zerohess.surrogates.low_rank import LowRank
 from torch_zerohess.surrogates.process import ProcessSurrogate
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
@@ -25,6 +25,8 @@ _WIDE = 64
 _EXACT = 1e-6
 """Share of the change of held-out outputs that a sparse map may leave, where the map of least norm leaves less: the
 sparse one takes far less time, and images have larger rounding."""
+_FEW = 3
+"""Points per parameter below which each point is left out once to measure the map of least norm."""
 
 
 class AutomaticSurrogate:
@@ -73,6 +75,9 @@ class AutomaticSurrogate:
         assert sparse.jacobian is not None
         explained, dense = sparse.jacobian.explained, sparse.jacobian.explained_dense
         if explained <= min(max(dense, 0.0), 1.0 - _EXACT):
+            return False
+        # `dense` is of a fit to a part of the points. With about n points that is far worse than the fit to all.
+        if n < P < _FEW * n and explained <= 1.0 - _EXACT and explained <= left_out_share(points, outputs):
             return False
         self.space, self.model = None, sparse
         return True

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.surrogate import checked, fitted
+from torch_zerohess.surrogates.surrogate import checked, fitted, scaled
 
 _RIDGE = 1e-9
 """Added to the squares of the points, in units of their mean: enough to be solvable."""
@@ -13,6 +13,8 @@ _UNIT = 6
 
 _ROUNDING = 16
 """Units of rounding by which the mean of equal numbers differs from them, at most."""
+_ALONE = 1e-6
+"""Part of the output of a point that the others tell, below which they tell nothing."""
 
 
 class LinearSurrogate:
@@ -64,6 +66,24 @@ class LinearSurrogate:
         return squares @ sigma.to(squares).square()
 
 
+def left_out_share(points: Tensor, outputs: Tensor) -> float:
+    """Return the share of the change of outputs [P, *out] that least squares predicts without them, at points [P, n].
+
+    Each point is left out once; P > n. Where a point alone determines a slope, the share is minus infinity.
+    """
+    z, y = points.double(), outputs.reshape(len(outputs), -1)
+    y = y if y.dtype == torch.float64 else y.float()
+    middle, y = z.mean(0), scaled(y - y.mean(0))[0]
+    z = (z - middle) / _units(z - middle, middle)
+    half = torch.linalg.solve_triangular(torch.linalg.cholesky(_raised(z.mT @ z)), z.mT, upper=False)
+    fitting = half.mT @ half
+    own = 1.0 - fitting.diagonal() - 1.0 / len(z)
+    if not float(own.min()) > _ALONE:
+        return -torch.inf
+    wrong = (y - fitting.to(y) @ y) / own.to(y)[:, None]
+    return 1.0 - float(wrong.square().sum(dtype=torch.float64)) / (float(y.square().sum(dtype=torch.float64)) or 1.0)
+
+
 def _units(z: Tensor, middle: Tensor) -> Tensor:
     """Return powers of two [n] in whose units deviations [P, n] from the middle [n] have similar sizes.
 
@@ -76,6 +96,10 @@ def _units(z: Tensor, middle: Tensor) -> Tensor:
 
 
 def _solve(square: Tensor, right: Tensor) -> Tensor:
-    """Solve (square + _RIDGE h) x = right for a positive matrix, h the mean of its diagonal."""
+    return torch.cholesky_solve(right, torch.linalg.cholesky(_raised(square)))
+
+
+def _raised(square: Tensor) -> Tensor:
+    """Add _RIDGE h to a positive matrix, h the mean of its diagonal."""
     square.diagonal().add_(_RIDGE * float(square.diagonal().mean()) or 1.0)
-    return torch.cholesky_solve(right, torch.linalg.cholesky(square))
+    return square

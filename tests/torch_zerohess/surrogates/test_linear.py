@@ -1,9 +1,11 @@
 """The linear surrogate against the map that it is fitted to."""
 
+import math
+
 import pytest
 import torch
 
-from torch_zerohess.surrogates.linear import LinearSurrogate
+from torch_zerohess.surrogates.linear import LinearSurrogate, left_out_share
 from truths import normal, vector
 
 SLOPE, OFFSET = normal(6, 10, seed=1), normal(10, seed=2)
@@ -56,6 +58,21 @@ def test_a_parameter_that_stays_has_no_slope(place, spread):
     model.fit(spread * points + place * vector(1, 0, 0, 0, 0, 0), images(points))
     new = model(spread * z + 3.0 * place * vector(1, 0, 0, 0, 0, 0))
     torch.testing.assert_close(new, images(z), atol=1e-6, rtol=0)
+
+
+def test_each_point_is_left_out_once():
+    """Against fits to all others, in any unit; and a point that determines a slope alone."""
+    points, outputs = normal(12, 6), normal(12, 10, seed=4) + images(normal(12, 6)).flatten(1)
+    rest = 0.0
+    for k in range(12):
+        model, others = LinearSurrogate(), torch.arange(12) != k
+        model.fit(points[others], outputs[others])
+        rest += float((model(points[k : k + 1]) - outputs[k]).square().sum())
+    expected = 1.0 - rest / float((outputs - outputs.mean(0)).square().sum())
+    assert left_out_share(points, outputs) == pytest.approx(expected, rel=1e-6)
+    assert left_out_share(points, 1e-30 * outputs.float()) == pytest.approx(expected, rel=1e-4)
+    points[1:, 0] = 0.0
+    assert left_out_share(points, outputs) == -math.inf
 
 
 def test_noise_is_averaged_by_least_squares():

@@ -11,7 +11,9 @@ _BISECTIONS = 30
 """Points of a line search at most."""
 
 
-def kinked_minimum(function: Callable[[Tensor], tuple[float, Tensor]], start: Tensor, iterations: int) -> Tensor:
+def kinked_minimum(
+    function: Callable[[Tensor], tuple[float, Tensor]], start: Tensor, iterations: int, radius: float
+) -> Tensor:
     """Return the lowest point [n] that BFGS finds from `start` [n].
 
     At a kink the line search, a bisection, ends with a slope of the other side. So BFGS learns the kink as a large
@@ -21,11 +23,13 @@ def kinked_minimum(function: Callable[[Tensor], tuple[float, Tensor]], start: Te
         function: maps [n] to its value and a slope [n], float64.
         start: its value is finite.
         iterations: at most.
+        radius: length of the first step that is tried. The path depends on it, and on no scale of the function.
 
     Source: Lewis and Overton (2013), "Nonsmooth optimization via quasi-Newton methods".
     """
-    x, inverse = start, torch.eye(len(start), dtype=start.dtype, device=start.device)
-    value, slope = function(x)
+    value, slope = function(start)
+    x, one = start, torch.eye(len(start), dtype=start.dtype, device=start.device)
+    inverse = one * (radius / (float(slope.norm()) or 1.0))
     for iteration in range(iterations):
         direction = -inverse @ slope
         down = float(slope @ direction)
@@ -50,7 +54,7 @@ def kinked_minimum(function: Callable[[Tensor], tuple[float, Tensor]], start: Te
         if curvature <= 0.0:
             continue
         if iteration == 0:
-            inverse = inverse * (curvature / float(change @ change))
-        left = torch.eye(len(x), dtype=x.dtype, device=x.device) - torch.outer(step, change) / curvature
+            inverse = one * (curvature / float(change @ change))
+        left = one - torch.outer(step, change) / curvature
         inverse = left @ inverse @ left.mT + torch.outer(step, step) / curvature
     return x

@@ -183,7 +183,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
             return value, slope + steep * s / length if length > radius else slope
 
         start = s if after < before else torch.zeros_like(s)
-        t = kinked_minimum(penalised, start, _ITERATIONS).clamp(lower, upper)
+        t = kinked_minimum(penalised, start, _ITERATIONS, radius).clamp(lower, upper)
         t = t * min(1.0, radius / max(float(t.norm()), math.ulp(0.0)))
         return t, before - self._of_linear(known, curvature, t)[0]
 

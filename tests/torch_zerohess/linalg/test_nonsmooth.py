@@ -10,13 +10,13 @@ from truths import vector
 PLACES = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-def minimum(f, iterations=100):
+def minimum(f, iterations=100, radius=1.0):
     def with_slope(x):
         x = x.clone().requires_grad_(True)
         value = f(x)
         return float(value.detach()), torch.autograd.grad(value, x)[0]
 
-    return kinked_minimum(with_slope, torch.full((4,), 2.0, dtype=torch.float64), iterations)
+    return kinked_minimum(with_slope, torch.full((4,), 2.0, dtype=torch.float64), iterations, radius)
 
 
 def test_the_sum_of_distances_is_least_at_the_median() -> None:
@@ -30,15 +30,21 @@ def test_the_largest_distance_is_least_at_half_the_largest_range() -> None:
     assert float((found - PLACES).abs().max()) == pytest.approx(least, rel=1e-6)
 
 
+@pytest.mark.parametrize("scale", [2.0**-60, 2.0**60])
+def test_the_scale_of_the_function_does_not_matter(scale) -> None:
+    for f in (lambda x: (x - PLACES).abs().sum(), lambda x: (x - PLACES).square().sum(1).sqrt().max()):
+        assert torch.equal(minimum(lambda x, f=f: scale * f(x), 40), minimum(f, 40))
+
+
 def test_a_smooth_valley_is_followed_to_its_end(monkeypatch) -> None:
     scale = vector(1.0, 10.0, 100.0, 1000.0)
 
     def valley(x):
         return (scale * (x - 1.0).square()).sum()
 
-    torch.testing.assert_close(minimum(valley, 30), torch.ones(4, dtype=torch.float64), rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(minimum(valley, 30, 1e4), torch.ones(4, dtype=torch.float64), rtol=0.0, atol=1e-6)
     monkeypatch.setattr(nonsmooth, "_BISECTIONS", 1)
-    assert float((minimum(valley, 30) - 1.0).abs().max()) > 1e-3
+    assert float((minimum(valley, 30, 1e4) - 1.0).abs().max()) > 1e-3
 
 
 def test_no_value_is_above_the_first_one() -> None:

@@ -187,7 +187,7 @@ def _output_shape(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> torch.Size:
     """Shape of one value: known from an earlier call, or from calling the black box once at zero."""
     signature = _signature(x.shape[1], aux)
     if signature not in owner.output_shapes:
-        with transforms.real_tensors(), torch.no_grad():
+        with transforms.real_tensors(), transforms.recording(False):
             probe = torch.zeros(1, int(x.shape[1]), dtype=x.dtype, device=x.device)
             others = [torch.zeros(1, *map(int, one.shape[1:]), dtype=one.dtype, device=one.device) for one in aux]
             try:

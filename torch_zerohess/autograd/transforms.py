@@ -15,8 +15,8 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
-| let autograd see what a custom operator does | `torch._C._ForceDispatchKeyGuard`, `_dispatch_tls_local_include_set`,
-`_dispatch_tls_local_exclude_set` | torch hides it, whatever `torch.enable_grad` says |
+| let torch see what a custom operator does | `torch._C._ForceDispatchKeyGuard`, `_dispatch_tls_local_include_set`,
+`_dispatch_tls_local_exclude_set` | autograd never sees it, `torch.func` and others do not see it where torch compiles |
 | leave all transforms for a while | `torch._functorch.pyfunctorch.temporarily_clear_interpreter_stack` | \
 a random seed is drawn once, whatever maps over the layer |
 | real tensors in a fake kernel | `torch._subclasses.fake_tensor.unset_fake_temporarily` | none exists |
@@ -155,16 +155,22 @@ def outside() -> AbstractContextManager[None]:
 _VMAP_MODE = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("VmapMode"))  # type: ignore[arg-type]
 
 
-_AUTOGRAD = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("AutogradFunctionality"))  # type: ignore[arg-type]
-for _key in ("AutogradOther", "AutogradNestedTensor", "ADInplaceOrView"):
-    _AUTOGRAD = _AUTOGRAD.add(torch._C._parse_dispatch_key(_key))  # type: ignore[arg-type]
+_HIDDEN = torch._C.DispatchKeySet(torch._C._parse_dispatch_key("AutogradFunctionality"))  # type: ignore[arg-type]
+for _key in (
+    *("AutogradOther", "AutogradNestedTensor", "ADInplaceOrView"),
+    # A call that compiles hides these, too. A conjugate that is not computed yet then counts as the number itself.
+    *("Conjugate", "Negative", "ZeroTensor", "Functionalize", "Batched", "Tracer", "PythonTLSSnapshot"),
+    *("FuncTorchDynamicLayerFrontMode", "FuncTorchDynamicLayerBackMode", "FuncTorchGradWrapper"),
+    *("FuncTorchBatched", "FuncTorchVmapMode"),
+):
+    _HIDDEN = _HIDDEN.add(torch._C._parse_dispatch_key(_key))  # type: ignore[arg-type]
 
 
 @contextlib.contextmanager
 def recording(records: bool) -> Iterator[None]:
-    """Let autograd record inside a custom operator, or not."""
+    """Compute inside a custom operator as outside of it, and let autograd record, or not."""
     include, exclude = torch._C._dispatch_tls_local_include_set(), torch._C._dispatch_tls_local_exclude_set()
-    with torch.set_grad_enabled(records), torch._C._ForceDispatchKeyGuard(include, exclude - _AUTOGRAD):
+    with torch.set_grad_enabled(records), torch._C._ForceDispatchKeyGuard(include, exclude - _HIDDEN):
         yield
 
 

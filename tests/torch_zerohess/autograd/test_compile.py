@@ -85,6 +85,46 @@ def test_a_compiled_layer_refuses_a_trainable_head_where_gradients_are_wanted(va
         torch.func.grad(lambda x: layer(x).sum())(BATCH)
 
 
+def sensor(z: Tensor) -> Tensor:
+    """A wave between two Fourier transforms, of which torch does not compute the conjugate before it is used."""
+    return torch.fft.ifft(torch.fft.fft(z).conj()).real[:, 1] + (1j * z).conj().imag[:, 0]
+
+
+def mapped(z: Tensor) -> Tensor:
+    """A simulator of one point that is mapped over a batch, by its gradient."""
+    return torch.func.vmap(torch.func.grad(lambda one: one.sin().prod()))(z).sum(1)
+
+
+def differentiating(z: Tensor) -> Tensor:
+    """A solver that differentiates inside, by operations that torch maps over in its own way."""
+    with torch.enable_grad():
+        return torch.autograd.functional.jacobian(lambda one: one.sin().prod(1), z, vectorize=True).sum((1, 2))
+
+
+def scripted(z: Tensor) -> Tensor:
+    return torch.jit.trace(lambda one: one.sin().prod(1), z)(z)
+
+
+@pytest.mark.parametrize("seen", [False, True], ids=["the shape of its output is unknown", "called before"])
+@pytest.mark.parametrize("fn", [sensor, mapped, differentiating, scripted], ids=lambda one: one.__name__)
+@pytest.mark.filterwarnings("ignore:.*torch.jit:FutureWarning", "ignore:.*torch.jit:DeprecationWarning")
+def test_the_call_that_compiles_runs_the_function_as_every_call_does(fn, seen: bool) -> None:
+    """It hides most of torch from its operators: the conjugates that are not computed yet, `torch.func`, autograd."""
+    layer, again = BlackBox(fn, AGGREGATE), BlackBox(fn, AGGREGATE)
+    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+    x, y = leaf(BATCH), leaf(BATCH)
+    expected = again(y)
+    expected.sum().backward()
+    if seen:
+        layer(BATCH)
+    result = compiled(x)
+    close(result.detach(), expected.detach())
+    result.sum().backward()
+    close(x.grad, y.grad)
+    with torch.no_grad():  # another graph
+        close(compiled(BATCH.clone()), expected.detach())
+
+
 def test_outputs_of_any_strides_in_compiled_code() -> None:
     """Compiled code reads the outputs by the strides of the fake kernel."""
     layer = BlackBox(lambda z: torch.stack([z[:, 0], z.sum(1), z.prod(1)]).T, AGGREGATE)

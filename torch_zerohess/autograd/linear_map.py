@@ -31,6 +31,13 @@ def _unflat(parts: tuple[Any, ...]) -> Samples:
     return parts[0] if len(parts) == 1 else Redrawn(*parts)
 
 
+def _in_graph(u: Samples, vectors: Tensor, transposed: bool) -> Tensor:
+    """Return U vectors, or U^T vectors where `transposed`, by operations that torch differentiates."""
+    if isinstance(u, Redrawn):
+        u = u.perturbations()
+    return vectors @ (u if transposed else u.mT)
+
+
 class _LinearMap(torch.autograd.Function):
     """`apply(vectors, transposed, zero, *samples)`: U vectors, or U^T vectors where `transposed`."""
 
@@ -53,7 +60,11 @@ class _LinearMap(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
         parts = (*ctx.saved_tensors, *ctx.flags)
-        return (_LinearMap.apply(gradient, not ctx.transposed, False, *parts), None, None, *(None for _ in parts))
+        if transforms.mapped_in_graph(gradient):
+            result = _in_graph(_unflat(parts), gradient, not ctx.transposed)
+        else:
+            result = _LinearMap.apply(gradient, not ctx.transposed, False, *parts)
+        return (result, None, None, *(None for _ in parts))
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: Any) -> Tensor:

@@ -10,6 +10,7 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | is a forward-mode level open | `forward_ad._current_level` | `forward_ad.unpack_dual` answers for one tensor only |
 | how large is a batch under vmap | `torch._C._functorch.is_batchedtensor`, `maybe_get_level`, `maybe_get_bdim` |
 `torch.func` does not tell |
+| does `is_grads_batched` map over it | `torch._C._functorch.is_legacy_batchedtensor` | it is a vmap of its own |
 | which `randomness` has a vmap | `torch._C._functorch.get_interpreter_stack`, `CVmapInterpreterPtr`, `TransformType`,
 `RandomnessType` | a vmap rule is told, but is not called where it maps over nothing |
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
@@ -100,6 +101,14 @@ def _mapped(x: Tensor) -> Iterator[tuple[int, int]]:
         if functorch.is_batchedtensor(x):
             yield functorch.maybe_get_level(x), int(inner.shape[functorch.maybe_get_bdim(x)])
         x = inner
+
+
+def mapped_in_graph(gradient: Tensor) -> bool:
+    """Whether a gradient of `is_grads_batched` is to have a graph, which functions applied to it lose without an error.
+
+    That vmap is older than `torch.func`. It maps over operations, and does not ask a function for its rule.
+    """
+    return torch.is_grad_enabled() and torch._C._functorch.is_legacy_batchedtensor(gradient)
 
 
 def mapped_size(tensors: Sequence[Tensor]) -> int:

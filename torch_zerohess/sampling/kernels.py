@@ -53,6 +53,13 @@ class Redrawn(NamedTuple):
             result[:, columns] = part
         return result
 
+    def perturbations(self) -> Tensor:
+        """Return all the rows, float64 [B, K, n]."""
+        result = self.sigma.new_empty(len(self.x), self.K, self.x.shape[1])
+        for _, part, _, columns in self.chunks():
+            result[:, columns] = part
+        return result
+
     def chunks(self, proposal: int = proposals.GAUSSIAN) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Yield points, perturbations and weights (see `place`) of some rows at a time, and their row numbers."""
         rows, x, sigma, antithetic, single = self.arguments()

@@ -55,6 +55,15 @@ def product(matrix: SparseRows, transposed: SparseRows, vectors: Tensor) -> Tens
     return result
 
 
+def _has_memory(gradient: Tensor) -> bool:
+    """Whether a gradient is no wrapper, such as that of `is_grads_batched`, where a function loses its graph."""
+    try:
+        gradient.data_ptr()
+    except RuntimeError:
+        return False
+    return True
+
+
 class _Product(torch.autograd.Function):
     """`apply(vectors, *matrix, *transposed)`: a linear map, whose derivatives are products with either matrix."""
 
@@ -70,6 +79,8 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
         parts = ctx.saved_tensors
+        if torch.is_grad_enabled() and not _has_memory(gradient):
+            return SparseRows(*parts[3:]).times_in_graph(gradient), *(None for _ in parts)
         return _Product.apply(gradient, *parts[3:], *parts[:3]), *(None for _ in parts)
 
     @staticmethod

@@ -6,6 +6,7 @@ from layers import AGGREGATE, BATCH, BOTH, EVERY, IMAGE, SCALAR, N, V, X, close,
 from torch import Tensor
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 
+import torch_zerohess as zh
 from torch_zerohess import BlackBox, Smoothing, estimate, smooth
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels
@@ -42,6 +43,42 @@ def test_tensor_valued() -> None:
     close(torch.func.jacrev(layer)(X), one.gradient)
     close(torch.func.jacfwd(layer)(X), one.gradient)
     close(torch.func.hessian(layer)(X), one.hessian())
+
+
+@BOTH
+@EVERY
+@pytest.mark.parametrize("form", ["layer", "frozen"])
+def test_second_derivatives_of_first_ones_in_a_batch(smoothing: Smoothing, form: str) -> None:
+    """`is_grads_batched` maps in an older way than `torch.func`, which takes the graph from functions."""
+    e, x, layer = estimate(IMAGE.f, X, smoothing), leaf(), BlackBox(IMAGE.f, smoothing)
+    f = layer if form == "layer" else layer.freeze(X)
+    rows = torch.autograd.functional.jacobian(f, x, create_graph=True, vectorize=True)
+    close(rows.detach(), e.gradient)
+    second = [torch.autograd.grad(one, x, retain_graph=True)[0] for one in rows.flatten()]
+    close(torch.stack(second).view(2, 2, N, N), e.hessian())
+
+
+@BOTH
+def test_a_penalty_of_a_jacobian_in_one_batch() -> None:
+    layer, target = BlackBox(IMAGE.f, AGGREGATE, head=zh.heads.SquaredError()), torch.zeros(4, 2, 2, dtype=X.dtype)
+    slopes = []
+    for vectorize in (False, True):
+        x = leaf(BATCH)
+        rows = torch.autograd.functional.jacobian(
+            lambda z: layer(z.sin(), target), x, create_graph=True, vectorize=vectorize
+        )
+        slopes.append(torch.autograd.grad(rows.square().sum(), x)[0])
+    close(slopes[1], slopes[0])
+
+
+@BOTH
+def test_third_derivatives_of_second_ones_in_a_batch() -> None:
+    slopes = []
+    for vectorize in (False, True):
+        x, f = leaf(), smooth(SCALAR.f, AGGREGATE)
+        hessian = torch.autograd.functional.hessian(f, x, create_graph=True, vectorize=vectorize)
+        slopes.append(torch.autograd.grad(hessian.square().sum(), x)[0])
+    close(slopes[1], slopes[0])
 
 
 @BOTH

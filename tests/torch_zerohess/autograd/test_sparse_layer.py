@@ -56,6 +56,19 @@ def test_gradient_and_gauss_newton_product():
     assert relative(dense[1], product) > 5.0
 
 
+def test_second_derivatives_of_first_ones_in_a_batch():
+    """`is_grads_batched` maps in an older way than `torch.func`, which takes the graph from functions."""
+    layer, x, v = zh.SparseBlackBox(blurred, SMOOTHING), X.clone().requires_grad_(), drawn(2, 3, 10, 10, seed=2)
+    y = layer(x.sin()).exp()
+    each = [torch.autograd.grad(y, x, one, create_graph=True)[0] for one in v]
+    (rows,) = torch.autograd.grad(y, x, v, create_graph=True, is_grads_batched=True)
+    torch.testing.assert_close(rows, torch.stack(each))
+    expected, found = (
+        torch.autograd.grad(one.square().sum(), x, retain_graph=True)[0] for one in (torch.stack(each), rows)
+    )
+    torch.testing.assert_close(found, expected)
+
+
 def test_the_layer_is_linear_around_the_point_of_the_call():
     layer, v = zh.SparseBlackBox(blurred, SMOOTHING), drawn(3, N, seed=2)
     slope, product = gradient_and_product(layer, v)

@@ -18,6 +18,7 @@ from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.evaluators.inline import Evaluator
+from torch_zerohess.precision import readable
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
@@ -91,6 +92,7 @@ def estimate(
     check_limits(tolerance, tolerance_of, max_evaluations)
     _check_memory(call, aux, memory, tolerance)
     x = checked_input(x).detach().clone()
+    _check_not_mapped(x)
     if joint and (x.ndim != 2 or head is not None or memory is not None):
         raise ValueError(
             f"joint=True needs x of shape [B, n], and neither head nor memory, got x {list(x.shape)}, "
@@ -144,6 +146,18 @@ def _check_memory(call: BlackBoxCall, aux: Sequence[Tensor], memory: Memory | No
         raise ValueError(
             f"a memory serves one batch, a tolerance asks for several: give one of the two, got tolerance {tolerance}"
         )
+
+
+def _check_not_mapped(x: Tensor) -> None:
+    """Raise ValueError if `torch.vmap` maps over x: of all wrappers, only those of vmap give no numbers."""
+    if readable(x):
+        return
+    try:
+        x.sum().item()
+    except RuntimeError as error:
+        raise ValueError(
+            "x must not be mapped over by vmap: estimate takes a batch x [*batch, n] in one call, and smooth has vmap"
+        ) from error
 
 
 def _relative_error(batches: list[Sums], of: Derivative) -> tuple[float, bool]:

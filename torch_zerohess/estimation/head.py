@@ -47,7 +47,8 @@ def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
                 f"head must not change aux[{number}], which serves other samples and is the caller's: use a copy of it"
             )
     if not isinstance(losses, Tensor) or not losses.is_floating_point():
-        raise TypeError(f"head must return a real floating-point tensor, got {getattr(losses, 'dtype', type(losses))}")
+        got = losses.dtype if isinstance(losses, Tensor) else type(losses)
+        raise TypeError(f"head must return a real floating-point tensor, got {got}")
     if losses.requires_grad and not graph:
         raise ValueError(f"head depends on a tensor that requires grad, {_ALONE}")
     if losses.shape != outputs.shape[:1]:

@@ -1,7 +1,6 @@
 """The result of an estimate: the value and derivatives, and the error of each."""
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, get_args
 
 import torch
@@ -15,6 +14,7 @@ from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
+from torch_zerohess.precision import readable
 
 _MOST_LEVEL = 0.9999  # up to which the factor of Student's t is right to four digits
 
@@ -53,6 +53,7 @@ class Estimate:
     ) -> None:
         self._batches, self._batch, self._x, self.reason = batches, batch, x, reason
         self._value_mode, self._term, self._chosen, self._joint = value, term, chosen, joint
+        self._made: dict[str, Tensor] = {}
         expansion = batches[0].evaluations.expansion
         self._sigma, self._out = expansion.sigma, expansion.base.shape[1:]
 
@@ -64,9 +65,12 @@ class Estimate:
         smoothed = self._value_mode == "smoothed"
         return self._shaped(self._completed(base, "value") if smoothed else base, "value")
 
-    @cached_property
+    @property
     def gradient(self) -> Tensor:
         """dF/dx_i: [*batch, *out, n]."""
+        return self._once("gradient", self._gradient)
+
+    def _gradient(self) -> Tensor:
         mean = combined(self._batches, lambda one: one.stein.scaled_gradient(one.a, self._sigma))
         return self._shaped(self._completed(mean, "gradient"), "gradient")
 
@@ -185,17 +189,23 @@ class Estimate:
         each = sum(one.K + (one.center is not None) for one in found)
         return each if self._joint else each * self._batch.numel()
 
-    @cached_property
+    @property
     def points(self) -> Tensor:
         """Every point that was evaluated, [*batch, K, n]; x itself is the last one where f(x) was evaluated."""
+        return self._once("points", self._points)
+
+    def _points(self) -> Tensor:
         x = self._x.reshape(-1, 1, len(self._sigma))
         centers = [x for one in self._batches if one.evaluations.center is not None]
         points = torch.cat([one.evaluations.points for one in self._batches] + centers, 1)
         return points.reshape((*self._batch, *points.shape[1:]))
 
-    @cached_property
+    @property
     def values(self) -> Tensor:
         """Values at `points`, [*batch, K, *out]."""
+        return self._once("values", self._values)
+
+    def _values(self) -> Tensor:
         found = [one.evaluations for one in self._batches]
         centers = [one.center[:, None] for one in found if one.center is not None]
         values = torch.cat([one.values for one in found] + centers, 1)
@@ -212,6 +222,15 @@ class Estimate:
         parts += [f"auto: {self._chosen}"] * bool(self._chosen)
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
+
+    def _once(self, name: str, make: Callable[[], Tensor]) -> Tensor:
+        """Make a tensor once. What a transform of torch or inference mode makes is not kept: it serves nothing else."""
+        if name in self._made:
+            return self._made[name]
+        result = make()
+        if readable(result) and not result.is_inference():
+            self._made[name] = result
+        return result
 
     def _spread(self, quantity: Quantity, v: Tensor | None) -> tuple[Tensor, Tensor, Shape]:
         """Return the standard error in units of x, its degrees of freedom and its shape; v as from `_vector`."""

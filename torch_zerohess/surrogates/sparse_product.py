@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_zerohess.precision import readable
 from torch_zerohess.sampling import extension
 
 _COMPILED = {torch.float32, torch.float64}
@@ -55,15 +56,6 @@ def product(matrix: SparseRows, transposed: SparseRows, vectors: Tensor) -> Tens
     return result
 
 
-def _has_memory(gradient: Tensor) -> bool:
-    """Whether a gradient is no wrapper, such as that of `is_grads_batched`, where a function loses its graph."""
-    try:
-        gradient.data_ptr()
-    except RuntimeError:
-        return False
-    return True
-
-
 class _Product(torch.autograd.Function):
     """`apply(vectors, *matrix, *transposed)`: a linear map, whose derivatives are products with either matrix."""
 
@@ -79,7 +71,7 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
         parts = ctx.saved_tensors
-        if torch.is_grad_enabled() and not _has_memory(gradient):
+        if torch.is_grad_enabled() and not readable(gradient):  # `is_grads_batched` takes the graph from functions
             return SparseRows(*parts[3:]).times_in_graph(gradient), *(None for _ in parts)
         return _Product.apply(gradient, *parts[3:], *parts[:3]), *(None for _ in parts)
 

@@ -451,3 +451,55 @@ def test_seed_none_follows_torch_and_a_number_does_not() -> None:
     state = torch.get_rng_state()
     estimate(SCALAR.f, x, Smoothing(sigma=0.5, seed=4, sampler="sobol"))
     assert torch.equal(torch.get_rng_state(), state)
+
+
+USES = {
+    "gradient": lambda e: e.gradient,
+    "points": lambda e: e.points,
+    "values": lambda e: e.values[:, None],
+}
+
+
+def squares():
+    return estimate(lambda z: z.square().sum(1), vector(0.5, -1.0), Smoothing(sigma=0.1, samples=4, seed=0))
+
+
+@pytest.mark.parametrize("name", USES)
+def test_an_estimate_serves_after_its_first_use_in_a_transform(name: str) -> None:
+    use, e, x = USES[name], squares(), vector(1.0, 2.0)
+    expected = torch.func.hessian(lambda t: (use(squares()) * t).square().sum())(x)
+    for _ in range(2):
+        torch.testing.assert_close(torch.func.hessian(lambda t: (use(e) * t).square().sum())(x), expected)
+    torch.testing.assert_close(use(e), use(squares()))
+
+
+@pytest.mark.parametrize("name", USES)
+def test_an_estimate_serves_after_its_first_use_in_inference_mode(name: str) -> None:
+    use, e, w = USES[name], squares(), vector(1.0, 2.0).requires_grad_()
+    with torch.inference_mode():
+        use(e)
+    (w * use(e)).sum().backward()
+    torch.testing.assert_close(w.grad, (use(squares()) + torch.zeros_like(w)).view(-1, 2).sum(0).detach())
+
+
+@pytest.mark.parametrize("name", USES)
+def test_what_an_estimate_has_made_is_kept(name: str) -> None:
+    e = squares()
+    assert getattr(e, name) is getattr(e, name)
+
+
+@pytest.mark.parametrize("seed", [None, 0])
+def test_an_estimate_is_not_mapped_over(seed: int | None) -> None:
+    X, smoothing = spread(6, -1.0, 1.0).view(3, 2), Smoothing(sigma=0.1, seed=seed)
+
+    def slope(x: Tensor) -> Tensor:
+        return estimate(lambda z: z.square().sum(1), x, smoothing).gradient
+
+    with pytest.raises(ValueError, match="x must not be mapped over by vmap"):
+        torch.func.vmap(slope)(X)
+    assert not torch.func.grad(lambda x: (slope(x) + 0 * x).sum())(X[0]).any()
+
+
+def test_a_head_that_returns_an_array_is_told_so() -> None:
+    with pytest.raises(TypeError, match=r"head must return a real floating-point tensor, got <class 'numpy.ndarray'>"):
+        estimate(lambda z: z, vector(1.0, 2.0), Smoothing(sigma=0.1), head=lambda outputs: outputs.sum(1).numpy())

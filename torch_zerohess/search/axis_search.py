@@ -178,7 +178,8 @@ def _is_sum(lines: AxisLines, losses: Tensor) -> bool:
     """Whether the losses [2] at points with exchanged coordinates are those of a sum."""
     ends = losses.new_tensor([lines.origin.loss, lines.other_loss])
     change, difference = float((losses[:, None] - ends).abs().min()), float((losses.sum() - ends.sum()).abs())
-    return change > 0.0 and difference <= _SUM * change  # False for values that are not finite
+    apart = bool((lines.other != lines.origin.point).all())
+    return apart and change > 0.0 and difference <= _SUM * change  # False for values that are not finite
 
 
 def _is_convex(lines: AxisLines, evaluated: Evaluated) -> bool:

@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
-from torch_zerohess.search.axis_search import AxisLines
+from torch_zerohess.search.axis_search import AxisLines, AxisSearch
 from torch_zerohess.search.descent_search import Descent
 from torch_zerohess.search.gaussian_process_search import GaussianProcessSearch
-from torch_zerohess.search.state import Best
+from torch_zerohess.search.method import Settings
+from torch_zerohess.search.state import Best, Evaluated
+from truths import vector
 
 BOX = (-5.0, 5.0)
 SEARCHES = [(Descent, 2), (Descent, 6), (GaussianProcessSearch, 2), (GaussianProcessSearch, 3)]
@@ -94,6 +96,15 @@ def test_a_loss_that_one_half_of_the_coordinates_does_not_change_is_no_sum(kind)
     f = lambda z: rastrigin(z[:, :1]) * (1.0 + z[:, 1].abs().clamp(max=0.0).double())  # noqa: E731
     met = stages(kind(start(2), sigma=2.0, bounds=BOX, seed=0), f, 300)
     assert "axes" not in [stage for stage, _ in met]
+
+
+def test_a_coordinate_that_is_equal_tells_nothing() -> None:
+    """Along it there is no chord either."""
+    settings = Settings(vector(0.0, 0.0, 5.0), *(vector(a, a, a) for a in BOX), None, 3, 1e-2, 0.0, None)
+    axes, points = AxisSearch(settings), vector(1.0, 2.0, 5.0, 0.0, 0.0, 5.0).reshape(2, 3)
+    lines, exchanged = axes.begin(None, Best(points[1], float(rastrigin(points[1:]))), points, rastrigin(points))
+    lines, asked = axes.next(lines, Evaluated(exchanged, rastrigin(exchanged)), several=False)
+    assert (lines.stage, len(asked)) == ("over", 0)
 
 
 def test_without_a_box_there_are_no_axes_to_search() -> None:

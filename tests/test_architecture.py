@@ -17,6 +17,7 @@ LAYERS = {
             "version",
             "arguments",
             "precision",
+            "wrappers",
             "evaluation_mode",
             "choice",
             "smoothing",

@@ -1,11 +1,10 @@
-"""How a black box is called: in full precision, without autograd, and with numbers that can be read."""
+"""How a black box is called: in full precision, and without autograd."""
 
 import contextlib
 from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
-from torch import Tensor
 
 _AS_IT_IS: AbstractContextManager[Any] = contextlib.nullcontext()
 
@@ -19,12 +18,3 @@ def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
     """Switch autocast off: rounding to bfloat16 is larger than the differences that derivatives are made of."""
     enabled = torch.is_autocast_enabled(device.type)
     return torch.autocast(device.type, enabled=False) if enabled else _AS_IT_IS
-
-
-def readable(tensor: Tensor) -> bool:
-    """Whether a tensor has memory of its own. A transform of torch hands out wrappers, which are of no use after it."""
-    try:
-        tensor.data_ptr()
-    except RuntimeError:
-        return False
-    return True

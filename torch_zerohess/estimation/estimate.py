@@ -18,9 +18,9 @@ from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.precision import readable
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 from torch_zerohess.surrogates.memory import Memory, check_memory
+from torch_zerohess.wrappers import readable
 
 _ONE_SIGMA = 0.6826894921370859  # probability within one standard deviation of a normal distribution
 _ROUNDING = 64 * torch.finfo(torch.float64).eps  # of a sum, relative to the sum of the magnitudes

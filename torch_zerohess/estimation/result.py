@@ -14,7 +14,7 @@ from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
 from torch_zerohess.estimation.sums import Sums, combined, combined_spread
 from torch_zerohess.estimation.surrogate_term import SurrogateTerm
-from torch_zerohess.precision import readable
+from torch_zerohess.wrappers import readable
 
 _MOST_LEVEL = 0.9999  # up to which the factor of Student's t is right to four digits
 

@@ -22,9 +22,9 @@ _SUM = 1e-5
 _CHORD = 5
 """Points on the line through two points, from which a loss of one minimum is told."""
 _PLACES = 40
-"""Places on every axis until quadratics begin at the lowest ones, at a time."""
+"""Places that are evaluated on every axis before quadratics begin at the lowest ones."""
 _LOWER, _AS_LOW = 1e-4, 1e-6
-"""What counts as lower, over the range of the values on an axis: in an interval, and at a place."""
+"""Decrease that is sought in an interval, and decrease that counts at a place, over the range of an axis's values."""
 _FURTHER = ("lower", "level")
 """Stages after which further places may be lower."""
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_zerohess.precision import readable
 from torch_zerohess.sampling import extension
+from torch_zerohess.wrappers import readable
 
 _COMPILED = {torch.float32, torch.float64}
 """Types of the C++ operator, which is for one vector: embedding_bag would take three times as long."""

@@ -25,6 +25,7 @@ SEARCHES = {
     "block Gauss-Newton": (BlockGaussNewton, 5, True),
     "local Gauss-Newton": (LocalGaussNewton, 20, True),
     "by evidence": (TrustRegion, 20, True),
+    "descent, then process": (TrustRegion, 5, True),
 }
 
 

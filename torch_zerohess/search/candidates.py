@@ -16,6 +16,8 @@ _REFINEMENTS = 6
 """Further sets of candidates around the best one,"""
 _WIDTH, _NARROWING = 0.3, 0.4
 """at this distance, which shrinks by this factor where none is better."""
+_MANY, _ALONG = 4, 4
+"""Parameters from which on there are further candidates: so many along each axis through the best one."""
 _SAME = 1e-4
 """Distance below which a point is known already."""
 
@@ -27,11 +29,15 @@ def lowest(
     n = len(best)
     near = [best + scale * normal(generator, lower, _CANDIDATES, n) for scale in _SCALES]
     candidates = torch.cat([*near, uniform(generator, lower, upper, 4 * _CANDIDATES)]).clamp(lower, upper)
+    if n >= _MANY:
+        candidates = torch.cat([candidates, _along_axes(best, lower, upper, generator)])
     scores = model(candidates)
     k, width = int(scores.argmin()), _WIDTH
     x, score = candidates[k], float(scores[k])
     for _ in range(_REFINEMENTS):
         candidates = (x + width * normal(generator, lower, 2 * _CANDIDATES, n)).clamp(lower, upper)
+        if n >= _MANY:
+            candidates = torch.cat([candidates, _along_axes(x, lower, upper, generator)])
         scores = model(candidates)
         k = int(scores.argmin())
         if float(scores[k]) < score:
@@ -61,3 +67,11 @@ def least_known(process: GaussianProcess, lower: Tensor, upper: Tensor, generato
     """Return a point [n] of the box where the process is uncertain."""
     spots = uniform(generator, lower, upper, 4 * _CANDIDATES)
     return spots[int(process.uncertainty(process.covariance(spots)).argmax())]
+
+
+def _along_axes(x: Tensor, lower: Tensor, upper: Tensor, generator: torch.Generator) -> Tensor:
+    """Return points [R, n] that differ from x [n] in one parameter each."""
+    n = len(x)
+    places = uniform(generator, lower, upper, _ALONG * n).view(_ALONG, n, n)
+    chosen = torch.eye(n, dtype=torch.bool, device=x.device)
+    return torch.where(chosen, places, x).view(-1, n)

@@ -5,8 +5,7 @@ among the outputs that lie within `_OPTIMISM` standard deviations of the predict
 composite function: Astudillo and Frazier 2019). If the process knows that point already, the search evaluates the point
 of the largest uncertainty, so it escapes local minima and plateaus.
 
-If the black box is noisy, the best point is the one whose *predicted* output has the lowest loss. Noise in outputs is
-detected by the evidence; noise in a plain loss is declared with `noise`.
+In noise the best point is the one whose *predicted* output has the lowest loss.
 """
 
 import math
@@ -25,6 +24,7 @@ from torch_zerohess.search.random_points import normal, orthonormal
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
+from torch_zerohess.surrogates.kernels import structures
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
 
@@ -47,8 +47,7 @@ _TELLING = 10
 _PROPORTION = 1e3
 """Losses are cut above the lowest one plus this times the distance of the median from it."""
 _EXPANSIONS = 3
-"""Expansions of the loss around predicted minima, until one predicts the loss there. If none does, the process is one
-of the loss itself from then on."""
+"""Expansions of the loss around predicted minima. If none predicts the loss there, the loss itself is modelled."""
 _POOL, _BATCHES = 60, 8
 """Evaluations kept, and batches of several points kept at least, unless `pool` says it."""
 _NEAR, _WIDENING, _WIDEST = 1e-3, 1.5, 10.0
@@ -65,6 +64,7 @@ class ProcessMethod(Method[Q]):
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
         self.capacity = max(settings.pool or _POOL, 2 * settings.n + 2)  # at least the start, its samples and steps
+        self._structures = structures(1 if settings.loss is None else settings.n)
         self._latest: tuple[Pool, LossModel] | None = None  # what `_model` would make again
 
     def take(self, known: Q, evaluated: Evaluated) -> Q:
@@ -289,16 +289,18 @@ class ProcessMethod(Method[Q]):
     def _fitted(self, known: Q, outputs: Tensor, deviation: float = 0.0) -> tuple[Q, GaussianProcess]:
         """Return the process of outputs [P, m]; if it ceases to find noise, the best point is `record` again.
 
-        deviation: of repeated outputs at one point; 0 if it is not known.
-
         An output that is not finite is replaced by the output with the highest loss, and is no evidence of noise. A
         loss alone is too little evidence to tell noise from ripples: it counts as noisy only if `noise` is given.
+        deviation: of repeated outputs at one point; 0 if it is not known.
         """
         pool, holes, noises = known.pool, known.holes, NOISES + HIGH_NOISES if self.tells_noise(known) else NOISES
         if len(holes) and noises != NOISES and not self.settings.noise:
-            noises = noises if GaussianProcess.fit(pool.points, outputs, noises).noise >= HIGH_NOISES[0] else NOISES
+            noise = GaussianProcess.fit(pool.points, outputs, noises, None, self._structures).noise
+            noises = noises if noise >= HIGH_NOISES[0] else NOISES
         outputs = torch.cat([outputs, outputs[int(pool.values.argmax())].expand(len(holes), -1)])
-        process = GaussianProcess.fit(torch.cat([pool.points, holes]), outputs, noises, deviation or None)
+        process = GaussianProcess.fit(
+            torch.cat([pool.points, holes]), outputs, noises, deviation or None, self._structures
+        )
         noisy = self.settings.noise > 0.0 or process.noise >= HIGH_NOISES[0]
         best = known.record if known.noisy and not noisy else known.best
         return replace(known, noisy=noisy, best=best), process

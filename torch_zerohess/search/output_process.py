@@ -17,7 +17,7 @@ from torch_zerohess.search.gaussian_process_finish import PATIENCE, FinishedProc
 from torch_zerohess.search.gaussian_process_method import ROUND
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -67,6 +67,15 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
         self.local = OutputGaussNewton(replace(settings, restarts=0), self.capacity, _PATIENCE)
+
+    def taking_over(
+        self, other: Progress, pool: Pool, generator: torch.Generator
+    ) -> tuple[OutputProcessProgress, Tensor]:
+        """Begin with the evaluations of another search; return the next points, too."""
+        nowhere = torch.full_like(self.settings.start, math.inf)
+        known = self.progress(**self.begun(), finished=nowhere, phase="trial").taking(other)
+        told = Evaluated(pool.points, pool.values, pool.outputs, other.shape)
+        return self.points(self.remembered(known, told), generator)
 
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:
         newton, best = known.local, known.best

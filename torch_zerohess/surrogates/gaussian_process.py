@@ -1,19 +1,23 @@
 """Gaussian process over a few parameters: predicts outputs between evaluations, and how well it knows them.
 
 All elements of an output share one kernel and one variance. A predicted output is therefore a weighted sum of known
-outputs, and the weights do not depend on the size of an output. The kernel is a constant plus one of `KERNELS`: the
-Gaussian kernel suits smooth functions, the Matern kernel suits renders with hard edges. Kernel, length and noise
-maximise the evidence, the likelihood of the outputs (Rasmussen and Williams 2006, section 5.4).
+outputs, and the weights do not depend on the size of an output. The kernel is a constant plus one of `KERNELS`, joint
+or additive. The Gaussian kernel suits smooth functions, and the Matern kernel renders with hard edges. An additive
+kernel suits parameters that act each by itself. Structure, kernel, length and noise maximise the evidence, the
+likelihood of the outputs (Rasmussen and Williams 2006, section 5.4).
 
 One length serves all parameters. For one length per parameter divide the points by these lengths (`ProcessSurrogate`).
 """
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+from torch_zerohess.surrogates.kernels import KERNELS, Kernel, Structure, covariances, separations
 
 LENGTHS = (0.3, 0.5, 1.0, 2.0, 4.0)
 """Length scales, in units of the points."""
@@ -29,24 +33,6 @@ DEVIATION_DEGREES = 7
 """Degrees of freedom of a deviation that the caller knows: as many as eight values at one point give."""
 _FLAT = 1e-14
 """Change of outputs, relative to their size, that is rounding."""
-_ZERO = 1e-16
-"""Added to squared distances: their root has no derivative at zero, and next to it the kernels' derivatives are lost in
-rounding."""
-
-
-def matern(distance: Tensor) -> Tensor:
-    """Matern kernel of order 3/2: (1 + sqrt(3) d) exp(-sqrt(3) d), once differentiable."""
-    scaled = math.sqrt(3.0) * distance
-    return (1.0 + scaled) * torch.exp(-scaled)
-
-
-def gaussian(distance: Tensor) -> Tensor:
-    """Gaussian kernel exp(-d^2 / 2), smooth."""
-    return torch.exp(-0.5 * distance.square())
-
-
-Kernel = Callable[[Tensor], Tensor]
-KERNELS: tuple[Kernel, ...] = (matern, gaussian)
 
 
 @dataclass(frozen=True)
@@ -54,6 +40,7 @@ class GaussianProcess:
     """Posterior given outputs [P, m] at points [P, n]; the prediction at x is mean + covariance(x) @ weights."""
 
     points: Tensor
+    structure: Structure
     kernel: Kernel
     length: float
     mean: Tensor
@@ -69,15 +56,21 @@ class GaussianProcess:
 
     @classmethod
     def fit(
-        cls, points: Tensor, outputs: Tensor, noises: Sequence[float] = NOISES, deviation: float | None = None
+        cls,
+        points: Tensor,
+        outputs: Tensor,
+        noises: Sequence[float] = NOISES,
+        deviation: float | None = None,
+        structures: Sequence[Structure] = ("joint",),
     ) -> "GaussianProcess":
-        """Choose kernel, length and noise from their lists by the evidence, and condition on P >= 2 outputs.
+        """Choose structure, kernel, length and noise from their lists by the evidence; condition on P >= 2 outputs.
 
         Args:
             points: [P, n], float64.
             outputs: [P, m], float64.
             noises: levels to choose from.
             deviation: standard deviation of repeated outputs at one point, if it is known.
+            structures: of the kernel, to choose from.
         """
         mean = outputs.mean(0)
         change = outputs - mean
@@ -85,14 +78,16 @@ class GaussianProcess:
         flat = scale <= _FLAT * float(mean.abs().max())
         relative = None if deviation is None or flat else deviation / scale
         target = torch.zeros_like(change) if flat else change / scale
-        evidence, variances = grid_evidence(points, target, noises, relative)
+        evidence, variances = grid_evidence(points, target, noises, relative, structures)
         best = int(evidence.argmax())
-        shape, level = divmod(best, len(noises))
-        kernel, length, noise = KERNELS[shape // len(LENGTHS)], LENGTHS[shape % len(LENGTHS)], noises[level]
+        every = itertools.product(structures, KERNELS, LENGTHS, noises)
+        structure, kernel, length, noise = next(itertools.islice(every, best, None))
         variance = 1.0 if flat else scale**2 * float(variances.flatten()[best])
-        factor = _factor(_distance(points, points), kernel, length, noise)
+        covariance = covariances(structure, kernel, separations(structure, points, points) / length) + CONSTANT
+        covariance.diagonal().add_(noise)
+        factor = torch.linalg.cholesky(covariance)
         weights = torch.cholesky_inverse(factor) @ change  # of many elements: faster than to solve for each
-        return cls(points, kernel, length, mean, weights, variance, noise, factor)
+        return cls(points, structure, kernel, length, mean, weights, variance, noise, factor)
 
     def pending(self, x: Tensor) -> "GaussianProcess":
         """Return the process as if its prediction at x [n] had been evaluated.
@@ -107,22 +102,14 @@ class GaussianProcess:
         weights = torch.nn.functional.pad(self.weights, (0, 0, 0, 1))
         return replace(self, points=torch.cat([self.points, x[None]]), weights=weights, factor=factor)
 
-    def __call__(self, x: Tensor) -> Tensor:
-        """Expected outputs [Q, m] at points x [Q, n], with derivatives of every order in x.
-
-        The Matern kernel has no third derivative at the known points; it counts as finite there.
-        """
-        apart = distances if torch.is_grad_enabled() else _distance  # the latter is faster
-        constant = self.mean + CONSTANT * self.weights.sum(0)
-        return constant + self.kernel(apart(x / self.length, self.points / self.length)) @ self.weights
-
     def predict(self, x: Tensor) -> Tensor:
-        """Expected outputs [Q, m] at points x [Q, n], without derivatives."""
+        """Expected outputs [Q, m] at points x [Q, n]."""
         return self.mean + self.covariance(x) @ self.weights
 
     def covariance(self, x: Tensor) -> Tensor:
         """Covariance [Q, P] of points x [Q, n] with the known ones, in units of `variance`."""
-        return self.kernel(_distance(x, self.points) / self.length) + CONSTANT
+        separation = separations(self.structure, x, self.points) / self.length
+        return covariances(self.structure, self.kernel, separation) + CONSTANT
 
     def uncertainty(self, covariance: Tensor) -> Tensor:
         """Variance [Q] of an element of the output, given `covariance` [Q, P]."""
@@ -131,9 +118,13 @@ class GaussianProcess:
 
 
 def grid_evidence(
-    points: Tensor, change: Tensor, noises: Sequence[float], deviation: float | None = None
+    points: Tensor,
+    change: Tensor,
+    noises: Sequence[float],
+    deviation: float | None = None,
+    structures: Sequence[Structure] = ("joint",),
 ) -> tuple[Tensor, Tensor]:
-    """Log evidence for every kernel, length and noise of the lists, and the most likely variance for each of them.
+    """Log evidence for every structure, kernel, length and noise, and the most likely variance for each of them.
 
     The evidence is 2/m times the log likelihood without its constants, plus 2 times the log prior of the length. (An
     output counts as one observation: its elements are not independent.) A known deviation enters as
@@ -144,16 +135,20 @@ def grid_evidence(
         change: outputs [P, m] less their mean, at most 1.
         noises: levels [N].
         deviation: of repeated outputs at one point, in the units of `change`; None if it is not known.
+        structures: of the kernel.
 
     Returns:
-        Two tensors [kernels * lengths, N].
+        Two tensors [structures * kernels * lengths, N].
     """
     P, m = change.shape
     lengths, levels = points.new_tensor(LENGTHS), points.new_tensor(noises)
-    scaled = _distance(points, points) / lengths[:, None, None]
-    values, vectors = torch.linalg.eigh(torch.cat([kernel(scaled) for kernel in KERNELS]) + CONSTANT)
+    every = []
+    for structure in structures:
+        separation = separations(structure, points, points)
+        every += [covariances(structure, kernel, separation / length) for kernel in KERNELS for length in LENGTHS]
+    values, vectors = torch.linalg.eigh(torch.stack(every) + CONSTANT)
     power = (vectors * (change @ change.mT @ vectors)).sum(1).clamp_min(0.0)
-    spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [kernels x lengths, N, P]
+    spectrum = values.clamp_min(0.0)[:, None] + levels[:, None]  # [structures x kernels x lengths, N, P]
     squares, logs, count = (power[:, None] / spectrum).sum(2) / m, spectrum.log().sum(2), P
     if deviation is not None:
         squares, logs, count = (
@@ -163,30 +158,10 @@ def grid_evidence(
         )
     variances = squares / count + math.ulp(0.0)
     evidence = -count * variances.log() - logs
-    evidence -= improbability(lengths).repeat(len(KERNELS))[:, None]
+    evidence -= improbability(lengths).repeat(len(structures) * len(KERNELS))[:, None]
     return evidence, variances
 
 
 def improbability(lengths: Tensor) -> Tensor:
     """Minus 2 times the log prior of each length."""
     return (lengths.log() / _SPREAD).square()
-
-
-def distances(a: Tensor, b: Tensor) -> Tensor:
-    """Distances [A, B] of points a [A, n] and b [B, n], with derivatives of every order that a kernel may multiply."""
-    middle = b.detach().sum(0) / max(len(b), 1)  # without points, too
-    a, b = a - middle, b - middle
-    squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
-    rounding = squares.detach().clamp(max=0.0)  # to be positive without a derivative of its own
-    return (squares - rounding + _ZERO).sqrt()
-
-
-def _distance(a: Tensor, b: Tensor) -> Tensor:
-    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
-
-
-def _factor(distance: Tensor, kernel: Kernel, length: float, noise: float) -> Tensor:
-    """Cholesky factor [P, P] of the covariance of points at these distances."""
-    covariance = kernel(distance / length) + CONSTANT
-    covariance.diagonal().add_(noise)
-    return torch.linalg.cholesky(covariance)

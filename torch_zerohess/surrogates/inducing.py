@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.surrogates.gaussian_process import CONSTANT, Kernel, distances
+from torch_zerohess.surrogates.gaussian_process import CONSTANT
+from torch_zerohess.surrogates.kernels import Kernel, distances
 
 MOST = 512
 """Chosen points at most."""

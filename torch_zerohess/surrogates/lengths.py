@@ -14,14 +14,12 @@ from torch import Tensor
 from torch_zerohess.surrogates.gaussian_process import (
     CONSTANT,
     HIGH_NOISES,
-    KERNELS,
     LENGTHS,
     NOISES,
-    Kernel,
-    distances,
     grid_evidence,
     improbability,
 )
+from torch_zerohess.surrogates.kernels import KERNELS, Kernel, distances
 
 _LEAST_NOISE = 1e-8
 """Noise below which a covariance of thousands of points is singular in double precision."""

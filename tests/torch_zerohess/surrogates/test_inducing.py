@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from torch_zerohess.surrogates.gaussian_process import CONSTANT, gaussian, matern
+from torch_zerohess.surrogates.gaussian_process import CONSTANT
 from torch_zerohess.surrogates.inducing import InducedProcess
+from torch_zerohess.surrogates.kernels import gaussian, matern
 
 
 def data(P: int = 25):

@@ -1,0 +1,117 @@
+"""Descent that hands over to a Gaussian process: where, where not, and what it gains."""
+
+import pytest
+import torch
+from every_search import same, saved
+from searches import points_of, run, square
+
+from torch_zerohess.optim import Descent, TrustRegion
+from torch_zerohess.search import descent_then_process
+from torch_zerohess.surrogates import kernels
+from truths import normal
+
+PLACES = torch.linspace(0.0, 1.0, 64, dtype=torch.float64)
+BOX = {"sigma": 0.2, "bounds": (0.0, 1.0)}
+
+
+def strips(z):
+    """Pictures [K, n, 64]: in each of n strips a bar with hard edges, where one parameter says."""
+    return ((PLACES - z[..., None]).abs() < 0.12).double()
+
+
+def misses(n):
+    """The loss of strips whose bars should be near .7. From a start near .25 every single bar is on a plateau."""
+    return square(strips(torch.linspace(0.6, 0.8, n, dtype=torch.float64)))
+
+
+def start(n, seed):
+    return 0.25 + 0.05 * torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def door(n, seed=0, kind=TrustRegion, **settings):
+    return kind(start(n, seed), loss=misses(n), seed=seed, **{**BOX, **settings})
+
+
+def evaluations(search, most):
+    first = float(misses(len(search.x))(strips(search.x)))
+    return run(search, strips, most, target=0.01 * first).evaluations
+
+
+@pytest.mark.parametrize(("n", "most"), [(6, 60), (10, 100)])
+def test_a_plateau_of_many_parameters_takes_a_few_evaluations_each(n, most):
+    """All bars in place, from three starts each; the descent alone takes several times as many."""
+    for seed in range(3):
+        search = door(n, seed)
+        assert search.engine == "descent"
+        assert evaluations(search, most) < most
+        assert search.engine == "gaussian_process"
+        assert search.reason.endswith("but descent gained little")
+        assert evaluations(door(n, seed, Descent), most) == most
+
+
+def test_without_additive_kernels_the_process_is_not_so_fast(monkeypatch):
+    monkeypatch.setattr(kernels, "_ADDITIVE", 100)
+    assert sum(evaluations(door(10, seed), 100) for seed in range(3)) > 250
+
+
+def smooth(x):
+    """Residuals [K, n + 2] whose sum of squares is 1 at its minimum 0."""
+    k = torch.arange(1, x.shape[1] + 1, dtype=x.dtype)
+    linear = (x + 0.3 * x.sum(1, keepdim=True)) / k
+    return torch.cat([linear, (x * k).sum(1, keepdim=True), 1 + 0.5 * x.square().sum(1, keepdim=True)], 1)
+
+
+@pytest.mark.parametrize("n", [5, 8])
+def test_smooth_outputs_are_left_to_the_descent(n):
+    """The points equal the points of `Descent`, to the last bit, also after it has arrived."""
+    settings = {"sigma": 0.5, "bounds": (-3.0, 3.0), "loss": lambda y: y.square().sum(), "seed": 0}
+    x0 = normal(1, n, seed=3)[0]
+    search = TrustRegion(x0, **settings)
+    assert torch.equal(points_of(search, smooth, 300), points_of(Descent(x0, **settings), smooth, 300))
+    assert search.engine == "descent"
+    assert search.rounds
+
+
+def test_a_descent_that_has_arrived_is_not_replaced(monkeypatch):
+    """However little it gains afterwards. Before it has, the same limit replaces it."""
+    settings = {"sigma": 0.5, "bounds": (-3.0, 3.0), "loss": lambda y: y.square().sum(), "seed": 0}
+    search = run(TrustRegion(normal(1, 5, seed=3)[0], **settings), smooth, 200, target=1 + 1e-9)
+    while search.rounds == 0:
+        search.tell(smooth(search.ask()))
+    monkeypatch.setattr(descent_then_process, "_GAIN", 2.0)
+    assert run(search, smooth, search.evaluations + 100).engine == "descent"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"restarts": 0}, {"noise": 1e-3}, {"bounds": (0.0, None)}, {"engine": "descent"}],
+    ids=["local", "noise", "no box", "descent"],
+)
+def test_where_it_is_the_descent_alone(settings):
+    search = run(door(6, **settings), strips, 100)
+    assert search.engine == "descent"
+
+
+def test_the_process_begins_with_all_evaluations():
+    """The next point after the change is the end of a step: no sample is drawn again."""
+    search = door(6)
+    while search.engine == "descent":
+        search.tell(strips(search.ask()))
+    assert len(search.ask()) == 1
+    progress = search.state_dict()["progress"]
+    assert len(progress["process"]["pool"]["values"]) == search.evaluations
+    assert progress["descent"] is None
+    again = door(6)
+    again.load_state_dict(saved(search.state_dict()))
+    assert same(run(again, strips, 40).state_dict(), run(search, strips, 40).state_dict())
+    assert again.value == search.value
+
+
+def test_batches_are_served_before_and_after_the_change():
+    search, sizes = door(6), []
+    while search.evaluations < 60:
+        points = search.ask(batch=4)
+        sizes.append(len(points))
+        search.tell(strips(points))
+    assert search.engine == "gaussian_process"
+    assert min(sizes) == 4

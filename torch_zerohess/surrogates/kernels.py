@@ -1,0 +1,71 @@
+"""Covariances of outputs at two points, in units of their variance and without its constant part.
+
+A joint kernel is a function of the distance of two points. An additive kernel is the mean over parameters of a function
+of the distance along one parameter. With it an output is a sum of functions of one parameter each. Then an evaluation
+tells about a parameter whatever the others are: ten parameters are ten lines, not a box of ten dimensions. An image of
+several objects that move by themselves is nearly such a sum, and an element of it depends on few parameters.
+
+Source: Duvenaud, Nickisch and Rasmussen (2011), "Additive Gaussian Processes", order 1. Order 2, sums of functions of
+pairs of parameters, was never the most likely on images of strips, discs and squares.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+_ZERO = 1e-16
+"""Added to squared distances: their root has no derivative at zero, and next to it the kernels' derivatives are lost in
+rounding."""
+
+Kernel = Callable[[Tensor], Tensor]
+"""From distances to covariances."""
+Structure = Literal["joint", "additive"]
+"""Whether the distance is the distance of two points, or the distance along each parameter."""
+
+
+def matern(distance: Tensor) -> Tensor:
+    """Matern kernel of order 3/2: (1 + sqrt(3) d) exp(-sqrt(3) d), once differentiable."""
+    scaled = math.sqrt(3.0) * distance
+    return (1.0 + scaled) * torch.exp(-scaled)
+
+
+def gaussian(distance: Tensor) -> Tensor:
+    """Gaussian kernel exp(-d^2 / 2), smooth."""
+    return torch.exp(-0.5 * distance.square())
+
+
+KERNELS: tuple[Kernel, ...] = (matern, gaussian)
+
+
+_ADDITIVE = 4
+"""Parameters from which on an additive kernel is worth a try. With fewer a joint kernel covers a box as well."""
+
+
+def structures(n: int) -> tuple[Structure, ...]:
+    """Return the structures to choose from for outputs of n parameters."""
+    return ("joint",) if n < _ADDITIVE else ("joint", "additive")
+
+
+def separations(structure: Structure, a: Tensor, b: Tensor) -> Tensor:
+    """Distances of points a [A, n] and b [B, n]: [A, B] for a joint kernel, [n, A, B] for an additive one."""
+    if structure == "joint":
+        return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+    return (a.mT[:, :, None] - b.mT[:, None, :]).abs()
+
+
+def covariances(structure: Structure, kernel: Kernel, separation: Tensor) -> Tensor:
+    """Covariances [A, B], 1 at a distance of 0, from `separations` in units of the length."""
+    each = kernel(separation)
+    return each if structure == "joint" else each.mean(0)
+
+
+def distances(a: Tensor, b: Tensor) -> Tensor:
+    """Distances [A, B] of points a [A, n] and b [B, n], with derivatives of every order that a kernel may multiply."""
+    middle = b.detach().sum(0) / max(len(b), 1)  # without points, too
+    a, b = a - middle, b - middle
+    squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
+    rounding = squares.detach().clamp(max=0.0)  # to be positive without a derivative of its own
+    return (squares - rounding + _ZERO).sqrt()

@@ -69,13 +69,12 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         self.local = OutputGaussNewton(replace(settings, restarts=0), self.capacity, _PATIENCE)
 
     def taking_over(
-        self, other: Progress, pool: Pool, generator: torch.Generator
+        self, other: Progress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[OutputProcessProgress, Tensor]:
-        """Begin with the evaluations of another search; return the next points, too."""
+        """Begin with evaluations of another search; return the next points, too."""
         nowhere = torch.full_like(self.settings.start, math.inf)
         known = self.progress(**self.begun(), finished=nowhere, phase="trial").taking(other)
-        told = Evaluated(pool.points, pool.values, pool.outputs, other.shape)
-        return self.points(self.remembered(known, told), generator)
+        return self.points(self.remembered(known, evaluated), generator)
 
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:
         newton, best = known.local, known.best

@@ -6,8 +6,8 @@ from typing import Any, Literal, get_args
 
 from torch import Tensor
 
+from torch_zerohess.search.descent_and_process import DescentAndProcess, TurnsProgress
 from torch_zerohess.search.descent_search import descent_method
-from torch_zerohess.search.descent_then_process import DescentThenProcess, DescentThenProcessProgress
 from torch_zerohess.search.gaussian_process_search import process_method
 from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalSettings
 from torch_zerohess.search.method import Method, Settings
@@ -29,8 +29,10 @@ class TrustRegion(AskTell[Any]):
     """A search that counts evaluations: `GaussianProcessSearch`, `Descent` or `LocalGaussNewton`. The caller evaluates.
 
     - Up to four parameters in a finite box: a Gaussian process, which escapes plateaus and local minima.
-    - 5 to 19 parameters in a finite box, an output and a `loss`, and `restarts`: descent, and the Gaussian process once
-      n + 1 evaluations of a descent without Gauss-Newton take away less than a fifth of the loss.
+    - 5 to 19 parameters in a finite box, an output and a `loss`, and `restarts`: descent and the Gaussian process in
+      turn. A descent that Gauss-Newton takes over stays. Otherwise the process has its turn where n + 1 evaluations of
+      the descent take away less than a fifth of the loss, and the descent where 8 (n + 1) of the process take away less
+      than a tenth.
     - 20 parameters or more, an output of many numbers and a `loss`: the evaluations tell whether these numbers depend
       on few parameters each. If they do: Gauss-Newton on a sparse Jacobian. The search asks this after its first batch
       and, where the answer is not clear, each time that its evaluations have doubled.
@@ -104,13 +106,13 @@ class TrustRegion(AskTell[Any]):
         known = self._state.progress
         if isinstance(known, SparseOrDenseProgress):
             return known.chosen or "descent"
-        return known.engine if isinstance(known, DescentThenProcessProgress) else self._method.engine
+        return known.engine if isinstance(known, TurnsProgress) else self._method.engine
 
     @property
     def reason(self) -> str:
         """Why this engine, in a sentence."""
         known = self._state.progress
-        if isinstance(known, DescentThenProcessProgress) and known.process is not None:
+        if isinstance(known, TurnsProgress) and known.process is not None:
             return f"{self._reason}, but descent gained little"
         return known.reason if isinstance(known, SparseOrDenseProgress) else self._reason
 
@@ -124,7 +126,7 @@ class TrustRegion(AskTell[Any]):
             return descent_method(settings)
         if engine == "descent" and (settings.loss is None or settings.n < FEWEST):
             hands_over = settings.loss is not None and settings.bounded and settings.restarts and not settings.noise
-            return DescentThenProcess(settings) if hands_over else descent_method(settings)
+            return DescentAndProcess(settings) if hands_over else descent_method(settings)
         tolerance = LOCAL_TOLERANCE if self._tolerance is None else settings.tolerance
         own = LocalSettings.checked(settings, grid=self._grid)
         local = local_method(replace(settings, tolerance=tolerance), own)

@@ -1,0 +1,161 @@
+"""Descent on an output and a Gaussian process of it, in turn: for 5 to 19 parameters in a finite box.
+
+On smooth outputs Gauss-Newton soon takes over from the descent, and needs fewer evaluations than the process. Where the
+descent has to follow the smoothed output, as over plateaus, the process often needs a fraction of its evaluations, and
+sometimes finds nothing. The evidence is the loss. The descent begins. If n + 1 evaluations of a descent that follows
+take away less than `_SLOW` of the lowest loss, the process goes on, with the evaluations of the descent. If
+`_PATIENCE` (n + 1) evaluations of the process take away less than `_STUCK` of it, the descent goes on: from where it
+was, or from the best point if that is much better. The next turn of the process comes when the descent has arrived.
+
+A descent whose Gauss-Newton has arrived, or has taken away as much as `_SLOW`, is never replaced.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
+from torch_zerohess.search.output_process import OutputProcess, OutputProcessProgress
+from torch_zerohess.search.relay import Relay
+from torch_zerohess.search.state import Evaluated, Progress
+
+_SLOW = 0.2
+"""Part of the lowest loss that n + 1 evaluations of a descent that follows must take away."""
+_STUCK, _PATIENCE = 0.1, 8
+"""Part of it that evaluations of the process must take away, and their number over n + 1."""
+_SHARED = "best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart"
+"""What the descent learns about a turn of the process."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TurnsProgress(Progress):
+    """The progress of both searches."""
+
+    descent: OutputDescentProgress
+    process: OutputProcessProgress | None = None
+    """None if it is not its turn."""
+    planned: Tensor
+    """Points [r, n] that the descent asks for next, when its turn comes again."""
+    output: Tensor
+    """At the best point [m]."""
+    smooth: bool = False
+    """Whether the descent is never replaced."""
+    resumed: bool = False
+    """Whether the process has had a turn."""
+    counted: int = 0
+    """Evaluations by which the search whose turn it is has followed, or looked, since the loss was last looked at."""
+    before: float = math.inf
+    """The lowest loss then, or when the turn of Gauss-Newton began."""
+
+    def gained(self, part: float, lowest: float) -> bool:
+        """Whether the lowest loss has fallen by this part."""
+        return lowest <= self.before - part * abs(self.before)
+
+    @property
+    def engine(self) -> str:
+        """Whose turn it is."""
+        return "descent" if self.process is None else "gaussian_process"
+
+
+class DescentAndProcess(Relay[TurnsProgress]):
+    """`OutputDescent` and `OutputProcess` in turn, within finite bounds."""
+
+    engine = "descent and gaussian_process"
+    progress = TurnsProgress
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__(settings)
+        self._descent, self._process = OutputDescent(settings), OutputProcess(settings)
+
+    def first(self, generator: torch.Generator) -> tuple[TurnsProgress, Tensor]:
+        descent, points = self._descent.first(generator)
+        none = points[:0]
+        known = TurnsProgress(
+            best=descent.best, center=descent.center, descent=descent, planned=none, output=none.flatten()
+        )
+        return known, points
+
+    def next(
+        self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[TurnsProgress, Tensor]:
+        finite = evaluated.those(evaluated.finite)
+        if len(finite) and float(finite.losses.min()) < known.best.loss:
+            assert finite.outputs is not None
+            known = replace(known, output=finite.outputs[int(finite.losses.argmin())])
+        step = self._by_descent if known.process is None else self._by_process
+        return step(known, evaluated, generator)
+
+    def turn(self, known: TurnsProgress) -> tuple[Method[Any], Any]:
+        return (self._descent, known.descent) if known.process is None else (self._process, known.process)
+
+    def _by_descent(
+        self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[TurnsProgress, Tensor]:
+        """Let the descent go on, and the process begin where the descent is slow, or has arrived in a later turn."""
+        before, rounds, first = known.descent.smooth, known.rounds, known.evaluations == 0
+        descent, points = self._descent.next(known.descent, evaluated, generator)
+        known = replace(known, descent=descent).taking(descent)
+        gained = known.gained(_SLOW, known.best.loss)
+        arrived = known.rounds > rounds
+        if known.smooth or (before is not None and (gained or arrived)):
+            return replace(known, smooth=True), points
+        if first or (descent.smooth is None) != (before is None):  # the first batch is no step
+            return replace(known, counted=0, before=known.best.loss), points
+        if known.done or descent.smooth is not None:
+            return known, points
+        known = replace(known, counted=known.counted + len(evaluated))
+        if arrived if known.resumed else known.counted > self.settings.n and not gained:
+            return self._to_process(known, points, generator)
+        if known.counted > self.settings.n:
+            known = replace(known, counted=0, before=known.best.loss)
+        return known, points
+
+    def _by_process(
+        self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[TurnsProgress, Tensor]:
+        """Let the process go on, and the descent where the process is stuck."""
+        assert known.process is not None
+        process, points = self._process.next(known.process, evaluated, generator)
+        known = replace(known, process=process, counted=known.counted + len(evaluated)).taking(process)
+        if known.gained(_STUCK, process.record.loss):
+            return replace(known, counted=0, before=process.record.loss), points
+        if known.counted <= _PATIENCE * (self.settings.n + 1) or process.finishing or known.done:
+            return known, points
+        return self._to_descent(known, process, generator)
+
+    def _to_process(
+        self, known: TurnsProgress, points: Tensor, generator: torch.Generator
+    ) -> tuple[TurnsProgress, Tensor]:
+        """Let the process begin with what the descent knows, and with the best point."""
+        pool, best = known.descent.descent.pool, known.best
+        assert pool.outputs is not None
+        told = Evaluated(
+            torch.cat([pool.points, best.point[None]]),
+            torch.cat([pool.values, pool.values.new_tensor([best.loss])]),
+            torch.cat([pool.outputs, known.output[None]]),
+            known.shape,
+        )
+        apart = (pool.points - best.point).norm(dim=1) > 0.0
+        told = told.those(torch.cat([apart, apart.new_ones(1)]))
+        process, asked = self._process.taking_over(known, told, generator)
+        known = replace(known, process=process, planned=points, counted=0, before=best.loss)
+        return known.taking(process), asked
+
+    def _to_descent(
+        self, known: TurnsProgress, process: OutputProcessProgress, generator: torch.Generator
+    ) -> tuple[TurnsProgress, Tensor]:
+        """Let the descent go on where it was; or at the best point, with what the process knows, if that is better."""
+        known = replace(known, best=process.record)  # in noise the best point of the process is one that it predicts
+        descent, points, pool = known.descent, known.planned, process.pool
+        if known.best.loss <= descent.best.loss - _STUCK * abs(descent.best.loss):
+            told = Evaluated(pool.points, pool.values, pool.outputs, known.shape)
+            told = told.those(pool.values.argsort(stable=True))
+            descent, points = self._descent.taking_over(known, told, generator)
+        inner = descent.descent.taking(known, *_SHARED)
+        descent = replace(descent, descent=inner).taking(known, *_SHARED)
+        known = replace(known, descent=descent, process=None, counted=0, before=known.best.loss, resumed=True)
+        return known.taking(descent), points

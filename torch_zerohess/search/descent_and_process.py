@@ -5,9 +5,10 @@ descent has to follow the smoothed output, as over plateaus, the process often n
 sometimes finds nothing. The evidence is the loss. The descent begins. If n + 1 evaluations of a descent that follows
 take away less than `_SLOW` of the lowest loss, the process goes on, with the evaluations of the descent. If
 `_PATIENCE` (n + 1) evaluations of the process take away less than `_STUCK` of it, the descent goes on: from where it
-was, or from the best point if that is much better. The next turn of the process comes when the descent has arrived.
+was, or from the best point if that is much better. The next turn of the process comes when the descent arrives.
 
-A descent whose Gauss-Newton has arrived, or has taken away as much as `_SLOW`, is never replaced.
+A descent whose Gauss-Newton arrives, or takes away as much as `_SLOW`, may be slow later: the process has its turn only
+if the descent arrives elsewhere than at the lowest minimum.
 """
 
 import math
@@ -43,7 +44,7 @@ class TurnsProgress(Progress):
     output: Tensor
     """At the best point [m]."""
     smooth: bool = False
-    """Whether the descent is never replaced."""
+    """Whether Gauss-Newton has arrived or taken away as much as `_SLOW`: a descent that follows may then be slow."""
     resumed: bool = False
     """Whether the process has had a turn."""
     counted: int = 0
@@ -95,24 +96,23 @@ class DescentAndProcess(Relay[TurnsProgress]):
     def _by_descent(
         self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[TurnsProgress, Tensor]:
-        """Let the descent go on, and the process begin where the descent is slow, or has arrived in a later turn."""
+        """Let the descent go on, and the process begin where the descent is slow, or arrives at another minimum."""
         before, rounds, first = known.descent.smooth, known.rounds, known.evaluations == 0
         descent, points = self._descent.next(known.descent, evaluated, generator)
         known = replace(known, descent=descent).taking(descent)
         gained = known.gained(_SLOW, known.best.loss)
-        arrived = known.rounds > rounds
-        if known.smooth or (before is not None and (gained or arrived)):
-            return replace(known, smooth=True), points
+        if known.rounds > rounds and not known.done and (known.resumed or known.agreed == 0):
+            return self._to_process(known, points, generator)
+        if before is not None and (gained or known.rounds > rounds):
+            known = replace(known, smooth=True)
         if first or (descent.smooth is None) != (before is None):  # the first batch is no step
             return replace(known, counted=0, before=known.best.loss), points
-        if known.done or descent.smooth is not None:
-            return known, points
         known = replace(known, counted=known.counted + len(evaluated))
-        if arrived if known.resumed else known.counted > self.settings.n and not gained:
-            return self._to_process(known, points, generator)
-        if known.counted > self.settings.n:
-            known = replace(known, counted=0, before=known.best.loss)
-        return known, points
+        if known.counted <= self.settings.n or descent.smooth is not None:
+            return known, points
+        if gained or known.smooth or known.resumed or known.done:
+            return replace(known, counted=0, before=known.best.loss), points
+        return self._to_process(known, points, generator)
 
     def _by_process(
         self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator

@@ -11,7 +11,7 @@ from torch_zerohess.search.protocol import AskTell
 
 
 class GaussianProcessSearch(AskTell[Any]):
-    """Search in a finite box by a Gaussian process, for one to about four parameters. It escapes local minima.
+    """Search in a finite box by a Gaussian process, for few parameters. It escapes plateaus and local minima.
 
     - With an output [K, *out] and a white-box `loss`, the process predicts the output anywhere in the box from all
       evaluations. The next point is the one where the loss of the prediction, with some optimism, is lowest; or where
@@ -34,13 +34,17 @@ class GaussianProcessSearch(AskTell[Any]):
     loss is declared with `noise`.
 
     It has the settings of `AskTell`; `bounds` are required and finite. By default the pool keeps 60 evaluations. The
-    time of a step grows with the third power of their number. More than four parameters are allowed, but random
-    candidates cover a box of so many dimensions badly.
+    time of a step grows with the third power of their number.
+
+    The process covers a box of about four parameters. With four parameters or more and an output, its kernel is additive
+    where the evidence says so: then it covers up to about fifteen, if each number of the output is a sum of functions of
+    one or two parameters, as a pixel of an image of several objects nearly is.
 
     Raises ValueError for settings out of range, or if a bound is missing or infinite; TypeError for settings of another
     type.
 
-    Source: Rasmussen and Williams (2006) for the process; Astudillo and Frazier (2019) for the composite function.
+    Source: Rasmussen and Williams (2006) for the process; Astudillo and Frazier (2019) for the composite function;
+    Duvenaud, Nickisch and Rasmussen (2011) for additive kernels.
 
     Example:
         >>> target = torch.tensor([0.3, 0.7]).sin()

@@ -1,12 +1,12 @@
 """Covariances of outputs at two points, in units of their variance and without its constant part.
 
 A joint kernel is a function of the distance of two points. An additive kernel is the mean over parameters of a function
-of the distance along one parameter. With it an output is a sum of functions of one parameter each. Then an evaluation
-tells about a parameter whatever the others are: ten parameters are ten lines, not a box of ten dimensions. An image of
-several objects that move by themselves is nearly such a sum, and an element of it depends on few parameters.
+of the distance along one parameter, or the mean over pairs of parameters of the product of two such functions. With it
+an output is a sum of functions of one parameter each, or of two each. Then an evaluation tells about a parameter
+whatever the others are: ten parameters are ten lines, or 45 squares, not a box of ten dimensions. An image of several
+objects that move by themselves is nearly such a sum.
 
-Source: Duvenaud, Nickisch and Rasmussen (2011), "Additive Gaussian Processes", order 1. Order 2, sums of functions of
-pairs of parameters, was never the most likely on images of strips, discs and squares.
+Source: Duvenaud, Nickisch and Rasmussen (2011), "Additive Gaussian Processes", orders 1 and 2.
 """
 
 import math
@@ -22,8 +22,8 @@ rounding."""
 
 Kernel = Callable[[Tensor], Tensor]
 """From distances to covariances."""
-Structure = Literal["joint", "additive"]
-"""Whether the distance is the distance of two points, or the distance along each parameter."""
+Structure = Literal["joint", "single", "pairs"]
+"""What a covariance is made of: all parameters at once, single parameters, or pairs of them."""
 
 
 def matern(distance: Tensor) -> Tensor:
@@ -41,16 +41,16 @@ KERNELS: tuple[Kernel, ...] = (matern, gaussian)
 
 
 _ADDITIVE = 4
-"""Parameters from which on an additive kernel is worth a try. With fewer a joint kernel covers a box as well."""
+"""Parameters from which on additive kernels are worth a try. With fewer a joint kernel covers a box as well."""
 
 
 def structures(n: int) -> tuple[Structure, ...]:
     """Return the structures to choose from for outputs of n parameters."""
-    return ("joint",) if n < _ADDITIVE else ("joint", "additive")
+    return ("joint",) if n < _ADDITIVE else ("joint", "single", "pairs")
 
 
 def separations(structure: Structure, a: Tensor, b: Tensor) -> Tensor:
-    """Distances of points a [A, n] and b [B, n]: [A, B] for a joint kernel, [n, A, B] for an additive one."""
+    """Distances of points a [A, n] and b [B, n]: [A, B] for a joint kernel, [n, A, B] for additive ones."""
     if structure == "joint":
         return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
     return (a.mT[:, :, None] - b.mT[:, None, :]).abs()
@@ -59,7 +59,12 @@ def separations(structure: Structure, a: Tensor, b: Tensor) -> Tensor:
 def covariances(structure: Structure, kernel: Kernel, separation: Tensor) -> Tensor:
     """Covariances [A, B], 1 at a distance of 0, from `separations` in units of the length."""
     each = kernel(separation)
-    return each if structure == "joint" else each.mean(0)
+    if structure == "joint":
+        return each
+    if structure == "single":
+        return each.mean(0)
+    n = len(each)
+    return (each.sum(0).square() - each.square().sum(0)) / (n * (n - 1))
 
 
 def distances(a: Tensor, b: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Descent that hands over to a Gaussian process: where, where not, and what it gains."""
+"""Descent and a Gaussian process in turn: whose turn it is, what it begins with, and what that gains."""
 
 import pytest
 import torch
@@ -104,6 +104,61 @@ def test_the_process_begins_with_all_evaluations():
     again.load_state_dict(saved(search.state_dict()))
     assert same(run(again, strips, 40).state_dict(), run(search, strips, 40).state_dict())
     assert again.value == search.value
+
+
+def flat(z):
+    """A picture [K, 3] that shows nothing, wherever its objects are."""
+    return torch.zeros(len(z), 3, dtype=torch.float64)
+
+
+def test_a_process_that_finds_nothing_gives_the_turn_back():
+    """After 8 (n + 1) evaluations, and gets it again when the descent has arrived; the descent goes on where it was."""
+    search = TrustRegion(start(5, 0), loss=square(1.0), seed=0, **BOX)
+    turns, planned = [], []
+    while len(turns) < 5:
+        if not turns or search.engine != turns[-1][0]:
+            turns.append((search.engine, search.evaluations, search.rounds))
+            if search.engine == "gaussian_process":
+                planned.append(search.state_dict()["progress"]["planned"])
+            elif planned:
+                assert torch.equal(search._space.parameters(planned[-1]), search.ask())
+        search.tell(flat(search.ask()))
+    engines, begins, rounds = zip(*turns, strict=True)
+    assert engines == ("descent", "gaussian_process", "descent", "gaussian_process", "descent")
+    assert begins[2] - begins[1] == begins[4] - begins[3] == 8 * 6 + 1
+    assert rounds[2] == rounds[1]
+    assert rounds[3] == rounds[2] + 1
+
+
+def test_the_descent_goes_on_at_a_better_point_with_what_the_process_knows():
+    n, restarts = 6, 10**6
+    search = door(n, restarts=restarts)
+    while search.engine == "descent":
+        search.tell(strips(search.ask()))
+    while search.engine == "gaussian_process":
+        search.tell(strips(search.ask()))
+    progress = search.state_dict()["progress"]["descent"]["descent"]
+    assert search.value == 0.0
+    assert float((progress["center"] - progress["best"]["point"]).norm()) == 0.0
+    assert len(progress["pool"]["values"]) > 8 * (n + 1)
+
+
+def ripples(z):
+    """Residuals [K, 15] of five parameters with many local minima."""
+    directions = normal(15, 5, seed=3) / 5**0.5
+    return (3.0 * z @ directions.mT).sin() + z @ directions.mT
+
+
+def test_smooth_outputs_with_several_minima_get_the_process_too():
+    """Its turn comes when the descent has arrived elsewhere than at its lowest minimum."""
+    target = ripples(0.5 * normal(1, 5, seed=7))[0]
+    x0 = normal(1, 5, seed=2)[0].clamp(-1.9, 1.9)
+    search = TrustRegion(x0, sigma=1.0, bounds=(-2, 2), loss=square(target), seed=0)
+    while search.engine == "descent":
+        search.tell(ripples(search.ask()))
+        assert search.evaluations < 600
+    assert search.rounds > 1
+    assert search.agreed == 0
 
 
 def test_batches_are_served_before_and_after_the_change():

@@ -36,9 +36,9 @@ class GaussianProcessSearch(AskTell[Any]):
     It has the settings of `AskTell`; `bounds` are required and finite. By default the pool keeps 60 evaluations. The
     time of a step grows with the third power of their number.
 
-    The process covers a box of about four parameters. With four parameters or more and an output, its kernel is additive
-    where the evidence says so: then it covers up to about fifteen, if each number of the output is a sum of functions of
-    one or two parameters, as a pixel of an image of several objects nearly is.
+    The process covers a box of about four parameters. With four parameters or more and an output, its kernel is
+    additive where the evidence says so. It then covers up to about fifteen parameters, if each number of the output is
+    a sum of functions of one or two parameters, as a pixel of an image of several objects nearly is.
 
     Raises ValueError for settings out of range, or if a bound is missing or infinite; TypeError for settings of another
     type.

@@ -22,7 +22,7 @@ from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
 from torch_zerohess.search.output_process import OutputProcess, OutputProcessProgress
 from torch_zerohess.search.relay import Relay
-from torch_zerohess.search.state import Evaluated, Progress
+from torch_zerohess.search.state import Best, Evaluated, Progress
 
 _SLOW = 0.2
 """Part of the lowest loss that n + 1 evaluations of a descent that follows must take away."""
@@ -41,8 +41,10 @@ class TurnsProgress(Progress):
     """None if it is not its turn."""
     planned: Tensor
     """Points [r, n] that the descent asks for next, when its turn comes again."""
+    record: Best
+    """The lowest loss that was evaluated: in noise the best point of the process is one that it predicts"""
     output: Tensor
-    """At the best point [m]."""
+    """and the output there [m]."""
     smooth: bool = False
     """Whether Gauss-Newton has arrived or taken away as much as `_SLOW`: a descent that follows may then be slow."""
     resumed: bool = False
@@ -54,7 +56,7 @@ class TurnsProgress(Progress):
 
     def gained(self, part: float, lowest: float) -> bool:
         """Whether the lowest loss has fallen by this part."""
-        return lowest <= self.before - part * abs(self.before)
+        return lowest < self.before - part * abs(self.before)
 
     @property
     def engine(self) -> str:
@@ -74,19 +76,20 @@ class DescentAndProcess(Relay[TurnsProgress]):
 
     def first(self, generator: torch.Generator) -> tuple[TurnsProgress, Tensor]:
         descent, points = self._descent.first(generator)
-        none = points[:0]
+        best, none = descent.best, points[:0]
         known = TurnsProgress(
-            best=descent.best, center=descent.center, descent=descent, planned=none, output=none.flatten()
+            best=best, center=descent.center, descent=descent, planned=none, record=best, output=none.flatten()
         )
         return known, points
 
     def next(
         self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[TurnsProgress, Tensor]:
-        finite = evaluated.those(evaluated.finite)
-        if len(finite) and float(finite.losses.min()) < known.best.loss:
-            assert finite.outputs is not None
-            known = replace(known, output=finite.outputs[int(finite.losses.argmin())])
+        new = evaluated.those(evaluated.finite)
+        record = known.record.or_lower(new, known.sigma)
+        if record is not known.record:
+            assert new.outputs is not None
+            known = replace(known, record=record, output=new.outputs[int(new.losses.argmin())])
         step = self._by_descent if known.process is None else self._by_process
         return step(known, evaluated, generator)
 
@@ -121,8 +124,8 @@ class DescentAndProcess(Relay[TurnsProgress]):
         assert known.process is not None
         process, points = self._process.next(known.process, evaluated, generator)
         known = replace(known, process=process, counted=known.counted + len(evaluated)).taking(process)
-        if known.gained(_STUCK, process.record.loss):
-            return replace(known, counted=0, before=process.record.loss), points
+        if known.gained(_STUCK, known.record.loss):
+            return replace(known, counted=0, before=known.record.loss), points
         if known.counted <= _PATIENCE * (self.settings.n + 1) or process.finishing or known.done:
             return known, points
         return self._to_descent(known, process, generator)
@@ -130,8 +133,8 @@ class DescentAndProcess(Relay[TurnsProgress]):
     def _to_process(
         self, known: TurnsProgress, points: Tensor, generator: torch.Generator
     ) -> tuple[TurnsProgress, Tensor]:
-        """Let the process begin with what the descent knows, and with the best point."""
-        pool, best = known.descent.descent.pool, known.best
+        """Let the process begin with what the descent knows, and with the lowest point."""
+        pool, best = known.descent.descent.pool, known.record
         assert pool.outputs is not None
         told = Evaluated(
             torch.cat([pool.points, best.point[None]]),
@@ -149,9 +152,9 @@ class DescentAndProcess(Relay[TurnsProgress]):
         self, known: TurnsProgress, process: OutputProcessProgress, generator: torch.Generator
     ) -> tuple[TurnsProgress, Tensor]:
         """Let the descent go on where it was; or at the best point, with what the process knows, if that is better."""
-        known = replace(known, best=process.record)  # in noise the best point of the process is one that it predicts
+        known = replace(known, best=known.record)
         descent, points, pool = known.descent, known.planned, process.pool
-        if known.best.loss <= descent.best.loss - _STUCK * abs(descent.best.loss):
+        if known.best.loss < descent.best.loss - _STUCK * abs(descent.best.loss):
             told = Evaluated(pool.points, pool.values, pool.outputs, known.shape)
             told = told.those(pool.values.argsort(stable=True))
             descent, points = self._descent.taking_over(known, told, generator)

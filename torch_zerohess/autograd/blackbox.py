@@ -13,7 +13,7 @@ from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import control_variate, opaque, tracing, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.limit import limited
-from torch_zerohess.autograd.linear_map import project
+from torch_zerohess.autograd.linear_map import product, project
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode
@@ -75,7 +75,8 @@ class BlackBox(nn.Module):
     seed and sigma, but one number of samples. With the ninth number fullgraph=True raises FailOnRecompileLimitHit.
     Without fullgraph torch logs a warning, and the layer runs without a graph for further numbers. Either way, a higher
     `recompile_limit` helps, isolate_recompiles does not. A layer with a memory is called between graphs: fullgraph=True
-    is an error, and so is `torch.func.grad` inside of compiled code.
+    is an error, and so is `torch.func.grad` inside of compiled code. `torch.func.hessian` and other second derivatives
+    can be compiled, but not forward mode of forward mode: fullgraph=True is an error, and without it no graph is made.
     `torch.export` and `torch.jit.trace` raise RuntimeError: no file holds a black box.
 
     Example:
@@ -118,6 +119,7 @@ class BlackBox(nn.Module):
             from torch_zerohess.autograd.in_graph import eager  # loaded late, as there
 
             return eager(self, x, *aux)
+        tracing.check_derivatives()
         dtype, x = checked_input(x, empty=True).dtype, working(x)
         check_aux(aux, self.memory, self.call.head)
         batch, n = x.shape[:-1], x.shape[-1]
@@ -292,7 +294,7 @@ def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> 
 
     def ratios(d: Tensor, zero: bool) -> Tensor:
         d = d if stein.highest is None else limited(d, stein.highest)
-        return (stein.ratio(d, functools.partial(project, zero=zero))[:, None] @ c)[:, 0]
+        return product(stein.ratio(d, functools.partial(project, zero=zero))[:, None], c.mT)[:, 0]
 
     d = (x.double() - center.double()) / expansion.sigma
     total = ratios(d, zero)

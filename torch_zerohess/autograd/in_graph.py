@@ -9,7 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from torch_zerohess.autograd import limit, opaque
+from torch_zerohess.autograd import limit, opaque, transforms
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -31,6 +31,8 @@ def _exporting() -> bool:
 
 exporting = torch.compiler.assume_constant_result(_exporting)
 """Whether this is an export. Up to torch 2.11 compiled code that asks torch is always told that it is."""
+forward_modes = torch.compiler.assume_constant_result(transforms.forward_modes)
+"""How many levels of forward mode of `torch.func` are open."""
 eager = torch.compiler.disable(
     _called, reason="the memory of a layer changes from call to call, and without one the layer needs torch 2.15"
 )

@@ -18,9 +18,17 @@ from torch_zerohess.sampling.kernels import Redrawn, Samples
 def project(u: Samples, t: Tensor, *, zero: bool = False) -> Tensor:
     """Return U t, [B, M, K], for u [B, K, n] and t [B, M, n]; `zero` promises that t is zero in value."""
     if torch.compiler.is_compiling() and isinstance(u, Tensor):
-        return t @ u.mT  # Dynamo traces no function with a custom jvp; plain operations need none
+        return product(t, u)  # Dynamo traces no function with a custom jvp; plain operations need none
     result: Tensor = _LinearMap.apply(t, False, zero, *_flat(u))
     return result
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Return a b^T, [B, M, K], for a [B, M, n] and b [B, K, n]."""
+    if torch.compiler.is_compiling() and transforms.forward_mode_active():
+        # torch (tried: 2.15) takes no derivative of the tangent of a batched product where it compiles.
+        return (a[:, :, None] * b[:, None]).sum(3)
+    return a @ b.mT
 
 
 def _flat(u: Samples) -> tuple[Any, ...]:

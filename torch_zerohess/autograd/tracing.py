@@ -27,6 +27,22 @@ def check_traceable() -> None:
             raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
 
 
+def check_derivatives() -> None:
+    """Raise RuntimeError for derivatives that torch (tried: 2.15) does not compile.
+
+    Its compiler fails in forward mode of forward mode, at products with numbers, for instance. Without fullgraph=True
+    an error makes the compiler leave the function as it is, and the result is right.
+    """
+    if torch.compiler.is_compiling():
+        from torch_zerohess.autograd import in_graph  # late: it loads the compiler
+
+        if in_graph.forward_modes() > 1:
+            raise RuntimeError(
+                "torch.compile fails at forward mode of forward mode: use torch.func.hessian in place of jacfwd of "
+                "jacfwd, and jvp of torch.func.grad in place of jvp of jvp"
+            )
+
+
 def never_compiled(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """Return a function that compiled code calls between two graphs, as it would be called without `torch.compile`."""
 

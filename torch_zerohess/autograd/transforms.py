@@ -13,6 +13,8 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | does `is_grads_batched` map over it | `torch._C._functorch.is_legacy_batchedtensor` | it is a vmap of its own |
 | which `randomness` has a vmap | `torch._C._functorch.get_interpreter_stack`, `CVmapInterpreterPtr`, `TransformType`,
 `RandomnessType` | a vmap rule is told, but is not called where it maps over nothing |
+| how often is forward mode nested | `torch._C._functorch.get_interpreter_stack`, `TransformType` | `torch.func` does \
+not tell |
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
@@ -51,6 +53,12 @@ def jit_traces() -> bool:
 def forward_mode_active() -> bool:
     """Whether a level of forward-mode differentiation is open in any thread, so that a tensor may carry a tangent."""
     return forward_ad._current_level >= 0
+
+
+def forward_modes() -> int:
+    """Return how many levels of forward mode of `torch.func` are open."""
+    functorch = torch._C._functorch
+    return sum(one.key() == functorch.TransformType.Jvp for one in functorch.get_interpreter_stack() or ())
 
 
 def has_tangent(x: Tensor) -> bool:

@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 import torch
-from layers import AGGREGATE, BATCH, IMAGE, SCALAR, SETTINGS, close, counting, leaf, network
+from layers import AGGREGATE, BATCH, IMAGE, SCALAR, SETTINGS, X, close, counting, leaf, network
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Memory, Smoothing, estimate
@@ -132,6 +132,42 @@ def test_outputs_of_any_strides_in_compiled_code() -> None:
     x = BATCH.reshape(-1, BATCH.shape[-1])
     with torch.no_grad():
         close(torch.compile(model, fullgraph=True, backend="inductor")(x), model(x))
+
+
+SECOND = {
+    "jacfwd of jacrev": lambda f: torch.func.hessian(f),
+    "jacrev of jacfwd": lambda f: torch.func.jacrev(torch.func.jacfwd(f)),
+    "jacrev of jacrev": lambda f: torch.func.jacrev(torch.func.jacrev(f)),
+}
+TWICE_FORWARD = {
+    "jacfwd of jacfwd": lambda f: torch.func.jacfwd(torch.func.jacfwd(f)),
+    "jvp of jvp": lambda f: lambda x: directional(lambda y: directional(f, y), x),
+}
+
+
+def directional(f, x: Tensor) -> Tensor:
+    return torch.func.jvp(f, (x,), (torch.ones_like(x),))[1]
+
+
+@pytest.mark.parametrize("way", SECOND.values(), ids=SECOND.keys())
+@pytest.mark.parametrize("smoothing", [AGGREGATE, SETTINGS["optimal"]], ids=["aggregate", "optimal"])
+def test_second_derivatives_inside_of_compiled_code(smoothing: Smoothing, way) -> None:
+    layer, x = BlackBox(SCALAR.f, smoothing), X.clone()
+    hessian = torch.compile(way(layer), fullgraph=True, backend="aot_eager")(x)
+    close(hessian, estimate(SCALAR.f, x, smoothing).hessian())
+
+
+@pytest.mark.parametrize("way", TWICE_FORWARD.values(), ids=TWICE_FORWARD.keys())
+def test_forward_mode_of_forward_mode_is_not_compiled(way) -> None:
+    """The compiler of torch fails there. With fullgraph=True our error says what to use, and without it nothing fails.
+
+    The aggregate weights have a product with a number, at which torch reports an internal assertion.
+    """
+    layer, x = BlackBox(SCALAR.f, AGGREGATE), X.clone()
+    with pytest.raises(Exception, match=r"use torch\.func\.hessian in place of jacfwd of jacfwd"):
+        torch.compile(way(layer), fullgraph=True, backend="aot_eager")(x)
+    torch.compiler.reset()
+    close(torch.compile(way(layer), backend="aot_eager")(x), way(layer)(x))
 
 
 class Between(torch.nn.Module):

@@ -13,7 +13,7 @@ functions. For n = 1, and with 4 or 8 evaluations, another way may have less err
 | 1 | E >= 6 n | gaussian | orthogonal | pairs | mean |
 | 1 | E >= n / 2 | gaussian | orthogonal | single | mean |
 | 1 | fewer evaluations | aggregate | random | single | mean |
-| 2 | n = 1 and E >= 32 | aggregate | sobol | single | mean |
+| 2 | n = 1 and E >= 16 | aggregate | sobol | single | mean |
 | 2 | E >= 64 and E >= 16 n | aggregate | sobol | pairs | mean |
 | 2 | E >= 8 and E >= n | aggregate | orthogonal | pairs | mean |
 | 2 | fewer evaluations | aggregate | random | pairs | mean |
@@ -23,8 +23,9 @@ two independent points measure two, which is a factor of sqrt(2) in error. Once 
 the error that remains comes from curvature, and pairs cancel it. The kernel of the Hessian is even, so that pairs
 cancel slopes. Lobes spoil the orthogonality of directions, and the gradient gains more from orthogonal directions than
 from lobes. A mean of other draws predicts f(x + sigma u) better than f(x) does. It needs two draws, and three that are
-not pairs; with fewer the baseline is "center". Draws of "sobol" are scrambles of at least 8 points, so that E < 32 has
-the baseline "center". Standard errors take three draws, but two pairs have one for the gradient.
+neither pairs nor scrambles; with fewer the baseline is "center". Draws of "sobol" are scrambles: from E = 32 on four
+of at least 8 points, with fewer evaluations two of at least 4. Two scrambles have a standard error with one degree of
+freedom.
 """
 
 from typing import Literal
@@ -36,6 +37,7 @@ _PAIRS = 64  # evaluations of so many pairs of Sobol points that they can be cut
 _WIDEST = 1024  # parameters up to which directions are made orthogonal: the time grows with n times the samples
 _SCRAMBLES = 4  # fewer would have a smaller error, and an interval of no use
 _LEAST_SCRAMBLE = 8  # points
+_EVEN = 4  # points of a scramble from which two scrambles have a standard error whatever their baseline
 
 
 def chosen_sampler(n: int, evaluations: int, order: int) -> Literal["random", "sobol", "orthogonal"]:
@@ -45,7 +47,7 @@ def chosen_sampler(n: int, evaluations: int, order: int) -> Literal["random", "s
     if order == 1:
         dense, least = n <= _LOW or evaluations >= _DENSE * n, n / 2
     else:
-        dense, least = evaluations >= max(_PAIRS if n > 1 else _PAIRS // 2, _DENSE * n), n
+        dense, least = evaluations >= max(_PAIRS if n > 1 else _DENSE, _DENSE * n), n
     if dense:
         return "sobol"
     return "orthogonal" if n > 1 and evaluations >= least else "random"
@@ -69,6 +71,6 @@ def scrambles_of(samples: int, most: int = _SCRAMBLES) -> int:
     return next(r for r in cuts if r <= 2 or samples >= r * _LEAST_SCRAMBLE)
 
 
-def chosen_baseline(antithetic: bool, draws: int) -> Literal["center", "mean"]:
-    """Return the baseline: f(x), or the mean of the other draws."""
-    return "mean" if draws >= (2 if antithetic else 3) else "center"
+def chosen_baseline(antithetic: bool, draws: int, size: int) -> Literal["center", "mean"]:
+    """Return the baseline: f(x), or the mean of the other draws, each of `size` points."""
+    return "mean" if draws >= (2 if antithetic or size >= _EVEN else 3) else "center"

@@ -198,7 +198,7 @@ class Smoothing:
             proposal = "gaussian" if self.order == 1 and sampler == "orthogonal" else "aggregate"
         if baseline == "auto":
             draws = scrambles if sampler == "sobol" and scrambles else samples
-            baseline = chosen_baseline(signs, draws) if mixed else "center"
+            baseline = chosen_baseline(signs, draws, samples // draws) if mixed else "center"
         chosen = {"proposal": proposal, "sampler": sampler, "antithetic": signs, "baseline": baseline}
         return {**chosen, "samples": samples, "scrambles": scrambles}
 

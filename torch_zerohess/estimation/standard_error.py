@@ -11,6 +11,7 @@ from torch_zerohess.estimation.skewness import shape_of
 from torch_zerohess.estimation.stein import Quantity, Spread, Stein
 
 _CHUNK = 1 << 22  # numbers held at a time
+_EVEN = 4  # points of a scramble from which its mean varies so little that two scrambles hardly depend on each other
 
 
 class Divisible(Stein):
@@ -52,6 +53,10 @@ def variance_of_draws(
     kernel, 2 (D - 1) / (D - 2) times. Where such products matter (the Hessian, and the gradient without antithetic
     pairs), the standard error is 20 to 40 % too large for four draws, and 3 to 8 % for sixteen.
 
+    Two draws leave no other draw for a baseline. Where they are scrambles of at least four single points, products of a
+    baseline and a kernel are small: both are means over evenly spread points. The draws then count as independent.
+    Scrambles of pairs do not: their intervals at 95 % cover 80 to 93 % of Hessians.
+
     Args:
         stein: the family.
         quantity: which sum.
@@ -67,7 +72,8 @@ def variance_of_draws(
     draws = [one.to(a.device) for one in draws]
     shares = torch.cat([share[:, one].sum(2) for one in draws], 1)  # [B, D]
     D = (shares > 0).sum(1).double()
-    fewest = 2 if pooled is None else 3
+    two = pooled is not None and shares.shape[1] == 2 and _scrambles(draws[0])
+    fewest = 2 if pooled is None or two else 3
     if int(D.min()) < fewest:
         raise ValueError(
             f"a standard error needs at least two independent draws, got {int(D.min())}: use at least 2 samples; "
@@ -75,16 +81,24 @@ def variance_of_draws(
             if pooled is None
             else f"a standard error with baseline 'mean' needs at least three independent draws, got {int(D.min())}: "
             "use baseline 'center', or at least 3 samples; sampler 'sobol' needs a multiple of 4, with scrambles=4 or, "
-            "from 32 samples on, scrambles=None"
+            "from 32 samples on, scrambles=None; without antithetic pairs an even number from 8 on is enough"
         )
     whole = stein.sums(quantity, a, v)
     divided = _Divided(stein, quantity, share, draws, v, whole[0].numel())
     if pooled is None:
         squares, cubes, fourth = _powers((y - s * whole[:, None]) / _positive(s).sqrt() for s, y in divided.sums(a))
+    elif two:
+        squares, cubes, fourth = _powers([_two(divided, a, pooled)])
     else:
         squares, cubes, fourth = _powers(_jackknife(divided, whole, shares, pooled))
     D = D.reshape(-1, *(1,) * (whole.dim() - 1))
     return Spread(squares / (D - 1), (D - 1).expand_as(whole), shape_of(squares, cubes, fourth, D))
+
+
+def _scrambles(draws: Tensor) -> bool:
+    """Whether draws [D, r] are evenly spread points: at least four rows, and not in pairs, which are far apart."""
+    rows = draws.shape[1]
+    return rows >= _EVEN and int(draws[0, -1] - draws[0, 0]) < rows
 
 
 def _powers(deviations: Iterable[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
@@ -96,6 +110,15 @@ def _powers(deviations: Iterable[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         third = third.to(one) + (square * one).sum(1)
         fourth = fourth.to(one) + (square * square).sum(1)
     return second, third, fourth
+
+
+def _two(divided: "_Divided", a: Tensor, pooled: Tensor) -> Tensor:
+    """Return (y_d - s_d Y) / sqrt(s_d) of two draws, each of which has the mean of the other one as its baseline."""
+    s, y = (torch.cat(parts, 1) for parts in zip(*divided.sums(a), strict=True))
+    if divided.quantity == "value":  # the baseline itself is part of it
+        means = torch.cat(list(divided.totals(pooled)), 1) / _positive(s)
+        y = y + s * means.flip(1)
+    return (y - s * y.sum(1, keepdim=True)) / _positive(s).sqrt()
 
 
 def _jackknife(divided: "_Divided", whole: Tensor, shares: Tensor, pooled: Tensor) -> Iterator[Tensor]:

@@ -70,6 +70,13 @@ def test_intervals_of_aggregate_contain_the_truth(sampler: str, baseline: str, a
     check(smoothing, seeds=4 if sampler == "sobol" else 1)  # a batch shares its scrambles
 
 
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("samples", [8, 16])
+def test_intervals_of_two_scrambles_with_the_mean_of_the_other_contain_the_truth(samples: int, order: int) -> None:
+    smoothing = PLAIN.replace(samples=samples, sampler="sobol", scrambles=2, baseline="mean", antithetic=False)
+    check(smoothing.replace(order=order), ("value", "gradient") if order == 1 else None, seeds=20)
+
+
 @pytest.mark.parametrize("antithetic", [True, False])
 @pytest.mark.parametrize("baseline", ["center", "mean", "none"])
 def test_intervals_of_gaussian_contain_the_truth(baseline: str, antithetic: bool) -> None:
@@ -229,6 +236,10 @@ def test_what_the_error_for_few_scrambles_advises_is_enough(samples: int) -> Non
             estimate(WAVE, X, few).standard_error(quantity)
         for changes in enough:
             assert bool((estimate(WAVE, X, few.replace(**changes)).standard_error(quantity) > 0).all())
+    apart = few.replace(antithetic=False)
+    assert bool((estimate(WAVE, X, apart).standard_error(quantity) > 0).all())
+    with pytest.raises(ValueError, match="without antithetic pairs an even number from 8 on"):
+        estimate(WAVE, X, apart.replace(samples=6)).standard_error(quantity)
     one = few.replace(baseline="center", scrambles=1)
     with pytest.raises(ValueError, match=r"got 1: .*'sobol' needs an even number, with scrambles None or at least 2"):
         estimate(WAVE, X, one).standard_error("value")

@@ -12,18 +12,19 @@ Rivals are restated in a few lines each, so that the study depends on none of th
 "EvoTorch, single" is a factor (K - 1) / K too short, because every value enters its own baseline. Where errors are as
 large as the gradient, that shrinkage alone lowers them. All others are unbiased. r is the density that the source draws
 u from over the normal one: the mean of the n lobes of the gradient, or of the n^2 lobes of the Hessian, without the
-Gaussian share of our mixture. The Hessian-vector product of optax is the second derivative of the same expression.
-EvoTorch has none.
+Gaussian share of our mixture. Hessian and Hessian-vector product of optax are second derivatives of the same
+expression. EvoTorch has none. The draws of the source for the Hessian serve nothing else; those of "auto" serve value
+and gradient, too.
 
 The rules of `torch_zerohess.choice` were chosen on six functions. Two more, a product of sines and a steep ridge, are
-held out: no rule was chosen on them.
+held out: no rule was chosen on them. Nor was any on losses of images: MUG, from a table of renders, and the BOX tasks.
 
 Errors are relative root-mean-square errors over independent runs. f(x) counts as an evaluation wherever a method uses
 it.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,13 +33,16 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.problems.closed_forms import PlaneWave, Quadratic, Step
 from experiments.reports.progress import progress
+from experiments.studies.estimator_problems import Problem
 from torch_zerohess.sampling.quantiles import gradient_lobe_quantile, hessian_lobe_quantile
 
 Function = Callable[[Tensor], Tensor]
 RIVALS = ("default", "optax", "EvoTorch, single", "EvoTorch, pairs", "source")
-SIZES = (1, 2, 3, 10, 30, 100, 1024)
+SIZES = (1, 2, 3, 10, 30, 100, 300, 1024)
+QUANTITIES = ("gradient", "hvp", "hessian")
 BUDGETS = (4, 8, 16, 32, 64, 128, 256, 512)
 _MOST_NUMBERS = 2_000_000  # of all perturbations of one setting
+_MOST_ELEMENTS = 20_000_000  # of all its Hessians
 _NOISE = 0.4
 
 
@@ -53,8 +57,8 @@ class Row:
     chosen: str
     errors: dict[str, float]
     """By method; "auto" is ours."""
-    held_out: bool = False
-    """Whether no rule of "auto" was chosen on the function."""
+    kind: str = "of the rules"
+    """Whether a rule of "auto" was chosen on the function."""
 
     @property
     def best_rival(self) -> str:
@@ -69,33 +73,48 @@ class Row:
 
 @dataclass(frozen=True)
 class Case:
-    """A function around x = 0 with sigma = 1, and its true smoothed value and derivatives there."""
+    """A function around x = 0 with sigma = 1, and the true derivatives of the smoothed function there."""
 
     name: str
     fn: Function
     gradient: Tensor
     hessian: Tensor
-    held_out: bool = False
+    kind: str = "of the rules"
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Case":
+        """Return a problem in units of its sigma."""
+        x, sigma, truth = problem.x, problem.sigma, problem.truth
+        gradient, hessian = truth["gradient"] * sigma, truth["hessian"] * sigma**2
+        return cls(problem.name, lambda u: problem.fn(x + sigma * u), gradient, hessian, problem.name)
 
 
 def compare(
-    *, sizes: tuple[int, ...] = SIZES, budgets: tuple[int, ...] = BUDGETS, runs: int = 100, seed: int = 0
+    *,
+    sizes: tuple[int, ...] = SIZES,
+    budgets: tuple[int, ...] = BUDGETS,
+    runs: int = 100,
+    seed: int = 0,
+    problems: Sequence[Problem] = (),
 ) -> list[Row]:
-    """Measure gradients (of order 1) and Hessian-vector products.
+    """Measure gradients (of order 1), Hessian-vector products and Hessians.
 
     Args:
         sizes: numbers of parameters.
         budgets: evaluations of one estimate, at most.
-        runs: independent estimates, fewer where n times the budget is large.
+        runs: independent estimates, fewer where n times the budget, or the Hessian, is large.
         seed: of the noise.
+        problems: further functions, each with rows of its own. Plane waves are among the functions already.
     """
+    groups = [(n, cases_of(n)) for n in sizes]
+    groups += [(len(one.x), [Case.of(one)]) for one in problems if not one.name.startswith("WAVE")]
     rows = []
-    for n in progress(sizes, "sizes"):
-        cases = cases_of(n)
+    for n, cases in progress(groups, "sizes"):
         for budget in budgets:
             count = max(8, min(runs, _MOST_NUMBERS // (n * budget)))
-            for quantity in ("gradient", "hvp"):
-                rows += _rows(cases, quantity, n, budget, count, seed)
+            for quantity in QUANTITIES:
+                most = count if quantity != "hessian" else max(8, min(count, _MOST_ELEMENTS // n**2))
+                rows += _rows(cases, quantity, n, budget, most, seed)
     return rows
 
 
@@ -135,7 +154,7 @@ def _product_of_sines(n: int) -> Case:
     gradient = torch.full((n,), math.exp(value) * slope, dtype=torch.float64)
     hessian = torch.full((n, n), math.exp(value) * slope**2, dtype=torch.float64)
     hessian.fill_diagonal_(-math.exp(value) * w**2)
-    return Case("product of sines", lambda z: torch.sin(w * (z + 1) + math.pi / 2).prod(-1), gradient, hessian, True)
+    return Case("product of sines", lambda z: torch.cos(w * (z + 1)).prod(-1), gradient, hessian, "held out")
 
 
 def _ridge(a: Tensor) -> Case:
@@ -143,7 +162,7 @@ def _ridge(a: Tensor) -> Case:
     t = torch.linspace(-9, 9, 20_001, dtype=torch.float64)
     weighted = torch.tanh(5 * t + 0.5) * torch.exp(-0.5 * t * t) / math.sqrt(2 * math.pi)
     slope, curvature = (torch.trapezoid(weighted * kernel, t) for kernel in (t, t * t - 1))
-    return Case("ridge", lambda z: torch.tanh(5 * (z @ a) + 0.5), slope * a, curvature * torch.outer(a, a), True)
+    return Case("ridge", lambda z: torch.tanh(5 * (z @ a) + 0.5), slope * a, curvature * torch.outer(a, a), "held out")
 
 
 def _valleys(z: Tensor) -> Tensor:
@@ -162,24 +181,30 @@ def _rows(cases: list[Case], quantity: str, n: int, budget: int, runs: int, seed
     lobes = draws_of_the_source(runs, budget // 2, n, order, generator)
     found = []
     for case in cases:
-        truth = case.gradient if quantity == "gradient" else case.hessian @ v
-        size = truth.norm() if quantity == "gradient" else case.hessian.norm() / math.sqrt(n)
+        truth = {"gradient": case.gradient, "hvp": case.hessian @ v, "hessian": case.hessian}[quantity]
+        size = truth.norm() if quantity != "hvp" else case.hessian.norm() / math.sqrt(n)
         methods = {"auto": auto, "default": default}
         estimates = {name: _ours(case.fn, one, n, runs, quantity, v) for name, one in methods.items()}
-        rivals = rival_gradients(case.fn, u) if quantity == "gradient" else {"optax": optax_product(case.fn, u, v)}
-        rivals["source"] = of_the_source(case.fn, *lobes, None if quantity == "gradient" else v)
+        vector = v if quantity == "hvp" else None
+        if quantity == "gradient":
+            rivals = rival_gradients(case.fn, u) | {"source": gradient_of_the_source(case.fn, *lobes)}
+        else:
+            rivals = {"optax": second_of_optax(case.fn, u, vector)}
+            rivals["source"] = second_of_the_source(case.fn, *lobes, vector)
         errors = {
-            name: float((one - truth).square().sum(1).mean().sqrt() / size)
+            name: float((one - truth).flatten(1).square().sum(1).mean().sqrt() / size)
             for name, one in (estimates | rivals).items()
         }
-        found.append(Row(case.name, quantity, n, budget, auto.resolved(n).sampling, errors, case.held_out))
+        found.append(Row(case.name, quantity, n, budget, auto.resolved(n).sampling, errors, case.kind))
     return found
 
 
 def _ours(fn: Function, smoothing: zh.Smoothing, n: int, runs: int, quantity: str, v: Tensor) -> Tensor:
     x = torch.zeros(runs, n, dtype=torch.float64)
     result = zh.estimate(fn, x, smoothing, value="smoothed")
-    return result.gradient if quantity == "gradient" else result.hvp(v)
+    if quantity == "gradient":
+        return result.gradient
+    return result.hvp(v) if quantity == "hvp" else result.hessian()
 
 
 def rival_gradients(fn: Function, u: Tensor) -> dict[str, Tensor]:
@@ -197,11 +222,18 @@ def rival_gradients(fn: Function, u: Tensor) -> dict[str, Tensor]:
     }
 
 
-def optax_product(fn: Function, u: Tensor, v: Tensor) -> Tensor:
-    """Return Hessian-vector products [R, n]: mean of (f(u) - f(0)) (u (u . v) - v)."""
+def second_of_optax(fn: Function, u: Tensor, v: Tensor | None) -> Tensor:
+    """Return the mean of (f(u) - f(0)) (u u^T - I), [R, n, n], or its products with v, [R, n]."""
     u = u[:, :-1]
-    f = fn(u.flatten(0, 1)).view(u.shape[:2]) - fn(torch.zeros_like(u[:, 0]))[:, None]
-    return (f[..., None] * (u * (u @ v)[..., None] - v)).mean(1)
+    return _second(fn(u.flatten(0, 1)).view(u.shape[:2]) - fn(torch.zeros_like(u[:, 0]))[:, None], u, v)
+
+
+def _second(weights: Tensor, u: Tensor, v: Tensor | None) -> Tensor:
+    """Return the mean over K of weights [R, K] times (u u^T - I), or times its product with v [n], for u [R, K, n]."""
+    if v is not None:
+        return (weights[..., None] * (u * (u @ v)[..., None] - v)).mean(1)
+    identity = torch.eye(u.shape[2], dtype=u.dtype)
+    return (weights[..., None] * u).mT @ u / u.shape[1] - weights.mean(1)[:, None, None] * identity
 
 
 def draws_of_the_source(R: int, S: int, n: int, order: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -219,12 +251,21 @@ def draws_of_the_source(R: int, S: int, n: int, order: int, generator: torch.Gen
     return u, (cross + math.sqrt(2 * math.pi * math.e) / 4 * (u.square() - 1).abs().sum(2)) / n**2
 
 
-def of_the_source(fn: Function, u: Tensor, ratio: Tensor, v: Tensor | None) -> Tensor:
-    """Return gradients [R, n] at x = 0 with sigma = 1, or products with v [n], from `draws_of_the_source` and -u."""
-    plus, minus = (fn(one.flatten(0, 1)).view(ratio.shape) / ratio for one in (u, -u))
-    if v is None:
-        return (0.5 * (plus - minus)[..., None] * u).mean(1)
-    return (0.5 * (plus + minus)[..., None] * (u * (u @ v)[..., None] - v)).mean(1)
+def gradient_of_the_source(fn: Function, u: Tensor, ratio: Tensor) -> Tensor:
+    """Return gradients [R, n] at x = 0 with sigma = 1, from `draws_of_the_source` and -u."""
+    plus, minus = _over(fn, u, ratio)
+    return (0.5 * (plus - minus)[..., None] * u).mean(1)
+
+
+def second_of_the_source(fn: Function, u: Tensor, ratio: Tensor, v: Tensor | None) -> Tensor:
+    """Return Hessians [R, n, n], or their products with v, [R, n], in the same way."""
+    plus, minus = _over(fn, u, ratio)
+    return _second(0.5 * (plus + minus), u, v)
+
+
+def _over(fn: Function, u: Tensor, ratio: Tensor) -> tuple[Tensor, Tensor]:
+    """Return f(u) and f(-u) over the ratio of the densities, [R, S]."""
+    return fn(u.flatten(0, 1)).view(ratio.shape) / ratio, fn(-u.flatten(0, 1)).view(ratio.shape) / ratio
 
 
 def summary(rows: list[Row]) -> tuple[list[str], list[list[object]]]:
@@ -234,8 +275,7 @@ def summary(rows: list[Row]) -> tuple[list[str], list[list[object]]]:
     """
     groups: dict[tuple[str, int, int, str], list[Row]] = {}
     for row in rows:
-        kind = "held out" if row.held_out else "of the rules"
-        groups.setdefault((row.quantity, row.n, row.budget, kind), []).append(row)
+        groups.setdefault((row.quantity, row.n, row.budget, row.kind), []).append(row)
     body: list[list[object]] = []
     for (quantity, n, budget, kind), same in groups.items():
         names = [name for name in ("auto", *RIVALS) if name in same[0].errors]

@@ -88,7 +88,7 @@ def variance(
         problems: any of box2, box10, mug, wave2 and wave10.
         methods: names of the ways to estimate.
         side: pixels along the image side of the BOX tasks.
-        sizes: numbers of parameters of the comparison with other packages.
+        sizes: numbers of parameters of the comparison with other packages, which has the problems, too.
         rivals: its runs; 0 leaves it out.
         store: name of the table that is kept under experiments/results, for the documents; the comparison with other
             packages is kept as NAME_rivals.
@@ -131,7 +131,7 @@ def variance(
     if store is not None:
         print(keep(headers, rows, store))
     if rivals:
-        beside = compare(sizes=sizes, runs=rivals, seed=seed)
+        beside = compare(sizes=sizes, runs=rivals, seed=seed, problems=made)
         print(f"\nErrors of auto settings and of other packages, geometric means\n\n{table(*summary(beside))}")
         if store is not None:
             print(keep(*summary(beside), f"{store}_rivals"))

@@ -9,16 +9,18 @@ import torch
 from experiments.problems.closed_forms import PlaneWave
 from experiments.studies.estimator_choice import (
     BUDGETS,
+    Case,
     cases_of,
     compare,
     draws_of_the_source,
-    of_the_source,
-    optax_product,
+    gradient_of_the_source,
     rival_gradients,
+    second_of_optax,
+    second_of_the_source,
     summary,
 )
 from experiments.studies.estimator_curves import Measurement, curve, slope
-from experiments.studies.estimator_problems import looked_up, quadrature
+from experiments.studies.estimator_problems import looked_up, made_problem, quadrature
 from experiments.studies.estimators import ESTIMATORS, OURS, PAPER
 from experiments.studies.variance import VarianceReport, variance
 
@@ -115,7 +117,7 @@ def test_problems_have_lower_case_names_too_and_both_tables_are_kept(tmp_path, n
     names, chosen = ("wave10", "WAVE10"), {"methods": (OURS,), "sizes": (1,)}
     found = variance(runs=2, budgets=(32,), problems=names, **chosen, out=tmp_path, rivals=2, store="estimators")
     assert [row[:3] for row in kept["estimators"]] == [["WAVE10", OURS, 32]]
-    assert {tuple(row[:2]) for row in kept["estimators_rivals"]} == {("gradient", 1), ("hvp", 1)}
+    assert {tuple(row[:2]) for row in kept["estimators_rivals"]} == {("gradient", 1), ("hvp", 1), ("hessian", 1)}
     assert {m.problem for m in found.measurements} == {"WAVE10"}
     compared = json.loads((tmp_path / "rivals.json").read_text())
     assert len(compared) == 8 * len(BUDGETS) * 2  # functions, budgets, gradient and product
@@ -154,34 +156,50 @@ def test_quadrature_and_table_agree_with_a_closed_form() -> None:
 
 def test_auto_settings_have_the_least_error() -> None:
     rows = compare(sizes=(2, 10), budgets=(64,), runs=60)
-    assert sum(row.held_out for row in rows) == 2 * 2 * 2
-    assert len(rows) == 2 * 8 * 2
+    assert sum(row.kind == "held out" for row in rows) == 2 * 2 * 3
+    assert len(rows) == 2 * 8 * 3
     assert max(row.ratio for row in rows) < 1.0
     headers, body = summary(rows)
-    assert [row[:5] for row in body][:4] == [
+    assert [row[:5] for row in body][:6] == [
         [quantity, 2, 64, kind, f"aggregate, sobol, {signs}, mean"]
-        for quantity, signs in (("gradient", "single"), ("hvp", "pairs"))
+        for quantity, signs in (("gradient", "single"), ("hvp", "pairs"), ("hessian", "pairs"))
         for kind in ("of the rules", "held out")
     ]
     assert all(len(row) == len(headers) for row in body)
 
 
+def test_problems_are_compared_in_units_of_their_sigma() -> None:
+    wave, box = (made_problem(name, 2**14, 8, 0) for name in ("WAVE2", "BOX2"))
+    case, unit = Case.of(wave), torch.ones(2, dtype=torch.float64)
+    form = PlaneWave(wave.fn.k * wave.sigma, phase=0.7 + math.pi / 2)
+    torch.testing.assert_close(case.gradient, form.gradient(torch.zeros_like(unit), unit))
+    torch.testing.assert_close(case.hessian, form.hessian(torch.zeros_like(unit), unit))
+    torch.testing.assert_close(case.fn(torch.eye(2).double()), form(torch.eye(2).double()))
+    rows = compare(sizes=(), budgets=(64,), runs=40, problems=[wave, box])  # a wave is among the functions already
+    assert [(row.function, row.kind, row.quantity, row.n) for row in rows] == [
+        ("BOX2", "BOX2", quantity, 2) for quantity in ("gradient", "hvp", "hessian")
+    ]
+    assert all(0.01 < row.errors["auto"] < 3 for row in rows)
+
+
 def test_rivals_are_unbiased_or_as_biased_as_stated() -> None:
-    """Means of 20 000 runs within 5 standard errors of the closed form: 27 comparisons."""
+    """Means of 20 000 runs within 5 standard errors of the closed form: 36 comparisons."""
     k, R, K = torch.tensor([0.6, -0.8, 0.3], dtype=torch.float64), 20_000, 5
     wave, x, sigma = PlaneWave(k, phase=0.4), torch.zeros(3).double(), torch.ones(3).double()
     u = torch.randn(R, K + 1, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     found = rival_gradients(wave, u)
     generator = torch.Generator().manual_seed(3)
     first, second = (draws_of_the_source(R, K, 3, order, generator) for order in (1, 2))
-    found["source"] = of_the_source(wave, *first, None)
+    found["source"] = gradient_of_the_source(wave, *first)
     for name, gradients in found.items():
         share = K / (K + 1) if name == "EvoTorch, single" else 1.0
         error = gradients.mean(0) - share * wave.gradient(x, sigma)
         assert float((error.abs() / gradients.std(0) * math.sqrt(R)).max()) < 5, name
-    for products in (optax_product(wave, u, k), of_the_source(wave, *second, k)):
-        error = products.mean(0) - wave.hessian(x, sigma) @ k
-        assert float((error.abs() / products.std(0) * math.sqrt(R)).max()) < 5
+    hessian = wave.hessian(x, sigma)
+    for v, truth in ((k, hessian @ k), (None, hessian)):
+        for found_second in (second_of_optax(wave, u, v), second_of_the_source(wave, *second, v)):
+            error = found_second.mean(0) - truth
+            assert float((error.abs() / found_second.std(0) * math.sqrt(R)).max()) < 5
 
 
 @pytest.mark.parametrize("n", [1, 2])
@@ -189,7 +207,7 @@ def test_truths_of_functions_that_are_held_out(n) -> None:
     """Stein's identities by the trapezoid rule over all parameters."""
     line = torch.linspace(-9, 9, 401, dtype=torch.float64)
     u = torch.cartesian_prod(*[line] * n).view(-1, n)
-    cases = [case for case in cases_of(n) if case.held_out]
+    cases = [case for case in cases_of(n) if case.kind == "held out"]
     assert [case.name for case in cases] == ["product of sines", "ridge"]
     for case in cases:
         f = case.fn(u) * torch.exp(-0.5 * u.square().sum(1)) * ((line[1] - line[0]) / math.sqrt(2 * math.pi)) ** n

@@ -43,6 +43,9 @@ COMMANDS = {
     "variance": Command(
         "experiments.studies.variance:variance", "error of every estimator against evaluations and samples", long=True
     ),
+    "smoothing_laws": Command(
+        "experiments.studies.smoothing_laws:smoothing_laws", "errors with other laws of the noise", long=True
+    ),
     "nonpsd": Command("experiments.studies.nonpsd:nonpsd_error", "error of the Hessian where it is indefinite"),
     "losses": Command("experiments.studies.losses:losses", "a loss inside the black box, or after an image", long=True),
     "gradients": Command(

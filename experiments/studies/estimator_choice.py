@@ -42,7 +42,8 @@ SIZES = (1, 2, 3, 10, 30, 100, 300, 1024)
 QUANTITIES = ("gradient", "hvp", "hessian")
 BUDGETS = (4, 8, 16, 32, 64, 128, 256, 512)
 _MOST_NUMBERS = 2_000_000  # of all perturbations of one setting
-_MOST_ELEMENTS = 20_000_000  # of all its Hessians
+_MOST_ELEMENTS = 10_000_000  # of all its Hessians
+_POINTS = 2048  # of a problem at a time, each with an image
 _NOISE = 0.4
 
 
@@ -85,8 +86,11 @@ class Case:
     def of(cls, problem: Problem) -> "Case":
         """Return a problem in units of its sigma."""
         x, sigma, truth = problem.x, problem.sigma, problem.truth
-        gradient, hessian = truth["gradient"] * sigma, truth["hessian"] * sigma**2
-        return cls(problem.name, lambda u: problem.fn(x + sigma * u), gradient, hessian, problem.name)
+
+        def fn(u: Tensor) -> Tensor:
+            return torch.cat([problem.fn(x + sigma * part) for part in u.split(_POINTS)])
+
+        return cls(problem.name, fn, truth["gradient"] * sigma, truth["hessian"] * sigma**2, problem.name)
 
 
 def compare(

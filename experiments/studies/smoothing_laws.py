@@ -191,6 +191,7 @@ def row_of(law: Law, n: int, profile: Profile, evaluations: int, runs: int, seed
 
     first, second = profile.truth(law, n)
     count = max(20, min(runs, _MOST_ELEMENTS // n**2))
+    hessian: Tensor | None
     if law.auto:
         gradient, hessian = _by_auto(law, fn, n, evaluations, count, seed)
     else:

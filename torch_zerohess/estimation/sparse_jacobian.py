@@ -46,8 +46,9 @@ def sparse_jacobian(
     the first is not larger, outputs depend on many parameters each, or there are too few samples.
 
     Args:
-        fn: [K, n] -> [K, *out], an image or another output of at least two numbers. Outputs [h, w] and
-            [h, w, channels] are images, whose neighbouring pixels share evidence.
+        fn: [K, n] -> [K, *out], an image or another output of at least two numbers. Outputs of two dimensions or more
+            are images, whose neighbouring pixels share evidence: [h, w], [*stack, h, w] as with channels first, and
+            [*stack, h, w, channels] with up to four channels.
         x: [n], float32 or float64.
         smoothing: how to sample; proposal "aggregate", "gaussian" or "uniform", sampler "random" or "orthogonal". For
             sampler "auto" it is "orthogonal" where `estimate` takes Sobol points. In many dimensions their coordinates
@@ -95,7 +96,7 @@ def sparse_jacobian(
     work = working(x)
     taken = previous.total_evaluations if isinstance(previous, SparseJacobian) else 0
     u, changes, weights, shape, evaluations = _sampled(call, work, smoothing, smoothing.drawn_seed(taken))
-    check_samples(len(u), settings.keep)
+    check_samples(smoothing.samples, settings.keep, smoothing.samples - len(u))
     _check_weights(weights, smoothing, settings.keep)
     sigma = smoothing.sigma_vector(len(x), x.device).to(work)
     earlier = None if previous is None else _checked(previous, len(x), shape).to(work).times(sigma)

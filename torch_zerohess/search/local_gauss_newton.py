@@ -65,7 +65,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
             how much, repeated outputs tell.
         seed: of the samples; from torch's global generator if None.
 
-    Outputs [h, w] and [h, w, channels] are images, whose neighbouring pixels share evidence.
+    Outputs of two dimensions or more are images, whose neighbouring pixels share evidence: see `sparse_jacobian`.
 
     Raises ValueError for settings out of range, TypeError for settings of another type, and ValueError from the first
     `tell` for outputs of one number.

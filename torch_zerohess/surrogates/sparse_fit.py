@@ -99,11 +99,14 @@ def fewest_samples(keep: int) -> int:
     return max(FEWEST_SAMPLES, keep + 2)
 
 
-def check_samples(samples: int, keep: int) -> None:
-    """Raise ValueError for fewer samples than the kept entries and a constant need."""
+def check_samples(samples: int, keep: int, dropped: int = 0) -> None:
+    """Raise ValueError for fewer samples than the kept entries and a constant need, without those that are dropped."""
     least = fewest_samples(keep)
-    if samples < least:
-        raise ValueError(f"samples must be at least {least} to fit {keep} parameters per output (keep), got {samples}")
+    if samples - dropped < least:
+        lost = f", of which {dropped} were dropped because their outputs are not finite" if dropped else ""
+        raise ValueError(
+            f"samples must be at least {least} to fit {keep} parameters per output (keep), got {samples}{lost}"
+        )
 
 
 def fit_sparse(

@@ -34,6 +34,8 @@ _COUNTED = 1 << 20
 """Correlations from which thresholds are taken, at most about."""
 _LEAST_OWN, _LEAST_JOINT = 4.0, 1.25
 """Least thresholds, in units of the 1/K that chance gives on average."""
+_CHANNELS = 4
+"""Of an image, at most, if they are its last dimension."""
 _BINS = 2048
 """Of the histograms of r^2 between 0 and 1."""
 
@@ -47,10 +49,15 @@ class Grids:
 
     @classmethod
     def of(cls, shape: torch.Size, parameters: tuple[int, int, int] | None) -> "Grids":
-        """Take outputs [h, w] and [h, w, c] as images with up to four channels, all others as numbers in no order."""
-        if len(shape) == 2 or (len(shape) == 3 and shape[2] <= 4):
-            return cls((shape[0], shape[1], shape[2] if len(shape) == 3 else 1), parameters)
-        return cls((shape.numel(), 1, 1), parameters)
+        """Take outputs [m] as numbers in no order, and all others as images, one below the other.
+
+        The last of three dimensions or more has the channels if it is at most four: [views, h, w, 3] are images
+        [h, w, 3]. Otherwise the last dimension has the columns: [3, h, w] are images [h, w].
+        """
+        if len(shape) < 2:
+            return cls((shape.numel(), 1, 1), parameters)
+        columns, channels = shape[-2:] if len(shape) > 2 and shape[-1] <= _CHANNELS else (shape[-1], 1)
+        return cls((shape.numel() // (columns * channels), columns, channels), parameters)
 
     @property
     def joint(self) -> bool:

@@ -186,6 +186,30 @@ def test_pixels_that_are_not_finite():
     torch.testing.assert_close(J.dense().view(N, N), torch.diag(SCALES), atol=3e-3, rtol=0)
 
 
+def test_an_error_names_the_samples_that_were_dropped():
+    def failing(z):
+        return torch.where(z[:, :1, None] > 0.01, math.nan, scaled(z))
+
+    given = smoothing(20, antithetic=False)
+    with pytest.raises(ValueError, match=r"at least 18 to fit 16 .*, got 20, of which \d were dropped because their"):
+        zh.sparse_jacobian(failing, torch.zeros(N).double(), given, on_nonfinite="drop")
+
+
+@pytest.mark.parametrize("dims", [(0, 1, 2, 3), (0, 3, 1, 2), (3, 0, 1, 2)])
+def test_neighbours_share_evidence_in_every_layout_of_images(dims):
+    """Two blurred images of 16x16 in three colours, whose pixels depend on nine texels."""
+
+    def colours(z):
+        blurred = torch.nn.functional.avg_pool2d(z.view(-1, 2, 16, 16), 3, 1, 1)
+        return torch.stack([blurred, 0.5 * blurred, -blurred], -1)  # [K, 2, 16, 16, 3]
+
+    def explained(fn):
+        return zh.sparse_jacobian(fn, torch.zeros(512).double(), smoothing(40), keep=12, grid=(32, 16)).explained
+
+    alone = explained(lambda z: colours(z).flatten(1))
+    assert explained(lambda z: colours(z).permute(0, *(1 + one for one in dims))) > alone + 0.3
+
+
 def test_one_point_at_a_time():
     J = zh.sparse_jacobian(lambda z: scaled(z)[0], torch.zeros(N).double(), smoothing(), vectorized=False)
     assert J.shape == (SIDE, SIDE)

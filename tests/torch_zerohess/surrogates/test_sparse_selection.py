@@ -77,6 +77,22 @@ def test_thresholds_of_large_images_are_those_of_all_pairs(monkeypatch):
     assert few.joint == pytest.approx(every.joint, rel=0.15)
 
 
+@pytest.mark.parametrize(
+    ("shape", "pixels"),
+    [
+        ((60,), (60, 1, 1)),
+        ((6, 10), (6, 10, 1)),
+        ((6, 10, 4), (6, 10, 4)),
+        ((3, 6, 10), (18, 10, 1)),
+        ((2, 6, 10, 3), (12, 10, 3)),
+        ((2, 3, 6, 10), (36, 10, 1)),
+        ((60, 1), (60, 1, 1)),
+    ],
+)
+def test_the_layout_of_an_image_is_read_from_its_shape(shape, pixels):
+    assert Grids.of(torch.Size(shape), None).pixels == pixels
+
+
 def test_an_output_beyond_float32_does_not_stop_the_others():
     u, rest = normal(40, 20).float(), normal(40, 20, seed=1).float()
     rest[:, 3] = torch.inf

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-SEARCHES = ("gaussian_process", "gaussian_process_loss", "descent", "descent_loss")
+SEARCHES = ("auto", "gaussian_process", "gaussian_process_loss", "descent", "descent_loss")
 """Methods of `experiments.methods.ours`."""
 _SIGMAS: dict[str, dict[str, Any]] = {
     # tune brdf --method descent --runs 100 --over sigma=0.2,0.25,0.36,0.5

@@ -8,6 +8,7 @@ from small import TARGET, TASK
 
 import torch_zerohess as zh
 from experiments.methods import METHODS
+from experiments.methods.settings import settings
 from experiments.problems import catalogue
 from experiments.runs.trial import Trial
 
@@ -69,6 +70,11 @@ def test_a_gaussian_process_needs_a_small_finite_box(name):
     assert "finite bounds" in method.unusable(replace(BOUNDED, bounds=half))
     assert method.unusable(replace(BOUNDED, n=10)) is None
     assert "up to 10 parameters, the task has 11" in method.unusable(replace(BOUNDED, n=11))
+
+
+@pytest.mark.parametrize("task", ["box10", "brdf"])
+def test_the_engine_that_is_chosen_has_the_sigma_of_this_engine_alone(task):
+    assert settings("auto", task) == settings("descent", task) != {}
 
 
 def test_methods_of_the_loss_alone_are_for_tasks_that_have_more():

@@ -52,8 +52,12 @@ def sparse_jacobian(
         x: [n], float32 or float64.
         smoothing: how to sample; proposal "aggregate", "gaussian" or "uniform", sampler "random" or "orthogonal". For
             sampler "auto" it is "orthogonal" where `estimate` takes Sobol points. In many dimensions their coordinates
-            are correlated, as if outputs depended on further parameters. An antithetic pair is one sample, of which
-            even orders of fn are gone. The baseline is not used: a constant is part of the regression.
+            are correlated, as if outputs depended on further parameters. Proposal "optimal" is refused because it
+            draws samples for each parameter by itself: n evaluations and more, and so many determine the dense
+            Jacobian. Proposal "fr22" is refused because no weight corrects it: its density vanishes where any u_i is
+            0, so the weights prod_i sqrt(2/pi) / |u_i| have an infinite variance for every n. An antithetic pair is
+            one sample, of which even orders of fn are gone. The baseline is not used: a constant is part of the
+            regression.
         keep: parameters per output, at most; 16 if None, or n if that is less.
         rate: of false discoveries among the pairs of output and parameter that are found in a round; there are three.
             A pair that is false gets a small slope. Fewer than 1 / rate pairs count only if each of
@@ -112,8 +116,8 @@ def _resolved(smoothing: Smoothing, n: int) -> Smoothing:
     smoothing = smoothing.resolved(n)
     if smoothing.proposal in ("optimal", "fr22"):
         raise ValueError(
-            f"proposal must be 'aggregate', 'gaussian' or 'uniform', which perturb all parameters by what a weight "
-            f"corrects, got {smoothing.proposal!r}"
+            f"proposal must be 'aggregate', 'gaussian' or 'uniform', got {smoothing.proposal!r}: 'optimal' evaluates "
+            "more points than there are parameters, and the weights of 'fr22' have an infinite variance"
         )
     if smoothing.sampler == "sobol":
         raise ValueError(

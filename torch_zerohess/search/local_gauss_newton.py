@@ -48,8 +48,10 @@ class LocalGaussNewton(AskTell[LocalProgress]):
             linear outputs, which calls it some hundred times per step.
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         grid: rows and columns (and channels) in which the parameters lie, with n numbers in all. Neighbours then share
-            evidence, which helps where outputs depend on patches of parameters. None: they lie in no order.
-        keep: parameters per output, at most; 16 if None, or all of them if they are fewer.
+            evidence, which helps where outputs depend on patches of parameters. If None, a grid in the proportions of
+            the image is tried in the first three fits. It stays if it predicts more of the held-out change.
+        keep: parameters per output, at most. If None, 16 at first, and twice as many where most outputs have reached
+            that: 64 at most, and never more than there are.
         samples: of an iteration at first, at least 8 and at least keep + 2. An iteration that hardly lowers the loss
             doubles them, once; a good one halves them again.
         rate: of false discoveries among the pairs of output and parameter that are found in a round of a fit, see

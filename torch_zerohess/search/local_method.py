@@ -34,8 +34,9 @@ from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.sparse_choices import fit_chosen
 from torch_zerohess.surrogates.sparse_evidence import Evidence
-from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples, fit_sparse
+from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples
 
 _TRUSTED = 0.9
 """Share of the held-out change. If the Jacobian predicts more, the first radius is at least 1, as for the samples."""
@@ -63,7 +64,7 @@ _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
 _SHARED = (
-    *("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost", "evidence"),
+    *("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost", "evidence", "grid"),
     *("points", "outputs", "variance", "pairs"),
 )
 """What a search that returns from a hop keeps."""
@@ -96,7 +97,7 @@ class LocalSettings:
                 "engine='descent'"
             )
         sparse = SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid)
-        result = cls(replace(sparse, robust=False), **own)  # samples have one variance
+        result = cls(replace(sparse, robust=False, grows=keep is None), **own)  # samples have one variance
         for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
             checked_number(name, getattr(result, name), above=0.0, most=most, below=math.inf)
         check_samples(result.samples, result.sparse.keep)
@@ -162,7 +163,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
             return known
         u = ((told.points - known.center) / known.sigma).float()
         changes = ((told.outputs - known.output) / known.sigma).float()
-        fitted = fit_sparse(u, changes, known.shape, self.own.sparse, known.fitted)
+        fitted, grid = fit_chosen(u, changes, known.shape, self.own.sparse, known.fitted, known.grid)
+        known = replace(known, grid=grid)
         evidence = known.evidence or Evidence.none(self.settings.n, u.device)
         known = known.fitting(fitted, evidence.with_batch(fitted, known.fitted, u, changes))
         if known.found_share < _FOUND and known.samples < _MOST * self.own.samples:

@@ -1,12 +1,13 @@
 """What the search of `LocalGaussNewton` knows."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
 from torch_zerohess.search.gauss_newton import JacobianProgress
 from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.surrogates.sparse_choices import GridEvidence
 from torch_zerohess.surrogates.sparse_evidence import Evidence
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
@@ -29,6 +30,8 @@ class LocalProgress(JacobianProgress):
     """With the other entries that were found, some of them by chance."""
     evidence: Evidence | None = None
     """Which parameters these are."""
+    grid: GridEvidence = field(default_factory=GridEvidence)
+    """Whether the parameters lie on a grid, if the caller does not say it."""
     samples: int
     """Of the next batch."""
     slow: int = 0

@@ -27,6 +27,7 @@ from torch_zerohess.search.noisy_step import alternating, constants, step_in_noi
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.sparse_choices import kept
 from torch_zerohess.surrogates.sparse_evidence import Evidence
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, fit_sparse
 
@@ -204,7 +205,8 @@ class NoisyLocalMethod(LocalMethod):
         if count < FEWEST_SAMPLES:
             return known, 0.0, 0.0
         u, changes = self._relative(known, known.points[near], known.outputs[near])
-        fitted = fit_sparse(u, changes, known.shape, self.own.sparse)
+        sparse = known.grid.settings(self.own.sparse, known.shape, settings.n)
+        fitted = fit_sparse(u, changes, known.shape, replace(sparse, keep=kept(sparse, None, count)))
         evidence = known.evidence or Evidence.none(settings.n, u.device)
         if new >= FEWEST_SAMPLES:
             latest = self._relative(known, known.points[-new:], known.outputs[-new:])

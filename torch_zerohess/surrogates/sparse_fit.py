@@ -63,6 +63,8 @@ class SparseSettings:
     """Whether the Jacobian of least norm is measured also where previous slopes are known; otherwise the share that it
     explained before is kept. It takes a system of as many equations as samples, or parameters if these are fewer, for
     each part that is held out."""
+    grows: bool = False
+    """Whether a search may keep more entries where rows are full; see `sparse_choices`."""
 
     @classmethod
     def checked(cls, n: int, *, keep: int | None, rate: float, grid: Sequence[int] | None) -> "SparseSettings":
@@ -209,7 +211,7 @@ def _support(
         least = thresholds(u, rest, grids, settings.rate)
         if number and least.own > 1.0 and least.joint > 1.0:
             break
-        chosen, kept = torch.zeros_like(index), torch.zeros_like(used)
+        chosen, kept = index.new_zeros(len(index), settings.keep), used.new_zeros(len(used), settings.keep)
         for block, *found in candidates(u, rest, grids, least):  # one after the other: all of them are many
             old = used[block]
             known = old.nonzero()[:, 0], index[block][old], values[block][old].abs()

@@ -49,14 +49,8 @@ class Grids:
 
     @classmethod
     def of(cls, shape: torch.Size, parameters: tuple[int, int, int] | None) -> "Grids":
-        """Take outputs [m] as numbers in no order, and all others as images, one below the other.
-
-        The last of three dimensions or more has the channels if it is at most four: [views, h, w, 3] are images
-        [h, w, 3]. Otherwise the last dimension has the columns: [3, h, w] are images [h, w].
-        """
-        if len(shape) < 2:
-            return cls((shape.numel(), 1, 1), parameters)
-        columns, channels = shape[-2:] if len(shape) > 2 and shape[-1] <= _CHANNELS else (shape[-1], 1)
+        """Take outputs [m] as numbers in no order, and all others as images, one below the other."""
+        _, columns, channels = image_of(shape)
         return cls((shape.numel() // (columns * channels), columns, channels), parameters)
 
     @property
@@ -114,6 +108,18 @@ def thresholds(u: Tensor, rest: Tensor, grids: Grids, rate: float) -> Thresholds
     own, joint = (_threshold(counts[k], counts[k + 1], rate) for k in (0, 2))
     own = min(own, _single(K, rate / (n * rest.shape[1])))
     return Thresholds(max(own, _LEAST_OWN / K), max(joint, _LEAST_JOINT / K))
+
+
+def image_of(shape: torch.Size) -> tuple[int, int, int]:
+    """Return rows, columns and channels of an image in an output [*out]; numbers in no order are a column.
+
+    The last of three dimensions or more has the channels if it is at most four: [views, h, w, 3] are images [h, w, 3].
+    Otherwise the last dimension has the columns: [3, h, w] are images [h, w].
+    """
+    if len(shape) < 2:
+        return shape.numel(), 1, 1
+    rows, columns, channels = shape[-3:] if len(shape) > 2 and shape[-1] <= _CHANNELS else (*shape[-2:], 1)
+    return rows, columns, channels
 
 
 def spaced(energy: Tensor, count: int) -> list[int]:

@@ -224,6 +224,23 @@ def test_overlapping_footprints():
     assert search.value < 1e-3 * float(square(blur(truth[None])[0])(torch.zeros(SIDE, SIDE).double()))
 
 
+def wide(x):
+    """Pixels [14, 14] of 25 texels each."""
+    texels = x.view(-1, 1, 14, 14)
+    return (0.3 * texels + torch.nn.functional.avg_pool2d(texels, 5, 1, 2))[:, 0]
+
+
+def test_full_rows_and_a_grid_of_parameters_are_found():
+    """25 entries per row, where 16 are kept at first; neighbours tell them, although nobody says that they are some."""
+    truth, order = normal(196), torch.randperm(196, generator=torch.Generator().manual_seed(0))
+    least = 1e-4 * float(wide(truth[None]).square().mean())
+    open_, few = (run(search_for(wide, truth, **one), wide, 300, least).evaluations for one in ({}, {"keep": 16}))
+    assert open_ <= 160
+    assert few >= open_ + 50
+    mixed = run(search_for(lambda x: wide(x[:, order]), truth), lambda x: wide(x[:, order]), 300, least)
+    assert mixed.evaluations >= open_ + 30
+
+
 def test_steps_in_the_output_are_crossed():
     """Each pixel is a staircase of its texel, whose own derivative is zero."""
 

@@ -10,14 +10,14 @@ from small import BUMP, SIZE, Bump, trained
 
 import torch_zerohess as zh
 from experiments.methods import METHODS
-from experiments.methods.paper_networks import hessian_by_differences
+from experiments.methods.paper_networks import first_order, hessian_by_differences
 from experiments.problems import catalogue
 from experiments.problems.network_task import Size
 from experiments.runs.network_trial import NetworkTrial
 
-PAPER = {"fr22": 2 * 3, "our_g": 2 * 3, "our_h": 4 * 7, "our_hvp": 4 * 7, "our_hvpa": 4 * 3}
+PAPER = {"fr22": 2 * 2, "our_g": 2 * 2, "our_h": 4 * 7, "our_hvp": 4 * 7, "our_hvpa": 4 * 3}
 """Renders of a step: images of a batch, times pairs of samples (two renders each; those of our_h for gradient, Hessian
-and value, of our_hvp for three gradients) and f(x)."""
+and value, of our_hvp for three gradients), and f(x) of the last three."""
 RENDERS = {**PAPER, "zerograds": 4 * 2, "relax": 4 * 2}
 """The last two: images of a batch, times samples."""
 
@@ -44,7 +44,7 @@ def test_a_run_repeats_itself(name):
 
 def test_sigma_and_the_step_go_down():
     """With one image per step, Adam moves every weight by about its rate: the first steps are the longest."""
-    size = replace(SIZE, evaluations=3 * 100)
+    size = replace(SIZE, evaluations=2 * 100)
     weights = []
 
     class Noted(Bump):
@@ -63,8 +63,31 @@ def test_sigma_and_the_step_go_down():
     assert max(moves[90:]) < 2e-5 * 5
 
 
+@pytest.mark.parametrize("proposal", ["fr22", "aggregate"])
+def test_the_first_order_gradient_needs_no_f_of_x(proposal):
+    """The steps of three batches are those of Adam with f(x) at every image, which costs a render more."""
+    trials = [NetworkTrial(Bump(replace(SIZE, evaluations=3 * 2 * renders)), "one", 0) for renders in (2, 3)]
+    smoothing = zh.Smoothing(sigma=Bump.sigma[0], samples=1, proposal=proposal, order=1)
+
+    torch.manual_seed(0)
+    first_order(trials[0], proposal=proposal, lr=(1e-3, 1e-3))
+    torch.manual_seed(0)
+    encoder, layer = trials[1].encoder, zh.BlackBox(trials[1].loss, smoothing)
+    optimizer, sigma = torch.optim.Adam(encoder.parameters(), lr=1e-3), zh.LinearSigma(layer, *Bump.sigma, steps=2)
+    for step in range(3):
+        images = trials[1].batch(step, 2)
+        optimizer.zero_grad()
+        layer(encoder(images), images).mean().backward()
+        optimizer.step()
+        sigma.step()
+
+    assert [trial.evaluations for trial in trials] == [3 * 2 * 2, 3 * 2 * 3]
+    for a, b in zip(trials[0].encoder.parameters(), encoder.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0.0, atol=1e-5)
+
+
 def test_the_image_error_of_a_row_is_the_mean_of_the_last_twentieth():
-    _, trial = trained("our_g", Bump(replace(SIZE, evaluations=6 * 60)))
+    _, trial = trained("our_g", Bump(replace(SIZE, evaluations=4 * 60)))
     losses = [row.loss for row in trial.rows[1:]]
     assert [row.image_error for row in trial.rows[3:]] == pytest.approx([sum(losses[k : k + 3]) / 3 for k in range(58)])
 

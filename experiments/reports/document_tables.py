@@ -200,6 +200,7 @@ _HEADER = {
     "image_divided": "image error divided by",
     "image_divided_worst": "at worst",
 }
+_UNTIL = "until parameter error divided by 100"
 
 
 def _trained(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
@@ -207,14 +208,27 @@ def _trained(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]
     hidden = () if query.take("titles", "show", ("show", "hide")) == "show" else ("title",)
     query.end()
     columns = [name for name in _HEADER if name not in hidden]
+    until = "reduced_share" in table and bool((table["reduced_share"] > 0).any())  # not in older tables
     rows = []
     for row in table.to_dict("records"):
         start = [row["task"].upper(), f"`{row['method']}`"]
         rest = [row[name] for name in columns[2:]]
-        rows.append([*start, *rest, f"{row['reached']} of {row['runs']} ({whole_percent(row['share'])})"])
-    headers = [*(_HEADER[name] for name in columns), "runs that succeed"]
+        ends = [f"{row['reached']} of {row['runs']} ({whole_percent(row['share'])})"]
+        rows.append([*start, *rest, *ends, *([_until(row)] if until else [])])
+    headers = [*(_HEADER[name] for name in columns), "runs that succeed", *([_UNTIL] if until else [])]
     note = "Medians over runs. Errors are mean squares of held-out images. A run succeeds if it divides the parameter "
-    return markdown(headers, rows), table, note + "error by 100."
+    note += "error by 100."
+    if until:
+        note += " Last column: renders and seconds until the parameter error is first divided by 100, of the runs that "
+        note += "get there; in brackets the share of runs that get there, if not all do."
+    return markdown(headers, rows), table, note
+
+
+def _until(row: dict[Any, Any]) -> str:
+    """Return renders and seconds until the parameter error was divided by 100, as a cell of `_fitted`."""
+    share = row["reduced_share"]
+    names = {"evaluations": row["reduced_evaluations"], "seconds": row["reduced_seconds"]}
+    return _cell(names | {"share": share, "reached": share, "runs": 1}, "both", False, False, False)
 
 
 def _fits(kind: str, query: Query) -> pd.DataFrame:

@@ -7,7 +7,8 @@ import pandas as pd
 
 from experiments.problems.network_task import NetworkTask
 from experiments.reports import error_curves, onnx_export, predictions
-from experiments.reports.results import METRICS, load
+from experiments.reports.medians import MEASURES, medians, reached
+from experiments.reports.results import METRICS, Run, load
 from experiments.reports.tables import table
 from experiments.reports.trained_network import Result, encoders_of
 from experiments.runs.records import Outcome, write
@@ -90,6 +91,18 @@ def per_method(rows: pd.DataFrame) -> pd.DataFrame:
         for end, share in (("low", 0.25), ("high", 0.75)):
             found[f"{name}_{end}"] = groups[name].quantile(share)
     return found.assign(reached=groups["reached"].sum(), runs=groups.size()).reset_index()
+
+
+def until_reduced(runs: Sequence[Run]) -> dict[str, float]:
+    """Return when the held-out parameter error of runs of one method was first divided by `REDUCTION`.
+
+    `reduced_evaluations` and `reduced_seconds` are medians, `..._worst` the most, over the runs that got there. They
+    are NaN if these are fewer than half. `reduced_share` is the share of the runs that got there. A run may get there
+    and end with a larger error.
+    """
+    found = medians(reached([((), runs)], (), [1.0 - 1.0 / REDUCTION]), ("metric",)).set_index("metric")
+    names = [f"{measure}{end}" for measure in MEASURES for end in ("", "_worst")]
+    return {f"reduced_{name}": float(found[name]["parameter"]) for name in (*names, "share")}
 
 
 def summary(task: NetworkTask, results: Sequence[Result]) -> str:

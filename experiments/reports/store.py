@@ -18,7 +18,7 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Preset
 from experiments.reports import result_files
 from experiments.reports.medians import medians, reached
-from experiments.reports.networks import HELD_OUT, per_method
+from experiments.reports.networks import HELD_OUT, per_method, until_reduced
 from experiments.reports.results import Results, Run, load
 from experiments.runs.trial import LEVELS
 
@@ -153,7 +153,8 @@ def measured(results: Results, preset: Preset) -> pd.DataFrame:
 def trained(results: Results, preset: Preset) -> pd.DataFrame:
     """Return a row per task and method: how far errors of held-out images went down, at the median and at worst.
 
-    And the task's own measure of the parameter error after training.
+    And the task's own measure of the parameter error after training, and when this error had gone down, see
+    `until_reduced`.
 
     A run that failed counts in `runs` alone.
     """
@@ -170,7 +171,7 @@ def trained(results: Results, preset: Preset) -> pd.DataFrame:
             (found,) = per_method(mine).to_dict("records")
             errors = found["parameter_after"], mine["parameter_after"].max()
             median, worst = (about.measured(float(one)) for one in errors)
-            found |= {"measure": about.measure, "measure_median": median, "measure_worst": worst}
+            found |= {"measure": about.measure, "measure_median": median, "measure_worst": worst} | until_reduced(runs)
             rows.append(_about(task, method, runs) | found | {"runs": len(runs), "share": found["reached"] / len(runs)})
     table = with_intervals(pd.DataFrame(rows)).drop(columns=["parameter_before", "parameter_after"])
     return table[[*(name for name in table if name not in _SHARES), *_SHARES]]

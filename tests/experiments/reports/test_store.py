@@ -142,6 +142,35 @@ def test_networks_have_a_row_per_method(tmp_path, results):
     assert "1 of 3 (33 %)" in text
 
 
+def test_networks_have_renders_and_seconds_until_the_parameter_error_is_divided_by_100(tmp_path, results):
+    """Parameter errors are squares of the image errors: 1600, and then 16 or less after 20, 10 and 30 renders."""
+    folder = tmp_path / "runs"
+    logs = {
+        "memory_newton": [[40.0, 9.0, 2.0], [40.0, 4.0, 9.0], [40.0, 9.0, 5.0, 2.0]],
+        "our_g": [[40.0, 9.0, 9.0], [40.0, 4.0, 2.0], [40.0, 9.0, 5.0]],
+        "fr22": [[40.0, 9.0]] * 3,
+    }
+    for method, runs in logs.items():
+        for run, errors in enumerate(runs):
+            write(folder, "cnn", method, run, errors, each=10)
+        ended = [Result(method, run, None, None, 1.0, 20, (40.0, 2.0), (8.0, 4.0)) for run in range(3)]
+        _remember(held_out("cnn", ended), folder / "cnn" / HELD_OUT)
+    store(folder, name="networks")
+    there = {row["method"]: row for row in rows(results, "networks")}
+    names = ("evaluations", "evaluations_worst", "seconds", "seconds_worst", "share")
+    ours, theirs, none = ([there[one][f"reduced_{name}"] for name in names] for one in logs)
+    assert [float(one) for one in ours] == [20.0, 30.0, 1.0, 1.5, 1.0]
+    assert theirs == ["", "", "", "", "0.333333"]
+    assert none == ["", "", "", "", "0"]
+    text = table_of("networks", Query.of(["titles=hide"]))
+    assert "| runs that succeed | until parameter error divided by 100 |" in text
+    cells = {line.split(" | ")[1]: line.split(" | ")[-1] for line in text.splitlines()[2:5]}
+    assert cells == {"`memory_newton`": "20, 1 s |", "`our_g`": "- (33 %) |", "`fr22`": "- (0 %) |"}
+    assert "Last column: renders and seconds until the parameter error is first divided by 100" in text
+    alone = table_of("networks", Query.of(["methods=fr22"]))  # nothing to show
+    assert "until" not in alone
+
+
 def another_commit(folder, monkeypatch):
     monkeypatch.setattr(provenance, "code", lambda: {"commit": "fedcba", "clean": True})
     write(folder, "bowl", "our_g", 3, [1.0, 0.1], each=1)

@@ -54,7 +54,7 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 def _style(method: Estimator) -> dict[str, Any]:
-    """The colour shows the proposal, the line the baseline, the marker how points depend on each other."""
+    """The colour shows the proposal, the line the baseline or a memory, the marker how points depend on each other."""
     colors = {
         "auto": "#7a9a01",
         "aggregate": "#c1272d",
@@ -72,7 +72,8 @@ def _style(method: Estimator) -> dict[str, Any]:
         "linewidth": 2.6 if method.name == OURS else 1.3,
     }
     if method.memory:
-        style |= {"color": "#7b3fa0", "linestyle": "-" if method.memory == "process" else "--"}
+        style["linestyle"] = "-."
+        style["color"] = style["color"] if method.memory == "process" else "#7b3fa0"
     if method.difference:
         style |= {"color": "#2e8b57", "marker": "d" if method.difference == "common" else "D"}
         style["linestyle"] = "-" if method.difference == "common" else ":"

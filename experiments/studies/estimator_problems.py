@@ -47,7 +47,7 @@ class Problem:
     """[K, n] -> [K, *out], of which `fn` is the mean squared difference to `reference`, where there is one."""
     reference: Tensor | None = None
     memories: dict[str, zh.Memory] = field(default_factory=dict)
-    """Memories that have served earlier estimates at x, by surrogate."""
+    """Memories that have served earlier estimates at x, by the name of the estimator."""
 
 
 def made_problem(name: str, truth_evaluations: int, side: int, seed: int) -> Problem:

@@ -75,9 +75,8 @@ class Estimator:
         return first if self.order == 1 else {**first, "hessian": result.hessian(), "hvp": result.hvp(problem.v)}
 
     def _remembered(self, problem: Problem) -> zh.Memory:
-        """Return a memory that has served a few estimates at the same point."""
-        assert self.memory is not None
-        if self.memory not in problem.memories:
+        """Return a memory that has served a few estimates of this kind at the same point."""
+        if self.name not in problem.memories:
             torch.manual_seed(0)
             shape = torch.Size() if problem.reference is None else problem.reference.shape
             memory = zh.Memory(_Untrained(len(problem.x), shape) if self.memory == "untrained" else None)
@@ -86,8 +85,8 @@ class Estimator:
                 _estimate(problem, lambda fn: fn, smoothing, memory)
             if self.memory == "process":
                 memory.fit()
-            problem.memories[self.memory] = memory
-        return problem.memories[self.memory]
+            problem.memories[self.name] = memory
+        return problem.memories[self.name]
 
 
 def _estimate(
@@ -133,12 +132,16 @@ ESTIMATORS = (
     Estimator("gaussian + center", "gaussian", "center"),
     Estimator("gaussian + center, sobol", "gaussian", "center", sampler="sobol"),
     Estimator("gaussian + center, orthogonal", "gaussian", "center", sampler="orthogonal"),
+    Estimator("gaussian + center, memory", "gaussian", "center", memory="process"),
+    Estimator("gaussian + mean", "gaussian", "mean"),
     Estimator("gaussian + none", "gaussian", "none"),
     Estimator(PAPER, "optimal", "none"),
     Estimator("per-element + none, unpaired", "optimal", "none", antithetic=False),
     Estimator("per-element + center", "optimal", "center"),
+    Estimator("per-element + center, memory", "optimal", "center", memory="process"),
     Estimator("uniform + none", "uniform", "none"),
     Estimator("uniform + center", "uniform", "center"),
+    Estimator("uniform + center, memory", "uniform", "center", memory="process"),
     Estimator("differences, independent", "aggregate", "center", difference="independent"),
     Estimator("differences, common", "aggregate", "center", difference="common"),
 )

@@ -179,7 +179,7 @@ def _ratios(measurements: list[Measurement]) -> list[Ratio]:
     hessian = {(m.problem, m.budget, m.method): m for m in measurements if m.quantity == "hessian"}
     ratios = []
     for (problem, budget, method), theirs in hessian.items():
-        if method.startswith("per-element") and (problem, budget, OURS) in hessian:
+        if method.startswith("per-element") and ", memory" not in method and (problem, budget, OURS) in hessian:
             ours = hessian[problem, budget, OURS]
             ratio = theirs.rmse / ours.rmse
             spread = ratio * math.hypot(theirs.rmse_error / theirs.rmse, ours.rmse_error / ours.rmse)

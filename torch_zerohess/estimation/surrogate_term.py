@@ -134,10 +134,13 @@ class SurrogateTerm:
         elif self.pathwise == 1:
             each = self._from_slopes(quantity, v)
         else:
+            ways = [self._along_points, self._in_reverse]
+            if self.control.outer.head is not None and self.u.shape[2] > 1:
+                ways.reverse()  # one loss per point: all parameters in one pass
             try:
-                each = self._along_points(quantity, v)
-            except RuntimeError:  # an operation without a forward mode
-                each = self._in_reverse(quantity, v)
+                each = ways[0](quantity, v)
+            except RuntimeError:  # an operation without a forward mode, or without a second derivative
+                each = ways[1](quantity, v)
         each, half = each.detach(), self.u.shape[1] // 2  # a module has parameters that require grad
         return 0.5 * (each[:, :half] + each[:, half:])
 

@@ -300,6 +300,11 @@ def test_operations_without_a_forward_mode(door: str, function: Any, n: int) -> 
         assert memory.pathwise == (2 if function is Square else 1)
     one = zh.estimate(identity, x, smoothing, r, head=lambda y, r: loss(y - r).mean(1), memory=memory)
     assert bool(one.hessian().isfinite().all())
+    if door == "surrogate":  # several outputs, which are differentiated along each parameter first
+        outputs = zh.Memory(own)
+        one = [zh.estimate(identity, x, smoothing, memory=outputs) for _ in range(3)][-1]
+        assert one._term is not None
+        assert bool(one.hessian().isfinite().all())
 
 
 @pytest.mark.parametrize("inference", [False, True])

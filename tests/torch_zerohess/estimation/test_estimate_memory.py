@@ -158,6 +158,25 @@ def test_the_standard_error_of_a_surrogate_is_the_deviation_over_seeds() -> None
         assert bool(((errors / deviations - 1.0).abs() < 0.4).all()), quantity
 
 
+def test_derivatives_of_a_loss_take_one_pass_for_all_parameters() -> None:
+    """Behind a head there is one loss per point: a product with the Hessian is one pass in reverse, whatever n is."""
+    n, calls = 10, []
+    memory = Whole(Model(lambda z: calls.append(len(z)) or torch.sin(2.0 * z)), draws=32)
+    x, v = torch.linspace(-1, 1, n, dtype=torch.float64)[None], torch.ones(n, dtype=torch.float64)
+    got = estimate(torch.sin, x, SMOOTHING, x + 1.0, head=SquaredError(), memory=memory, value="smoothed")
+    assert memory.pathwise == 2
+    for ask, passes in ((lambda: got.gradient, 1), (lambda: got.hvp(v), 1), (got.hessian_diagonal, 1), (got.hessian, n)):
+        calls.clear()
+        ask()
+        assert len(calls) == passes
+    for quantity in ("gradient", "hessian_diagonal", "hvp"):
+        along, reverse = (
+            way(quantity, v[None] if quantity == "hvp" else None)
+            for way in (got._term._along_points, got._term._in_reverse)
+        )
+        torch.testing.assert_close(along, reverse)
+
+
 def test_the_value_at_the_center_is_the_head_of_the_output_there() -> None:
     memory = Whole(SURROGATES["bad"])
     got = estimated(memory, 0, batch=3, value="center")

@@ -8,6 +8,7 @@ import pandas as pd
 
 from experiments.reports import result_files, source_table
 from experiments.reports.digits import significant
+from experiments.reports.pivots import across
 from experiments.reports.speed_ups import HEADERS, speed_ups, with_ratios
 
 SPEED_UP = "speed_up"
@@ -69,6 +70,10 @@ def _made(name: str, query: Query) -> tuple[str, pd.DataFrame, str]:
         return _fitted(table, query)
     if "parameter_divided" in table:
         return _trained(table, query)
+    if column := query.take("across", ""):
+        names = query.take("rows", ""), query.take("show", "")
+        rows = _where(table, query)
+        return markdown(*across(rows, column, *names, number)), rows, ""
     columns = query.names("columns", [one for one in table if one not in result_files.ORIGIN])
     rows = _where(table, query)
     return markdown(columns, rows[columns].to_numpy().tolist()), rows, ""

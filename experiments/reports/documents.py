@@ -13,6 +13,8 @@ What is between the marks is written by the command. Marks in code are left alon
 - `table_2` in place of a name: the ratios of the source's Table 2 beside our ratios from the tables in `of=`; `tasks=`,
   `metric=`;
 - a study: `columns=`, and `column=value` for the rows to show;
+- a study with `across=COLUMN rows=COLUMN show=COLUMN`: a column per value of the first one, a row per value of the
+  second, and in each cell the numbers of the third;
 - any: `origin=full|commit`, where `commit` leaves out machine and command.
 """
 

@@ -8,8 +8,8 @@ error is reported.
 The source plots variance against samples per element (its figure 11). A Hessian with a sample set per element then
 costs n (n + 1) / 2 times as many evaluations as one with a set for all elements. Both axes are drawn.
 
-Methods with a memory know 256 earlier evaluations around the same point, which the budget does not count. On the BOX
-tasks these are images, not losses.
+Methods with a memory know the evaluations of four earlier estimates of their kind around the same point, 64 each where
+that is enough for one. The budget does not count them. On the BOX tasks these are images, not losses.
 
 Methods take turns within every run, so that whatever else the machine does falls on all of them alike.
 

@@ -368,6 +368,24 @@ def test_studies_are_kept_as_they_are(results):
     assert "Commit `012345678`" in text
 
 
+def test_a_study_with_a_column_per_value(results):
+    rows = [["A", "m", 8, 0.5], ["A", "m", 32, 0.25], ["A", "n", 8, 3.0], ["B", "n", 8, 2.0], ["B", "o", 8, None]]
+    result_files.keep(["problem", "method", "budget", "error"], rows, "study")
+    text = table_of("study", Query.of(["across=problem", "rows=method", "show=error"]))
+    assert text.splitlines()[:5] == [
+        "| method | A | B |",
+        "| --- | --- | --- |",
+        "| m | 0.5, 0.25 |  |",
+        "| n | 3 | 2 |",
+        "",
+    ]
+    assert "Commit `012345678`" in text
+    few = table_of("study", Query.of(["across=problem", "rows=method", "show=error", "budget=32"]))
+    assert few.splitlines()[2:4] == ["| m | 0.25 |", ""]
+    with pytest.raises(SystemExit, match=r"columns are problem, .*got mistake"):
+        table_of("study", Query.of(["across=problem", "rows=method", "show=mistake"]))
+
+
 def test_a_study_is_refused_before_it_measures(results, monkeypatch):
     monkeypatch.setattr(provenance, "code", lambda: {"commit": COMMIT, "clean": False})
     for study, given in ((bench, {"repeats": 10**9}), (variance, {"runs": 10**9})):

@@ -135,6 +135,18 @@ def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tm
             assert untrained < 1.2 * plain
 
 
+def test_a_memory_lowers_the_error_of_every_proposal(tmp_path, no_figures) -> None:
+    """It explains a plane wave nearly. Each has a memory of its own evaluations, and none is compared per element."""
+    plain = tuple(f"{kind} + center" for kind in ("gaussian", "uniform", "per-element"))
+    methods = tuple(name + more for name in plain for more in ("", ", memory"))
+    report = variance(runs=8, budgets=(32,), problems=("WAVE2",), methods=(OURS, *methods), out=tmp_path, rivals=0)
+    for name in plain:
+        for quantity in ("gradient", "hessian", "hvp"):
+            without, memory = (measured(report, "WAVE2", name + more, 32, quantity).rmse for more in ("", ", memory"))
+            assert memory < 0.5 * without, (name, quantity)
+    assert {ratio.method for ratio in report.ratios} == {"per-element + center"}
+
+
 def test_samples_per_element_are_fewer_where_every_element_has_its_own(report) -> None:
     ours, theirs = (measured(report, "BOX2", name, 512, "hessian") for name in (OURS, PAPER))
     assert ours.evaluations - 2 <= ours.samples <= 512

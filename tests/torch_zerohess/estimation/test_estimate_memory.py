@@ -165,7 +165,8 @@ def test_derivatives_of_a_loss_take_one_pass_for_all_parameters() -> None:
     x, v = torch.linspace(-1, 1, n, dtype=torch.float64)[None], torch.ones(n, dtype=torch.float64)
     got = estimate(torch.sin, x, SMOOTHING, x + 1.0, head=SquaredError(), memory=memory, value="smoothed")
     assert memory.pathwise == 2
-    for ask, passes in ((lambda: got.gradient, 1), (lambda: got.hvp(v), 1), (got.hessian_diagonal, 1), (got.hessian, n)):
+    asked = (lambda: got.gradient, 1), (lambda: got.hvp(v), 1), (got.hessian_diagonal, 1), (got.hessian, n)
+    for ask, passes in asked:
         calls.clear()
         ask()
         assert len(calls) == passes

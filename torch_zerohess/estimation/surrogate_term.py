@@ -135,8 +135,9 @@ class SurrogateTerm:
             each = self._from_slopes(quantity, v)
         else:
             ways = [self._along_points, self._in_reverse]
-            if self.control.outer.head is not None and self.u.shape[2] > 1:
-                ways.reverse()  # one loss per point: all parameters in one pass
+            one_number = self.control.outer.head is not None or self.control.memory.output_shape == ()
+            if one_number and self.u.shape[2] > 1:
+                ways.reverse()  # one number per point: all parameters in one pass
             try:
                 each = ways[0](quantity, v)
             except RuntimeError:  # an operation without a forward mode, or without a second derivative

@@ -158,12 +158,18 @@ def test_the_standard_error_of_a_surrogate_is_the_deviation_over_seeds() -> None
         assert bool(((errors / deviations - 1.0).abs() < 0.4).all()), quantity
 
 
-def test_derivatives_of_a_loss_take_one_pass_for_all_parameters() -> None:
-    """Behind a head there is one loss per point: a product with the Hessian is one pass in reverse, whatever n is."""
+@pytest.mark.parametrize("head", [SquaredError(), None])
+def test_derivatives_of_one_number_take_one_pass_for_all_parameters(head: SquaredError | None) -> None:
+    """A product with the Hessian of a loss, or of a function with one number, is one pass in reverse, whatever n is."""
     n, calls = 10, []
-    memory = Whole(Model(lambda z: calls.append(len(z)) or torch.sin(2.0 * z)), draws=32)
+
+    def box(z: Tensor) -> Tensor:
+        return torch.sin(z) if head else torch.sin(z).sum(1)
+
+    memory = Whole(Model(lambda z: calls.append(len(z)) or box(2.0 * z)), draws=32)
     x, v = torch.linspace(-1, 1, n, dtype=torch.float64)[None], torch.ones(n, dtype=torch.float64)
-    got = estimate(torch.sin, x, SMOOTHING, x + 1.0, head=SquaredError(), memory=memory, value="smoothed")
+    references = [x + 1.0] if head else []
+    got = estimate(box, x, SMOOTHING, *references, head=head, memory=memory, value="smoothed")
     assert memory.pathwise == 2
     asked = (lambda: got.gradient, 1), (lambda: got.hvp(v), 1), (got.hessian_diagonal, 1), (got.hessian, n)
     for ask, passes in asked:

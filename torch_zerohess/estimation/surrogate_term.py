@@ -135,8 +135,7 @@ class SurrogateTerm:
             each = self._from_slopes(quantity, v)
         else:
             ways = [self._along_points, self._in_reverse]
-            one_number = self.control.outer.head is not None or self.control.memory.output_shape == ()
-            if one_number and self.u.shape[2] > 1:
+            if self.control.outer.head is not None or self.control.memory.output_shape == ():
                 ways.reverse()  # one number per point: all parameters in one pass
             try:
                 each = ways[0](quantity, v)

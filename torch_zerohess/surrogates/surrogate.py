@@ -58,4 +58,4 @@ def scaled(numbers: Tensor) -> tuple[Tensor, float]:
     if largest == 0.0 or not math.isfinite(largest) or 1.0 / _MIDDLING <= largest <= _MIDDLING:
         return numbers, 1.0
     size = 2.0 ** math.frexp(largest)[1]
-    return numbers.double().div_(size).to(numbers.dtype), size
+    return numbers.to(torch.float64, copy=True).div_(size).to(numbers.dtype), size

@@ -60,6 +60,20 @@ def test_a_parameter_that_stays_has_no_slope(place, spread):
     torch.testing.assert_close(new, images(z), atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize(("unit", "size"), [(1.0, 1.0), (1e-20, 1e-20), (1.0, 1e30)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_products_are_in_the_precision_of_the_outputs_where_that_is_enough(dtype, unit, size):
+    """Float32 has few digits, and few exponents: points or slopes that are far from 1 stay in float64."""
+    points, z = normal(50, 6) + 3.0, normal(5, 6, seed=3)
+    model = LinearSurrogate()
+    model.fit(unit * points, size * images(points).to(dtype))
+    single = dtype == torch.float32 and unit == size == 1.0
+    assert model._slope.dtype == (torch.float32 if single else torch.float64)
+    error = 1e-5 if dtype == torch.float32 else 1e-7
+    torch.testing.assert_close(model(unit * z) / size, images(z), atol=error, rtol=0)
+    assert model((unit * z).float()).dtype == torch.float32
+
+
 def test_each_point_is_left_out_once():
     """Against fits to all others, in any unit; and a point that determines a slope alone."""
     points, outputs = normal(12, 6), normal(12, 10, seed=4) + images(normal(12, 6)).flatten(1)

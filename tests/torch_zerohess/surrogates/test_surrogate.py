@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torch_zerohess import surrogates
+from torch_zerohess.surrogates.surrogate import scaled
 
 
 @pytest.mark.parametrize(
@@ -42,3 +43,13 @@ def test_a_capacity_is_at_least_two(make):
     for capacity in (1, 0, -5):
         with pytest.raises(ValueError, match=f"capacity must be at least 2, got {capacity}"):
             make(capacity=capacity)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_numbers_are_scaled_in_a_copy(dtype):
+    numbers = torch.tensor([1e25, -3e24], dtype=dtype)
+    before = numbers.clone()
+    found, size = scaled(numbers)
+    assert torch.equal(numbers, before)
+    assert torch.equal(found * size, before)
+    assert float(found.abs().max()) <= 1.0

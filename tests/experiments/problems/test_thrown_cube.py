@@ -5,8 +5,8 @@ import pickle
 import torch
 
 from experiments.problems import catalogue
-from experiments.problems.scenes.thrown_cube import UNITS, ThrownCube
-from experiments.problems.tasks.cnn_throw import FLOOR, Floor
+from experiments.problems.scenes.thrown_cube import LOWER, UNITS, UPPER, ThrownCube
+from experiments.problems.tasks.cnn_throw import BEHIND, FLOOR, Floor
 
 WALL, REACH = 2.0, 0.15  # metres; the cube reaches half of its diagonal beyond its middle
 
@@ -26,10 +26,23 @@ def test_the_wall_stops_low_throws_and_lets_high_ones_pass():
 
 def test_a_launch_alone_decides():
     x = launches(*(torch.rand(6, 5, generator=torch.Generator().manual_seed(0)) * 4).tolist())
-    throw = ThrownCube()
+    throw = ThrownCube("sand")
     ends = throw(x)
     assert torch.equal(throw(x.flip(0)).flip(0), ends)
     assert torch.equal(pickle.loads(pickle.dumps(throw))(x), ends)
+
+
+def spread_of_ends(ground):
+    """Mean distance [m] between ends behind the wall of launches that differ by 0.05 units."""
+    lower, upper, generator = torch.tensor(LOWER), torch.tensor(UPPER), torch.Generator().manual_seed(0)
+    x = lower + (upper - lower) * torch.rand(200, 5, generator=generator)
+    throw = ThrownCube(ground)
+    ends, near = throw(x), throw(x + 0.05 * torch.randn(200, 5, generator=generator))
+    return float((ends - near).norm(dim=1)[ends[:, 0] > BEHIND].mean())
+
+
+def test_a_cube_stays_where_it_falls_into_sand():
+    assert spread_of_ends("sand") < 0.15 < 0.5 < spread_of_ends("floor")
 
 
 def test_starts_of_the_fitting_task_bounce_and_the_target_can_be_reached():

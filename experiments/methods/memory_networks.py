@@ -3,8 +3,8 @@
 The layer subtracts what a surrogate of all earlier renders explains (`zh.Memory`). New renders are made for few images
 of a batch. With up to 10 parameters the loss is the local entropy, which leaves plateaus where the mean does not. With
 more parameters a few draws never hit a valley, and the loss is the mean. This is what a user would write: everything
-comes from the public names of the library. All tasks have the same settings, the defaults below, but for the radius of
-`memory_newton` on CNN-THROW. They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
+comes from the public names of the library. All tasks have the same settings, the defaults below, but for CNN-THROW (see
+`settings/ours.py`). They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
 runs 100 to 107 of CNN-THROW. The weights in the coefficient of `zh.Memory` were chosen on runs 14, 16 and 17 of CNN
 with 1 200 renders, `output_radius` on runs 17, 33 and 36, and `warm_up` on run 8 of CNN-TEXTURE. No table reports one
 of these runs, but for run 8: CNN-TEXTURE was stored with 20 runs afterwards.
@@ -59,6 +59,7 @@ def through_memory(
     many_lr: tuple[float, float] = (1e-2, 3e-4),
     warm_up: float = 0.05,
     temperature: float = 0.15,
+    least_steps: int = 0,
 ) -> zh.Memory:
     """Train until the evaluations are used, and return what has been rendered.
 
@@ -82,12 +83,14 @@ def through_memory(
         warm_up: share of the training in which the learning rate grows to its first value. Without it, some networks
             do not train.
         temperature: of the local entropy over the mean loss, with up to 10 parameters.
+        least_steps: where fewer steps use all evaluations, steps on the surrogate alone come between them.
     """
     task, network = trial.task, trial.encoder
     error = zh.heads.SquaredError()
     first = min(max(task.evaluations // 10, 20), 64) if task.n <= MOST else min(task.evaluations, task.n + 76)
     fresh = max(1, round((task.evaluations - first) / (2 * _STEPS)))
-    total = (task.evaluations - first) // (2 * fresh)
+    rendered = (task.evaluations - first) // (2 * fresh)
+    total = max(rendered, least_steps) if rendered else _STEPS_ALONE
     memory = zh.Memory(fresh=fresh, order=2 if steps == "newton" else 1)
     layer = zh.BlackBox(
         trial.image,
@@ -100,8 +103,6 @@ def through_memory(
         x = network(trial.batch(0, first))
         x = x + task.sigma[0] * torch.randn_like(x)
     memory.add(x, trial.image(x))
-    if not total:  # everything is known that may be known
-        memory.fresh, total = 0, _STEPS_ALONE
     update = {
         "newton": partial(_newton, network, layer, radius, output_radius, damping),
         "targets": partial(_targets, network, layer, target_damping, target_radius, fit_damping)
@@ -113,6 +114,7 @@ def through_memory(
         share = min(step / (ANNEALED * total), 1.0)
         sigma = geometric(task.sigma, share)
         layer.smoothing = layer.smoothing.replace(sigma=sigma)
+        memory.fresh = fresh * ((step + 1) * rendered // total - step * rendered // total)
         loss = update(trial.batch(step, batch), share, sigma)
         every, last = max(1, total // ROWS), step == total - 1
         if step % every == 0 or last:

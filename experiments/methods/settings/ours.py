@@ -24,11 +24,16 @@ LOCAL: dict[str, dict[str, Any]] = {
 }
 """Prior knowledge of CAUSTIC and CAUSTIC64: that their coefficients lie on a grid."""
 
+_STEPS = 400
 NETWORKS: dict[str, dict[str, Any]] = {
-    # By hand on runs 100 to 102 with 1 000 simulations, beside the default radius.
+    # By hand: the radius on runs 100 to 102 with 1 000 simulations, beside the default; the steps and the learning rate
+    # on runs 1000 to 1003 with 60 to 300 simulations.
     "cnn_throw": {
-        "memory_newton": {"radius": (0.3, 0.01)},
-        "memory_pairs": {"newton": {"radius": (0.3, 0.01)}},
+        "memory_newton": {"radius": (0.3, 0.01), "least_steps": _STEPS},
+        "memory_targets": {"least_steps": _STEPS},
+        "memory_adam": {"lr": (1e-3, 1e-4), "least_steps": _STEPS},
+        "memory_pairs": {"newton": {"radius": (0.3, 0.01), "least_steps": _STEPS}},
     },
 }
-"""Radii on the weights, where the default ends before the outputs have moved."""
+"""Radii on the weights, where the default ends before the outputs have moved, and steps on the surrogate alone, where a
+simulation tells more than a step can use."""

@@ -5,8 +5,8 @@ A network sees a picture of the floor from above, with a spot at the target, and
 targets are behind the wall. They are the ends of random launches, so that each can be reached. An untrained network
 throws at the wall, where the loss is a plateau with ripples.
 
-The cube falls into sand. On the hard floor of THROW no network could hit: a launch that is known to 0.05 units, 0.6 % of
-the range of a velocity, leaves at best 1/30 of the error of an untrained network.
+The cube falls into sand. On the hard floor of THROW no network could hit: a launch that is exact to 0.05 units, 0.6 %
+of the range of a velocity, leaves at best 1/31 of the error of an untrained network.
 
 Many launches reach a target, so there is no parameter error: both errors are the mean squared distance on the floor.
 """

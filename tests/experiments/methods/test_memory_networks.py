@@ -23,3 +23,10 @@ def test_uses_its_evaluations_and_reduces_the_error(method, evaluations, most, l
     outcome, trial = trained(method, Bump(replace(SIZE, evaluations=evaluations)))
     assert outcome.evaluations == evaluations
     assert trial.rows[-1].parameter_error < left * trial.rows[0].parameter_error
+
+
+def test_steps_on_the_surrogate_alone_come_between_those_with_renders():
+    outcome, trial = trained("memory_adam", Bump(replace(SIZE, evaluations=60)), least_steps=50)
+    used = [row.evaluations for row in trial.rows]
+    assert (outcome.evaluations, len(used)) == (60, 51)  # a row at the start, and one after each step
+    assert used[25] == 40  # half of those after the first 20

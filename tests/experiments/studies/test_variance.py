@@ -120,7 +120,7 @@ def test_problems_have_lower_case_names_too_and_both_tables_are_kept(tmp_path, n
     assert {tuple(row[:2]) for row in kept["estimators_rivals"]} == {("gradient", 1), ("hvp", 1), ("hessian", 1)}
     assert {m.problem for m in found.measurements} == {"WAVE10"}
     compared = json.loads((tmp_path / "rivals.json").read_text())
-    assert len(compared) == 8 * len(BUDGETS) * 2  # functions, budgets, gradient and product
+    assert len(compared) == 8 * len(BUDGETS) * 3  # functions, budgets; gradient, product and Hessian
 
 
 def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tmp_path, no_figures) -> None:

@@ -76,7 +76,8 @@ class Estimator:
 
     def _remembered(self, problem: Problem) -> zh.Memory:
         """Return a memory that has served a few estimates of this kind at the same point."""
-        if self.name not in problem.memories:
+        key = self.name
+        if key not in problem.memories:
             torch.manual_seed(0)
             shape = torch.Size() if problem.reference is None else problem.reference.shape
             memory = zh.Memory(_Untrained(len(problem.x), shape) if self.memory == "untrained" else None)
@@ -85,8 +86,8 @@ class Estimator:
                 _estimate(problem, lambda fn: fn, smoothing, memory)
             if self.memory == "process":
                 memory.fit()
-            problem.memories[self.name] = memory
-        return problem.memories[self.name]
+            problem.memories[key] = memory
+        return problem.memories[key]
 
 
 def _estimate(

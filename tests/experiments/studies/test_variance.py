@@ -136,7 +136,7 @@ def test_a_memory_lowers_the_error_and_an_untrained_network_does_not_raise_it(tm
 
 
 def test_a_memory_lowers_the_error_of_every_proposal(tmp_path, no_figures) -> None:
-    """It explains a plane wave nearly. Each has a memory of its own evaluations, and none is compared per element."""
+    """It explains a plane wave nearly. None is compared per element."""
     plain = tuple(f"{kind} + center" for kind in ("gaussian", "uniform", "per-element"))
     methods = tuple(name + more for name in plain for more in ("", ", memory"))
     report = variance(runs=8, budgets=(32,), problems=("WAVE2",), methods=(OURS, *methods), out=tmp_path, rivals=0)
@@ -145,6 +145,17 @@ def test_a_memory_lowers_the_error_of_every_proposal(tmp_path, no_figures) -> No
             without, memory = (measured(report, "WAVE2", name + more, 32, quantity).rmse for more in ("", ", memory"))
             assert memory < 0.5 * without, (name, quantity)
     assert {ratio.method for ratio in report.ratios} == {"per-element + center"}
+
+
+def test_every_proposal_has_a_memory_of_its_own_evaluations() -> None:
+    problem = made_problem("WAVE2", 1000, 16, 0)
+    remembering = [one for one in ESTIMATORS if one.memory == "process"]
+    for one in remembering:
+        one.estimate(problem, lambda fn: fn, 32, 0)
+    points = [memory.points for memory in problem.memories.values()]
+    assert len(points) == len(remembering) == 4
+    for k, some in enumerate(points):
+        assert not any(some.shape == others.shape and torch.equal(some, others) for others in points[:k])
 
 
 def test_samples_per_element_are_fewer_where_every_element_has_its_own(report) -> None:

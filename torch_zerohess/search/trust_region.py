@@ -30,9 +30,9 @@ class TrustRegion(AskTell[Any]):
 
     - Up to four parameters in a finite box: a Gaussian process, which escapes plateaus and local minima.
     - 5 to 19 parameters in a finite box, an output and a `loss`, and `restarts`: descent and the Gaussian process in
-      turn. A descent that Gauss-Newton takes over stays. Otherwise the process has its turn where n + 1 evaluations of
-      the descent take away less than a fifth of the loss, and the descent where 8 (n + 1) of the process take away less
-      than a tenth.
+      turn. Descent begins, and stays where its Gauss-Newton makes good steps. Elsewhere the process has its turn when
+      n + 1 evaluations of the descent take away less than a fifth of the loss. The descent has its turn again when
+      8 (n + 1) evaluations of the process take away less than a tenth.
     - 20 parameters or more, an output of many numbers and a `loss`: the evaluations tell whether these numbers depend
       on few parameters each. If they do: Gauss-Newton on a sparse Jacobian. The search asks this after its first batch
       and, where the answer is not clear, each time that its evaluations have doubled.
@@ -102,7 +102,10 @@ class TrustRegion(AskTell[Any]):
 
     @property
     def engine(self) -> str:
-        """Which search it is: "gaussian_process", "descent" or "local"; "descent" as long as it is not decided."""
+        """Which search it is: "gaussian_process", "descent" or "local"; the one whose turn it is, where two take turns.
+
+        "descent" as long as it is not decided.
+        """
         known = self._state.progress
         if isinstance(known, SparseOrDenseProgress):
             return known.chosen or "descent"
@@ -113,7 +116,7 @@ class TrustRegion(AskTell[Any]):
         """Why this engine, in a sentence."""
         known = self._state.progress
         if isinstance(known, TurnsProgress) and known.process is not None:
-            return f"{self._reason}, but descent gained little"
+            return "descent gained little, or arrived at another minimum than the lowest"
         return known.reason if isinstance(known, SparseOrDenseProgress) else self._reason
 
     def _make(self, settings: Settings) -> Method[Any]:

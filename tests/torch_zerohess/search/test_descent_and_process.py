@@ -45,7 +45,7 @@ def test_a_plateau_of_many_parameters_takes_a_few_evaluations_each(n, most):
         assert search.engine == "descent"
         assert evaluations(search, most) < most
         assert search.engine == "gaussian_process"
-        assert search.reason.endswith("but descent gained little")
+        assert search.reason.startswith("descent gained little")
         assert evaluations(door(n, seed, Descent), most) == most
 
 

@@ -34,8 +34,8 @@ _OPTIMISM = 0.3
 """Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
 _EXPLORING = 2.0
 """The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
-_BESIDE = 0.5
-"""Spread of points around the end of a step that are evaluated with it, over the distance of the nearest evaluation."""
+_BESIDE, _EVERY = 0.5, 4
+"""Spread of points of a batch around the end of a step, over the distance of the nearest evaluation; one in so many."""
 _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
 _FLOOR = 1e-2
@@ -110,7 +110,7 @@ class ProcessMethod(Method[Q]):
     def more(self, known: Q, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Return points around the first one, and points chosen as if the process was right about those before."""
         lower, upper = self.settings.lower, self.settings.upper
-        near = count // 2
+        near = count // _EVERY
         if known.phase == "start" or len(known.pool) < 2:
             around = self._drawn(known.center, 1.0, near, generator)
             return torch.cat([around, farthest(torch.cat([points, around]), count - near, lower, upper, generator)])

@@ -250,7 +250,7 @@ def test_the_model_at_the_best_point_is_that_of_the_output_there():
     torch.testing.assert_close(model.full_hessian() / (0.5 * sigma) ** 2, truth, rtol=0.02, atol=0)
 
 
-def test_half_of_a_batch_is_around_the_end_of_the_step():
+def test_a_quarter_of_a_batch_is_around_the_end_of_the_step():
     """With half of the distance of the nearest evaluation as their root mean square distance from it."""
     search = GaussianProcessSearch(
         vector(0.0, 0.9), sigma=1.0, bounds=(-30.0, 30.0), loss=misfit(waves, vector(1.0, 1.0)), seed=0
@@ -259,8 +259,9 @@ def test_half_of_a_batch_is_around_the_end_of_the_step():
     search.tell(waves(first))
     points = search.ask(101)
     nearest = float((first - points[0]).norm(dim=1).min())
-    spread = float((points[1:51] - points[0]).square().sum(1).mean().sqrt())
-    assert spread == pytest.approx(0.5 * nearest, rel=5 / math.sqrt(2 * 100))
+    around, others = ((part - points[0]).square().sum(1).mean().sqrt() for part in (points[1:26], points[26:51]))
+    assert float(around) == pytest.approx(0.5 * nearest, rel=5 / math.sqrt(2 * 50))
+    assert float(others) > 2 * nearest
 
 
 def test_eight_batches_are_kept():

@@ -27,7 +27,7 @@ from torch_zerohess.linalg.nonsmooth import kinked_minimum
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.region_descent import BAD, LONG, RegionDescent
+from torch_zerohess.search.region_descent import BAD, LONG, NEAR, RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress, latest
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.least_change import LeastNorm
@@ -44,6 +44,8 @@ _ITERATIONS = 100
 """Of the minimisation without the quadratic."""
 _NOTHING = 1e-8
 """Promised decrease, over the loss, that is next to nothing."""
+_LEVEL = 1e-3
+"""Distance from a bound, over the distance of the farthest evaluation near by, that tells nothing about the slope."""
 _HOLES = 3
 """Values in a row that are not finite, after which it has failed."""
 
@@ -143,6 +145,19 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         if 2 * short <= known.rejected:
             return replace(known, failed=True), bad
         return replace(known, done=True, message="short steps promise and achieve nothing"), bad
+
+    def _unseen(self, known: OutputProgress) -> Tensor | None:
+        """Return the axis off a bound on which the best point and all evaluations near it lie.
+
+        Least norm makes the slope along it zero, so that the best point would pass for a minimum.
+        """
+        x, settings = known.lowest.point, self.settings
+        near = known.points[known.scaled.norm(dim=1) <= NEAR] - x
+        level = near.abs().amax(0) <= _LEVEL * near.norm(dim=1).max()
+        unseen = level & ((x == settings.lower) | (x == settings.upper))
+        if not bool(unseen.any()):
+            return None
+        return torch.nn.functional.one_hot(unseen.nonzero()[0, 0], self._n).to(x)
 
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
         assert self.settings.loss is not None

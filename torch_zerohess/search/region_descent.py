@@ -34,7 +34,7 @@ _STILL, _CLOSING = 1e-3, 0.3
 """Length of a step that is not worth an evaluation, and the factor for sigma after it."""
 _LEAPING, _CONFIRMED = 1e-3, 0.1
 """The same where a point of the region was as predicted, within this part of its difference from the best point."""
-_CLOSE, _NEAR = 1.5, 2.0
+_CLOSE, NEAR = 1.5, 2.0
 """Distance within which n + 1 evaluations allow sigma to shrink after a rejected step, and after one of no length."""
 _ROUNDING = 4 * torch.finfo(torch.float64).eps
 """Decrease, relative to the value, that is rounding."""
@@ -84,6 +84,10 @@ class RegionDescent(Method[R]):
         """Return the root B of the metric after a quadratic through so many evaluations."""
         return known.root
 
+    def _unseen(self, known: R) -> Tensor | None:
+        """Return a direction u [n] that the evaluations near the best point say nothing about, if there is one."""
+        return None
+
     def _step(self, known: R) -> tuple[Tensor, float]:
         """Return the step [n] to the minimum of the quadratic within the region, and the decrease that it promises."""
         x, settings = known.lowest.point, self.settings
@@ -132,8 +136,12 @@ class RegionDescent(Method[R]):
                 end = (x + s).clamp(settings.lower, settings.upper)
                 root = self._learned(known, count)
                 return replace(known, root=root, phase="trial", promised=promised, length=length), end[None]
-            if not known.confirmed and int((known.scaled.norm(dim=1) <= _NEAR).sum()) <= n:
-                return self._geometry(known, torch.nn.functional.normalize(normal(generator, x, n), dim=0), generator)
+            if not known.confirmed:
+                direction = self._unseen(known)
+                if direction is None and int((known.scaled.norm(dim=1) <= NEAR).sum()) <= n:
+                    direction = torch.nn.functional.normalize(normal(generator, x, n), dim=0)
+                if direction is not None:
+                    return self._geometry(known, direction, generator)
             known = replace(known, sigma=(_LEAPING if known.confirmed else _CLOSING) * known.sigma, confirmed=False)
         reason = f"sigma fell below {self._finest:g} of the first one"
         return self._arrived(known, reason, generator)
@@ -156,10 +164,10 @@ class RegionDescent(Method[R]):
         distance = (known.points - best.point).norm(dim=1)
         sigma = self.settings.tolerance
         while True:  # so wide that evaluations at this distance tell a quadratic
-            near = distance <= _NEAR * sigma
+            near = distance <= NEAR * sigma
             if bool(near.all()) or int((near & (distance > _TOLD * sigma)).sum()) >= self._coefficients:
                 break
-            sigma *= _NEAR
+            sigma *= NEAR
         u, values = (known.points[near] - best.point) / sigma, known.values[near]
         weights = torch.ones_like(values)
         return with_true_errors(fit_values(u, values, weights), u, weights), sigma

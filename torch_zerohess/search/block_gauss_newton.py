@@ -26,11 +26,13 @@ from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.levenberg_marquardt import damped_steps
 from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress
 from torch_zerohess.search.method import Settings
+from torch_zerohess.search.noisy_step import alternating
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated, arriving
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.surrogate import scaled
 
 _RIDGE = 1e-6
 """Added to D D^T, in units of its mean diagonal: bounds can make the steps of a block dependent."""
@@ -126,10 +128,11 @@ class BlockMethod(GaussNewton[BlockProgress]):
         directions = jacobian.view(-1, *known.shape)
         assert self.settings.loss is not None
         loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
-        slope, bend = loss.slope.flatten(), loss.products(directions)
+        _, unit = scaled(loss.product(alternating(loss.slope)))  # a second derivative may be beyond float32
+        slope, bend = loss.slope.flatten(), loss.products(directions, unit)
         steep, bent = _largest(slope), _largest(bend)
         gradient, hessian = jacobian @ (slope / steep).float(), jacobian @ (bend / bent).mT
-        return size * steep * gradient.double(), size**2 * bent * hessian.double()
+        return size * steep * gradient.double(), size**2 * bent * unit * hessian.double()
 
 
 class BlockGaussNewton(AskTell[BlockProgress]):

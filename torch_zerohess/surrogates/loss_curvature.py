@@ -23,11 +23,11 @@ class LossCurvature:
         """Return the second derivative times s [*out]."""
         return self.second * s if isinstance(self.second, float) else self.second(s)
 
-    def products(self, directions: Tensor) -> Tensor:
-        """Return the products with directions [r, *out], [r, m] in their type."""
+    def products(self, directions: Tensor, unit: float = 1.0) -> Tensor:
+        """Return the products with directions [r, *out], [r, m] in their type, divided by a unit."""
         if isinstance(self.second, float):
-            return self.second * directions.reshape(len(directions), -1)
-        return torch.stack([self.second(one.to(self.slope)).flatten() for one in directions]).to(directions)
+            return self.second / unit * directions.reshape(len(directions), -1)
+        return torch.stack([self.second(one.to(self.slope)).flatten() / unit for one in directions]).to(directions)
 
 
 def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurvature:

@@ -260,6 +260,23 @@ def test_outputs_of_any_size(scale):
     torch.testing.assert_close(search.x, truth, atol=0.05, rtol=0)
 
 
+@pytest.mark.parametrize("scale", [2.0**-80, 2.0**100])
+@pytest.mark.parametrize("power", [2, 4])
+def test_a_second_derivative_of_any_size(scale, power):
+    """A loss in units of the outputs has second derivatives of 1 / scale^2, which float32 may not have."""
+    f, truth = bent(20, 40)
+    target, seen = f(truth[None])[0], []
+    for size in (1.0, scale):
+
+        def loss(y, size=size):
+            return (y / size - target).pow(power).mean()
+
+        search = zh.optim.BlockGaussNewton(torch.zeros(20).double(), sigma=1.0, loss=loss, seed=0)
+        run(search, lambda x, size=size: size * f(x), 60)
+        seen.append((search.x, search.value))
+    torch.testing.assert_close(seen[1], seen[0], atol=1e-4, rtol=1e-3)
+
+
 def test_the_model_at_the_best_point_is_gauss_newton():
     f, truth = bent(10, 30)
     target = f(truth[None])[0]

@@ -181,7 +181,8 @@ def _predicted(start: LocalProgress | None) -> tuple[float, float, str]:
 def _gathered(known: SparseOrDenseProgress, evaluated: Evaluated) -> SparseOrDenseProgress:
     """Add what was evaluated."""
     assert evaluated.outputs is not None
-    outputs = torch.cat([known.outputs, evaluated.outputs]) if len(known.outputs) else evaluated.outputs
+    # A copy: the caller may use the memory of the outputs again.
+    outputs = torch.cat([known.outputs, evaluated.outputs]) if len(known.outputs) else evaluated.outputs.clone()
     losses = torch.cat([known.losses, evaluated.losses])
     points = torch.cat([known.points, evaluated.points])
     return replace(known, points=points, losses=losses, outputs=outputs, shape=evaluated.shape)

@@ -28,6 +28,20 @@ def test_a_sparse_jacobian_is_chosen_by_evidence():
     assert torch.equal(again.ask(), search.ask())
 
 
+def test_the_caller_may_use_the_memory_of_outputs_again():
+    """The first samples tell too little: the search keeps them, and chooses with those of the second part."""
+    A, b, values = normal(150, 40), normal(150, seed=1), []
+    for reuses in (False, True):
+        search = door(40, square(b))
+        while search.evaluations < 60:
+            outputs = search.ask() @ A.mT
+            search.tell(outputs)
+            if reuses:
+                outputs.zero_()
+        values.append((search.value, search.x.tolist()))
+    assert values[0] == values[1]
+
+
 @pytest.mark.parametrize(("noise", "asked"), [(0.5, 6), (1.0, 32)])
 def test_where_the_first_samples_predict_less_than_half_the_rest_is_asked_for(noise, asked):
     """Otherwise the next points are steps. A perfect fit would predict 1 / (1 + noise^2) of the change."""

@@ -10,6 +10,7 @@ import torch
 from searches import TARGET, raising, tilted, zeros
 
 import torch_zerohess as zh
+from truths import vector
 
 
 class Counted:
@@ -444,6 +445,12 @@ def test_a_callback_cannot_change_the_search():
     )
     for name in ("x", "points", "values", "gradient", "hessian"):
         assert torch.equal(getattr(fit, name), getattr(plain, name))
+    start = vector(1.0, 2.0)
+    for one in (callback, None):  # all values are equal: x is the start
+        fit = zh.minimize(lambda z: 0.0 * z[:, 0], start, sigma=2.0, seed=0, max_evaluations=10, callback=one)
+        assert torch.equal(fit.points[0], start)
+    fit.x.zero_()
+    assert torch.equal(fit.points[0], start)
 
 
 def test_a_checkpoint_goes_on_where_it_was(tmp_path):

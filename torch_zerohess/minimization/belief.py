@@ -33,7 +33,7 @@ def lowest(points: Tensor, losses: Tensor, start: Tensor) -> Belief:
     if not len(losses):
         return Belief(start, math.nan, 0.0)
     k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
-    return Belief(points[k], float(losses[k]), 0.0)
+    return Belief(points[k].clone(), float(losses[k]), 0.0)
 
 
 def believed(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise: float) -> Belief:

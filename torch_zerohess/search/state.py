@@ -60,9 +60,9 @@ class Progress:
     agreed: int = 0
     """Rounds in a row that have arrived at the best point, or at other points with the same loss."""
     place: Best | None = None
-    """Where the first of them arrived."""
+    """The best point when the first of them arrived."""
     apart: bool = False
-    """Whether they arrived at several points: there are several minima, or the floor of a valley."""
+    """Whether some of them arrived at another point: there are several minima, or the floor of a valley."""
     lost: int = 0
     """Batches in a row that were lost: with values that are not finite at points that the search needed; in noise, and
     for Gauss-Newton, without any finite value."""
@@ -129,7 +129,7 @@ def agreeing(known: P, end: Best, tolerance: float, losses: Tensor | None = None
     if not is_best(end):
         return replace(known, agreed=0)
     if known.place is None or known.agreed == 0 or not is_best(known.place):
-        return replace(known, agreed=1, place=best, apart=False)
+        return replace(known, agreed=1, place=best, apart=not are_same(end.point, best.point, tolerance))
     apart = known.apart or not are_same(end.point, known.place.point, tolerance)
     return replace(known, agreed=known.agreed + 1, apart=apart)
 

@@ -139,6 +139,11 @@ def test_rounds_agree_that_arrive_at_one_loss():
     lower = replace(second, best=Best(vector(5.0), 0.0))
     after = agreeing(lower, Best(vector(5.0), 0.0), tolerance, losses)
     assert (after.agreed, after.apart) == (1, False)
+    # A round elsewhere comes between: the first round after it counts like all others.
+    broken = agreeing(second, Best(vector(8.0), 9.0), tolerance, losses)
+    again = agreeing(broken, Best(vector(3.0), 1.0 + 4e-4), tolerance, losses)
+    again = agreeing(again, Best(vector(0.0), 1.0), tolerance, losses)
+    assert (broken.agreed, again.agreed, again.apart) == (0, 2, True)
 
 
 def test_an_output_that_is_not_finite_is_no_value_whatever_its_loss():

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_zerohess.linalg.krylov import krylov_steps
 from torch_zerohess.linalg.smoothed_newton import LinearOutputs, smoothed_minimum
-from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature
+from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature, value_and_slope
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _ITERATIONS = 100
@@ -62,11 +62,8 @@ def local_steps(
     steps = krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
 
     def valued(y: Tensor) -> tuple[float, Tensor]:
-        with torch.enable_grad():
-            y = y.detach().requires_grad_(True)
-            value = loss(y.view(output.shape))
-            (slope,) = torch.autograd.grad(value, y)
-        return float(value.detach()), torch.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0)
+        value, slope = value_and_slope(loss, y.view(output.shape))
+        return value, slope.flatten()
 
     rows, columns = jacobian.entries
     outputs = LinearOutputs(

@@ -31,7 +31,7 @@ from torch_zerohess.search.region_descent import BAD, LONG, NEAR, RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress, latest
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.least_change import LeastNorm
-from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_and_slope
 from torch_zerohess.surrogates.quadratic import coefficients
 
 _PATIENCE = 5
@@ -207,12 +207,9 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         assert self._linear is not None
         assert self.settings.loss is not None
         output, jacobian = self._linear
-        with torch.enable_grad():
-            y = (output + s @ jacobian).requires_grad_(True)
-            loss = self.settings.loss(y.view(known.shape))
-            (slope,) = torch.autograd.grad(loss, y)
+        loss, slope = value_and_slope(self.settings.loss, (output + s @ jacobian).view(known.shape))
         bent = curvature @ s
-        return float(loss.detach()) + 0.5 * float(s @ bent), jacobian @ torch.nan_to_num(slope) + bent
+        return loss + 0.5 * float(s @ bent), jacobian @ slope.flatten() + bent
 
     def _on_plateau(self, known: OutputProgress, generator: torch.Generator) -> tuple[OutputProgress, Tensor]:
         return replace(known, failed=True), known.points[:0]

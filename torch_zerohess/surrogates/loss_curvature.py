@@ -62,6 +62,15 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
     return LossCurvature(float(value.detach()), fixed, product)
 
 
+def value_and_slope(loss: Callable[[Tensor], Tensor], output: Tensor) -> tuple[float, Tensor]:
+    """Return the loss at an output [*out], float64, and its slope [*out]; numbers as in `loss_curvature`."""
+    with torch.enable_grad():
+        y = output.detach().requires_grad_(True)
+        value = loss(y)
+        (slope,) = torch.autograd.grad(value, y)
+    return float(value.detach()), _finite(slope)
+
+
 def _finite(derivatives: Tensor) -> Tensor:
     """Replace derivatives that are not finite by zero: of a norm at zero, of a logarithm outside of its domain."""
     return torch.nan_to_num(derivatives, nan=0.0, posinf=0.0, neginf=0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_and_slope
 from torch_zerohess.surrogates.quadratic import fit_outputs, fit_values
 from truths import vector
 
@@ -312,3 +312,12 @@ def test_a_second_derivative_that_is_a_multiple_of_the_identity_is_seen():
     assert loss_curvature(lambda z: 3 * (z - 0.3).square().mean() / 7, y).second == pytest.approx(2 * 3 / 7 / 60)
     bent = loss_curvature(lambda z: (z - 0.3).square().mean() + 1e-9 * z[0] ** 2, y)
     assert not isinstance(bent.second, float)
+
+
+def test_slopes_that_are_not_finite_count_as_zero():
+    loss, output = lambda z: z.sqrt().sum() + z.square().sum(), torch.tensor([[0.0, 4.0]], dtype=torch.float64)
+    expected = torch.tensor([[0.0, 8.25]], dtype=torch.float64)
+    value, slope = value_and_slope(loss, output)
+    assert value == 18.0
+    assert torch.equal(slope, expected)
+    assert torch.equal(loss_curvature(loss, output).slope, expected)

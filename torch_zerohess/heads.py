@@ -55,7 +55,8 @@ class LocalEntropy:
     the valley, so that the gradient points to it from as far as it is hit at all (Chaudhari et al. 2017, "Entropy-SGD",
     equation 5). T = `temperature` times the mean loss under the smoothing, for each element of the batch: it needs no
     scale, and vanishes with the loss. T is not differentiated. For a large temperature the local entropy is the mean.
-    The estimate is the logarithm of a sample mean, hence biased if the samples are few.
+    The estimate is the logarithm of a sample mean, hence biased if the samples are few. Baseline "center" subtracts
+    nothing where exp(-loss / T) at x is more than twice its mean over the samples, as it is near a minimum.
 
     Args:
         head: outputs [K, *out], *aux [K, ...] -> losses [K]; no local entropy itself.

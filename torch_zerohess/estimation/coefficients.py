@@ -40,6 +40,19 @@ def baseline_of(values: Tensor, mean: Tensor | None, K: int, smoothing: Smoothin
     return center if smoothing.baseline == "center" else torch.zeros_like(center)
 
 
+def without_useless_center(values: Tensor, share: Tensor) -> Tensor:
+    """Return values [B, K + 1] with 0 in place of the one at the center, the last one, where it is no baseline.
+
+    A baseline removes variance only if its distance to the mean of the values is at most the size of that mean. Of a
+    local entropy the value at the center may be thousands of times the others.
+
+    share: weight of each of the K rows in the mean, [B, K].
+    """
+    sampled, center = values[:, :-1], values[:, -1:]
+    mean = (sampled * share).sum(1, keepdim=True)
+    return torch.cat([sampled, torch.where((center - mean).abs() <= mean.abs(), center, 0.0)], 1)
+
+
 def mean_of_others(f: Tensor, share: Tensor, draws: list[Tensor]) -> Tensor:
     """Mean over the rows of all other independent draws: a baseline that no row's own value enters.
 

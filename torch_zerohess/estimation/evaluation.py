@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, check_evaluator, check_head
 from torch_zerohess.estimation.advice import add_advice
-from torch_zerohess.estimation.coefficients import baseline_of, coefficients_of, share_of
+from torch_zerohess.estimation.coefficients import baseline_of, coefficients_of, share_of, without_useless_center
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluations import Evaluations
@@ -208,13 +208,16 @@ def evaluate(
             return (stein.value(losses[:, None] * share.mT) / stein.value(share.mT))[:, 0]
 
         counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
+        losses = values if kept is None else outer.filled(values, kept)
         if scales is None:
-            scales = outer.scales(lambda: values[:, :K].double(), mean)
-        remaining = outer.inner(values, scales)
+            scales = outer.scales(lambda: losses[:, :K].double(), mean)
+        remaining = outer.inner(losses, scales)
         if control is not None:
             predicted = control.explain(values, points(), outputs, references, encoded, added, counted)
             if predicted is not None:
                 remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
+        if not outer.linear and smoothing.baseline == "center":
+            remaining = without_useless_center(remaining, share[..., 0])
         baseline, coefficients = coefficients_of(remaining, share, K, smoothing, n)
         if not all_finite(coefficients):
             raise ValueError(

@@ -34,6 +34,10 @@ class Outer:
         """Return the scales, float64 [B, 2], of losses [B, K] and their mean [B], or None."""
         return None
 
+    def filled(self, values: Tensor, kept: Tensor) -> Tensor:
+        """Return values [B, E, ...] with numbers that change no `scales` in place of rows that are not kept [B, K]."""
+        return values
+
     def inner(self, values: Tensor, scales: Tensor | None) -> Tensor:
         """Return the numbers whose expectation is Z."""
         return values
@@ -68,6 +72,12 @@ class Entropy(Outer):
         found = losses().detach()
         T = self.temperature * mean(found).double().abs()
         return torch.stack([T.clamp_min(torch.finfo(torch.float32).tiny), found.double().min(1).values], 1)
+
+    def filled(self, values: Tensor, kept: Tensor) -> Tensor:
+        """The least loss: the zeros in place of dropped losses would be less than all others."""
+        sampled, center = values.tensor_split([kept.shape[1]], 1)
+        least = torch.where(kept, sampled, torch.inf).min(1, keepdim=True).values
+        return torch.cat([torch.where(kept, sampled, least), center], 1)
 
     def inner(self, values: Tensor, scales: Tensor | None) -> Tensor:
         """exp((m - l) / T) for losses [B, K]; at most e^60, for the smallest losses that m did not know."""

@@ -2,12 +2,14 @@
 
 import functools
 import math
+from typing import Literal
 
 import pytest
 import torch
 from torch import Tensor
 
 import torch_zerohess as zh
+from torch_zerohess.estimation.coefficients import without_useless_center
 from torch_zerohess.estimation.outer import Entropy
 
 
@@ -122,3 +124,52 @@ def test_a_local_entropy_inside_of_another_function_is_refused() -> None:
             layer(x)
     with pytest.raises(TypeError, match="head must give losses, not be a LocalEntropy itself"):
         zh.heads.LocalEntropy(inner)
+
+
+def test_near_a_minimum_the_center_is_no_baseline() -> None:
+    n, sigma, at, temperature = 20, 0.1, 0.1, 0.1
+    x = torch.zeros(400, n, dtype=torch.float64)
+    x[:, 0] = at
+    x.requires_grad_()
+    smoothing = zh.Smoothing(sigma=sigma, samples=16, seed=0)
+    layer = zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(square, temperature), value="smoothed")
+    F = layer(x)
+    (g,) = torch.autograd.grad(F.sum(), x, create_graph=True)
+    (h,) = torch.autograd.grad(g[:, 0].sum(), x)
+    T = temperature * (at**2 + n * sigma**2)
+    spread = 1.0 + 2.0 * sigma**2 / T
+    expected = at**2 / spread + 0.5 * n * T * math.log(spread)
+    found = [float(one.detach().mean()) for one in (F, g[:, 0], h[:, 0])]
+    assert found[0] == pytest.approx(expected, rel=0.1)  # 16 pairs are few
+    assert found[1:] == pytest.approx([2.0 * at / spread, 2.0 / spread], rel=0.3)
+
+
+@pytest.mark.parametrize(("center", "used"), [(3.9, 3.9), (4.1, 0.0), (0.1, 0.1), (-0.1, 0.0)])
+def test_a_center_at_more_than_twice_the_mean_is_no_baseline(center: float, used: float) -> None:
+    values, share = torch.tensor([[1.0, 7.0, center]]), torch.tensor([[5 / 6, 1 / 6]])
+    assert without_useless_center(values, share).tolist() == [[1.0, 7.0, pytest.approx(used)]]
+
+
+@pytest.mark.parametrize("baseline", ["none", "mean", "center"])
+def test_dropped_losses_are_not_the_least(baseline: Literal["none", "mean", "center"]) -> None:
+    points = []
+
+    def broken(z: Tensor) -> Tensor:
+        points.append(z.double())
+        losses = 1.0 + (z - 1.0).square().sum(1)
+        losses[0] = torch.nan
+        return losses
+
+    temperature, samples, x = 0.005, 64, torch.zeros(2, requires_grad=True)
+    smoothing = zh.Smoothing(sigma=0.05, samples=samples, seed=1, proposal="gaussian", baseline=baseline)
+    head = zh.heads.LocalEntropy(lambda y: y, temperature)
+    layer = zh.BlackBox(broken, smoothing, head=head, on_nonfinite="drop", value="smoothed")
+    F = layer(x)
+    (g,) = torch.autograd.grad(F, x)
+    z = torch.cat([points[0][1:samples], points[0][samples + 1 : 2 * samples]])  # without the pair of the first point
+    losses = 1.0 + (z - 1.0).square().sum(1)
+    T = temperature * losses.mean()
+    weights = torch.softmax(-losses / T, 0)
+    expected = -T * (torch.logsumexp(-losses / T, 0) - math.log(len(z)))
+    torch.testing.assert_close(F.detach().double(), expected, rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(g.double(), -T * (weights[:, None] * z).sum(0) / 0.05**2, rtol=1e-3, atol=1e-3)

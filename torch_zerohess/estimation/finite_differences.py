@@ -13,6 +13,9 @@ from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 
+_INEXACT = 0.1
+"""Error of the rounded step, relative to its length, up to which it is the step that was asked for."""
+
 
 def finite_difference_hvp(
     fn: Callable[..., Any],
@@ -51,7 +54,8 @@ def finite_difference_hvp(
         [*batch, *out, n], of the dtype of x.
 
     Raises:
-        ValueError, TypeError: as `estimate`, or if v or step are not as described.
+        ValueError, TypeError: as `estimate`, if v or step are not as described, or if the step is lost in the rounding
+            of x.
 
     Example:
         >>> x, v = torch.tensor([1.0, 2.0]), torch.tensor([1.0, 0.0])
@@ -71,7 +75,13 @@ def finite_difference_hvp(
     direction = torch.where(size > 0, t / size, 0.0)
     norm = direction.norm(dim=-1, keepdim=True)
     length = size * norm
-    offset = (step * sigma * direction / norm.clamp_min(1.0)).to(x.dtype)  # the norm is 0 or at least 1
+    exact = step * sigma * direction / norm.clamp_min(1.0)  # the norm is 0 or at least 1
+    offset = exact.to(x.dtype)
+    made = 0.5 * ((x + offset).double() - (x - offset).double())
+    wrong = ((made - exact) / sigma).norm(dim=-1) > _INEXACT * step
+    if bool(wrong.any()):
+        advice = "use float64, a larger step or a larger sigma" if x.dtype == torch.float32 else "use a larger sigma"
+        raise ValueError(f"step is below the rounding of x in {x.dtype}, got {step:g} of sigma: {advice}")
     seed = smoothing.drawn_seed()
     other = seed if common else seed ^ (1 << 61)
     how: dict[str, Any] = {"vectorized": vectorized, "evaluator": evaluator, "on_nonfinite": on_nonfinite}

@@ -103,6 +103,17 @@ def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
     assert abs(float(found[0]) - 2.0) < 0.1
 
 
+@pytest.mark.parametrize("sigma", [1e-4, 3e-4])
+def test_a_step_that_rounding_changes_is_an_error(sigma: float) -> None:
+    """Neighbours of 1 000 are 6e-5 apart. Of the smaller step nothing would be left, of the other one a third more."""
+    x = torch.tensor([1000.0, 1000.0])
+    v, smoothing = torch.tensor([1.0, 0.5]), zh.Smoothing(sigma=sigma, samples=4, seed=0)
+    with pytest.raises(ValueError, match=r"step is below the rounding of x in torch\.float32"):
+        zh.finite_difference_hvp(lambda z: z.square().sum(1), x, v, smoothing)
+    zh.finite_difference_hvp(lambda z: z.square().sum(1), x.double(), v, smoothing)
+    zh.finite_difference_hvp(lambda z: z.square().sum(1), x, 0.0 * v, smoothing)
+
+
 def test_errors() -> None:
     smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
     with pytest.raises(ValueError, match=r"shape \[3\] or of the shape of x, got torch.Size\(\[2\]\)"):

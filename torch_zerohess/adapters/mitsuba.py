@@ -117,7 +117,7 @@ class MitsubaScene:
             raise ValueError("parameters must name at least one part of the scene, got none")
         self.mi: Any = select_variant(variant, threads)
         self.variant: str = self.mi.variant()
-        self.spp, self.seed, self.noise, self.loss, self.nan = spp, seed, noise, loss, nan
+        self.spp, self.seed, self.noise, self.loss, self.nan = spp, int(seed), noise, loss, nan  # no seed of NumPy
         described = _described(self.mi, description)
         self.scene: Any = _load(self.mi, described)
         self.values: Any = self.mi.traverse(self.scene)
@@ -151,7 +151,7 @@ class MitsubaScene:
         """[n], the scene as it was loaded, or the nearest within the bounds."""
         self.values.update()  # forgets which entries were read: those that go would be looked up later
         self.values.keep([rf"{re.escape(name)}\Z" for one in self.parameters for name in one.names])
-        self._calls = seed
+        self._calls = self.seed
         self._lock = threading.RLock()  # from the writing of a point to the end of its render
 
     def __repr__(self) -> str:

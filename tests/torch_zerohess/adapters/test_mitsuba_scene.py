@@ -303,6 +303,14 @@ def test_workers_do_not_repeat_the_noise_of_each_other() -> None:
             assert torch.equal(images[0], scalar(*fn.args, **fn.kwargs)(x))
 
 
+@pytest.mark.parametrize("integer", [np.int64, torch.tensor])
+def test_integers_may_be_those_of_others(variant, integer) -> None:
+    numbers = {"spp": 2, "depth": 2, "seed": 3, "threads": 1}
+    settings = {name: integer(number) for name, number in numbers.items()}
+    scenes = [MitsubaScene(lamp, [Value(RADIANCE)], variant=variant, **given) for given in (settings, numbers)]
+    assert torch.equal(*(scene(scene.x0[None]) for scene in scenes))
+
+
 def test_seed_changes_the_noise_and_nothing_else() -> None:
     def image(seed):
         scene = scalar(plane, [Value(REFLECTANCE)], spp=64, seed=seed, integrator={"type": "path", "max_depth": 2})

@@ -11,6 +11,8 @@ from torch_zerohess.autograd.curvature import CurvatureOperator
 
 _TOLERANCE = 1e-3
 """Relative error of the blocks against a product with A at which the loss is not a sum over the batch."""
+_ROUNDINGS = 2.0
+"""The same in units of rounding, which is all there is in half precision."""
 
 
 def output_blocks(operator: CurvatureOperator) -> list[Tensor]:
@@ -42,7 +44,8 @@ def _check(operator: CurvatureOperator, blocks: list[Tensor]) -> None:
         expected = (block @ vector.reshape(len(block), -1, 1).double())[..., 0]
         error += float((product.reshape_as(expected).double() - expected).norm())
         size += float(block.norm())
-    if error > _TOLERANCE * size:
+    rounding = max(torch.finfo(one.dtype).eps for one in operator.through)
+    if error > max(_TOLERANCE, _ROUNDINGS * rounding) * size:
         raise ValueError(
             "modification and solver 'dual' need a loss that is a sum or mean over the batch of black boxes, but the "
             "loss couples its elements: use modification=None and solver 'steihaug' or 'clip'"

@@ -152,6 +152,22 @@ def test_coupled_elements_are_refused(loss) -> None:
         output_blocks(operator)
 
 
+@pytest.mark.parametrize("n", [2, 100])
+def test_elements_in_half_precision_are_not_coupled_by_rounding(n: int) -> None:
+    y = torch.randn(6, n, generator=torch.Generator().manual_seed(0)).bfloat16().requires_grad_()
+
+    def blocks(loss: Tensor) -> Tensor:
+        return output_blocks(CurvatureOperator(loss, y, mode="gauss_newton", through=y))[0]
+
+    losses_of = (y[:, 1] - y[:, 0].square()).square() + (1 - y[:, 0]).square()
+    hessian = torch.func.vmap(torch.func.hessian(lambda z: (z[1] - z[0] ** 2) ** 2 + (1 - z[0]) ** 2))
+    exact = hessian(y.detach().double())
+    rounding = torch.finfo(y.dtype).eps * float(exact.abs().max())
+    torch.testing.assert_close(blocks(losses_of.sum()), exact, rtol=0.0, atol=4.0 * rounding)
+    with pytest.raises(ValueError, match="couples its elements"):
+        blocks(y.square().mean().square())
+
+
 @pytest.mark.parametrize("solver", ["dual", "clip"])
 def test_indefinite_curvature_is_descended(solver) -> None:
     """On -|y|^2, which no step makes positive, a Newton step would go to the maximum."""

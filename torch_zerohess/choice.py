@@ -38,7 +38,7 @@ _PAIRS = 64  # evaluations of so many pairs of Sobol points that they can be cut
 _WIDEST = 1024  # parameters up to which directions are made orthogonal: the time grows with n times the samples
 _SCRAMBLES = 4  # fewer would have a smaller error, and an interval of no use
 _LEAST_SCRAMBLE = 8  # points
-_EVEN = 4  # points of a scramble from which two scrambles have a standard error whatever their baseline
+EVEN = 4  # points of a scramble from which its mean varies so little that two scrambles hardly depend on each other
 
 
 def chosen_sampler(n: int, evaluations: int, order: int) -> Literal["random", "sobol", "orthogonal"]:
@@ -74,4 +74,4 @@ def scrambles_of(samples: int, most: int = _SCRAMBLES) -> int:
 
 def chosen_baseline(antithetic: bool, draws: int, size: int) -> Literal["center", "mean"]:
     """Return the baseline: f(x), or the mean of the other draws, each of `size` points."""
-    return "mean" if draws >= (2 if antithetic or size >= _EVEN else 3) else "center"
+    return "mean" if draws >= (2 if antithetic or size >= EVEN else 3) else "center"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.choice import EVEN
 from torch_zerohess.estimation.skewness import shape_of
 from torch_zerohess.estimation.stein import Quantity, Spread, Stein
 
 _CHUNK = 1 << 22  # numbers held at a time
-_EVEN = 4  # points of a scramble from which its mean varies so little that two scrambles hardly depend on each other
 
 
 class Divisible(Stein):
@@ -98,7 +98,7 @@ def variance_of_draws(
 def _scrambles(draws: Tensor) -> bool:
     """Whether draws [D, r] are evenly spread points: at least four rows, and not in pairs, which are far apart."""
     rows = draws.shape[1]
-    return rows >= _EVEN and int(draws[0, -1] - draws[0, 0]) < rows
+    return rows >= EVEN and int(draws[0, -1] - draws[0, 0]) < rows
 
 
 def _powers(deviations: Iterable[Tensor]) -> tuple[Tensor, Tensor, Tensor]:

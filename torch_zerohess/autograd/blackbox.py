@@ -162,11 +162,12 @@ class BlackBox(nn.Module):
         check_aux(aux, self.memory, self.call.head)
         # With grad: the function may be differentiated elsewhere, and a head must be a constant there.
         with torch.enable_grad(), contextlib.nullcontext() if self.memory is None else self.memory.lock:
-            around = self._around(center, folded_aux(_without_grad(aux), batch), zero=False)
+            copies = [one.clone() for one in folded_aux(_without_grad(aux), batch)]  # the caller may write to them
+            around = self._around(center, copies, zero=False)
 
         def frozen(z: Tensor) -> Tensor:
-            if z.shape != x.shape:
-                raise ValueError(f"x must have the shape {list(x.shape)} that was frozen, got {list(z.shape)}")
+            if z.shape != (*batch, n):  # not x, which would keep its graph
+                raise ValueError(f"x must have the shape {[*batch, n]} that was frozen, got {list(z.shape)}")
             result = around(z.reshape(-1, n))
             return result.reshape((*batch, *result.shape[1:]))
 

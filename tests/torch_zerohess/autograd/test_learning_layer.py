@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils.weak import TensorWeakRef
 
 import torch_zerohess as zh
 
@@ -65,6 +66,29 @@ def test_a_frozen_function_changes_with_its_argument(head: Any, memory: bool) ->
     change = float((frozen(at + h) - frozen(at - h)).detach()) / (2 * h)
     assert change > 1.0
     assert change == pytest.approx(float(slope), rel=0.1)
+
+
+def test_a_frozen_function_has_its_own_auxiliary_inputs() -> None:
+    memory, z, references = zh.Memory(), torch.linspace(-1, 1, 40)[:, None], torch.ones(2, 1)
+    memory.add(z, z)
+    memory.fit()
+    memory.regression.moments = [[1.0, 1.0]]
+    smoothing = zh.Smoothing(sigma=0.1, samples=4)
+    box = zh.BlackBox(lambda z: z, smoothing, head=lambda y, r: (y - r).square().sum(1), memory=memory).eval()
+    x = torch.zeros(2, 1)
+    frozen = box.freeze(x, references)
+    before = frozen(x + 0.1)
+    references.zero_()
+    assert torch.equal(frozen(x + 0.1), before)
+
+
+def test_a_frozen_function_keeps_no_graph() -> None:
+    x = 2.0 * torch.ones(1, 1, requires_grad=True)
+    held = TensorWeakRef(x)
+    frozen = zh.BlackBox(lambda z: z.square().sum(1), zh.Smoothing(sigma=0.1)).freeze(x)
+    del x
+    assert held() is None
+    frozen(torch.ones(1, 1))
 
 
 def test_parameters_must_be_as_many_as_those_in_memory() -> None:

@@ -1,7 +1,9 @@
 """Evaluations that are kept, and the surrogate fitted to them: a control variate for later estimates."""
 
+import functools
 import threading
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -23,11 +25,26 @@ _EXCESS = 1.05
 _BLOCK = 1024
 """Points whose distances to others are held at once."""
 
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def _locked(method: "Callable[Concatenate[Memory, _P], _T]") -> "Callable[Concatenate[Memory, _P], _T]":
+    """Return a method of a memory that no other thread interrupts: it waits for a call that is under way."""
+
+    @functools.wraps(method)
+    def called(self: "Memory", /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        with self.lock:
+            return method(self, *args, **kwargs)
+
+    return called
+
 
 class Memory:
     """Evaluations of a black box, and a surrogate g of it, as a control variate of `BlackBox` and `estimate`.
 
-    Several of them can share one memory, and `minimize` adds to it. All must call the same black box.
+    Several of them can share one memory, and `minimize` adds to it. All must call the same black box. Another thread
+    that reads evaluations or the state waits for the end of a call.
 
     With a head h after the black box f and a coefficient c,
 
@@ -104,7 +121,7 @@ class Memory:
         """Orders of pathwise derivatives of the surrogate's term, 0, 1 or 2, see `estimation.surrogate_term`; None: to
         be measured."""
         self.lock = threading.RLock()
-        """Held during a call, so that the surrogate does not change in it."""
+        """Held during a call, so that the surrogate does not change in it, and by what reads or changes evaluations."""
         self._points: list[Tensor] = []
         self._outputs: list[Tensor] = []
         self._size = 0
@@ -122,12 +139,14 @@ class Memory:
         return self._size
 
     @property
+    @_locked
     def points(self) -> Tensor:
         """Points of the evaluations that are kept, [P, n]."""
         self._points = _joined(self._points)
         return self._points[0] if self._points else torch.empty(0, 0, device="cpu")
 
     @property
+    @_locked
     def outputs(self) -> Tensor:
         """Outputs there, [P, *out]."""
         self._outputs = _joined(self._outputs)
@@ -143,6 +162,7 @@ class Memory:
         if self._points and (kept := self._points[0].shape[1]) != n:
             raise ValueError(f"x must have {kept} parameters like the evaluations in memory, got {n}")
 
+    @_locked
     def add(self, points: Tensor, outputs: Tensor) -> None:
         """Keep outputs [K, *out] at points [K, n]; those that are not finite are left out.
 
@@ -172,6 +192,7 @@ class Memory:
         if self._size > _EXCESS * self.capacity:
             self._thin()
 
+    @_locked
     def fit(self) -> None:
         """Fit the surrogate to all evaluations that are kept; a module without `fit` is left as it is.
 
@@ -191,6 +212,7 @@ class Memory:
                     points, outputs = points.clone(), outputs.clone()
                 self.surrogate.fit(points, outputs)
 
+    @_locked
     def refresh(self) -> None:
         """Fit the surrogate if that is due: `evaluations` has grown by 30 % since the last fit."""
         if self._size >= _FEWEST and self.evaluations >= _GROWTH * self._fitted:
@@ -218,6 +240,7 @@ class Memory:
             self._points, self._outputs = [self.points[kept]], [self.outputs[kept]]
         self._size, self._rows = len(kept), int((kept < self._rows).sum())
 
+    @_locked
     def state_dict(self) -> dict[str, Any]:
         """Return everything but the settings: evaluations, the coefficient, and the state of the surrogate if any."""
         model = self.surrogate.state_dict() if isinstance(self.surrogate, nn.Module) else None
@@ -234,6 +257,7 @@ class Memory:
             "version": VERSION,
         }
 
+    @_locked
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew.
 
@@ -256,8 +280,10 @@ class Memory:
         elif self._rows > 1:
             self._fit_rows()
 
+    @_locked
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "lock"}
+        found = {name: value for name, value in vars(self).items() if name != "lock"}
+        return {**found, "_points": [*self._points], "_outputs": [*self._outputs]}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, lock=threading.RLock())

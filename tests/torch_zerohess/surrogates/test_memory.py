@@ -1,12 +1,14 @@
 """What a memory keeps, when it fits, and what it thinks of its surrogate."""
 
 import copy
+import threading
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 import torch_zerohess as zh
+from torch_zerohess.surrogates import memory as module
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.memory import Memory
 from truths import normal
@@ -230,3 +232,51 @@ def test_a_surrogate_cannot_change_what_is_kept() -> None:
     memory.fit()
     assert torch.equal(memory.points, z)
     assert torch.equal(memory.outputs, y)
+
+
+def test_a_memory_that_is_read_in_one_thread_grows_in_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second batch comes while the first ones become one tensor."""
+    store, z, joined = Memory(), torch.arange(3.0)[:, None], module._joined
+    adding = threading.Thread(target=store.add, args=(z, z))
+
+    def interrupted(parts: list[Tensor]) -> list[Tensor]:
+        result = joined(parts)
+        if adding.ident is None:
+            adding.start()
+            adding.join(0.2)
+        return result
+
+    store.add(z, z)
+    store.add(z, z)
+    monkeypatch.setattr(module, "_joined", interrupted)
+    assert len(store.points) == 6
+    adding.join()
+    assert len(store.points) == len(store.outputs) == len(store) == 9
+
+
+def test_a_state_is_of_one_moment() -> None:
+    """The second batch comes between the points and the outputs of the state."""
+
+    class Interrupted(Memory):
+        @property
+        def outputs(self) -> Tensor:
+            if adding.ident is None:
+                adding.start()
+                adding.join(0.2)
+            return super().outputs
+
+    store, z = Interrupted(), torch.arange(3.0)[:, None]
+    adding = threading.Thread(target=store.add, args=(z, z))
+    store.add(z, z)
+    state = store.state_dict()
+    adding.join()
+    assert len(state["points"]) == len(state["outputs"]) == 3
+    assert len(store.outputs) == 6
+
+
+def test_what_copies_a_memory_may_take_its_time() -> None:
+    store, z = Memory(), torch.arange(3.0)[:, None]
+    store.add(z, z)
+    state = store.__getstate__()
+    store.add(z, z)
+    assert len(state["_points"]) == len(state["_outputs"]) == 1

@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
+from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators.lifetime import ending
 
 MINIMUM_LLVM = 16
@@ -142,12 +143,12 @@ def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleT
 
     Raises:
         ModuleNotFoundError: Mitsuba is not installed.
-        ValueError: `threads` below 1.
+        ValueError, TypeError: `threads` is below 1, or no integer.
         RuntimeError: the variant asked for does not work here; the message has the reason and what to do.
 
     """
-    if threads is not None and threads < 1:
-        raise ValueError(f"threads must be at least 1 or None, got {threads}")
+    if threads is not None:
+        threads = checked_integer("threads", threads, 1)
     if importlib.util.find_spec("mitsuba") is None:
         raise ModuleNotFoundError(INSTALL, name="mitsuba")
     if variant == "auto":

@@ -90,7 +90,7 @@ class OnnxFunction:
         """Number of parameters."""
         self._batched = all(_free(self._inputs[name].shape[:1]) for name in (*self.parameters, *self.aux))
         self._constants = {
-            name: self._converted("constants", name, torch.as_tensor(one, device="cpu")).clone()
+            name: self._converted("constants", name, torch.as_tensor(_compact(one), device="cpu")).clone()
             for name, one in fixed.items()
         }
 
@@ -238,6 +238,11 @@ class OnnxFunction:
         if name is not None and name not in names:
             raise ValueError(f"output must be one of {names}, got {name!r}")
         return name or names[0]
+
+
+def _compact(numbers: Any) -> Any:
+    """Return a copy of an array of NumPy, whose strides may be negative; anything else as it is."""
+    return numbers.copy() if hasattr(numbers, "strides") else numbers
 
 
 def _again(*arguments: Any) -> OnnxFunction:

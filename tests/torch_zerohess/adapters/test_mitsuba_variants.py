@@ -120,3 +120,5 @@ def test_explicit_variant_that_does_not_work_raises_with_the_reason() -> None:
         adapter.select_variant("no_such_variant")
     with pytest.raises(ValueError, match="threads must be at least 1"):
         adapter.select_variant("scalar_rgb", threads=0)
+    with pytest.raises(TypeError, match="threads must be an integer, got '2'"):
+        adapter.select_variant("scalar_rgb", threads="2")

@@ -9,6 +9,11 @@ from torch_zerohess.surrogates.plateau import is_plateau
 
 _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 """Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
+_EDGE, _LEAST, _SIDE = 1e-4, 1e-6, 3
+"""Distance in units of sigma, and difference over the range of all values: values that are higher by the same amount
+at distances that differ tenfold lie beyond an edge, if so many do, and as many rise by less on this side of it."""
+_ALIKE, _TENFOLD = 0.05, 10.0
+"""Relative spread of differences that are the same, and ratio of the distances."""
 _FAILED = 0.07
 """Distance, root mean square over the parameters in units of sigma, up to which a failure is next to x: before a wall
 of failures a search ends at a region of 0.01 sigma, and its last steps are several times as long."""
@@ -62,7 +67,23 @@ def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor)
     distance, range_ = ((points - x) / unit).norm(dim=1), finite.max() - finite.min()
     if not bool(torch.isfinite(losses[distance <= _FAILED * math.sqrt(len(x))]).all()):
         return True
-    return not all(bool((losses[distance <= near] - value <= part * range_).all()) for near, part in _NEXT)
+    if not all(bool((losses[distance <= near] - value <= part * range_).all()) for near, part in _NEXT):
+        return True
+    beside = (distance > 0.0) & (distance <= _EDGE)
+    return _has_edge(distance[beside], losses[beside] - value, float(_LEAST * range_))
+
+
+def _has_edge(distance: Tensor, rise: Tensor, least: float) -> bool:
+    """Whether two smooth pieces meet in a jump: rises [K] beyond it are all the same, rises on this side far smaller.
+
+    Roughness has rises of every size, a kink rises that grow with the distance, and rounded values rises of zero.
+    """
+    if not len(rise) or (highest := float(rise.max())) <= least:
+        return False
+    beyond, here = rise > 0.5 * highest, (rise > 0.0) & (rise < _ALIKE * highest)
+    far = distance[beyond]
+    alike = float(rise[beyond].min()) > (1.0 - _ALIKE) * highest and float(far.max()) >= _TENFOLD * float(far.min())
+    return alike and min(int(beyond.sum()), int(here.sum())) >= _SIDE
 
 
 def has_cusp(points: Tensor, losses: Tensor, x: Tensor, unit: Tensor) -> bool:

@@ -38,6 +38,28 @@ def test_failures_are_next_to_x_by_their_distance_per_parameter(failed: float, e
     assert jumps(points, vector(0.0, math.nan, 1.0), x, 0.0, torch.ones_like(x)) is expected
 
 
+@pytest.mark.parametrize(
+    ("beyond", "expected"),
+    [
+        (lambda d: 1e-4 + 0.01 * d, True),
+        (lambda d: 1e-7 + 0.0 * d, False),  # less than what tells
+        (lambda d: 1e-4 * (0.55 + 4e3 * d), False),  # roughness has rises of every size
+        (lambda d: d, False),  # a kink
+    ],
+)
+def test_a_small_jump_between_smooth_pieces_is_an_edge(beyond, expected):
+    """The loss rises by 1e-5 of the distance on this side of the edge, by more beyond it, and nowhere above 1."""
+    x, d = vector(3.0), torch.logspace(-7, -4, 7, dtype=torch.float64)
+    points = torch.cat([x[None], x + d[:, None], x - d[:, None], x[None] + 5.0])
+    losses = torch.cat([vector(0.0), 1e-5 * d, beyond(d), vector(1.0)])
+    assert jumps(points, losses, x, 0.0, vector(1.0)) is expected
+    few = torch.tensor([0, 1, 2, *range(8, 16)])  # too few on this side
+    assert not jumps(points[few], losses[few], x, 0.0, vector(1.0))
+    assert not jumps(points, torch.where(losses < 5e-5, 0.0, losses), x, 0.0, vector(1.0))  # rounded values
+    near = ((points - x).norm(dim=1) < 1.0)[:, None]  # all at one distance
+    assert not jumps(torch.where(near, x + 1e-5 * (points - x).sign(), points), losses, x, 0.0, vector(1.0))
+
+
 def test_without_a_finite_value_nothing_is_known() -> None:
     assert not jumps(torch.zeros(2, 1).double(), vector(math.nan, math.nan), vector(0.0), math.nan, vector(1.0))
 

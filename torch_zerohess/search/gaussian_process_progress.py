@@ -55,9 +55,10 @@ class ProcessProgress(Progress):
         It agrees with earlier arrivals if the search has since evaluated elsewhere as often as it had evaluated until
         then: beside a minimum that was hard to find there may be a lower one that is as hard to find.
         """
-        if not self.pool.ties(self.best.point, self.best.loss, tolerance):  # a plateau is no minimum
+        found = self.is_minimum(tolerance)
+        if found or (self.noisy and not self.pool.ties(self.best.point, self.best.loss, tolerance)):
             self = arriving(self, self.best)
-        if not self.is_minimum(tolerance):
+        if not found:  # a plateau, or no minimum of the quadratics
             return self
         known = agreeing(self, end or self.best, tolerance, self.pool.values)
         if known.agreed > 1 and not self.has_looked:

@@ -128,7 +128,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         if self._axes.may_begin(known.lines, several=known.several):
             lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values)
             return replace(known, lines=lines, steps=0), points
-        if known.arrived is not None and known.agreed == 0 and not known.beside:
+        if bool(known.finished.isfinite().all()) and known.agreed == 0 and not known.beside:
             return _finishing(known, *self._hop(known, generator), beside=True)
         return self._elsewhere(known, generator)
 

@@ -1,6 +1,7 @@
 """The search in a small box from the loss alone: over plateaus as the process, to the last digit as quadratics."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,10 @@ from searches import cosine_bowl, well
 from torch_zerohess import minimize
 from torch_zerohess.optim import GaussianProcessSearch
 from torch_zerohess.search import loss_process
-from truths import vector
+from torch_zerohess.search.loss_process import LossProcess
+from torch_zerohess.search.method import Settings
+from torch_zerohess.search.state import Evaluated
+from truths import normal, vector
 
 
 def search_for(f, x0, evaluations, **settings):
@@ -253,3 +257,14 @@ def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch
     agreed = [one.agreed for one in ends if one.beside]
     assert len(agreed) > 3
     assert max(agreed) == 0
+
+
+def test_an_arrival_is_a_minimum_of_the_quadratics():
+    """Short steps of the process alone are none, and a search that has no other is not solved."""
+    settings = Settings(vector(0.4, 0.1), vector(-3.0, -3.0), vector(3.0, 3.0), None, 0, 1e-2, 0.0, None)
+    method, points = LossProcess(settings), normal(12, 2, seed=0)
+    known, _ = method.first(torch.Generator().manual_seed(0))
+    known = method.remembered(known, Evaluated(points, points.square().sum(1), None))
+    assert known.agreeing(settings.tolerance).arrived is None
+    solved = replace(known, solved=known.best.point).agreeing(settings.tolerance)
+    assert solved.arrived is known.best

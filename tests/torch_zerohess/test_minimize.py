@@ -219,7 +219,7 @@ def test_a_plot_passes_over_values_that_are_not_numbers():
     assert bool(fit.values.isnan().any())
     axes = fit.plot()
     assert axes.lines[1].get_ydata()[-1] == fit.value
-    assert axes.get_yscale() == "linear"
+    assert axes.get_yscale() == "log"
 
 
 def test_starts_of_lists_and_arrays():

@@ -103,7 +103,7 @@ class Minimum:
         Args:
             axes: of matplotlib, which must be installed; new ones if None.
 
-        The scale is logarithmic where all losses are above zero. In noise the value with its standard error stands at
+        The scale is logarithmic where no loss is zero or below. In noise the value with its standard error stands at
         the end: the lowest loss lies below it by luck.
         """
         if axes is None:
@@ -111,14 +111,14 @@ class Minimum:
 
             axes = pyplot.subplots()[1]
         values = self.values.detach().double().cpu()
-        known = values.nan_to_num(nan=float("inf"))
+        known = torch.where(values.isnan(), torch.inf, values)
         counts = torch.arange(1, len(values) + 1, device="cpu")
         axes.plot(counts, values, ".", color="0.7", label="evaluations")
         axes.step(counts, known.cummin(0).values, where="post", label="lowest so far")
         if self.value_error:
             axes.errorbar([len(values)], [self.value], [self.value_error], fmt="o", capsize=3, label="value at x")
         axes.set(xlabel="evaluations", ylabel="loss", title=self.message)
-        if bool((values > 0).all()):
+        if bool((known > 0).all()):
             axes.set_yscale("log")
         axes.legend()
         return axes

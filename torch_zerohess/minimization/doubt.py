@@ -10,10 +10,11 @@ from torch_zerohess.surrogates.plateau import is_plateau
 _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 """Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
 _EDGE, _LEAST, _SIDE = 1e-4, 1e-6, 3
-"""Distance in units of sigma, and difference over the range of all values: values that are higher by the same amount
-at distances that differ tenfold lie beyond an edge, if so many do, and as many rise by less on this side of it."""
+"""Points within this distance of x, in units of sigma, tell an edge. Beyond it values are higher than at x by more than
+this part of the range of all values. At least so many points lie on each side."""
 _ALIKE, _TENFOLD = 0.05, 10.0
-"""Relative spread of differences that are the same, and ratio of the distances."""
+"""Values beyond an edge are higher by the same amount, but for this part of it. The ratio of their distances is at
+least the second number. Values on this side are higher by less than the first part of that amount."""
 _FAILED = 0.07
 """Distance, root mean square over the parameters in units of sigma, up to which a failure is next to x: before a wall
 of failures a search ends at a region of 0.01 sigma, and its last steps are several times as long."""

@@ -35,7 +35,7 @@ _OPTIMISM = 0.3
 _EXPLORING = 2.0
 """The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
 _BESIDE, _EVERY = 0.5, 4
-"""Spread of points of a batch around the end of a step, over the distance of the nearest evaluation; one in so many."""
+"""Spread of points around the end of a step, over the distance of the nearest evaluation. One in so many lies there."""
 _SETTLED = 3
 """Steps in a row that stay within the tolerance of the best point: the search has arrived."""
 _FLOOR = 1e-2

@@ -260,7 +260,7 @@ def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch
 
 
 def test_an_arrival_is_a_minimum_of_the_quadratics():
-    """Short steps of the process alone are none, and a search that has no other is not solved."""
+    """Short steps of the process alone are no arrival."""
     settings = Settings(vector(0.4, 0.1), vector(-3.0, -3.0), vector(3.0, 3.0), None, 0, 1e-2, 0.0, None)
     method, points = LossProcess(settings), normal(12, 2, seed=0)
     known, _ = method.first(torch.Generator().manual_seed(0))

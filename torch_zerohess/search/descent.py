@@ -60,7 +60,7 @@ class LocalQuadratics(Method[DescentProgress]):
     def go_on(self, pool: Pool, best: Best, sigma: float) -> DescentProgress:
         """Return a round that begins at the best point of another search, with the evaluations of that search."""
         known = self.begun(best)
-        pool = known.pool.add(pool.points, pool.values, None, best.point, 1.0).latest(self.capacity)
+        pool = known.pool.add(pool.points, pool.values, None, best.point, 1.0).latest(self.capacity, best.point)
         return self._planned(replace(known, pool=pool, value=best.loss, sigma=sigma).trying())
 
     def next(
@@ -135,12 +135,12 @@ class LocalQuadratics(Method[DescentProgress]):
             trial = known.phase == "trial"
             drawn = (evaluated.points[0], _BESIDE * known.sigma) if trial else (known.center, known.sigma)
             pool = pool.add(more.points, more.losses, more.outputs, *drawn)
-        pool = pool.latest(self.capacity)
+        lowest = known.lowest.or_lower(new, known.sigma)
         return replace(
             known,
-            pool=pool,
+            pool=pool.latest(self.capacity, lowest.point),
             best=known.best.or_lower(new, known.sigma),
-            lowest=known.lowest.or_lower(new, known.sigma),
+            lowest=lowest,
             shape=evaluated.shape,
             evaluations=known.evaluations + len(evaluated),
             lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,

@@ -171,12 +171,12 @@ class ProcessMethod(Method[Q]):
         pool = known.pool
         while len(pool) + len(new) > capacity > len(new) and not known.noisy:
             pool = pool.thin(best)
-        known = replace(known, pool=pool.add(new.points, new.losses, new.outputs, best, 1.0).latest(capacity))
+        pool = pool.add(new.points, new.losses, new.outputs, best, 1.0)
         k = int(new.losses.argmin())
-        if float(new.losses[k]) >= known.record.loss:
-            return known
-        record = Best(new.points[k], float(new.losses[k]), max(known.sigma, self.settings.tolerance))
-        return replace(known, record=record, best=known.best if known.noisy else record)
+        if float(new.losses[k]) < known.record.loss:
+            record = Best(new.points[k], float(new.losses[k]), max(known.sigma, self.settings.tolerance))
+            known = replace(known, record=record, best=known.best if known.noisy else record)
+        return replace(known, pool=pool.latest(capacity, known.record.point))
 
     def avoiding(self, known: Q, holes: Tensor) -> Q:
         """Note points [K, n] whose values are not finite."""

@@ -19,9 +19,9 @@ from torch import Tensor
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import further_start, normal
-from torch_zerohess.search.region_progress import latest
 from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, Progress, arriving
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
+from torch_zerohess.surrogates.pool import latest
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
 
 _FITTED = 3

@@ -28,10 +28,11 @@ from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.region_descent import BAD, LONG, NEAR, RegionDescent
-from torch_zerohess.search.region_progress import RegionProgress, latest
+from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.least_change import LeastNorm
 from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_and_slope
+from torch_zerohess.surrogates.pool import latest
 from torch_zerohess.surrogates.quadratic import coefficients
 
 _PATIENCE = 5

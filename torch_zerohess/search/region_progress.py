@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.surrogates.pool import latest
 
 R = TypeVar("R", bound="RegionProgress")
 
@@ -75,12 +76,3 @@ class RegionProgress(Progress):
             evaluations=self.evaluations + len(evaluated),
             lost=0 if bool(evaluated.needed.finite.all()) else self.lost + 1,
         )
-
-
-def latest(points: Tensor, keep: Tensor, capacity: int) -> Tensor:
-    """Return which points [P, n] are kept [capacity]: the latest ones, and the point `keep` [n] where it is older."""
-    which = torch.arange(max(len(points) - capacity, 0), len(points), device=points.device)
-    if len(which) < len(points):
-        same = (points == keep).all(1).nonzero()[-1:, 0]
-        which[: len(same)] = torch.minimum(which[: len(same)], same)
-    return which

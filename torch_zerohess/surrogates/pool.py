@@ -59,19 +59,9 @@ class Pool:
             torch.cat([self.origin, group]),
         )
 
-    def latest(self, count: int) -> "Pool":
-        """Keep the latest `count` evaluations."""
-        origin = self.origin[-count:]
-        first = int(origin.min()) if len(origin) else 0
-        outputs = None if self.outputs is None else self.outputs[-count:]
-        return Pool(
-            self.points[-count:],
-            self.values[-count:],
-            outputs,
-            self.centers[first:],
-            self.sigmas[first:],
-            origin - first,
-        )
+    def latest(self, count: int, keep: Tensor) -> "Pool":
+        """Keep the latest `count` evaluations, and the one at `keep` [n] where it is older."""
+        return self._those(latest(self.points, keep, count))
 
     def thin(self, keep: Tensor) -> "Pool":
         """Find the two points closest to each other relative to their distance from `keep` [n]; drop the worse one.
@@ -84,10 +74,7 @@ class Pool:
         relative = (distance / (away[:, None] + away)).fill_diagonal_(math.inf)
         pair = divmod(int(relative.argmin()), len(self))
         worse = max(pair, key=lambda i: (not torch.equal(self.points[i], keep), float(self.values[i])))
-        rest = torch.arange(len(self), device=self.points.device) != worse
-        outputs = None if self.outputs is None else self.outputs[rest]
-        groups, origin = torch.unique(self.origin[rest], return_inverse=True)
-        return Pool(self.points[rest], self.values[rest], outputs, self.centers[groups], self.sigmas[groups], origin)
+        return self._those(torch.arange(len(self), device=self.points.device) != worse)
 
     def ties(self, x: Tensor, value: float, distance: float) -> bool:
         """Whether x [n] lies on a plateau, by evaluations farther away than this, root mean square."""
@@ -105,3 +92,17 @@ class Pool:
         each = share.log() - 0.5 * (distance / self.sigmas).square() - n * self.sigmas.log()
         ratio = (target - torch.logsumexp(each, 1)) * min(1.0, _FLAT / n)
         return torch.where(here == 0, 1.0, ratio.exp().clamp(max=_CAP))
+
+    def _those(self, which: Tensor) -> "Pool":
+        outputs = None if self.outputs is None else self.outputs[which]
+        groups, origin = torch.unique(self.origin[which], return_inverse=True)
+        return Pool(self.points[which], self.values[which], outputs, self.centers[groups], self.sigmas[groups], origin)
+
+
+def latest(points: Tensor, keep: Tensor, count: int) -> Tensor:
+    """Return which points [P, n] are the latest ones [count]; the point `keep` [n] is one of them where it is older."""
+    which = torch.arange(max(len(points) - count, 0), len(points), device=points.device)
+    if len(which) < len(points):
+        same = (points == keep).all(1).nonzero()[-1:, 0]
+        which[: len(same)] = torch.minimum(which[: len(same)], same)
+    return which

@@ -7,6 +7,7 @@ from searches import points_of, run, square
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import descent_and_process
+from torch_zerohess.search.output_gauss_newton import OutputGaussNewton
 from torch_zerohess.surrogates import kernels
 from truths import normal
 
@@ -169,3 +170,28 @@ def test_batches_are_served_before_and_after_the_change():
         search.tell(strips(points))
     assert search.engine == "gaussian_process"
     assert min(sizes) == 4
+
+
+@pytest.mark.parametrize(("n", "seed"), [(5, 3), (5, 0), (6, 6)])
+def test_the_best_point_is_kept_where_many_points_have_the_least_loss(n, seed, monkeypatch):
+    """Gauss-Newton begins at it, in turn with the descent and with the process, also where noise was suspected."""
+    places = torch.linspace(0.0, 1.0, 40, dtype=torch.float64)
+    waves = torch.stack([torch.cos((k + 1) * 3 * places) for k in range(n)])
+
+    def silhouette(x):
+        return ((6 * places * x[..., :1]).sin() + x[..., 1:] @ waves[1:] > 0.6).double()
+
+    plans = []
+    plan = OutputGaussNewton.plan
+
+    def noted(method, known, generator):
+        plans.append(bool((known.points == known.lowest.point).all(1).any()))
+        return plan(method, known, generator)
+
+    monkeypatch.setattr(OutputGaussNewton, "plan", noted)
+    first = torch.rand(n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    solution = torch.tensor([0.3, 0.5, 0.7, 0.4, 0.6, 0.5], dtype=torch.float64)[:n]
+    search = TrustRegion(first, sigma=0.3, bounds=(0.0, 1.0), loss=square(silhouette(solution)), seed=seed)
+    assert run(search, silhouette, 300).value == 0.0
+    assert plans
+    assert all(plans)

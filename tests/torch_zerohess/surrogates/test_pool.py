@@ -60,7 +60,7 @@ def test_a_point_at_x_itself_weighs_one():
 
 def test_the_latest_are_kept():
     pool, drawn = filled_pool(2, batches=5)
-    every, latest = torch.cat([points for points, *_ in drawn]), pool.latest(9)
+    every, latest = torch.cat([points for points, *_ in drawn]), pool.latest(9, vector(0.0, 0.0))
     assert torch.equal(latest.points, every[-9:])
     assert torch.equal(latest.values, every[-9:].sum(1))
     # What has been forgotten leaves no trace: eight of the last batch, one of the one before.
@@ -70,12 +70,21 @@ def test_the_latest_are_kept():
     torch.testing.assert_close(latest.weights(x, 0.7), fresh.weights(x, 0.7), rtol=1e-13, atol=0)
 
 
+def test_an_older_evaluation_is_kept_on_demand():
+    pool, drawn = filled_pool(2, batches=5)
+    every = torch.cat([points for points, *_ in drawn])
+    kept = pool.latest(9, every[3])
+    assert torch.equal(kept.points, torch.cat([every[3:4], every[-8:]]))
+    assert torch.equal(kept.values, kept.points.sum(1))
+    assert torch.equal(pool.latest(9, every[-2]).points, every[-9:])
+
+
 def test_a_pool_never_changes():
     pool, _ = filled_pool(2)
     before = [one.clone() for one in (pool.points, pool.values, pool.centers, pool.sigmas, pool.origin)]
     pool.add(pool.points, pool.values, None, pool.points[0], 1.0)
     pool.thin(pool.points[0])
-    pool.latest(3)
+    pool.latest(3, pool.points[0])
     after = (pool.points, pool.values, pool.centers, pool.sigmas, pool.origin)
     assert all(torch.equal(x, y) for x, y in zip(before, after, strict=True))
 
@@ -101,7 +110,7 @@ def test_outputs_go_with_their_points():
     assert pool.outputs is None
     for _ in range(3):
         points = normal(generator, 3, 2)
-        pool = pool.add(points, points.sum(1), points.repeat(1, 3), points[0], 1.0).latest(5)
+        pool = pool.add(points, points.sum(1), points.repeat(1, 3), points[0], 1.0).latest(5, points[0])
     thinned = pool.thin(pool.points[0])
     assert (len(pool), len(thinned)) == (5, 4)
     for one in (pool, thinned):

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
-from torch_zerohess.search.local_progress import LocalProgress
+from torch_zerohess.search.local_progress import LocalProgress, in_range
 from torch_zerohess.search.local_steps import LocalSteps, derivatives, local_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal
@@ -131,6 +131,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
         """Return the progress after a center, the first one, and samples around it; None if they give no Jacobian."""
         if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
             return None
+        if not in_range((evaluated.outputs - evaluated.outputs[0])[evaluated.finite]):
+            return None
         known = replace(self.begun(), center=evaluated.points[0], shape=evaluated.shape, evaluations=len(evaluated))
         known = self.sampled(known.recorded(evaluated), evaluated)
         return None if known.jacobian is None else known
@@ -156,13 +158,12 @@ class LocalMethod(GaussNewton[LocalProgress]):
 
     def renewed(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Fit the Jacobian to samples; too few of them are drawn again."""
-        known.check_outputs()
         first, told = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
         assert told.outputs is not None
         if len(told) < FEWEST_SAMPLES:
             return known
-        u = ((told.points - known.center) / known.sigma).float()
-        changes = ((told.outputs - known.output) / known.sigma).float()
+        known.check_outputs(told.outputs)
+        u, changes = known.relative(told.points, told.outputs)
         fitted, grid = fit_chosen(u, changes, known.shape, self.own.sparse, known.fitted, known.grid)
         known = replace(known, grid=grid)
         evidence = known.evidence or Evidence.none(self.settings.n, u.device)

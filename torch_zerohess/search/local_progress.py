@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
 from torch_zerohess.search.gauss_newton import JacobianProgress
@@ -84,13 +85,23 @@ class LocalProgress(JacobianProgress):
         some, every = (0 if one is None else int(one.found.sum()) for one in (self.jacobian, self.fitted))
         return some / every if every else 1.0
 
-    def check_outputs(self) -> None:
-        """Raise ValueError for outputs of one number."""
+    def check_outputs(self, outputs: Tensor) -> None:
+        """Raise ValueError for outputs [K, m] of one number, and for first ones whose changes are beyond float32."""
         if len(self.output) == 1:
             raise ValueError(
                 "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
                 "number: use engine='descent'"
             )
+        changes = (outputs - self.output) / self.sigma
+        if self.jacobian is None and not in_range(changes):
+            raise ValueError(
+                "the engine 'local' computes in float32, got outputs whose largest change over sigma is "
+                f"{float(changes.abs().max()):g}: return them in other units, so that it is near 1"
+            )
+
+    def relative(self, points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return directions from the center and changes of the output along them, in units of sigma, float32."""
+        return ((points - self.center) / self.sigma).float(), ((outputs - self.output) / self.sigma).float()
 
     def telling_noise(self, one: Tensor, other: Tensor) -> "LocalProgress":
         """Take what two outputs [m] at one point tell about noise: a mean over all pairs, mostly the latest ones."""
@@ -120,3 +131,9 @@ class LocalProgress(JacobianProgress):
         """Whether a hop has led to a loss that is lower by more than rounding."""
         added = self.hopped - before if self.hopped < math.inf else 0.0
         return loss < before - _ROUNDING * max(abs(before), added)
+
+
+def in_range(changes: Tensor) -> bool:
+    """Whether the largest of these numbers is a normal number in float32, or all are 0."""
+    largest, known = float(changes.abs().max()), torch.finfo(torch.float32)
+    return largest == 0.0 or known.tiny <= largest <= known.max

@@ -204,12 +204,12 @@ class NoisyLocalMethod(LocalMethod):
         count = int(near.sum())
         if count < FEWEST_SAMPLES:
             return known, 0.0, 0.0
-        u, changes = self._relative(known, known.points[near], known.outputs[near])
+        u, changes = known.relative(known.points[near], known.outputs[near])
         sparse = known.grid.settings(self.own.sparse, known.shape, settings.n)
         fitted = fit_sparse(u, changes, known.shape, replace(sparse, keep=kept(sparse, None, count)))
         evidence = known.evidence or Evidence.none(settings.n, u.device)
         if new >= FEWEST_SAMPLES:
-            latest = self._relative(known, known.points[-new:], known.outputs[-new:])
+            latest = known.relative(known.points[-new:], known.outputs[-new:])
             evidence = evidence.with_batch(fitted, known.fitted, *latest)
         known = known.fitting(fitted, evidence)
         jacobian = known.jacobian
@@ -248,10 +248,6 @@ class NoisyLocalMethod(LocalMethod):
             return known.output, variance / count
         weight = moved / (moved + own)
         return known.output + weight * difference, weight * own
-
-    def _relative(self, known: LocalProgress, points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return directions from the center and changes of the output along them, in units of sigma, float32."""
-        return ((points - known.center) / known.sigma).float(), ((outputs - known.output) / known.sigma).float()
 
     def _undone(self, known: LocalProgress, before: Best) -> LocalProgress:
         """Return to where the last step began, and sample nearer."""

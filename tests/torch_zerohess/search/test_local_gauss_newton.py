@@ -372,6 +372,20 @@ def test_an_output_of_one_number_is_refused():
         search.tell(search.ask().sum(1, keepdim=True))
 
 
+@pytest.mark.parametrize("scale", [1e42, 1e-42])
+def test_outputs_beyond_float32_are_refused_and_left_to_the_descent(scale):
+    def scaled(x):
+        return scale * image(x)
+
+    start, loss = torch.zeros(N).double(), lambda y: (y / scale - 1.0).square().mean()
+    search = LocalGaussNewton(start, sigma=1.0, loss=loss, seed=0)
+    with pytest.raises(ValueError, match=r"computes in float32, .*e[+-]42: return them in other units"):
+        search.tell(scaled(search.ask()))
+    search = zh.optim.TrustRegion(start, sigma=1.0, loss=loss, seed=0)
+    assert run(search, scaled, 2 * N).value < 1e-4
+    assert search.engine == "descent"
+
+
 def test_minimize_takes_it():
     truth = normal(N)
     fit = zh.minimize(

@@ -138,7 +138,7 @@ class LocalQuadratics(Method[DescentProgress]):
         lowest = known.lowest.or_lower(new, known.sigma)
         return replace(
             known,
-            pool=pool.latest(self.capacity, lowest.point),
+            pool=pool.latest(self.capacity, None if self.settings.noise else lowest.point),
             best=known.best.or_lower(new, known.sigma),
             lowest=lowest,
             shape=evaluated.shape,

@@ -167,8 +167,7 @@ class ProcessMethod(Method[Q]):
         if not len(new):
             return known
         capacity = self.capacity if self.settings.pool else max(self.capacity, known.room)
-        best = known.best.point
-        pool = known.pool
+        best, pool = known.best.point, known.pool
         while len(pool) + len(new) > capacity > len(new) and not known.noisy:
             pool = pool.thin(best)
         pool = pool.add(new.points, new.losses, new.outputs, best, 1.0)
@@ -176,7 +175,8 @@ class ProcessMethod(Method[Q]):
         if float(new.losses[k]) < known.record.loss:
             record = Best(new.points[k], float(new.losses[k]), max(known.sigma, self.settings.tolerance))
             known = replace(known, record=record, best=known.best if known.noisy else record)
-        return replace(known, pool=pool.latest(capacity, known.record.point))
+        keep = None if self.settings.noise else known.record.point  # in noise it is the luckiest one
+        return replace(known, pool=pool.latest(capacity, keep))
 
     def avoiding(self, known: Q, holes: Tensor) -> Q:
         """Note points [K, n] whose values are not finite."""

@@ -59,8 +59,8 @@ class Pool:
             torch.cat([self.origin, group]),
         )
 
-    def latest(self, count: int, keep: Tensor) -> "Pool":
-        """Keep the latest `count` evaluations, and the one at `keep` [n] where it is older."""
+    def latest(self, count: int, keep: Tensor | None) -> "Pool":
+        """Keep the latest `count` evaluations, and the one at `keep` [n], if any, where it is older."""
         return self._those(latest(self.points, keep, count))
 
     def thin(self, keep: Tensor) -> "Pool":
@@ -99,10 +99,10 @@ class Pool:
         return Pool(self.points[which], self.values[which], outputs, self.centers[groups], self.sigmas[groups], origin)
 
 
-def latest(points: Tensor, keep: Tensor, count: int) -> Tensor:
+def latest(points: Tensor, keep: Tensor | None, count: int) -> Tensor:
     """Return which points [P, n] are the latest ones [count]; the point `keep` [n] is one of them where it is older."""
     which = torch.arange(max(len(points) - count, 0), len(points), device=points.device)
-    if len(which) < len(points):
+    if keep is not None and len(which) < len(points):
         same = (points == keep).all(1).nonzero()[-1:, 0]
         which[: len(same)] = torch.minimum(which[: len(same)], same)
     return which

@@ -54,6 +54,39 @@ def test_a_start_that_models_cannot_take_is_refused():
         zh.minimize(lambda z: z[:, :1].expand(-1, 3) + LARGEST, zeros(2), sigma=1.0, loss=lambda y: y.tanh().sum())
 
 
+@pytest.mark.parametrize("noise", [1e-9, 1e60])
+@pytest.mark.parametrize(
+    ("bounds", "output", "engine"),
+    [(None, False, "auto"), ((-2.0, 2.0), False, "auto"), ((-2.0, 2.0), True, "auto"), (None, True, "local")],
+)
+def test_noise_may_be_far_larger_than_the_losses(bounds, output, engine, noise):
+    def small(y):
+        return 1e-200 * y.square().sum(-1)
+
+    more = {"bounds": bounds, "engine": engine, "loss": small if output else None}
+    fn = (lambda z: z) if output else small
+    fit = zh.minimize(fn, 1.0 + zeros(2), sigma=0.5, noise=noise, seed=0, max_evaluations=40, **more)
+    assert 0.0 <= fit.value < 1e-199
+    assert noise / 4 < fit.value_error < noise
+    assert fit.standard_errors is None or bool(torch.isfinite(fit.standard_errors["gradient"]).all())
+
+
+@pytest.mark.parametrize("scale", [1e-240, 1e240])
+def test_noise_of_the_largest_and_of_the_smallest_losses_is_measured(scale):
+    """Squares of these numbers are no numbers."""
+    found = []
+    for size in (1.0, scale):
+        generator = torch.Generator().manual_seed(0)
+
+        def fn(z, size=size, generator=generator):
+            return size * (z.square().sum(1) + 0.1 * torch.randn(len(z), generator=generator).double())
+
+        found.append(zh.minimize(fn, 1.0 + zeros(2), sigma=0.5, seed=0, max_evaluations=60))
+    one, other = found
+    assert other.noise == pytest.approx(scale * one.noise)
+    assert other.value_error == pytest.approx(scale * one.value_error, rel=0.5)
+
+
 def test_a_search_goes_on_after_a_numerical_failure(monkeypatch):
     right, calls = region_descent.region_step, []
 

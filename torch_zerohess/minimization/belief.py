@@ -60,7 +60,7 @@ def believed(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise
     if bool((z == z[0]).all() or (values == values[0]).all()):  # all are of one point, or none is lower than another
         return Belief(points[0], float(values.mean()), noise / math.sqrt(len(values)))
     z = z / (reach * math.sqrt(len(unit)))
-    size = float(values.abs().max())  # the squares of values / size neither overflow nor vanish
+    size = max(float(values.abs().max()), noise)  # the squares of values / size and noise / size do not overflow
     process = GaussianProcess.fit(z, values[:, None] / size, (*NOISES, *_FINE_NOISES, *HIGH_NOISES), noise / size)
     expected = process.predict(z)[:, 0]
     k = int(expected.argmin())

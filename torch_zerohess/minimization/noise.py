@@ -45,7 +45,10 @@ def are_counts(losses: Tensor) -> bool:
 def deviation(losses: Tensor) -> float:
     """Standard deviation of the finite losses [K] at one point; 0 if there is only one."""
     finite = losses[torch.isfinite(losses)]
-    return float(finite.std()) if len(finite) > 1 else 0.0
+    if len(finite) < 2:
+        return 0.0
+    size = float(finite.abs().max()) or 1.0  # squares of losses / size neither overflow nor vanish
+    return float((finite / size).std()) * size
 
 
 def noise_of_counts(
@@ -156,7 +159,8 @@ def _spread(groups: Sequence[Tensor], noise: float) -> float:
     if freedom == 0:
         return noise
     apart = [one - one[0] for one in groups if len(one)]  # exactly 0 where values are equal, as their mean is not
-    measured = math.sqrt(sum(float((one - one.mean()).square().sum()) for one in apart) / freedom)
+    size = max(noise, *(float(one.abs().max()) for one in apart)) or 1.0  # squares over it do not overflow
+    measured = math.sqrt(sum(float((one - one.mean()).div(size).square().sum()) for one in apart) / freedom) * size
     if measured == 0.0 or measured >= noise:
         return max(noise, measured)
     ratio, own, other = (measured / noise) ** (2 / 3), 2 / (9 * freedom), 2 / (9 * (REPEATED - 1))

@@ -194,10 +194,12 @@ class BlockGaussNewton(AskTell[BlockProgress]):
 def broyden_update(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
     """Return the Jacobian [n, m] nearest to `jacobian` that explains changes [k, m] of the output along steps [k, n].
 
-    Nearest in the Frobenius norm: with one step it is Broyden's update.
+    Nearest in the Frobenius norm: with one step it is Broyden's update. A step of no length tells nothing.
     """
-    if not len(steps):
+    long = steps.abs().amax(1) > 0.0
+    if not bool(long.any()):
         return jacobian
+    steps, changes = steps[long], changes[long]
     length = steps.norm(dim=1).mean().clamp_min(torch.finfo(torch.float64).tiny)
     d, c = (steps / length).float(), (changes / length).float()
     square = d @ d.mT

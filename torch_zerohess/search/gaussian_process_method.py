@@ -278,8 +278,8 @@ class ProcessMethod(Method[Q]):
         least, middle = float(values.min()), float(values.median())
         if middle > least:  # a value out of all proportion, such as a penalty, counts as high and no more
             values = values.clamp(max=least + _PROPORTION * (middle - least))
-        spread = float(values.max()) - least or 1.0
-        values = (values - least) / spread  # their squares do not overflow
+        spread = max(float(values.max()) - least, self.settings.noise) or 1.0
+        values = (values - least) / spread  # neither their squares nor that of the noise overflow
         known, process = self._fitted(known, values[:, None], self.settings.noise / spread)
         if known.noisy:
             values = process.predict(known.pool.points)[:, 0]

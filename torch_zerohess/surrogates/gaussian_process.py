@@ -74,8 +74,9 @@ class GaussianProcess:
         """
         mean = outputs.mean(0)
         change = outputs - mean
-        scale = float(change.abs().max())
-        flat = scale <= _FLAT * float(mean.abs().max())
+        largest = float(change.abs().max())
+        flat = largest <= _FLAT * float(mean.abs().max())
+        scale = max(largest, deviation or 0.0)  # neither change nor deviation overflows when it is squared
         relative = None if deviation is None or flat else deviation / scale
         target = torch.zeros_like(change) if flat else change / scale
         evidence, variances = grid_evidence(points, target, noises, relative, structures)

@@ -78,8 +78,8 @@ def fit_noisy(u: Tensor, values: Tensor, weights: Tensor, noise: float, before: 
         noise: standard deviation of a value.
         before: Hessian that is expected [n, n].
     """
-    n, size = u.shape[1], float(values.abs().max()) or 1.0
-    values, noise, before = values / size, noise / size, before / size  # their squares neither overflow nor vanish
+    n, size = u.shape[1], max(float(values.abs().max()), noise) or 1.0
+    values, noise, before = values / size, noise / size, before / size  # their squares do not overflow
     terms = quadratic_terms(u)
     middle = values.median()
     spread = float((values - middle).abs().median()) + noise + math.ulp(1.0)

@@ -213,7 +213,8 @@ def fit_outputs(
         """
         coherent = weights @ (missed @ directions.mT).square()
         single = (weights @ missed.square()) @ directions.square().mT
-        return (own * torch.maximum(coherent, single) * (P / max(spare, 1))).sqrt().clamp_min(math.ulp(0.0))
+        missing = torch.maximum(coherent, single).clamp_min(math.ulp(0.0))  # infinity times zero is no number
+        return (own * missing * (P / max(spare, 1))).sqrt().clamp_min(math.ulp(0.0))
 
     return LocalModel(
         expanded.value,

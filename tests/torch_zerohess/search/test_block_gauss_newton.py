@@ -38,6 +38,15 @@ def test_along_the_samples_it_is_renewed_and_across_them_it_stays():
     torch.testing.assert_close(broyden_update(before, 0.0 * one, 0.0 * change), before)
 
 
+def test_a_step_of_no_length_tells_nothing():
+    """In noise the output changes along it, too: where the Jacobian is zero, all steps are such steps."""
+    a, before = normal(5, 3), normal(5, 3).float()
+    steps = torch.cat([torch.zeros(1, 5).double(), torch.eye(5).double()[:2]])
+    changes = steps @ a + 1e-3
+    assert torch.equal(broyden_update(before, steps[:1], changes[:1]), before)
+    assert torch.equal(broyden_update(before, steps, changes), broyden_update(before, steps[1:], changes[1:]))
+
+
 def test_samples_that_bounds_have_made_dependent():
     """Twelve steps in a space of three dimensions."""
     a, before = normal(4, 6), torch.zeros(4, 6)

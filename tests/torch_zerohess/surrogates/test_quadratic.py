@@ -240,6 +240,14 @@ def test_standard_errors_of_outputs_cover_the_truth():
     assert 0.8 < 5.0 * float(z.square().mean().sqrt()) < 1.2
 
 
+def test_as_many_points_as_coefficients_do_not_tell_the_errors_of_outputs():
+    """A sum of magnitudes has no curvature: its error is still infinite, and no NaN."""
+    _, _, _, f = linear_output(3, (5,))
+    u = normal(torch.Generator().manual_seed(0), 4, 3)
+    model = fit_outputs(u, f(u), torch.ones(4, dtype=torch.float64), lambda y: y.abs().sum(), torch.Size([5]))
+    assert all(bool((error == math.inf).all()) for error in model.full_errors())
+
+
 def test_standard_errors_of_outputs_cover_what_is_curved():
     """Outputs exp(0.3 A u), all curved alike, and squares: J^T J at 0 from 14 points is off by up to 40 %."""
     generator = torch.Generator().manual_seed(0)

@@ -222,7 +222,11 @@ def lengths(columns: Tensor) -> Tensor:
 
 
 def _normalized(columns: Tensor) -> Tensor:
-    return columns / lengths(columns).clamp_min(torch.finfo(columns.dtype).tiny)
+    tiny, norms = torch.finfo(columns.dtype).tiny, lengths(columns)
+    if bool((norms < math.sqrt(tiny / torch.finfo(columns.dtype).eps)).any()):  # squares may vanish
+        columns = columns / columns.abs().amax(0).clamp_min(tiny)
+        norms = lengths(columns)
+    return columns / norms.clamp_min(tiny)
 
 
 def _histogram(squares: Tensor, least: float) -> Tensor:

@@ -113,3 +113,11 @@ def test_few_pairs_count_and_chance_alone_does_not():
     assert {(0, 0), (1, 1), (2, 2)} <= {
         pair for one in found for pair in zip(one[1].tolist(), one[2].tolist(), strict=True)
     }
+
+
+def test_changes_whose_squares_vanish_have_the_correlations_of_larger_ones():
+    """The rest of a fit may be 1e-30 in float32: r^2 was far above 1 there, and could not be counted."""
+    u, rest = centered(normal(60, 6)).float(), centered(normal(60, 30)).float()
+    grids = Grids((30, 1, 1))
+    expected, found = (thresholds(u, scale * rest, grids, 0.1) for scale in (1.0, 1e-30))
+    assert found.own == pytest.approx(expected.own, rel=1e-5)

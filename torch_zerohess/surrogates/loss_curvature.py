@@ -44,7 +44,10 @@ def loss_curvature(loss: Callable[[Tensor], Tensor], output: Tensor) -> LossCurv
         y = output.detach().requires_grad_(True)
         value = loss(y)
         if not value.requires_grad:
-            raise ValueError("loss must be differentiable by torch, got a value that does not depend on its output")
+            raise ValueError(
+                "loss must be differentiable by torch, got a value that does not depend on its output; where it is "
+                "constant, add 0 * output.sum()"
+            )
         (slope,) = torch.autograd.grad(value, y, create_graph=True)
 
     def product(s: Tensor) -> Tensor:

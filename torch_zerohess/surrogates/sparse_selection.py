@@ -223,8 +223,9 @@ def lengths(columns: Tensor) -> Tensor:
 
 def _normalized(columns: Tensor) -> Tensor:
     tiny, norms = torch.finfo(columns.dtype).tiny, lengths(columns)
-    if bool((norms < math.sqrt(tiny / torch.finfo(columns.dtype).eps)).any()):  # squares may vanish
-        columns = columns / columns.abs().amax(0).clamp_min(tiny)
+    small = norms < math.sqrt(tiny / torch.finfo(columns.dtype).eps)
+    if bool(small.any()):  # their squares may vanish
+        columns = torch.where(small, columns / columns.abs().amax(0).clamp_min(tiny), columns)
         norms = lengths(columns)
     return columns / norms.clamp_min(tiny)
 

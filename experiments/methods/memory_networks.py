@@ -7,7 +7,7 @@ comes from the public names of the library. All tasks have the same settings, th
 `settings/ours.py`). They were chosen on runs 100 to 104 of CNN and CNN wide, on run 100 of CNN-TEXTURE, and on
 runs 100 to 107 of CNN-THROW. The weights in the coefficient of `zh.Memory` were chosen on runs 14, 16 and 17 of CNN
 with 1 200 renders, `output_radius` on runs 17, 33 and 36, and `warm_up` on run 8 of CNN-TEXTURE. No table reports one
-of these runs, but for run 8: CNN-TEXTURE was stored with 20 runs afterwards.
+of these runs.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the

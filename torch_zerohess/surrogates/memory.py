@@ -13,7 +13,7 @@ from torch_zerohess.evaluation_mode import mixes_in_evaluation
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.coefficient import Coefficient
-from torch_zerohess.surrogates.surrogate import Surrogate, outside_inference
+from torch_zerohess.surrogates.surrogate import Surrogate, floating, outside_inference
 from torch_zerohess.version import VERSION
 
 _GROWTH = 1.3
@@ -166,7 +166,8 @@ class Memory:
     def add(self, points: Tensor, outputs: Tensor) -> None:
         """Keep outputs [K, *out] at points [K, n]; those that are not finite are left out.
 
-        Raises ValueError if a shape differs from the shapes of earlier evaluations, TypeError for what is no tensor.
+        Integers and truth values become float64, as what fn returns. Raises ValueError if a shape differs from the
+        shapes of earlier evaluations, TypeError for what is no tensor of real numbers.
         """
         for name, one in (("points", points), ("outputs", outputs)):
             if not isinstance(one, Tensor):
@@ -181,13 +182,14 @@ class Memory:
                     f"{name} must be [K, {', '.join(map(str, kept[0].shape[1:]))}] like the earlier ones, "
                     f"got {list(new.shape)}"
                 )
+        points, outputs = floating("points", points), floating("outputs", outputs)
         finite = torch.isfinite(points).all(1) & torch.isfinite(outputs.reshape(len(outputs), -1)).all(1)
         self.evaluations += len(points)
         if not bool(finite.any()):
             return
         with outside_inference():
-            self._points.append(points.detach()[finite])
-            self._outputs.append(outputs.detach()[finite])
+            self._points.append(points[finite])
+            self._outputs.append(outputs[finite])
         self._size += len(self._points[-1])
         if self._size > _EXCESS * self.capacity:
             self._thin()

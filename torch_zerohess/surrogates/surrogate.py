@@ -29,12 +29,22 @@ class Surrogate(Protocol):
 
 
 def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points [P, n] and outputs [P, *out] without their graphs; ValueError if a shape is wrong."""
+    """Return points [P, n] and outputs [P, *out] as floating numbers without their graphs.
+
+    Raises ValueError if a shape is wrong, TypeError for complex numbers.
+    """
     if points.ndim != 2 or len(points) < 2:
         raise ValueError(f"points must be [P, n] with P >= 2, got {list(points.shape)}")
     if outputs.ndim < 1 or len(outputs) != len(points):
         raise ValueError(f"outputs must be [{len(points)}, *out], one per point, got {list(outputs.shape)}")
-    return points.detach(), outputs.detach()
+    return floating("points", points), floating("outputs", outputs)
+
+
+def floating(name: str, numbers: Tensor) -> Tensor:
+    """Return numbers without their graph; integers and truth values as float64. TypeError for complex numbers."""
+    if numbers.is_complex():
+        raise TypeError(f"{name} must be real numbers, got {numbers.dtype}: give .real, .abs() or both parts")
+    return numbers.detach() if numbers.is_floating_point() else numbers.detach().double()
 
 
 def fitted(model: T | None) -> T:

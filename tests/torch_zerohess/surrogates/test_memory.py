@@ -31,6 +31,22 @@ def test_it_keeps_what_is_added() -> None:
     assert len(memory) == memory.evaluations == 6
 
 
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int64])
+@pytest.mark.parametrize("out", [(), (100,)])
+def test_integers_and_truth_values_are_fitted_as_numbers(dtype, out) -> None:
+    memory, z = Memory(), normal(40, 2).round()
+    y = (z[:, 0].reshape(40, *[1 for _ in out]) > 0).expand(40, *out)
+    memory.add(z.long(), y.to(dtype))
+    memory.fit()
+    assert memory.points.dtype == memory.outputs.dtype == torch.float64
+    torch.testing.assert_close(memory.surrogate(z), y.double(), rtol=0.0, atol=0.2)
+
+
+def test_complex_numbers_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"outputs must be real numbers, got torch\.complex128: give \.real"):
+        Memory().add(normal(4, 2), torch.complex(normal(4), normal(4)))
+
+
 def test_rows_that_are_not_finite_are_left_out() -> None:
     memory, z, y = Memory(), normal(4, 2), normal(4, 3, seed=1)
     y[1, 2], z[3, 0] = float("nan"), float("inf")

@@ -152,6 +152,42 @@ def test_coupled_elements_are_refused(loss) -> None:
         output_blocks(operator)
 
 
+@pytest.mark.parametrize("batch", [(5,), (2, 3)])
+def test_curvature_of_rounding_couples_no_elements(batch) -> None:
+    """Second derivatives of locally linear losses are zero but for rounding, which is not symmetric."""
+    y = torch.zeros(*batch, 2, dtype=torch.float64, requires_grad=True)
+
+    class Rounded(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, z: Tensor) -> Tensor:
+            return torch.ones_like(z)
+
+        @staticmethod
+        def backward(ctx, gradient: Tensor) -> Tensor:
+            return 1e-19 * torch.stack([0.3 * gradient[..., 1], -0.2 * gradient[..., 0] + gradient[..., 1]], -1)
+
+    class Slopes(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, z: Tensor) -> Tensor:
+            ctx.save_for_backward(z)
+            return z.sum()
+
+        @staticmethod
+        def backward(ctx, gradient: Tensor) -> Tensor:
+            return gradient * Rounded.apply(*ctx.saved_tensors)
+
+    operator = CurvatureOperator(Slopes.apply(y), y, mode="gauss_newton", through=y)
+    assert output_blocks(operator)[0].abs().max() < 1e-18
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 5), (4, 0)])
+def test_two_coupled_elements_are_refused(pair) -> None:
+    y = torch.randn(6, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
+    loss = y.square().sum() + y[pair[0], 0] * y[pair[1], 1]
+    with pytest.raises(ValueError, match="couples its elements"):
+        output_blocks(CurvatureOperator(loss, y, mode="gauss_newton", through=y))
+
+
 @pytest.mark.parametrize("n", [2, 100])
 def test_elements_in_half_precision_are_not_coupled_by_rounding(n: int) -> None:
     y = torch.randn(6, n, generator=torch.Generator().manual_seed(0)).bfloat16().requires_grad_()

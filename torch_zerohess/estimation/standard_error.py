@@ -51,7 +51,7 @@ def variance_of_draws(
     jackknife (Efron and Stein 1981), from the estimates Y_d without draw d, whose baselines leave it out as well:
     sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 / (D - 1). It counts the variance of products of two draws, a baseline times a
     kernel, 2 (D - 1) / (D - 2) times. Where such products matter (the Hessian, and the gradient without antithetic
-    pairs), the standard error is 20 to 40 % too large for four draws, and 3 to 8 % for sixteen.
+    pairs), the standard error is 35 to 50 % too large for three draws, 20 to 40 % for four, and 3 to 8 % for sixteen.
 
     Two draws leave no other draw for a baseline. Where they are scrambles of at least four single points, products of a
     baseline and a kernel are small: both are means over evenly spread points. The draws then count as independent.

@@ -119,9 +119,9 @@ def _model(u: Tensor, values: Tensor, noise: float) -> LocalModel | None:
     largest, n = float(values.abs().max()) or 1.0, u.shape[1]
     values, noise = values / largest, noise / largest  # differences of the largest numbers overflow
     base = values.median()
-    range_ = float((values - base).abs().max())
-    size = max(range_, noise)  # neither the square of a change nor that of the noise overflows
-    choices = _choices(u, (values - base) / size, noise / size) if range_ > 0.0 else None
+    spread = float((values - base).abs().max())
+    size = max(spread, noise)  # neither the square of a change nor that of the noise overflows
+    choices = _choices(u, (values - base) / size, noise / size) if spread > 0.0 else None
     if choices is None:
         return None
     weights = choices.evidence.softmax(0)

@@ -54,8 +54,9 @@ def _answers(operator: CurvatureOperator, vectors: list[Tensor]) -> float:
     """Return how far elements of the batch answer to vectors of other ones: 0 if A is block-diagonal.
 
     Rounding changes products, too: in half precision, and where curvature is zero but for rounding. But it makes no
-    element answer to another one. For each bit of the number of an element, those with the bit move, and those without
-    it answer: the numbers of two elements differ in some bit.
+    element answer to another one. The elements are numbered. For each bit of the numbers, only elements with this bit
+    have a vector, and the products at the elements without it are summed up. This finds every pair, because two numbers
+    differ in some bit.
     """
     flat = [one.reshape(-1, one.shape[-1]) for one in vectors]
     counts = [len(one) for one in flat]

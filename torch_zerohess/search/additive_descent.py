@@ -13,7 +13,7 @@ from torch_zerohess.search.state import Evaluated, agreeing
 
 
 class AdditiveQuadratics(KinkedQuadratics):
-    """The method of `Descent` for a loss alone without noise, of up to 40 parameters."""
+    """The method of `Descent` for a loss alone without noise, of up to 200 parameters."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)

@@ -41,13 +41,20 @@ _POOL, _POOL_PER_PARAMETER, _POOL_OF_QUADRATIC = 60, 6, 500
 
 
 class LocalQuadratics(Method[DescentProgress]):
-    """The method of `Descent` where there is an output and a loss, noise, or a plateau."""
+    """The method of `Descent` where there is an output and a loss, noise, a plateau, or very many parameters.
+
+    Args:
+        settings: of the search.
+        arrives: whether a small sigma is an arrival at a minimum. It is none where evaluations are too few to determine
+            a model: wrong models lower sigma, too.
+    """
 
     engine = "descent"
     progress = DescentProgress
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, arrives: bool = True) -> None:
         super().__init__(settings)
+        self._arrives = arrives
         self._n = n = settings.n
         self.follows = settings.loss is not None and n > _FEW
         """Whether it models the output, not the loss."""
@@ -159,7 +166,7 @@ class LocalQuadratics(Method[DescentProgress]):
     ) -> DescentProgress:
         """End, or start another round: at a random point and around the best one in turn."""
         settings = self.settings
-        if known.lost < LOST and known.sigma < settings.tolerance:
+        if self._arrives and known.lost < LOST and known.sigma < settings.tolerance:
             known = arriving(self._agreeing(known), known.lowest)
         known = known.ended_round(reason, 0 if last else settings.restarts)
         if known.done:

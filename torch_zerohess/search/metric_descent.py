@@ -32,7 +32,7 @@ from torch_zerohess.surrogates.plateau import is_plateau
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
-MOST = 40
+MOST = 200
 """Parameters up to which a metric is learned. A step costs O(n^3 + P^3) for n parameters and P evaluations."""
 _FITTED = 300
 """Evaluations that a quadratic is fitted to, at most; otherwise n more than it has coefficients."""

@@ -84,6 +84,10 @@ class NoisyProgress(Progress):
     """Iterations in a row that told nothing new."""
 
 
+MOST = 40
+"""Parameters up to which a regression is made at every step."""
+
+
 class NoisyQuadratics(Method[NoisyProgress]):
     """The method of `Descent` for a loss alone with noise, of up to 40 parameters.
 

@@ -15,13 +15,14 @@ from torch import Tensor
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.metric_descent import MOST
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
 from torch_zerohess.search.relay import Relay
 from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
+MOST = 40
+"""Parameters up to which Gauss-Newton by interpolation goes on. Its first model takes n + 1 evaluations."""
 _PREDICTED = 0.25
 """Misfit of a predicted output below which the output counts as smooth."""
 _LEAST = 0.1

@@ -99,6 +99,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     """
 
     progress = OutputProgress
+    _singular = 1e-16  # the square of units of outputs that differ by 1e6, and a margin
 
     def __init__(self, settings: Settings, capacity: int, patience: int | None = None) -> None:
         super().__init__(settings, min(coefficients(settings.n), capacity), capacity)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.metric import region_step
+from torch_zerohess.linalg.subproblem import SINGULAR
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.region_progress import R, RegionProgress
@@ -55,6 +56,9 @@ class RegionDescent(Method[R]):
         capacity: evaluations that are kept.
     """
 
+    _singular = SINGULAR
+    """Curvature, relative to the largest one, that may as well be zero."""
+
     def __init__(self, settings: Settings, fitted: int, capacity: int) -> None:
         super().__init__(settings)
         self._n = settings.n
@@ -91,7 +95,8 @@ class RegionDescent(Method[R]):
     def _step(self, known: R) -> tuple[Tensor, float]:
         """Return the step [n] to the minimum of the quadratic within the region, and the decrease that it promises."""
         x, settings = known.lowest.point, self.settings
-        s = region_step(known.gradient, known.hessian, known.sigma * known.root, settings.lower - x, settings.upper - x)
+        root, lower, upper = known.sigma * known.root, settings.lower - x, settings.upper - x
+        s = region_step(known.gradient, known.hessian, root, lower, upper, self._singular)
         return s, -known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
 
     # The search.
@@ -150,8 +155,8 @@ class RegionDescent(Method[R]):
         """Return ends of shorter and longer steps, then points of the region around the end of the step."""
         trial, x, ends = known.phase == "trial", known.lowest.point, points[:1]
         for factor in _OTHER_LENGTHS[: (count + 1) // 2] if trial else ():
-            lower, upper = self.settings.lower - x, self.settings.upper - x
-            step = region_step(known.gradient, known.hessian, factor * known.sigma * known.root, lower, upper)
+            root, lower, upper = factor * known.sigma * known.root, self.settings.lower - x, self.settings.upper - x
+            step = region_step(known.gradient, known.hessian, root, lower, upper, self._singular)
             if float((ends - x - step).norm(dim=1).min()) > _STILL * known.sigma:
                 ends = torch.cat([ends, (x + step)[None]])
         steps = normal(generator, x, count + 1 - len(ends), self._n) @ (known.sigma / math.sqrt(self._n) * known.root)

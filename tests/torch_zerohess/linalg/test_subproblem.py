@@ -97,6 +97,14 @@ def test_does_not_run_along_a_null_direction(direction):
         torch.testing.assert_close(s, vector(0.0, -1.0), rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("others", [(), (0.0,)])
+def test_what_may_as_well_be_zero_is_up_to_the_caller(others):
+    """Outputs whose units differ by 1e6 have curvatures that differ by 1e12."""
+    gradient, curvature = vector(-1e-12, 1.0, *others), torch.diag(vector(1e-12, 1.0, *others))
+    s = ball_step(gradient, curvature, 10.0, singular=1e-16)
+    torch.testing.assert_close(s, vector(1.0, -1.0, *others), rtol=0.02, atol=1e-9)
+
+
 @pytest.mark.parametrize("of_gradient", [-150, -20, 0, 20, 150])
 @pytest.mark.parametrize("of_hessian", [-150, -20, 0, 20, 150])
 @pytest.mark.parametrize("of_radius", [-150, -20, 0, 20, 150])

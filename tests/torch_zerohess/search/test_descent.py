@@ -275,7 +275,7 @@ def following(progress):
 @pytest.mark.parametrize(
     ("n", "with_loss", "pool", "expected"),
     [
-        *[(2, False, None, 200), (9, False, None, 200), (10, False, None, 228), (100, False, None, 600)],
+        *[(2, False, None, 200), (9, False, None, 200), (10, False, None, 228), (300, False, None, 1800)],
         *[(3, True, None, 60), (20, True, None, 120), (2, False, 7, 7)],
     ],
 )
@@ -291,7 +291,7 @@ def test_as_many_evaluations_are_kept_as_models_take(n, with_loss, pool, expecte
 
 
 def test_at_most_64_samples_at_a_time():
-    search = Descent(zeros(200), sigma=1.0, seed=0)
+    search = Descent(zeros(201), sigma=1.0, seed=0)
     assert len(search.ask()) == 65  # with the start
     counts = set()
     while search.evaluations < 1500:

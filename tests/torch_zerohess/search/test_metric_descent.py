@@ -246,6 +246,24 @@ def test_a_wall_near_the_largest_number_is_forgotten(seed):
     assert evaluations_to(search, wall_beside_a_bowl, 1e-10) < 60
 
 
+@pytest.mark.parametrize("n", [41, 120])
+def test_many_parameters_of_a_loss_alone(n):
+    """Models of fewer evaluations than parameters end at a loss of 0.1 and more."""
+    scale = 10.0 ** torch.linspace(0.0, 1.0, n, dtype=torch.float64)
+    search = Descent(zeros(n), sigma=1.0, seed=0, restarts=0)
+    assert evaluations_to(search, lambda z: ((z - 0.3).square() * scale).sum(1), 1e-9) < 5 * n
+
+
+def test_very_many_parameters_of_a_loss_alone_are_no_proof_of_a_minimum():
+    def valley(z):
+        return (10.0 * (z[:, 1:] - z[:, :-1] ** 2) ** 2 + (1.0 - z[:, :-1]) ** 2).sum(1)
+
+    search = run(Descent(zeros(201), sigma=1.0, seed=0, restarts=0), valley, 1200)
+    assert search.done
+    assert search.value > 100.0
+    assert not search.solved
+
+
 @pytest.mark.parametrize("n", [4, 10])
 def test_parameters_that_change_nothing_are_no_plateau(n):
     """The quadratics that go on are not isotropic: those give 1e-6 where these give 1e-12."""

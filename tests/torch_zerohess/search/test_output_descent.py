@@ -5,6 +5,7 @@ import torch
 from every_search import same, saved
 from searches import plateau, rays, rays_loss, run, zeros
 
+import torch_zerohess as zh
 from torch_zerohess.optim import Descent
 from torch_zerohess.search import output_descent, output_gauss_newton
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton
@@ -101,23 +102,23 @@ def test_at_a_kink_the_step_is_the_best_one_in_the_region(seed, monkeypatch):
     assert ratio() < 0.95
 
 
-@pytest.mark.parametrize("seed", range(56, 59))
-def test_rounded_outputs_do_not_keep_it_from_arriving(seed, monkeypatch):
+def test_rounded_outputs_do_not_keep_it_from_arriving(monkeypatch):
     """Residuals that are not zero, rounded to 1e-8 as by an adaptive solver: short steps promise what is not there.
 
-    Three in five of the searches arrive within 100 evaluations: with the others, short steps promise too much.
+    Three in five of the searches arrive within 100 evaluations: with the others, short steps promise too much. Which
+    ones these are depends on the last bits of the machine's linear algebra.
     """
 
-    def found():
+    def found(seed):
         search = Descent(torch.full((4,), 2.0, dtype=torch.float64), sigma=0.5, loss=squares, seed=seed, restarts=0)
         return run(search, lambda x: torch.round(1e8 * bent(x)) / 1e8, 300)
 
-    search = found()
-    assert search.done
-    assert search.evaluations < 100
-    assert search.value == pytest.approx(1.0, abs=1e-8)
+    searches = [found(seed) for seed in range(50, 60)]
+    assert all(one.value == pytest.approx(1.0, abs=1e-8) for one in searches)
+    assert sum(one.done and one.evaluations < 100 for one in searches) >= 4
     monkeypatch.setattr(output_gauss_newton, "_NOTHING", 0.0)
-    assert found().evaluations > 1.2 * search.evaluations
+    taken = sum(one.evaluations for one in searches)
+    assert sum(found(seed).evaluations for seed in range(50, 60)) > 1.5 * taken
 
 
 def test_the_hessian_of_an_output_is_not_damped():
@@ -285,3 +286,16 @@ def test_holes_do_not_shift_the_outputs():
 def test_before_a_wall_gauss_newton_fails():
     """The descent finds the way around: with one method alone every step goes into the wall."""
     assert evaluations(from_afar(), bent_but_for(1.0, 1.6), 1.1) < 100
+
+
+@pytest.mark.parametrize("restarts", [0, None])
+def test_outputs_in_units_that_differ_by_a_million(restarts):
+    """Each curvature is the square of an output's unit: a step that takes small ones for zero goes nowhere."""
+
+    def outputs(z):
+        return torch.stack([1e6 * (z[:, 0] + z[:, 1] - 1.0), z[:, 0] - z[:, 1] + 0.2, 1e-3 * (z[:, 2] - 100.0)], 1)
+
+    settings = {"sigma": [1.0, 1.0, 100.0], "seed": 0, "restarts": restarts, "max_evaluations": 100}
+    found = zh.minimize(outputs, [0.0, 0.0, 0.0], loss=lambda y: y.square().mean(), **settings)
+    assert found.success
+    torch.testing.assert_close(found.x.double(), vector(0.4, 0.6, 100.0), rtol=1e-5, atol=1e-6)

@@ -153,9 +153,12 @@ def turns(found, fn, evaluations):
 
 def test_where_the_output_jumps_the_process_goes_on_after_rejected_steps():
     """After two of them in a row, or after five where a step of this turn was good."""
-    ends, begins = turns(search(restarts=100, seed=4), steps, 150)
-    assert {(one["kept"], one["rejected"]) for one in ends} == {(False, 2), (True, 5)}
-    assert len({one[1:] for one in begins}) == len(begins)  # it does not begin twice at one point with one region
+    every = set()
+    for seed, scale in itertools.product(range(1, 5), (16.0, 1000.0)):
+        ends, begins = turns(search(restarts=100, seed=seed), lambda x, s=scale: torch.round(s * swing(x)) / s, 150)
+        every |= {(one["kept"], one["rejected"]) for one in ends}
+        assert len({one[1:] for one in begins}) == len(begins)  # it does not begin twice at one point with one region
+    assert every == {(False, 2), (True, 5)}
 
 
 def test_gauss_newton_begins_again_where_its_first_turn_failed():

@@ -3,9 +3,11 @@
 import os
 import signal
 import time
+import types
 import zlib
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from torch_zerohess.evaluators.process_identity import own_seed
@@ -248,3 +250,44 @@ def with_processes(z):
     """Sums [K], by a process of its own."""
     loader = torch.utils.data.DataLoader(z, batch_size=len(z), num_workers=1)
     return next(iter(loader)).sum(1)
+
+
+GENERATOR = np.random.default_rng(0)
+PLACE = types.ModuleType("place")
+PLACE.generator = torch.Generator().manual_seed(0)
+
+
+class Noisy:
+    """Noise by a generator of its own."""
+
+    def __init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(0)
+
+    def __call__(self, z):
+        time.sleep(0.02)
+        return z[:, 0] + torch.randn(len(z), dtype=z.dtype, generator=self.generator)
+
+
+def noisy(z):
+    time.sleep(0.02)
+    return z[:, 0] + torch.from_numpy(GENERATOR.standard_normal(len(z)))
+
+
+def noisy_of_one(point):
+    return noisy(point[None])[0]
+
+
+def noisy_elsewhere(z):
+    time.sleep(0.02)
+    return z[:, 0] + torch.randn(len(z), dtype=z.dtype, generator=PLACE.generator)
+
+
+def noisy_with_numpy(z):
+    time.sleep(0.02)
+    return z[:, 0] + torch.from_numpy(np.random.standard_normal(len(z)))
+
+
+def seeded():
+    """Return a black box after a seed for the generator of NumPy, which all processes share."""
+    np.random.seed(0)
+    return noisy_with_numpy

@@ -19,6 +19,7 @@ from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
+from torch_zerohess.evaluators.random_numbers import draw_apart
 from torch_zerohess.evaluators.values import checked_values
 
 _HELD = 4
@@ -181,10 +182,13 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str) -> An
     """
     become_worker(caller)
     with _lock:
+        is_new = name not in _held
         fn = _held.setdefault(name, fn)
         while len(_held) > _HELD:
             _held.pop(next(iter(_held)))
     try:
+        if is_new:
+            in_this_process(draw_apart, fn)
         return True, values_of(fn, data)
     except BaseException as error:  # SystemExit too
         if caller == identity():  # a thread: the error itself can be raised

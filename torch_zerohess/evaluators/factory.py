@@ -93,14 +93,6 @@ class Each:
         return torch.stack(values)
 
 
-def built(fn: Callable[..., Any]) -> None:
-    """Make the black box now, if it is one that is made."""
-    if isinstance(fn, Each):
-        built(fn.fn)
-    elif isinstance(fn, Factory):
-        fn.build()
-
-
 def same(first: Callable[..., Any] | None, second: Callable[..., Any]) -> bool:
     """Whether two black boxes are the same object; a bound method is a new object at each access."""
     if isinstance(first, Each) and isinstance(second, Each):

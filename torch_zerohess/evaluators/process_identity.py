@@ -30,12 +30,20 @@ def become_worker(caller: str = "") -> None:
     _worker = _worker or caller != identity()
 
 
+def is_worker() -> bool:
+    """Whether this process evaluates black boxes for another one."""
+    return _worker
+
+
 def own_seed(seed: int, below: int) -> int:
     """Return the seed itself, or in a worker a pseudorandom one of 0 to below - 1 that depends on the process."""
-    if not _worker:
-        return seed
-    digest = hashlib.blake2b(f"{identity()} {seed}".encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "little") % below
+    return digest(str(seed).encode()) % below if _worker else seed
+
+
+def digest(data: bytes) -> int:
+    """Return a pseudorandom number of 0 to 2^64 - 1 that depends on the data and on this process."""
+    own = hashlib.blake2b(f"{identity()} ".encode() + data, digest_size=8)
+    return int.from_bytes(own.digest(), "little")
 
 
 def in_this_process(fn: Callable[..., Any], *args: Any) -> Any:

@@ -17,6 +17,7 @@ from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.executor import values_of
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker
+from torch_zerohess.evaluators.random_numbers import draw_apart
 
 _LOOK = 0.05
 """Seconds after which a wait looks for calls that were submitted meanwhile."""
@@ -208,7 +209,9 @@ class Actor:
         try:
             if held[0] != self._held:
                 self._fn = None
-                self._fn, self._held = ray.get(held[0]), held[0]
+                fn = ray.get(held[0])
+                draw_apart(fn)
+                self._fn, self._held = fn, held[0]
             return True, values_of(self._fn, data)
         except BaseException as error:  # SystemExit too: Ray would end the actor
             if hasattr(error, "ray_terminate_msg"):  # Ray itself ends the actor

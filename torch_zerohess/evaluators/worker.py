@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
-from torch_zerohess.evaluators.factory import Each, built
+from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
 from torch_zerohess.evaluators.process_identity import become_worker, in_this_process
+from torch_zerohess.evaluators.random_numbers import draw_apart
 from torch_zerohess.evaluators.values import checked_values
 
 READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
@@ -85,7 +86,7 @@ def main(connection: "Connection[Any, Any]") -> None:
                 if kind == FUNCTION:
                     fn = None  # what it holds is given back before the next one is made
                     fn = pickle.loads(parts[0].data)
-                    in_this_process(built, fn)
+                    in_this_process(draw_apart, fn)
                 else:
                     tensors = [one.tensor() for one in parts]
                     values = checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))

@@ -1,0 +1,147 @@
+"""Workers draw different random numbers, wherever the black box keeps its generators."""
+
+import concurrent.futures
+import functools
+import multiprocessing
+import random
+import sys
+import types
+
+import black_boxes
+import numpy as np
+import pytest
+import torch
+
+from torch_zerohess.evaluators import Executor, Factory, ProcessPool, random_numbers
+from torch_zerohess.evaluators.factory import Each
+from torch_zerohess.evaluators.random_numbers import draw_apart
+
+Z = torch.zeros(6, 1, dtype=torch.float64)
+KINDS = {
+    "torch": lambda: torch.Generator().manual_seed(0),
+    "numpy": lambda: np.random.default_rng(0),
+    "numpy, old": lambda: np.random.RandomState(0),
+    "python": lambda: random.Random(0),
+}
+BOXES = {
+    "an attribute": black_boxes.Noisy(),
+    "a factory": Factory(black_boxes.Noisy),
+    "a global variable": black_boxes.noisy,
+    "a global variable of a module": black_boxes.noisy_elsewhere,
+    "the generator of NumPy": Factory(black_boxes.seeded),
+    "one point": Each(black_boxes.noisy_of_one),
+}
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_workers_of_a_pool_draw_different_numbers(name):
+    with ProcessPool(2) as pool:
+        values = torch.cat([pool(BOXES[name], Z) for _ in range(3)])
+    assert len(values.unique()) == len(values)
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_workers_of_an_executor_draw_different_numbers(name):
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as workers:
+        executor = Executor(workers)
+        values = torch.cat([executor(BOXES[name], Z) for _ in range(3)])
+    assert len(values.unique()) == len(values)
+
+
+def state(generator):
+    if isinstance(generator, torch.Generator):
+        return generator.get_state().tolist()
+    return repr(generator.getstate() if isinstance(generator, random.Random) else vars_of(generator))
+
+
+def vars_of(generator):
+    bits = getattr(generator, "bit_generator", None) or generator._bit_generator
+    return {key: np.asarray(one).tolist() if key != "state" else repr(one) for key, one in bits.state.items()}
+
+
+class Slotted:
+    __slots__ = ("rng",)
+
+    def __init__(self, rng):
+        self.rng = rng
+
+    def __call__(self, z):
+        return z
+
+
+def boxes_with(generator):
+    """Black boxes that reach a generator in every way there is."""
+    module = types.ModuleType("simulator")
+    module.rng = generator
+    names = {"held": generator, "module": module}
+    code = "def named(z): return held\ndef through(z): return module.rng\ndef inner(z): return [held for _ in z]"
+    exec(code, names)
+
+    def enclosing(z):
+        return generator
+
+    def default(z, rng=generator):
+        return z
+
+    def by_name(z, *, rng=generator):
+        return z
+
+    slotted = Slotted([{"deep": generator}])
+    return [
+        *(names["named"], names["through"], names["inner"], enclosing, default, by_name, slotted, slotted.__call__),
+        *(functools.partial(default, rng=generator), Each(enclosing), lambda z: enclosing(z)),
+    ]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_way_to_a_generator_is_found(monkeypatch, kind):
+    monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
+    monkeypatch.setattr(random_numbers, "_global_ones", list)
+    before = torch.get_rng_state()
+    for fn in boxes_with(generator := KINDS[kind]()):
+        earlier = state(generator)
+        draw_apart(fn)
+        assert state(generator) != earlier, fn
+        later = state(generator)
+        draw_apart(lambda z: z)  # has none
+        assert state(generator) == later
+    torch.set_rng_state(before)
+
+
+def test_generators_here_stay_as_they_are():
+    generator = KINDS["torch"]()
+    before = state(generator), torch.get_rng_state(), random.getstate(), repr(np.random.get_state())
+    for fn in boxes_with(generator):
+        draw_apart(fn)
+    assert state(generator) == before[0]
+    assert torch.equal(torch.get_rng_state(), before[1])
+    assert (random.getstate(), repr(np.random.get_state())) == before[2:]
+
+
+def test_two_generators_of_one_black_box_stay_different(monkeypatch):
+    monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
+    monkeypatch.setattr(random_numbers, "_global_ones", list)
+    before = torch.get_rng_state()
+    pair = [torch.Generator().manual_seed(k) for k in (0, 1)]
+    draw_apart(functools.partial(max, pair))
+    torch.set_rng_state(before)
+    assert state(pair[0]) != state(pair[1])
+
+
+def test_a_black_box_that_holds_itself_and_much_else():
+    box = types.SimpleNamespace(rows=[list(range(100)) for _ in range(1000)])
+    box.itself = box
+    assert random_numbers._held_by(functools.partial(print, box)) == []
+
+
+def test_without_numpy(monkeypatch):
+    monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
+    for name in [one for one in sys.modules if one.partition(".")[0] == "numpy"]:
+        monkeypatch.delitem(sys.modules, name)
+    before, generator = (torch.get_rng_state(), random.getstate()), KINDS["torch"]()
+    earlier = state(generator)
+    draw_apart(functools.partial(print, generator))
+    torch.set_rng_state(before[0])
+    random.setstate(before[1])
+    assert state(generator) != earlier

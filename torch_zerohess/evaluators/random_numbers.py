@@ -1,0 +1,122 @@
+"""Random numbers of black boxes in workers: every process draws its own.
+
+Every worker gets the same black box, so its generators begin with the same state. Workers would draw alike, and the
+noise of repeated values would look smaller than it is.
+"""
+
+import contextlib
+import functools
+import inspect
+import itertools
+import random
+import sys
+import types
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import torch
+
+from torch_zerohess.evaluators.factory import Each, Factory
+from torch_zerohess.evaluators.process_identity import digest, is_worker
+
+_DEPTH = 8
+_MOST = 10_000
+"""Objects that are looked at: a black box may hold a long list."""
+_numbers = itertools.count()
+"""Of seeds: an executor may send a black box again, as it was at first."""
+
+
+def draw_apart(fn: Callable[..., Any]) -> None:
+    """Give the generators that a black box uses seeds of this process, if it is a worker. A `Factory` is built first.
+
+    These are the generators of torch, NumPy and Python in what fn holds and in the global variables that its code
+    names, and the three global ones. Others, as inside of a C++ library, are the black box's own affair.
+    """
+    if isinstance(fn, Each):
+        draw_apart(fn.fn)
+        return
+    if isinstance(fn, Factory):
+        fn = fn.build()
+    if not is_worker():
+        return
+    for generator in (torch.default_generator, *_global_ones(), *_held_by(fn)):
+        _reseed(generator)
+
+
+def _global_ones() -> Iterator[Any]:
+    """Return the generators behind the functions of `random` and `numpy.random`."""
+    yield random.seed.__self__  # type: ignore[attr-defined]
+    if "numpy.random" in sys.modules:
+        yield sys.modules["numpy.random"].mtrand._rand
+
+
+def _held_by(fn: Callable[..., Any]) -> list[Any]:
+    """Return the generators that can be reached from a black box, in an order that is the same in all processes."""
+    found, waiting = list[Any](), [(fn, _DEPTH)]
+    seen = dict[int, Any]()  # what is seen is kept: the number of an object that is gone may be that of another one
+    while waiting and len(seen) < _MOST:
+        thing, depth = waiting.pop(0)
+        if id(thing) in seen or isinstance(thing, str | bytes | int | float | torch.Tensor):
+            continue
+        seen[id(thing)] = thing
+        if _is_generator(thing):
+            found.append(thing)
+        elif depth:
+            waiting += [(part, depth - 1) for part in _parts(thing)]
+    return found
+
+
+def _parts(thing: Any) -> Iterator[Any]:
+    """Return the objects that a thing consists of, and for code those that it names."""
+    if isinstance(thing, Mapping):
+        yield from thing.values()
+    elif isinstance(thing, list | tuple | set | frozenset):
+        yield from thing
+    elif isinstance(thing, functools.partial):
+        yield from (thing.func, thing.args, thing.keywords)
+    elif isinstance(thing, types.FunctionType):
+        yield from _of_code(thing.__code__, thing.__globals__)
+        yield from (thing.__defaults__, thing.__kwdefaults__)
+        with contextlib.suppress(ValueError):  # of a variable that is not assigned yet
+            yield from inspect.getclosurevars(thing).nonlocals.values()
+    elif isinstance(thing, types.MethodType):
+        yield from (thing.__self__, thing.__func__)
+    elif not isinstance(thing, type | types.ModuleType):
+        yield getattr(thing, "__dict__", None)
+        yield from (getattr(thing, name, None) for one in type(thing).__mro__ for name in _slots(one))
+        yield vars(type(thing)).get("__call__")
+
+
+def _slots(kind: type) -> tuple[str, ...]:
+    names = vars(kind).get("__slots__", ())
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+def _of_code(code: types.CodeType, names: Mapping[str, Any]) -> Iterator[Any]:
+    """Return the global variables that code names, also of modules: `sim.rng` of the module sim."""
+    for name in code.co_names:
+        thing = names.get(name)
+        if isinstance(thing, types.ModuleType):
+            yield from (vars(thing).get(one) for one in code.co_names)
+        else:
+            yield thing
+    yield from (part for one in code.co_consts if isinstance(one, types.CodeType) for part in _of_code(one, names))
+
+
+def _is_generator(thing: Any) -> bool:
+    if isinstance(thing, torch.Generator | random.Random):
+        return True
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and isinstance(thing, numpy.random.Generator | numpy.random.RandomState)
+
+
+def _reseed(generator: Any) -> None:
+    """Give a generator a seed of its own, which no other generator in any process has."""
+    seed = digest(f"generator {next(_numbers)}".encode())
+    if isinstance(generator, torch.Generator):
+        generator.manual_seed(seed >> 1)
+    elif isinstance(generator, random.Random):
+        generator.seed(seed)
+    else:
+        bits = getattr(generator, "bit_generator", None) or generator._bit_generator
+        bits.state = type(bits)(seed).state

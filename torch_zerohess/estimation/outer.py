@@ -71,7 +71,7 @@ class Entropy(Outer):
         """T = `temperature` times the mean loss, and m, the least loss."""
         found = losses().detach()
         T = self.temperature * mean(found).double().abs()
-        return torch.stack([T.clamp_min(torch.finfo(torch.float32).tiny), found.double().min(1).values], 1)
+        return torch.stack([T.clamp_min(torch.finfo(T.dtype).tiny), found.double().min(1).values], 1)
 
     def filled(self, values: Tensor, kept: Tensor) -> Tensor:
         """The least loss: the zeros in place of dropped losses would be less than all others."""

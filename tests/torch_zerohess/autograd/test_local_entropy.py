@@ -173,3 +173,15 @@ def test_dropped_losses_are_not_the_least(baseline: Literal["none", "mean", "cen
     expected = -T * (torch.logsumexp(-losses / T, 0) - math.log(len(z)))
     torch.testing.assert_close(F.detach().double(), expected, rtol=1e-4, atol=0.0)
     torch.testing.assert_close(g.double(), -T * (weights[:, None] * z).sum(0) / 0.05**2, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [1e-45, 1e-150, 1e150])
+def test_the_temperature_follows_losses_of_any_size(size):
+    x = torch.tensor([0.3, -0.2], dtype=torch.float64)
+
+    def gradient(unit):
+        head = zh.heads.LocalEntropy(lambda y: unit * y.square().sum(1))
+        layer = zh.BlackBox(lambda z: z, zh.Smoothing(sigma=0.5, samples=8, seed=3), head=head)
+        return torch.func.grad(layer)(x) / unit
+
+    torch.testing.assert_close(gradient(size), gradient(1.0))

@@ -62,14 +62,15 @@ def _held_by(fn: Callable[..., Any]) -> list[Any]:
         if _is_generator(thing):
             found.append(thing)
         elif depth:
-            waiting += [(part, depth - 1) for part in _parts(thing)]
+            with contextlib.suppress(Exception):  # what a foreign object does where it is looked at
+                waiting += [(part, depth - 1) for part in _parts(thing)]
     return found
 
 
 def _parts(thing: Any) -> Iterator[Any]:
     """Return the objects that a thing consists of, and for code those that it names."""
-    if isinstance(thing, Mapping):
-        yield from thing.values()
+    if isinstance(thing, dict):
+        yield from dict.values(thing)
     elif isinstance(thing, list | tuple | set | frozenset):
         yield from thing
     elif isinstance(thing, functools.partial):
@@ -77,8 +78,7 @@ def _parts(thing: Any) -> Iterator[Any]:
     elif isinstance(thing, types.FunctionType):
         yield from _of_code(thing.__code__, thing.__globals__)
         yield from (thing.__defaults__, thing.__kwdefaults__)
-        with contextlib.suppress(ValueError):  # of a variable that is not assigned yet
-            yield from inspect.getclosurevars(thing).nonlocals.values()
+        yield from inspect.getclosurevars(thing).nonlocals.values()  # ValueError before all of them are assigned
     elif isinstance(thing, types.MethodType):
         yield from (thing.__self__, thing.__func__)
     elif not isinstance(thing, type | types.ModuleType):

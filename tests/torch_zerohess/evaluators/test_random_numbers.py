@@ -145,3 +145,24 @@ def test_without_numpy(monkeypatch):
     torch.set_rng_state(before[0])
     random.setstate(before[1])
     assert state(generator) != earlier
+
+
+class Lazy(dict):
+    """As the parameters of a scene, whose values are made where they are read."""
+
+    __slots__ = ("missing",)
+
+    def values(self):
+        raise KeyError("no value yet")
+
+
+def test_objects_that_mind_being_looked_at():
+    generator = KINDS["torch"]()
+    assert random_numbers._held_by(functools.partial(print, Lazy(a=1), [generator])) == [generator]
+    assert random_numbers._held_by(functools.partial(print, Lazy(a=generator))) == [generator]
+
+    def not_yet(z):
+        return late
+
+    assert random_numbers._held_by(functools.partial(not_yet, generator)) == [generator]
+    late = None

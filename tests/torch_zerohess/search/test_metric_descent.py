@@ -127,9 +127,12 @@ def test_the_quadratic_of_a_round_is_made_of_more_than_rounding():
     def f(z):
         return (z - 0.5).cosh().log().sum(1) + 0.1 * z.square().sum(1)
 
-    search = run(Descent(vector(0.4, 3.0), sigma=1.0, seed=4, restarts=2), f, 10_000)
-    assert search.agreed == 3
-    assert search.evaluations < 50
+    def found(seed):
+        return run(Descent(vector(0.4, 3.0), sigma=1.0, seed=seed, restarts=2), f, 10_000)
+
+    searches = [found(seed) for seed in range(12)]
+    assert all(one.agreed == 3 for one in searches)
+    assert sum(one.evaluations for one in searches) < 570  # 657 with that Hessian
 
 
 def arrived_at_zero():

@@ -4,6 +4,7 @@ Every worker gets the same black box, so its generators begin with the same stat
 noise of repeated values would look smaller than it is.
 """
 
+import collections
 import contextlib
 import functools
 import inspect
@@ -21,7 +22,11 @@ from torch_zerohess.evaluators.process_identity import digest, is_worker
 
 _DEPTH = 8
 _MOST = 10_000
-"""Objects that are looked at: a black box may hold a long list."""
+"""Objects that are looked at, and parts of one object: a black box may hold a long list."""
+_PLAIN = str | bytes | int | float | torch.Tensor | None
+"""Types of objects that hold no generator."""
+_LIBRARIES = "torch", "numpy"
+"""Packages whose classes and functions hold no generator but the global ones."""
 _numbers = itertools.count()
 """Of seeds: an executor may send a black box again, as it was at first."""
 
@@ -39,7 +44,8 @@ def draw_apart(fn: Callable[..., Any]) -> None:
         fn = fn.build()
     if not is_worker():
         return
-    for generator in (torch.default_generator, *_global_ones(), *_held_by(fn)):
+    torch.manual_seed(_next_seed() >> 1)  # on every device
+    for generator in (*_global_ones(), *_held_by(fn)):
         _reseed(generator)
 
 
@@ -52,18 +58,19 @@ def _global_ones() -> Iterator[Any]:
 
 def _held_by(fn: Callable[..., Any]) -> list[Any]:
     """Return the generators that can be reached from a black box, in an order that is the same in all processes."""
-    found, waiting = list[Any](), [(fn, _DEPTH)]
+    found, waiting = list[Any](), collections.deque([(fn, _DEPTH)])
     seen = dict[int, Any]()  # what is seen is kept: the number of an object that is gone may be that of another one
     while waiting and len(seen) < _MOST:
-        thing, depth = waiting.pop(0)
-        if id(thing) in seen or isinstance(thing, str | bytes | int | float | torch.Tensor):
+        thing, depth = waiting.popleft()
+        if id(thing) in seen:
             continue
         seen[id(thing)] = thing
         if _is_generator(thing):
             found.append(thing)
         elif depth:
             with contextlib.suppress(Exception):  # what a foreign object does where it is looked at
-                waiting += [(part, depth - 1) for part in _parts(thing)]
+                parts = itertools.islice(_parts(thing), _MOST)
+                waiting += [(part, depth - 1) for part in parts if not isinstance(part, _PLAIN)]
     return found
 
 
@@ -75,6 +82,8 @@ def _parts(thing: Any) -> Iterator[Any]:
         yield from thing
     elif isinstance(thing, functools.partial):
         yield from (thing.func, thing.args, thing.keywords)
+    elif _is_of_a_library(thing):
+        return
     elif isinstance(thing, types.FunctionType):
         yield from _of_code(thing.__code__, thing.__globals__)
         yield from (thing.__defaults__, thing.__kwdefaults__)
@@ -84,7 +93,14 @@ def _parts(thing: Any) -> Iterator[Any]:
     elif not isinstance(thing, type | types.ModuleType):
         yield getattr(thing, "__dict__", None)
         yield from (getattr(thing, name, None) for one in type(thing).__mro__ for name in _slots(one))
-        yield vars(type(thing)).get("__call__")
+        yield from (part for one in type(thing).__mro__ if not _is_of_a_library(one) for part in vars(one).values())
+    elif isinstance(thing, type):
+        yield from vars(thing).values()
+
+
+def _is_of_a_library(thing: Any) -> bool:
+    """Whether a class or a function belongs to torch or NumPy."""
+    return isinstance(thing, type | types.FunctionType) and str(thing.__module__).partition(".")[0] in _LIBRARIES
 
 
 def _slots(kind: type) -> tuple[str, ...]:
@@ -111,8 +127,7 @@ def _is_generator(thing: Any) -> bool:
 
 
 def _reseed(generator: Any) -> None:
-    """Give a generator a seed of its own, which no other generator in any process has."""
-    seed = digest(f"generator {next(_numbers)}".encode())
+    seed = _next_seed()
     if isinstance(generator, torch.Generator):
         generator.manual_seed(seed >> 1)
     elif isinstance(generator, random.Random):
@@ -120,3 +135,8 @@ def _reseed(generator: Any) -> None:
     else:
         bits = getattr(generator, "bit_generator", None) or generator._bit_generator
         bits.state = type(bits)(seed).state
+
+
+def _next_seed() -> int:
+    """Return a seed of 64 bits that no other generator in any process has."""
+    return digest(f"generator {next(_numbers)}".encode())

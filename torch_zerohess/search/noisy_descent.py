@@ -24,6 +24,8 @@ from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.pool import latest
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
 
+MOST = 40
+"""Parameters up to which a regression is made at every step."""
 _FITTED = 3
 """Evaluations per coefficient that a quadratic is fitted to, at least."""
 _MORE, _ENOUGH = 60, 3000
@@ -82,10 +84,6 @@ class NoisyProgress(Progress):
     """Of the last step, in units of the region."""
     still: int = 0
     """Iterations in a row that told nothing new."""
-
-
-MOST = 40
-"""Parameters up to which a regression is made at every step."""
 
 
 class NoisyQuadratics(Method[NoisyProgress]):

@@ -151,18 +151,21 @@ def identity_misfit(output):
 
 
 @pytest.mark.parametrize(
-    ("fn", "dtype", "settings", "most"),
+    ("fn", "dtype", "settings", "rounds", "most"),
     [
-        (lambda z: 0.5 + (z - CENTER.to(z)).square().sum(1), torch.float32, {}, 80),
-        (lambda z: z, torch.float64, {"loss": identity_misfit}, 300),
-        (lambda z: z, torch.float64, {"loss": identity_misfit, "bounds": (-5.0, 5.0)}, 250),
-        (lambda z: (z - CENTER).square().sum(1), torch.float64, {"bounds": (-5.0, 5.0)}, 250),
+        (lambda z: 0.5 + (z - CENTER.to(z)).square().sum(1), torch.float32, {}, 3, 80),
+        (lambda z: z, torch.float64, {"loss": lambda y: 0.5 + identity_misfit(y)}, 3, 300),
+        (lambda z: z, torch.float64, {"loss": identity_misfit}, 2, 200),
+        (lambda z: z, torch.float64, {"loss": identity_misfit, "bounds": (-5.0, 5.0)}, 2, 200),
+        (lambda z: (z - CENTER).square().sum(1), torch.float64, {"bounds": (-5.0, 5.0)}, 2, 200),
+        (lambda z: (z - CENTER).square().sum(1) - 1e-9, torch.float64, {"bounds": (-5.0, 5.0)}, 3, 250),
     ],
-    ids=["float32", "output", "output in a box", "loss in a box"],
+    ids=["float32", "output", "exact output", "exact output in a box", "zero in a box", "negative in a box"],
 )
-def test_every_search_ends_when_three_rounds_agree(fn, dtype, settings, most):
+def test_every_search_ends_when_rounds_agree(fn, dtype, settings, rounds, most):
+    """Three of them, or two where the loss has fallen to zero and none was negative."""
     fit = zh.minimize(fn, zeros(2, dtype), sigma=1.0, seed=0, max_evaluations=400, **settings)
-    assert (fit.status, fit.success, fit.message) == ("solved", True, "3 rounds in a row have arrived at x")
+    assert (fit.status, fit.success, fit.message) == ("solved", True, f"{rounds} rounds in a row have arrived at x")
     assert fit.evaluations < most
     assert float((fit.x.double() - CENTER).norm()) < 1e-3
 

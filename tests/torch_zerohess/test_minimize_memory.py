@@ -12,7 +12,7 @@ SETTINGS = {"sigma": 1.0, "seed": 0, "max_evaluations": 30}
 
 
 def wave(z):
-    return 2.0 - torch.cos(z @ FREQUENCIES) - torch.cos(z[:, 0])
+    return 3.0 - torch.cos(z @ FREQUENCIES) - torch.cos(z[:, 0])
 
 
 def picture(z):

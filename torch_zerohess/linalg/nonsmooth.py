@@ -9,10 +9,16 @@ _DECREASE, _SLOPE = 1e-4, 0.9
 """Part of the decrease that the slope promises, and part of the slope, of a line search: conditions of Wolfe."""
 _BISECTIONS = 30
 """Points of a line search at most."""
+_LATEST = 10
+"""Iterations whose decrease is compared with the whole decrease."""
 
 
 def kinked_minimum(
-    function: Callable[[Tensor], tuple[float, Tensor]], start: Tensor, iterations: int, radius: float
+    function: Callable[[Tensor], tuple[float, Tensor]],
+    start: Tensor,
+    iterations: int,
+    radius: float,
+    least_gain: float = 0.0,
 ) -> Tensor:
     """Return the lowest point [n] that BFGS finds from `start` [n].
 
@@ -24,12 +30,14 @@ def kinked_minimum(
         start: its value is finite.
         iterations: at most.
         radius: length of the first step that is tried. The path depends on it, and on no scale of the function.
+        least_gain: ends where ten iterations have lowered the value by at most this share of the whole decrease.
 
     Source: Lewis and Overton (2013), "Nonsmooth optimization via quasi-Newton methods".
     """
     value, slope = function(start)
     x, one = start, torch.eye(len(start), dtype=start.dtype, device=start.device)
     inverse = one * (radius / (float(slope.norm()) or 1.0))
+    values = [value]
     for iteration in range(iterations):
         direction = -inverse @ slope
         down = float(slope @ direction)
@@ -50,6 +58,9 @@ def kinked_minimum(
             break
         step, change = new - x, turned - slope
         x, value, slope = new, now, turned
+        values.append(value)
+        if len(values) > _LATEST and values[-1 - _LATEST] - value <= least_gain * (values[0] - value):
+            break
         curvature = float(step @ change)
         if curvature <= 0.0:
             continue

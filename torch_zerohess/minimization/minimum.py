@@ -68,7 +68,7 @@ class Minimum:
             that it may have looked for a lower one until its evaluations were used up: then the status is "budget".
         status: target: the value is at most the target. solved: the search has ended at a minimum, possibly a local
             one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and, unless
-            three rounds agree, where fn jumps, fails, is constant or has a cusp at x, or a kink whose slopes do not
+            several rounds agree, where fn jumps, fails, is constant or has a cusp at x, or a kink whose slopes do not
             tell; or the loss falls without end. budget, time: evaluations or seconds are used up. callback,
             interrupted: the caller has ended it. failed: the black box, the loss, the callback or the search has
             raised.

@@ -2,12 +2,18 @@
 
 from dataclasses import dataclass
 
+import torch
+
 from torch_zerohess.minimization.doubt import UNBOUNDED
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.running import Running
 
 _AGREED = 3
 """Rounds from random points that arrive at one point, or at one loss, after which a search without `restarts` ends."""
+_AGREED_AT_ZERO = 2
+"""The same, where the loss at x is zero but for rounding and no loss is negative: then nothing lower is likely."""
+_ZERO = 1e-10
+"""Loss at x that counts as zero, as a share of the least loss of the first n + 1 evaluations."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,7 @@ class Stopping:
             return running.ending(arrived=True), f"the model promises a decrease of at most ftol ({self.ftol})"
         if search.solved and (self.xtol, self.ftol) != (None, None):
             return running.ending(arrived=True), "the search has arrived at x"
-        if self.agrees and not running.noise and search.agreed >= _AGREED:
+        if self.agrees and not running.noise and _agree(running):
             where = "points with the loss at x: the minimum is not unique" if search.apart else "x"
             status: Status = "stalled" if running.doubt == UNBOUNDED else "solved"
             return status, f"{search.agreed} rounds in a row have arrived at {where}"
@@ -47,3 +53,14 @@ class Stopping:
         if self.time_limit is not None and running.seconds > self.time_limit:
             return "time", f"time_limit ({self.time_limit} s) used up"
         return None
+
+
+def _agree(running: Running) -> bool:
+    """Whether enough rounds have agreed: fewer where data are fitted exactly, because no loss there is negative."""
+    agreed = running.search.agreed
+    if not _AGREED_AT_ZERO <= agreed < _AGREED:
+        return agreed >= _AGREED
+    losses = running.record.told[1]
+    first = losses[: running.search.x.numel() + 1].nan_to_num(nan=torch.inf)
+    lowest = float(losses.nan_to_num(nan=torch.inf).min())
+    return 0.0 <= lowest <= _ZERO * float(first.min())

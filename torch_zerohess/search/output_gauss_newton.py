@@ -43,6 +43,8 @@ _STEEP = 10.0
 """Slope of the penalty beyond the region, over the slope of the loss."""
 _ITERATIONS = 100
 """Of the minimisation without the quadratic."""
+_LEAST_GAIN = 1e-3
+"""Share of its decrease that ten iterations bring at least: the outputs are not known to be linear any better."""
 _NOTHING = 1e-8
 """Promised decrease, over the loss, that is next to nothing."""
 _LEVEL = 1e-3
@@ -200,7 +202,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
             return value, slope + steep * s / length if length > radius else slope
 
         start = s if after < before else torch.zeros_like(s)
-        t = kinked_minimum(penalised, start, _ITERATIONS, radius).clamp(lower, upper)
+        t = kinked_minimum(penalised, start, _ITERATIONS, radius, _LEAST_GAIN).clamp(lower, upper)
         t = t * min(1.0, radius / max(float(t.norm()), math.ulp(0.0)))
         return t, before - self._of_linear(known, curvature, t)[0]
 

@@ -10,13 +10,13 @@ from truths import vector
 PLACES = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-def minimum(f, iterations=100, radius=1.0):
+def minimum(f, iterations=100, radius=1.0, least_gain=0.0):
     def with_slope(x):
         x = x.clone().requires_grad_(True)
         value = f(x)
         return float(value.detach()), torch.autograd.grad(value, x)[0]
 
-    return kinked_minimum(with_slope, torch.full((4,), 2.0, dtype=torch.float64), iterations, radius)
+    return kinked_minimum(with_slope, torch.full((4,), 2.0, dtype=torch.float64), iterations, radius, least_gain)
 
 
 def test_the_sum_of_distances_is_least_at_the_median() -> None:
@@ -53,3 +53,20 @@ def test_no_value_is_above_the_first_one() -> None:
     found = minimum(lambda x: torch.log(3.0 - x).sum() - x.sum())
     assert bool((found < 3.0).all())
     assert minimum(lambda x: 0.0 * x.sum()).tolist() == [2.0] * 4
+
+
+def test_it_ends_where_ten_iterations_bring_next_to_nothing() -> None:
+    calls = 0
+
+    def f(x):
+        nonlocal calls
+        calls += 1
+        return (x - PLACES).abs().sum()
+
+    least = float(f(PLACES.median(0).values))
+    whole, calls = float(f(minimum(f))) - least, 0
+    minimum(f)
+    without, calls = calls, 0
+    left = float(f(minimum(f, least_gain=1e-3))) - least
+    assert without > 1.5 * calls
+    assert whole <= left < 2e-3 * (float(f(torch.full_like(PLACES[0], 2.0))) - least)

@@ -31,7 +31,8 @@ def steihaug(
     what follows would be fitted to the noise, and grows without limit in flat directions. If the curvature of the very
     first direction is that uncertain, it is taken at the upper end of its error.
     """
-    residuals = gradient.reshape(-1, gradient.shape[-1]).clone()
+    scale = _power_of_two(gradient)  # squares of small and of large gradients are no numbers
+    residuals = gradient.reshape(-1, gradient.shape[-1]) / scale
     residual = residuals.mean(0)
     g, s = residual, torch.zeros_like(residual)
     direction = -residual
@@ -40,14 +41,14 @@ def steihaug(
     images_s = torch.zeros_like(residual)  # H s, kept for the decrease
 
     def finish(step: Tensor, image: Tensor, reason: str) -> Step:
-        return Step(step, -float(g.dot(step) + 0.5 * step.dot(image)), reason)
+        return Step(step, -scale * float(g.dot(step) + 0.5 * step.dot(image)), reason)
 
     if float(square) == 0.0:
         return finish(s, images_s, "converged")
     for iteration in range(iterations):
         if float(square.sqrt()) < noise_level(residuals, noise):
             return finish(s, images_s, "noise")
-        images = product(direction).reshape(residuals.shape)
+        images = product(direction).reshape(residuals.shape) / scale
         image = images.mean(0)
         bend = direction.dot(image)
         error = noise_level((images @ direction)[:, None], noise)
@@ -88,6 +89,12 @@ def noise_level(estimates: Tensor, noise: float) -> float:
     deviations = estimates - estimates.mean(0)
     gram = deviations @ deviations.mT / (R * (R - 1))  # trace(gram) = tr C, |gram|^2 = tr C^2
     return float((gram.trace() + noise * math.sqrt(2) * gram.norm()).sqrt())
+
+
+def _power_of_two(gradient: Tensor) -> float:
+    """Return the power of two by which the largest entry of g is divided exactly, so that it is of the size of one."""
+    largest = float(gradient.abs().max())
+    return math.ldexp(1.0, math.frexp(largest)[1] - 1) if 0.0 < largest < math.inf else 1.0
 
 
 def _to_boundary(s: Tensor, direction: Tensor, radius: float) -> Tensor:

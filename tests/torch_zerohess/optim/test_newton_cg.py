@@ -51,6 +51,18 @@ def test_a_curvature_that_is_too_small_to_divide_by_leads_to_the_boundary():
     assert step.decrease == 2.0
 
 
+@pytest.mark.parametrize("spectrum", [[1.0, 2.0, 5.0], [-1.0, 2.0, 5.0]])
+@pytest.mark.parametrize("exponent", [-900, -600, 600, 900])
+def test_the_step_is_the_same_for_a_loss_of_any_size(spectrum, exponent):
+    """Squares of such gradients are zero or infinite."""
+    (H, g), factor = random_problem(1, spectrum), 2.0**exponent
+    for radius in (0.1, 10.0):
+        step = steihaug(H.mv, g, radius, iterations=20, tolerance=1e-10)
+        scaled = steihaug((factor * H).mv, factor * g, radius, iterations=20, tolerance=1e-10)
+        assert torch.equal(scaled.s, step.s)
+        assert (scaled.decrease, scaled.exit) == (factor * step.decrease, step.exit)
+
+
 @pytest.mark.parametrize("condition", [1.0, 1e3, 1e6])
 def test_newton_cg_solves_a_quadratic_in_one_step(condition):
     scales = torch.tensor([1.0, condition**0.5, condition], dtype=torch.float64)

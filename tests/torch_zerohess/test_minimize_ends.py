@@ -521,7 +521,7 @@ def has_steps(z: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("engine", ["descent", "gaussian_process"])
 @pytest.mark.parametrize("fn", [fails, is_cut_off, has_steps])
 def test_a_search_that_ends_at_a_jump_has_not_solved(fn, engine):
-    settings = {"sigma": 0.5, "bounds": (-4.0, 4.0), "engine": engine, "restarts": 0, "max_evaluations": 200}
+    settings = {"sigma": 0.5, "bounds": (-4.0, 4.0), "engine": engine, "restarts": 0, "max_evaluations": 400}
     found = zh.minimize(fn, torch.tensor([2.0, 1.5]).double(), seed=0, **settings)
     assert (found.status, found.success) == ("stalled", False)
     assert "fn jumps or fails next to x, which may be no minimum" in found.message
@@ -537,7 +537,7 @@ def test_a_search_that_ends_at_a_jump_has_not_solved(fn, engine):
     ],
 )
 def test_kinks_and_narrow_valleys_are_no_jumps(fn, engine):
-    settings = {"sigma": 0.5, "bounds": (-4.0, 4.0), "engine": engine, "restarts": 0, "max_evaluations": 200}
+    settings = {"sigma": 0.5, "bounds": (-4.0, 4.0), "engine": engine, "restarts": 0, "max_evaluations": 400}
     found = zh.minimize(fn, torch.tensor([2.0, 1.5]).double(), seed=0, **settings)
     assert (found.status, found.success) == ("solved", True)
     assert "jumps" not in found.message

@@ -11,6 +11,8 @@ _WIDEST = 16.0
 """Bound on logarithms of squared lengths of a metric: axes differ by a factor of e^16 at most."""
 _SMALLEST = 1e-300
 """Least number of which a logarithm is taken."""
+_BEYOND = 1e-12
+"""Distance beyond a border or a bound that is rounding, in units of the region."""
 
 
 def learned(root: Tensor, hessian: Tensor, rate: float, floor: float = 0.0) -> Tensor:
@@ -31,15 +33,31 @@ def learned(root: Tensor, hessian: Tensor, rate: float, floor: float = 0.0) -> T
 
 
 def region_step(
-    gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, upper: Tensor, singular: float = SINGULAR
+    gradient: Tensor,
+    hessian: Tensor,
+    root: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    singular: float = SINGULAR,
+    border: Tensor | None = None,
 ) -> Tensor:
     """Return s [n] that minimises gradient.s + s.hessian s/2 within |B^-1 s| <= 1 and lower <= s <= upper.
 
     The parameter farthest beyond a bound is set to the bound, and the others get a new step in the rest of the region,
     until none is beyond. The set of parameters at bounds is a guess.
 
-    singular: curvature in B s, relative to the largest one, that may as well be zero.
+    Args:
+        gradient: [n].
+        hessian: [n, n].
+        root: B [n, n].
+        lower: [n], at most 0.
+        upper: [n], at least 0.
+        singular: curvature in B s, relative to the largest one, that may as well be zero.
+        border: a and b [n + 1]; s has a.s <= b, too, b at least 0.
     """
+    if border is not None:
+        u = _constrained(root.mT @ gradient, root.mT @ hessian @ root, root, lower, upper, border, singular)
+        return (root @ u).clamp(lower, upper)
     s = root @ ball_step(root.mT @ gradient, root.mT @ hessian @ root, 1.0, singular)
     beyond = torch.maximum(lower - s, s - upper)
     if float(beyond.max()) <= 0.0:
@@ -65,3 +83,26 @@ def region_step(
             s[free] = middle + own @ ball_step(own.mT @ inner, bend, left**0.5, singular)
         beyond = torch.where(free, torch.maximum(lower - s, s - upper), 0.0)
     return s.clamp(lower, upper)
+
+
+def _constrained(
+    gradient: Tensor, hessian: Tensor, root: Tensor, lower: Tensor, upper: Tensor, border: Tensor, singular: float
+) -> Tensor:
+    """Return u [n] that minimises gradient.u + u.hessian u/2 within |u| <= 1, a border, and bounds on s = root u.
+
+    The constraint that is farthest exceeded becomes an equation, until none is exceeded.
+    """
+    rows = torch.cat([border[None, :-1] @ root, root, -root])
+    most = torch.cat([border[-1:], upper, -lower])
+    length = rows.norm(dim=1)
+    rows, most = (rows / length[:, None])[most.isfinite()], (most / length)[most.isfinite()]
+    u, equations = ball_step(gradient, hessian, 1.0, singular), torch.zeros_like(most, dtype=torch.bool)
+    while float((beyond := torch.where(equations, -1.0, rows @ u - most)).max()) > _BEYOND:
+        equations[int(beyond.argmax())] = True
+        u = torch.linalg.pinv(rows[equations]) @ most[equations]  # the nearest point to the center of the region
+        left = 1.0 - float(u @ u)
+        if int(equations.sum()) >= len(u) or left <= 0.0:
+            return u / max(1.0, float(u.norm()))
+        free = torch.linalg.svd(rows[equations])[2][int(equations.sum()) :].mT
+        u = u + free @ ball_step(free.mT @ (gradient + hessian @ u), free.mT @ hessian @ free, left**0.5, singular)
+    return u

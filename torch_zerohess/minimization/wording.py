@@ -38,7 +38,7 @@ def worded(
     cut = status in ("budget", "time")
     if equal and status != "target":
         message += f"; all {equal} values are equal: enlarge sigma"
-    elif (status == "stalled" or (arrived and cut)) and doubt not in message:
+    elif (status == "stalled" or (cut and (arrived or failed))) and doubt not in message:
         message += f"; {doubt}"
     if success and cut:
         message += "; the search had arrived at x, a minimum at least of its surroundings"

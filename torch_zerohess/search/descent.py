@@ -12,7 +12,7 @@ from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
 from torch_zerohess.search.random_points import further_start, normal, orthonormal
-from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving, not_finite
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -80,7 +80,7 @@ class LocalQuadratics(Method[DescentProgress]):
         """Return the progress after an evaluation, with a step or the number of samples to ask for next."""
         known = self._remembered(known, evaluated)
         if known.lost >= LOST:
-            return self.arrive(known, NOT_FINITE, generator, last=known.rounds == 0)
+            return self.arrive(known, not_finite(known.lost), generator, last=known.rounds == 0)
         loss = float(evaluated.losses[0]) if bool(evaluated.finite[0]) else math.inf
         if known.phase == "trial":
             known = self._judged(replace(known, iterations=known.iterations + 1), evaluated, loss)

@@ -21,7 +21,7 @@ from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal, orthonormal
-from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
+from torch_zerohess.search.state import LOST, Best, Evaluated, not_finite
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.kernels import structures
@@ -80,7 +80,7 @@ class ProcessMethod(Method[Q]):
         )
         before = known.best.point
         if known.lost >= LOST:
-            return known.ended_round(NOT_FINITE, 0)
+            return known.ended_round(not_finite(known.lost), 0)
         known = self.remembered(known, evaluated.those(finite))
         known = self.avoiding(known, evaluated.points[~finite])
         if evaluated.extra:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_zerohess.linalg.hull import shortest
 from torch_zerohess.search.metric_descent import MetricProgress, MetricQuadratics
 from torch_zerohess.search.random_points import normal
-from torch_zerohess.search.state import LOST, Evaluated
+from torch_zerohess.search.state import Evaluated
 
 _BESIDE, _APART = 1e-4, ((1e-2, 1.0), (1.0, math.inf))
 """Distances over the tolerance up to which an evaluation is beside the best point, and between which it is apart; the
@@ -77,7 +77,7 @@ class KinkedQuadratics(MetricQuadratics):
     def _arrived(
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[MetricProgress, Tensor]:
-        if known.slopes is None and known.lost < LOST and self._is_kink(known):
+        if known.slopes is None and not known.is_lost and self._is_kink(known):
             nothing = known.root[:0]
             return self._measuring(replace(known, slopes=nothing, reason=reason), generator)
         return super()._arrived(replace(known, slopes=None), reason, generator, last=last)

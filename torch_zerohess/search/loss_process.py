@@ -174,7 +174,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         patient = known.waited < _PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
-        converged = now.done and not now.lost
+        converged = now.done and not now.is_lost
         if best is now.best:
             solved = best.point if converged else torch.full_like(best.point, math.inf)
             known = replace(known, finished=best.point, solved=solved)

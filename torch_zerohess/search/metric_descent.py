@@ -25,7 +25,7 @@ from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import further_start, normal
 from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
-from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, are_same, arriving
+from torch_zerohess.search.state import Best, Evaluated, agreeing, are_same, arriving
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.plateau import is_plateau
@@ -101,8 +101,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def go_on(self, points: Tensor, values: Tensor, best: Best, sigma: float) -> MetricProgress:
         """Return a round that begins at the best point of another search, with its evaluations [P, n] and [P]."""
-        known = replace(self._begun(best), points=points, values=values, lowest=best, sigma=sigma)
-        return replace(known, phase="geometry")
+        return self._begun(best).holding(points, values, lowest=best, sigma=sigma, phase="geometry")
 
     def begin(self, center: Tensor, sigma: float, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Return a round that begins at a point [n] with this sigma, and its first points."""
@@ -165,7 +164,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[MetricProgress, Tensor]:
         """End, or start another round at a random point."""
-        if known.lost >= LOST:
+        if known.is_lost:
             return self._ended(known, None, reason, generator, last=last)
         if torch.equal(known.lowest.point, known.best.point):
             known = self._with_quadratic(known)
@@ -178,7 +177,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
         The last quadratic of the round is made of differences near rounding. A fit to more evaluations is better.
         """
-        around = quadratic_around(known.lowest.point, known.points, known.values)
+        around = quadratic_around(known.lowest.point, known.points[~known.holes], known.values[~known.holes])
         if around is None or around[2] > _SURE:
             slope, bend = known.size * known.gradient, known.size * known.hessian
         else:

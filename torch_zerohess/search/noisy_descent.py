@@ -19,7 +19,7 @@ from torch import Tensor
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import further_start, normal
-from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated, Progress, arriving
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, arriving, not_finite
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.pool import latest
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
@@ -115,7 +115,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
     ) -> tuple[NoisyProgress, Tensor]:
         known = self._remembered(known, evaluated)
         if known.lost >= LOST:
-            return self._arrived(known, NOT_FINITE, generator, last=known.rounds == 0)
+            return self._arrived(known, not_finite(known.lost), generator, last=known.rounds == 0)
         values = evaluated.losses[evaluated.finite]
         if known.lost or float(values.min()) > known.highest + _LOW * self._noise:
             factor = _HALVING if known.lost else _SHRINKING

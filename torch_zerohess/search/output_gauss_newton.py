@@ -113,7 +113,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         pool = known.pool
         assert pool.outputs is not None
         begun = self._begun(lowest).taking(known, "best", "evaluations", "iterations", "shape")
-        return replace(begun, points=pool.points, values=pool.values, outputs=pool.outputs, sigma=sigma)
+        return begun.holding(pool.points, pool.values, outputs=pool.outputs, sigma=sigma)
 
     def plan(self, known: OutputProgress, generator: torch.Generator) -> tuple[OutputProgress, Tensor]:
         known, points = super().plan(known, generator)

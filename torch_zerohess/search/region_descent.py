@@ -14,10 +14,11 @@ from torch import Tensor
 
 from torch_zerohess.linalg.metric import region_step
 from torch_zerohess.linalg.subproblem import SINGULAR
+from torch_zerohess.search.border import border_between
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.region_progress import R, RegionProgress
-from torch_zerohess.search.state import LOST, NOT_FINITE, Best, Evaluated
+from torch_zerohess.search.state import Best, Evaluated, not_finite
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
@@ -43,8 +44,8 @@ _TOLD = 0.1
 """Distance, in units of the width of the model at the best point, from which an evaluation says something about it."""
 _TIES = 3
 """Steps in a row to exactly the same value that are a plateau."""
-_HALVING = 0.5
-"""Factor for sigma after points of which no value is finite."""
+_HALVING, _BEYOND = 0.5, 0.95
+"""Factor for sigma after points of which no value is finite; and after the end of a step, beyond a plane border."""
 
 
 class RegionDescent(Method[R]):
@@ -96,7 +97,7 @@ class RegionDescent(Method[R]):
         """Return the step [n] to the minimum of the quadratic within the region, and the decrease that it promises."""
         x, settings = known.lowest.point, self.settings
         root, lower, upper = known.sigma * known.root, settings.lower - x, settings.upper - x
-        s = region_step(known.gradient, known.hessian, root, lower, upper, self._singular)
+        s = region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
         return s, -known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
 
     # The search.
@@ -110,10 +111,10 @@ class RegionDescent(Method[R]):
         evaluated = evaluated.needed
         confirmed = known.phase == "geometry" and abs(told - known.expected) <= _CONFIRMED * abs(told - before)
         known = replace(known, confirmed=confirmed)
-        if known.lost >= LOST:
-            return self._arrived(known, NOT_FINITE, generator, last=known.rounds == 0)
         if not bool(evaluated.finite.any()):
-            known = replace(known, sigma=_HALVING * known.sigma)
+            known = self._outside(known)
+        if known.is_lost:
+            return self._arrived(known, not_finite(known.lost), generator, last=known.rounds == 0)
         if known.phase == "start":
             return self._after_start(known, evaluated, generator)
         if known.phase == "trial":
@@ -133,7 +134,7 @@ class RegionDescent(Method[R]):
         """Fit a quadratic and return the end of its step; or, where too little is known, a point around the best."""
         settings, n = self.settings, self._n
         while known.sigma >= self._finest:
-            known, count = self._modelled(known)
+            known, count = self._modelled(self._bordered(known)[0])
             x = known.lowest.point
             s, promised = self._step(known)
             length = float(torch.linalg.solve(known.root, s).norm()) / known.sigma
@@ -156,7 +157,7 @@ class RegionDescent(Method[R]):
         trial, x, ends = known.phase == "trial", known.lowest.point, points[:1]
         for factor in _OTHER_LENGTHS[: (count + 1) // 2] if trial else ():
             root, lower, upper = factor * known.sigma * known.root, self.settings.lower - x, self.settings.upper - x
-            step = region_step(known.gradient, known.hessian, root, lower, upper, self._singular)
+            step = region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
             if float((ends - x - step).norm(dim=1).min()) > _STILL * known.sigma:
                 ends = torch.cat([ends, (x + step)[None]])
         steps = normal(generator, x, count + 1 - len(ends), self._n) @ (known.sigma / math.sqrt(self._n) * known.root)
@@ -200,6 +201,7 @@ class RegionDescent(Method[R]):
             first=self.settings.start,
             points=nothing[:0],
             values=nothing[:0, 0],
+            holes=torch.zeros(0, dtype=torch.bool, device=start.device),
             root=torch.eye(n, dtype=start.dtype, device=start.device),
             hessian=nothing,
             gradient=nothing[0],
@@ -229,10 +231,28 @@ class RegionDescent(Method[R]):
         nearest = u[distance.argsort()[: self._fitted]]
         return known, torch.linalg.eigh(nearest.mT @ nearest)[1][:, 0]
 
+    def _bordered(self, known: R) -> tuple[R, bool]:
+        """Look for a border of the black box, and whether it is plane as far as evaluations are looked at."""
+        found = border_between(known.scaled, known.holes) if bool(known.holes.any()) else None
+        if found is None:
+            return replace(known, border=None), False
+        normal, offset, plane = found
+        normal = torch.linalg.solve(known.root, normal) / known.sigma  # B is symmetric
+        return replace(known, border=torch.cat([normal, normal.new_tensor([offset])])), plane
+
+    def _outside(self, known: R) -> R:
+        """Change sigma where no value is finite: less where the point was the end of a step and tells a border."""
+        known, plane = self._bordered(known)
+        if known.border is None or known.phase != "trial":
+            return replace(known, sigma=_HALVING * known.sigma)
+        return replace(known, sigma=(_BEYOND if plane else _SHRINKING) * known.sigma)
+
     def _geometry(self, known: R, direction: Tensor, generator: torch.Generator) -> tuple[R, Tensor]:
         """Ask for a point of the region in a direction u [n] or its opposite."""
         step = known.sigma * (known.root @ direction)
         step = -step if float(torch.rand((), generator=generator, device="cpu")) < 0.5 else step
+        if known.border is not None and float(known.border[:-1] @ step) > float(known.border[-1]):
+            step = -step
         x = self.settings.inside((known.lowest.point + step)[None])
         return replace(known, phase="geometry", expected=_expected(known, x[0])), x
 
@@ -240,6 +260,8 @@ class RegionDescent(Method[R]):
         """Return which evaluations are the nearest [P], the best one first; only the first `least` may be far away."""
         distance = known.scaled.norm(dim=1)
         order = distance.argsort()
+        if known.border is not None:
+            order = order[~known.holes[order]]
         far = max(_FAR, _RELATIVELY * float(distance[order[min(self._n + 1, len(order) - 1)]]))
         nearest = order[: self._fitted]
         enough = torch.arange(len(nearest), device=nearest.device) < least

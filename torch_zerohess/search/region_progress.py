@@ -2,13 +2,16 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import latest
+
+_AT_BORDER = 10 * LOST
+"""Batches in a row that are lost beside a border, after which a round ends."""
 
 R = TypeVar("R", bound="RegionProgress")
 
@@ -21,6 +24,10 @@ class RegionProgress(Progress):
     """Evaluations of the round [P, n]."""
     values: Tensor
     """[P]"""
+    holes: Tensor
+    """Which of the evaluations [P] have no finite value; they have the highest one of the round."""
+    border: Tensor | None = None
+    """a and b [n + 1] of the half-space a.s <= b of steps s from the best point, beyond which the holes near it lie."""
     root: Tensor
     """B [n, n], symmetric, positive, of determinant 1."""
     hessian: Tensor
@@ -52,9 +59,18 @@ class RegionProgress(Progress):
     """Steps in a row whose end has exactly the value of the best point."""
 
     @property
+    def is_lost(self) -> bool:
+        """Whether so many batches in a row were lost that the round ends; at a border the ends of many steps are."""
+        return self.lost >= (LOST if self.border is None else _AT_BORDER)
+
+    @property
     def scaled(self) -> Tensor:
         """The evaluations as u [P, n]."""
         return torch.linalg.solve(self.root, (self.points - self.lowest.point).mT).mT / self.sigma
+
+    def holding(self: R, points: Tensor, values: Tensor, **own: Any) -> R:
+        """Return a round with other evaluations [P, n] and finite values [P]."""
+        return replace(self, points=points, values=values, holes=torch.zeros_like(values, dtype=torch.bool), **own)
 
     def remembered(self: R, evaluated: Evaluated, capacity: int) -> R:
         """Add evaluations; a value that is not finite counts as the highest one of the round."""
@@ -62,9 +78,11 @@ class RegionProgress(Progress):
         new = evaluated.those(finite)
         lowest = self.lowest.or_lower(new, self.sigma)
         points, values = torch.cat([self.points, new.points]), torch.cat([self.values, new.losses])
+        holes = torch.cat([self.holes, torch.zeros_like(new.losses, dtype=torch.bool)])
         if len(values) and len(new) < len(evaluated):
-            holes = evaluated.points[~finite]
-            points, values = torch.cat([points, holes]), torch.cat([values, values.max().expand(len(holes))])
+            failed = evaluated.points[~finite]
+            points, values = torch.cat([points, failed]), torch.cat([values, values.max().expand(len(failed))])
+            holes = torch.cat([holes, holes.new_ones(len(failed))])
         which = latest(points, lowest.point, capacity)
         return replace(
             self,
@@ -73,6 +91,7 @@ class RegionProgress(Progress):
             center=lowest.point,
             points=points[which],
             values=values[which],
+            holes=holes[which],
             evaluations=self.evaluations + len(evaluated),
             lost=0 if bool(evaluated.needed.finite.all()) else self.lost + 1,
         )

@@ -18,8 +18,6 @@ _EQUAL = 1e-4
 """Difference between two losses that are the same, over the distance of the lower quartile of all from the lowest."""
 LOST = 10
 """Batches in a row that are lost, after which a round or the search ends."""
-NOT_FINITE = f"{LOST} batches in a row had values that are not finite"
-"""Why it then ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +92,11 @@ class Progress:
 _COMMON = tuple(field.name for field in fields(Progress))
 
 P = TypeVar("P", bound=Progress)
+
+
+def not_finite(batches: int) -> str:
+    """Why a round or the search ends after so many batches that are lost."""
+    return f"{batches} batches in a row had values that are not finite"
 
 
 def arriving(known: P, end: Best) -> P:

@@ -2,7 +2,7 @@
 
 import torch
 
-from torch_zerohess.linalg.hull import shortest
+from torch_zerohess.linalg.hull import shortest, shortest_between
 
 
 def test_the_shortest_vector_of_a_hull_is_a_corner_a_point_of_a_side_or_zero() -> None:
@@ -23,3 +23,14 @@ def test_it_makes_no_acute_angle_with_what_is_shorter_along_it() -> None:
         vectors = torch.randn(m, n, generator=generator, dtype=torch.float64) + 0.8
         found = shortest(vectors)
         assert float((vectors @ found).min()) >= float(found @ found) - 1e-3 * float(found.norm())
+
+
+def test_between_two_hulls_no_other_vector_is_shorter() -> None:
+    """The conditions of optimality: no end is nearer along the vector, and no origin farther."""
+    generator = torch.Generator().manual_seed(0)
+    for m, n in ((3, 2), (12, 4), (40, 10)):
+        origins, ends = torch.randn(2, m, n, generator=generator, dtype=torch.float64)
+        ends[:, 0] += 8.0
+        found = shortest_between(origins, ends)
+        assert float((ends @ found).min() - (origins @ found).max()) >= (1.0 - 1e-5) * float(found @ found)
+        assert float(shortest_between(origins, origins.flip(0)).norm()) < 1e-6

@@ -34,13 +34,15 @@ def test_curvature_below_the_floor_is_taken_as_the_floor():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_step_in_a_box_is_as_low_as_any_of_many_points(seed):
+@pytest.mark.parametrize("border", [None, vector(1.0, -1.0, 0.5, 0.1)], ids=["", "beside a border"])
+def test_a_step_in_a_box_is_as_low_as_any_of_many_points(seed, border):
     generator = torch.Generator().manual_seed(seed)
     root, H = rotated([0.5, 1.0, 2.0], seed), rotated([-1.0, 0.5, 3.0], seed + 10)
     g = torch.randn(3, generator=generator, dtype=torch.float64)
     lower, upper = vector(-0.3, -2.0, -0.1), vector(0.5, 0.2, 2.0)
-    s = region_step(g, H, root, lower, upper)  # the active set is a guess: within 5 %
+    s = region_step(g, H, root, lower, upper, border=border)  # the active set is a guess: within 5 %
     assert bool(((s >= lower) & (s <= upper)).all())
+    assert border is None or float(border[:-1] @ s) <= float(border[-1]) + 1e-9
 
     def model(z):
         return z @ g + 0.5 * ((z @ H) * z).sum(-1)
@@ -48,6 +50,8 @@ def test_a_step_in_a_box_is_as_low_as_any_of_many_points(seed):
     u = torch.randn(20_000, 3, generator=generator, dtype=torch.float64)
     every = (torch.rand(20_000, 1, generator=generator) ** 0.3 * u / u.norm(dim=1, keepdim=True)) @ root
     inside = ((every >= lower) & (every <= upper)).all(1)
+    if border is not None:
+        inside &= every @ border[:-1] <= border[-1]
     assert float(model(s)) < 0.95 * float(model(every[inside]).min())
 
 

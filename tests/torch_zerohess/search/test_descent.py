@@ -173,12 +173,12 @@ def test_a_wall_of_values_that_are_not_finite(wrong, output):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_a_rejected_step_is_shortened(noise):
+def test_a_step_without_a_value_is_shortened(noise):
     search = Descent(zeros(1), sigma=1.0, noise=noise, seed=0)
     search.tell((search.ask()[:, 0] - 5) ** 2)
-    sigma, x = search.sigma, search.x
+    x, step = search.x, search.ask() - search.x
     search.tell(torch.full((len(search.ask()),), math.nan))
-    assert search.sigma == 0.5 * sigma
+    assert float((search.ask() - x).abs().max()) <= 0.51 * float(step.abs().max())
     assert torch.equal(search.center, x)
 
 
@@ -342,15 +342,16 @@ def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
         assert round(power) <= 7
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_after_ten_batches_without_a_finite_value_it_ends(noise):
+@pytest.mark.parametrize(("noise", "least", "most"), [(0.0, 20, 100), (0.1, 10, 10)])
+def test_after_many_batches_without_a_finite_value_it_ends(noise, least, most):
+    """Without noise the ends of steps lie in the middle between a border and the best point: they may fail for long."""
     search, batches = Descent(zeros(2), sigma=1.0, noise=noise, seed=0), 0
     search.tell(bowl(search.ask()))
-    while not search.done and batches < 30:
+    while not search.done and batches < 300:
         search.tell(torch.full((len(search.ask()),), math.nan))
         batches += 1
-    assert batches == 10
-    assert "10 batches in a row had values that are not finite" in search.message
+    assert least <= batches <= most
+    assert f"{batches} batches in a row had values that are not finite" in search.message
 
 
 @pytest.mark.parametrize(("lost", "arrives"), [(9, True), (10, False)])

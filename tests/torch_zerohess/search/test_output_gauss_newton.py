@@ -33,7 +33,7 @@ def test_it_looks_off_a_bound_on_which_all_evaluations_lie(bound, seed):
     known = evaluated(torch.stack([torch.full_like(along, bound), 0.3 + along], 1))
     lowest = int(known.losses.argmin())
     begun = method._begun(Best(known.points[lowest], float(known.losses[lowest]), 0.1))
-    begun = replace(begun, points=known.points, values=known.losses, outputs=known.outputs, shape=known.shape)
+    begun = begun.holding(known.points, known.losses, outputs=known.outputs, shape=known.shape)
     progress, points = method.plan(replace(begun, sigma=0.1), generator)
     while len(points):
         progress, points = method.next(progress, evaluated(points), generator)

@@ -16,6 +16,7 @@ from setuptools.command.build_ext import build_ext
 TORCH = "torch>=2.10"
 STABLE_ABI = "0x020a000000000000"  # torch 2.10, the oldest release whose stable ABI has parallel_for
 PYTHON_ABI = "0x030a0000"  # Python 3.10
+FREE_THREADED = bool(sysconfig.get_config_var("Py_GIL_DISABLED"))  # these Pythons have no limited API
 UNIX_FLAGS = [
     "-std=c++20",
     "-O3",
@@ -73,14 +74,17 @@ def extension(torch: Path) -> Extension:
         include_dirs=[str(torch / "include")],
         library_dirs=[str(torch / "lib")],
         libraries=["torch", "torch_cpu", "c10"],
-        define_macros=[("TORCH_TARGET_VERSION", STABLE_ABI), ("Py_LIMITED_API", PYTHON_ABI)],
+        define_macros=[("TORCH_TARGET_VERSION", STABLE_ABI), ("Py_LIMITED_API", PYTHON_ABI)][
+            : 1 if FREE_THREADED else 2
+        ],
         extra_compile_args=WINDOWS_FLAGS if windows else UNIX_FLAGS,
-        py_limited_api=True,
+        py_limited_api=not FREE_THREADED,
     )
 
 
 torch = find_torch()
-building = any(command.startswith(("bdist", "build", "install", "develop", "editable")) for command in sys.argv[1:])
+COMMANDS = ("bdist", "build", "install", "develop", "editable", "sdist")  # which need the headers, or name them
+building = any(command.startswith(COMMANDS) for command in sys.argv[1:])
 if torch is None and building:
     sys.exit(
         f"torch_zerohess needs torch to build. Run: pip install '{TORCH}'   and then install torch_zerohess again."
@@ -91,5 +95,5 @@ setup(
     setup_requires=[] if torch else [TORCH],
     ext_modules=[extension(torch)] if torch else [],
     cmdclass={"build_ext": BuildIfPossible},
-    options={"bdist_wheel": {"py_limited_api": "cp310"}},
+    options={} if FREE_THREADED else {"bdist_wheel": {"py_limited_api": "cp310"}},
 )

@@ -194,7 +194,7 @@ auto stored(const Tensor& u) {
   };
 }
 
-// Checks what follows divides by.
+// Rejects empty batches: callers divide by x.size(0).
 auto drawn(const Tensor& rows, const Tensor& x, const Tensor& sigma, bool single) {
   const Row* row = row_data(rows);
   STD_TORCH_CHECK(x.dim() == 2 && sigma.dim() == 1, "x and sigma must have 2 and 1 dimensions");

@@ -14,8 +14,8 @@ from torch_zerohess.version import installed_version
 
 _OPTIONAL = ("mitsuba", "drjit", "onnxruntime", "numpy")
 _NAME = "torch_zerohess"
-_DEVELOPERS = "test"
-"""The extra that only those need who change this package."""
+_DEVELOPERS = "test", "experiments", "rivals"
+"""The extras that only those need who have a clone of this package: an installation has no tests and experiments."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,6 @@ def _extras() -> dict[str, list[str]]:
     for one in required:
         name = re.match(r"[\w.-]+", one)
         extra = re.search(r"""extra == ["']([\w-]+)["']""", one)
-        if name and extra and extra[1] != _DEVELOPERS and name[0].replace("-", "_") != _NAME:
+        if name and extra and extra[1] not in _DEVELOPERS and name[0].replace("-", "_") != _NAME:
             found.setdefault(extra[1], []).append(name[0])
     return found

@@ -54,7 +54,9 @@ class LocalEntropy:
     The mean averages a narrow valley away: its gradient vanishes where the valley is rarely hit. exp(-loss / T) keeps
     the valley, so that the gradient points to it from as far as it is hit at all (Chaudhari et al. 2017, "Entropy-SGD",
     equation 5). T = `temperature` times the mean loss under the smoothing, for each element of the batch: it needs no
-    scale, and vanishes with the loss. T is not differentiated. For a large temperature the local entropy is the mean.
+    scale, and vanishes with the loss. So losses must not be negative, and must be small where the fit is good: with a
+    large constant added to a loss T is large, and the local entropy is hardly different from the mean. T is not
+    differentiated. For a large temperature the local entropy is the mean.
     The estimate is the logarithm of a sample mean, hence biased if the samples are few. Baseline "center" subtracts
     nothing where exp(-loss / T) at x is more than twice its mean over the samples, as it is near a minimum.
 

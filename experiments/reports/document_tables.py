@@ -284,11 +284,11 @@ def _origin(table: pd.DataFrame, note: str, whole: bool) -> str:
     if {"runs", "first_run"} <= set(table):  # medians of runs; a study may have a column of this name, too
         counts = sorted({int(one) for one in table["runs"]})
         starts = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-        parts.append(f"{starts} starts, from number {_only(table, 'first_run')} on.")
+        parts.append(f"{starts} starts, numbered from {_only(table, 'first_run')}.")
         parts += _limits(table)
         if "clock" in table:
-            clock = "processor" if _only(table, "clock") == "processor" else "clock on the wall"
-            parts.append(f"Seconds are of the {clock}.")
+            clock = "processor" if _only(table, "clock") == "processor" else "wall-clock"
+            parts.append(f"Seconds are {clock} time.")
     commits = ", ".join(f"`{one[:9]}`" for one in dict.fromkeys(table["commit"]))
     if not whole:
         return " ".join([*parts, f"Commit {commits}."])

@@ -222,6 +222,26 @@ def test_a_plot_passes_over_values_that_are_not_numbers():
     assert axes.get_yscale() == "log"
 
 
+def test_arrays_of_any_strides():
+    """NumPy counts a reversed array with one element as contiguous; torch does not."""
+
+    def fn(z):
+        return (np.asarray(z) ** 2).sum(1)[::-1][::-1][::-1] if len(z) == 1 else (np.asarray(z) ** 2).sum(1)
+
+    wide = np.ones(4)
+    backwards = {"sigma": wide[::-2], "bounds": (-2.0 * wide[::-2], 2.0 * wide[::-2])}
+    forwards = {"sigma": wide[:2].copy(), "bounds": (-2.0 * wide[:2], 2.0 * wide[:2])}
+    found, wanted = (
+        zh.minimize(fn, x0, seed=0, max_evaluations=20, **settings)
+        for x0, settings in ((wide[::-2], backwards), (wide[:2], forwards))
+    )
+    assert torch.equal(found.points, wanted.points)
+    image = zh.estimate(
+        lambda z: np.ones((len(z), 3, 1))[..., ::-1], torch.zeros(2), zh.Smoothing(sigma=0.1, samples=4)
+    )
+    assert float(image.gradient.abs().max()) == 0.0
+
+
 def test_starts_of_lists_and_arrays():
     starts = zeros(2), [0.0, 0.0], (0, 0), np.zeros(2), np.zeros(2, dtype=int), torch.zeros(2, dtype=torch.int32)
     fits = [zh.minimize(tilted, x0, sigma=2.0, seed=0, max_evaluations=20) for x0 in starts]

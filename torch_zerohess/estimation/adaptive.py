@@ -12,6 +12,7 @@ Derivative = Literal["gradient", "hessian_diagonal", "hessian"]
 """Derivatives whose error may end the drawing."""
 MOST = 100_000
 """Evaluations that a tolerance may take where no other number is given."""
+_ZERO = "; it is 0 in all draws of an element, as on a plateau and at a symmetric minimum: try another sigma"
 _NAMES = {"gradient": "gradient", "hessian_diagonal": "diagonal of the Hessian", "hessian": "Hessian"}
 
 
@@ -56,8 +57,8 @@ def draw_until(
         used, multiple = used + cost(own), multiple + following
         found, flat = error(batches)
         if found <= tolerance:
-            still = "; it is 0 in all draws of an element, which says nothing: enlarge sigma" if flat else ""
-            return batches, f"tolerance: the relative error of the {name} is {found:.2g}, at most {tolerance:g}{still}"
+            reason = f"tolerance: the relative error of the {name} is {found:.2g}, at most {tolerance:g}"
+            return batches, reason + (_ZERO if flat else "")
     if not batches:
         raise ValueError(
             f"max_evaluations must be at least {cost(smoothing)}, one batch of the smoothing, got {max_evaluations}"

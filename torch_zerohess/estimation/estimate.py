@@ -49,8 +49,8 @@ def estimate(
     gradient, or of `tolerance_of`, is at most the tolerance. That error is |e| / |g| in units of sigma, over the
     outputs and entries of one batch element, the largest of the batch; e are half widths of 68 % intervals, which are
     standard errors where there are many draws. Stopping when the error looks small is slightly too early on average.
-    `Estimate.reason` says what ended it. On a plateau all draws give 0, and the relative error counts as 0. `reason`
-    then says that this tells nothing.
+    `Estimate.reason` says what ended it. On a plateau, and at a minimum where pairs cancel, all draws give 0, and the
+    relative error counts as 0. `reason` then says so.
 
     Args:
         fn: [K, n], *aux [K, ...] -> [K, *out]; it may use NumPy or anything else. Without aux if there is a head.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.estimate import estimate
-from torch_zerohess.estimation.inputs import checked_input, working
+from torch_zerohess.estimation.inputs import all_finite, checked_input, short, working
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.smoothing import Smoothing, check_smoothing
 
@@ -68,6 +68,8 @@ def finite_difference_hvp(
     n = x.shape[-1]
     if not isinstance(v, Tensor) or v.shape not in ((n,), x.shape):
         raise ValueError(f"v must be a tensor of shape [{n}] or of the shape of x, got {getattr(v, 'shape', v)}")
+    if not all_finite(v):
+        raise ValueError(f"v must be finite, got {short(v)}")
     checked_number("step", step, above=0.0, below=math.inf)
     sigma = smoothing.sigma_vector(n, x.device)
     t = v.detach().double() / sigma

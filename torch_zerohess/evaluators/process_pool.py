@@ -95,8 +95,7 @@ class ProcessPool(Ahead):
         self.workers = cores() if workers is None else checked_integer("workers", workers, 1)
         retries = checked_integer("retries", retries, 0)
         recycle = None if recycle is None else checked_integer("recycle", recycle, 1)
-        if memory_limit is not None and not memory_limit > 0:
-            raise ValueError(f"memory_limit must be bytes > 0 or None, got {memory_limit!r}")
+        memory_limit = None if memory_limit is None else int(checked_number("memory_limit", memory_limit, above=0.0))
         if memory_limit is not None and sys.platform != "linux":
             raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
         self.timeout = None if timeout is None else checked_number("timeout", timeout, above=0.0)

@@ -40,6 +40,7 @@ def _known(array: Any) -> Any:
     """Return an array of NumPy that torch can share: of its own byte order, types and strides."""
     numpy = sys.modules["numpy"]
     long = array.dtype.kind == "f" and array.dtype.itemsize > 8
+    array = array.copy() if min(array.strides, default=0) < 0 else array  # also of a length of 1
     return numpy.require(array, dtype=float if long else array.dtype.newbyteorder("="), requirements="CW")
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_number
+from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
 from torch_zerohess.search.local_progress import LocalProgress, in_range
 from torch_zerohess.search.local_steps import LocalSteps, derivatives, local_steps
@@ -100,6 +100,7 @@ class LocalSettings:
         result = cls(replace(sparse, robust=False, grows=keep is None), **own)  # samples have one variance
         for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
             checked_number(name, getattr(result, name), above=0.0, most=most, below=math.inf)
+        checked_integer("samples", result.samples, 1)
         check_samples(result.samples, result.sparse.keep)
         return result
 

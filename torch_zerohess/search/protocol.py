@@ -119,7 +119,7 @@ class AskTell(ABC, Generic[P]):
     @property
     def unit(self) -> Tensor:
         """The first sigma per parameter [n]: what `sigma` and `LocalModel` are in units of."""
-        return self._space.unit
+        return self._space.unit.clone()
 
     @property
     def evaluations(self) -> int:

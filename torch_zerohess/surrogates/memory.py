@@ -77,9 +77,9 @@ class Memory:
             Under `vmap` each element is a batch of its own: all of them get new evaluations, unless there are none.
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
-        draws: points per element at which the surrogate's term is evaluated. None: for more than 32 parameters 4, or 64
-            with kinks or jumps; for fewer 1024 / B and at least 64. An affine surrogate under `heads.SquaredError`
-            needs none in a layer: the expectation is known.
+        draws: points per element at which the surrogate's term is evaluated, at least 3. None: for more than 32
+            parameters 4, or 64 with kinks or jumps; for fewer 1024 / B and at least 64. An affine surrogate under
+            `heads.SquaredError` needs none in a layer: the expectation is known.
 
     Raises:
         TypeError, ValueError: an argument is not as described.

@@ -301,7 +301,7 @@ def test_a_table_of_fits(folder):
     cells = {line.split(" | ")[0].strip("| `"): line.split(" | ")[-1].strip(" |") for line in lines[2:4]}
     assert cells == {"fr22": "- (33 %)", "descent": "7.5, 1.25 s"}
     limits = "A run has at most 400 evaluations. The limit of 15 s ended no run."
-    for part in ("2 to 3 starts, from number 3 on. " + limits, "Commit `012345678`", "`python -m experiments run"):
+    for part in ("2 to 3 starts, numbered from 3. " + limits, "Commit `012345678`", "`python -m experiments run"):
         assert part in lines[-1]
     others = table_of("bowls", Query.of(["level=90", "metric=parameter", "show=evaluations", "methods=fr22"]))
     assert "| 30 (33 %) |" not in others  # one of three is fewer than half
@@ -313,7 +313,7 @@ def test_a_table_of_fits(folder):
     assert "The quartiles stand in brackets after each median." in spread
     short = table_of("bowls", Query.of(["titles=hide", "origin=commit"])).splitlines()
     assert short[0] == "| method | uses | BOWL, n = 2 |"
-    assert short[-1].endswith("Seconds are of the processor. Commit `012345678`.")
+    assert short[-1].endswith("Seconds are processor time. Commit `012345678`.")
 
 
 def test_a_table_says_which_runs_the_time_ended(folder, results):

@@ -1,5 +1,7 @@
 """Products by finite differences against closed forms, and the settings of the source."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -50,6 +52,12 @@ def test_both_sides_use_the_same_perturbations_unless_they_are_not_to() -> None:
     for settings, same in (({}, True), ({"common": True}, True), ({"common": False}, False)):
         forward, backward = points_of_two_gradients(vector(1.0, 0.0), **settings)
         assert torch.allclose(forward - forward.mean(0), backward - backward.mean(0)) == same
+
+
+def test_a_vector_that_is_not_finite_is_named() -> None:
+    smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=0)
+    with pytest.raises(ValueError, match="v must be finite, got"):
+        zh.finite_difference_hvp(lambda z: z.sum(1), torch.ones(2), vector(1.0, math.nan), smoothing)
 
 
 def test_a_zero_vector_gives_zero() -> None:

@@ -463,10 +463,12 @@ def test_arguments_are_checked():
         ({"timeout": 0}, "timeout must be positive, got 0"),
         ({"retries": -1}, "retries must be at least 0, got -1"),
         ({"recycle": 0}, "recycle must be at least 1, got 0"),
-        ({"memory_limit": 0}, "memory_limit must be bytes > 0 or None, got 0"),
+        ({"memory_limit": 0}, "memory_limit must be positive, got 0"),
     ]:
         with pytest.raises(ValueError, match=message):
             ProcessPool(**wrong)
+    with pytest.raises(TypeError, match="memory_limit must be a number, got '1e9'"):
+        ProcessPool(memory_limit="1e9")
     assert ProcessPool().workers == cores()
     with pytest.raises(TypeError, match="make must be callable"):
         Factory(3)

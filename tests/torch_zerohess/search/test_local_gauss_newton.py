@@ -366,6 +366,11 @@ def test_settings_out_of_range(settings, message):
         search_for(image, normal(N), **settings)
 
 
+def test_samples_are_whole():
+    with pytest.raises(TypeError, match=r"samples must be an integer, got 20\.5"):
+        search_for(image, normal(N), samples=20.5)
+
+
 def test_an_output_of_one_number_is_refused():
     search = LocalGaussNewton(torch.zeros(N).double(), sigma=1.0, loss=torch.sum, seed=0)
     with pytest.raises(ValueError, match="got an output of one number: use engine='descent'"):

@@ -22,13 +22,12 @@ def border_between(u: Tensor, holes: Tensor) -> tuple[Tensor, float, bool] | Non
         a, b, and whether the plane holds for all evaluations that are looked at, as it does not where the border is
         curved; None if there is no hole, no plane, or only one evaluation with a value.
     """
-    distance = u.norm(dim=1)
-    farthest = _FARTHEST
+    distance, farthest = u.norm(dim=1), _FARTHEST
+    if int((~holes).sum()) < _LEAST:
+        return None
     while farthest > _NEAREST and bool((holes & (distance <= farthest)).any()):
         near = distance <= farthest
         inside, outside = u[near & ~holes], u[near & holes]
-        if len(inside) < _LEAST:
-            return None
         normal = torch.nn.functional.normalize(shortest_between(inside, outside), dim=0)
         low, high = float((inside @ normal).max()), float((outside @ normal).min())
         if high > low:

@@ -50,7 +50,13 @@ def ball(n, generator):
 
 @pytest.mark.parametrize(
     ("problem", "n", "bounds", "excess"),
-    [(plane, 2, None, 1e-6), (plane, 2, (-2.0, 2.0), 1e-6), (plane, 4, None, 1e-3), (ball, 2, None, 1e-3)],
+    [
+        (plane, 2, None, 1e-6),
+        (plane, 2, (-2.0, 2.0), 1e-6),
+        (plane, 4, None, 1e-4),
+        (ball, 2, None, 1e-3),
+        (ball, 4, None, 1e-2),
+    ],
 )
 def test_a_minimum_on_a_border_is_found(problem, n, bounds, excess):
     """From most starts: where the border is learned slowly, the evaluations may be used up."""

@@ -100,8 +100,7 @@ class LocalSettings:
         result = cls(replace(sparse, robust=False, grows=keep is None), **own)  # samples have one variance
         for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
             checked_number(name, getattr(result, name), above=0.0, most=most, below=math.inf)
-        checked_integer("samples", result.samples, 1)
-        check_samples(result.samples, result.sparse.keep)
+        check_samples(checked_integer("samples", result.samples, 1), result.sparse.keep)
         return result
 
 

@@ -17,6 +17,7 @@ TORCH = "torch>=2.10"
 STABLE_ABI = "0x020a000000000000"  # torch 2.10, the oldest release whose stable ABI has parallel_for
 PYTHON_ABI = "0x030a0000"  # Python 3.10
 FREE_THREADED = bool(sysconfig.get_config_var("Py_GIL_DISABLED"))  # these Pythons have no limited API
+LIMITED_API = [] if FREE_THREADED else [("Py_LIMITED_API", PYTHON_ABI)]
 UNIX_FLAGS = [
     "-std=c++20",
     "-O3",
@@ -74,9 +75,7 @@ def extension(torch: Path) -> Extension:
         include_dirs=[str(torch / "include")],
         library_dirs=[str(torch / "lib")],
         libraries=["torch", "torch_cpu", "c10"],
-        define_macros=[("TORCH_TARGET_VERSION", STABLE_ABI), ("Py_LIMITED_API", PYTHON_ABI)][
-            : 1 if FREE_THREADED else 2
-        ],
+        define_macros=[("TORCH_TARGET_VERSION", STABLE_ABI), *LIMITED_API],
         extra_compile_args=WINDOWS_FLAGS if windows else UNIX_FLAGS,
         py_limited_api=not FREE_THREADED,
     )

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 _STEPS = 100
-"""Vectors that are taken into account one after the other, at most."""
+"""Corners of the hull that are added one after the other, at most."""
 _PRECISE, _ROUNDING = 1e-4, 1e-14
 """Relative precision of the squared length; and of products of vectors."""
 
@@ -19,25 +19,28 @@ def shortest_between(origins: Tensor, ends: Tensor) -> Tensor:
 
     Source: Wolfe (1976), "Finding the nearest point in a polytope"; the vectors between the two sets are not formed.
     """
-    corners, weights = ends[:1] - origins[:1], ends.new_ones(1)
-    size = float((ends - origins[0]).norm(dim=1).max())
+    size = float((ends - origins[0]).abs().max())
+    if size == 0.0:
+        return torch.zeros_like(ends[0])
+    ends, origins = (ends - origins[0]) / size, (origins - origins[0]) / size  # squares of other sizes are no numbers
+    corners, weights = ends[:1], ends.new_ones(1)
     for _ in range(_STEPS):
         x = weights @ corners
         square = float(x @ x)
         corner = ends[int((ends @ x).argmin())] - origins[int((origins @ x).argmax())]
-        if square <= _ROUNDING * size**2:
+        if square <= _ROUNDING:
             return torch.zeros_like(x)
         if float(corner @ x) >= (1.0 - _PRECISE) * square or bool((corners == corner).all(1).any()):
             break
         corners, weights = _nearest(torch.cat([corners, corner[None]]), torch.cat([weights, weights.new_zeros(1)]))
-    return weights @ corners
+    return size * (weights @ corners)
 
 
 def _nearest(corners: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return those of corners [m, n] whose hull has the point nearest to zero in its inside, and weights of the point.
 
-    From a point of the hull, with weights [m], towards the point of the affine hull; a corner whose weight is used up
-    on the way is left out.
+    The point moves from the one with weights [m] towards the nearest point of the affine hull. A corner whose weight
+    becomes zero on the way is left out.
     """
     while True:
         products = corners @ corners.mT

@@ -13,7 +13,7 @@ _AGREED = 3
 _AGREED_AT_ZERO = 2
 """The same, where the loss at x is zero but for rounding and no loss is negative: then nothing lower is likely."""
 _ZERO = 1e-10
-"""Loss at x that counts as zero, as a share of the least loss of the first n + 1 evaluations."""
+"""Loss at x that counts as zero, as a share of the least of the first n + 1 losses."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,5 @@ def _agree(running: Running) -> bool:
     if not _AGREED_AT_ZERO <= agreed < _AGREED:
         return agreed >= _AGREED
     losses = running.record.told[1]
-    first = losses[: running.search.x.numel() + 1].nan_to_num(nan=torch.inf)
-    lowest = float(losses.nan_to_num(nan=torch.inf).min())
-    return 0.0 <= lowest <= _ZERO * float(first.min())
+    losses = losses[torch.isfinite(losses)]
+    return 0.0 <= float(losses.min()) <= _ZERO * float(losses[: running.search.x.numel() + 1].min())

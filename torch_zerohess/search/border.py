@@ -6,7 +6,7 @@ from torch import Tensor
 from torch_zerohess.linalg.hull import shortest_between
 
 _FARTHEST, _NEARER, _NEAREST = 3.0, 0.6, 0.05
-"""Distance up to which evaluations are looked at; its factor where no plane is between them; where to give up."""
+"""Distance up to which evaluations are looked at, its factor where no plane separates them, and the least distance."""
 _LEAST = 2
 """Evaluations with a value: one alone may be all that there is."""
 
@@ -19,8 +19,8 @@ def border_between(u: Tensor, holes: Tensor) -> tuple[Tensor, float, bool] | Non
         holes: which of them have no value [P].
 
     Returns:
-        a, b, and whether the plane holds for all evaluations that are looked at, as it does not where the border is
-        curved; None if there is no hole, no plane, or only one evaluation with a value.
+        a, b, and whether the plane separates all evaluations that are looked at. Where the border is curved, it
+        separates the nearest ones alone. None if there is no hole, no plane, or only one evaluation with a value.
     """
     distance, farthest = u.norm(dim=1), _FARTHEST
     if int((~holes).sum()) < _LEAST:

@@ -45,7 +45,7 @@ _TOLD = 0.1
 _TIES = 3
 """Steps in a row to exactly the same value that are a plateau."""
 _HALVING, _BEYOND = 0.5, 0.95
-"""Factor for sigma after points of which no value is finite; and after the end of a step, beyond a plane border."""
+"""Factors for sigma after points without a finite value: any points; and the end of a step beyond a plane border."""
 
 
 class RegionDescent(Method[R]):
@@ -232,7 +232,7 @@ class RegionDescent(Method[R]):
         return known, torch.linalg.eigh(nearest.mT @ nearest)[1][:, 0]
 
     def _bordered(self, known: R) -> tuple[R, bool]:
-        """Look for a border of the black box, and whether it is plane as far as evaluations are looked at."""
+        """Return the progress with the border that is near, if there is one, and whether the border is plane."""
         found = border_between(known.scaled, known.holes) if bool(known.holes.any()) else None
         if found is None:
             return replace(known, border=None), False
@@ -241,7 +241,7 @@ class RegionDescent(Method[R]):
         return replace(known, border=torch.cat([normal, normal.new_tensor([offset])])), plane
 
     def _outside(self, known: R) -> R:
-        """Change sigma where no value is finite: less where the point was the end of a step and tells a border."""
+        """Shrink sigma after points without a finite value; less if the end of a step was beyond a border."""
         known, plane = self._bordered(known)
         if known.border is None or known.phase != "trial":
             return replace(known, sigma=_HALVING * known.sigma)

@@ -11,7 +11,7 @@ from torch_zerohess.search.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import latest
 
 _AT_BORDER = 10 * LOST
-"""Batches in a row that are lost beside a border, after which a round ends."""
+"""Batches in a row that are lost beside a border, after which a round ends. Half of the steps there may fail."""
 
 R = TypeVar("R", bound="RegionProgress")
 
@@ -25,9 +25,9 @@ class RegionProgress(Progress):
     values: Tensor
     """[P]"""
     holes: Tensor
-    """Which of the evaluations [P] have no finite value; they have the highest one of the round."""
+    """Which of the evaluations [P] have no finite value. Their entry of `values` is the highest one of the round."""
     border: Tensor | None = None
-    """a and b [n + 1] of the half-space a.s <= b of steps s from the best point, beyond which the holes near it lie."""
+    """a and b [n + 1] of a plane a.s = b, s from the best point. The holes near that point are at a.s > b."""
     root: Tensor
     """B [n, n], symmetric, positive, of determinant 1."""
     hessian: Tensor
@@ -60,7 +60,7 @@ class RegionProgress(Progress):
 
     @property
     def is_lost(self) -> bool:
-        """Whether so many batches in a row were lost that the round ends; at a border the ends of many steps are."""
+        """Whether so many batches in a row were lost that the round ends."""
         return self.lost >= (LOST if self.border is None else _AT_BORDER)
 
     @property

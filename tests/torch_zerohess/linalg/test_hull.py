@@ -25,6 +25,13 @@ def test_it_makes_no_acute_angle_with_what_is_shorter_along_it() -> None:
         assert float((vectors @ found).min()) >= float(found @ found) - 1e-3 * float(found.norm())
 
 
+def test_the_scale_of_the_vectors_does_not_matter() -> None:
+    """Also where squares of their lengths are zero or infinite."""
+    vectors = torch.randn(12, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.8
+    for scale in (2.0**-600, 2.0**600):
+        assert torch.equal(shortest(scale * vectors), scale * shortest(vectors))
+
+
 def test_between_two_hulls_no_other_vector_is_shorter() -> None:
     """The conditions of optimality: no end is nearer along the vector, and no origin farther."""
     generator = torch.Generator().manual_seed(0)

@@ -342,15 +342,15 @@ def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
         assert round(power) <= 7
 
 
-@pytest.mark.parametrize(("noise", "least", "most"), [(0.0, 20, 100), (0.1, 10, 10)])
-def test_after_many_batches_without_a_finite_value_it_ends(noise, least, most):
+@pytest.mark.parametrize(("noise", "most"), [(0.0, 100), (0.1, 10)])
+def test_after_many_batches_without_a_finite_value_it_ends(noise, most):
     """Without noise the ends of steps lie in the middle between a border and the best point: they may fail for long."""
     search, batches = Descent(zeros(2), sigma=1.0, noise=noise, seed=0), 0
     search.tell(bowl(search.ask()))
     while not search.done and batches < 300:
         search.tell(torch.full((len(search.ask()),), math.nan))
         batches += 1
-    assert least <= batches <= most
+    assert batches == most
     assert f"{batches} batches in a row had values that are not finite" in search.message
 
 

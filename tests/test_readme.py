@@ -167,27 +167,9 @@ def test_named_files_exist(name, file):
     assert any(found), f"{name} names {file}"
 
 
-def test_code_that_mutations_change_is_there():
-    """A row of the list of constants quotes the code that it changes, with spaces for the ends of lines."""
-    quoted = re.findall(r"^\| `([^`]+)` \| .* \| `([^`]+)` -> ", TEXTS["tests/README.md"].replace(r"\|", "|"), re.M)
-    assert len(quoted) > 150
-    missing = [row for row in quoted if " ".join(row[1].split()) not in " ".join((ROOT / row[0]).read_text().split())]
-    assert not missing
-
-
-def test_tests_that_are_named_exist():
-    """The list of constants names the test that notices each of them."""
-    named = set(re.findall(r"`(test_\w+)`", TEXTS["tests/README.md"]))
-    defined = {
-        name for path in (ROOT / "tests").rglob("test_*.py") for name in re.findall(r"def (test_\w+)", path.read_text())
-    }
-    assert len(named) > 90
-    assert named <= defined
-
-
 def test_constants_that_are_named_exist():
     """The prose before the list of constants names those without a row."""
-    named = set(re.findall(r"`(_?[A-Z][A-Z_]+)`", TEXTS["tests/README.md"].partition("The library:")[0]))
+    named = set(re.findall(r"`(_?[A-Z][A-Z_]+)`", TEXTS["tests/README.md"]))
     sources = "\n".join(path.read_text() for path in (ROOT / "torch_zerohess").rglob("*.py"))
     assigned = {name for line in re.findall(r"^([A-Z_, ]+) = ", sources, re.MULTILINE) for name in line.split(", ")}
     assert len(named) > 5

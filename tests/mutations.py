@@ -1,6 +1,6 @@
 """Change one rule of the code at a time, and see whether the test that is named for it fails.
 
-`python tests/mutations.py TEXT ...` tries the rows of `mutations.csv` that contain every TEXT, or all rows without TEXT.
+`python tests/mutations.py TEXT ...` tries the rows of `mutations.csv` that contain every TEXT; without one, all rows.
 It works in a copy of the tree. The exit status is 1 if a test did not notice a change.
 """
 

@@ -256,7 +256,9 @@ def settings_of(smoothing: Smoothing) -> dict[str, Any]:
 def smoothing_of(settings: Mapping[str, Any], what: str) -> Smoothing:
     """Return the smoothing that `settings_of` described, in the state of `what`; KeyError for a name of no setting."""
     if unknown := settings.keys() - {one.name for one in fields(Smoothing)}:
-        raise KeyError(f"state must be a state_dict of {what}, this one has {', '.join(sorted(unknown))}")
+        raise KeyError(f"state must be a state_dict of {what}, this one has {', '.join(sorted(map(str, unknown)))}")
+    if "sigma" not in settings:
+        raise KeyError(f"state must be a state_dict of {what}, this one lacks sigma")
     return Smoothing(**settings)
 
 

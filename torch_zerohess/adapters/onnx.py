@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_tensors
+from torch_zerohess.arguments import check_tensors, checked_integer
 
 _TYPES = {
     "tensor(float)": torch.float32,
@@ -46,7 +46,7 @@ class OnnxFunction:
         aux: names of the inputs that auxiliary inputs of the black box fill, in this order.
         output: name of the output; may be None if the model has one.
         threads: of onnxruntime; its own choice if None. Take 1 in worker processes.
-        providers: execution providers of onnxruntime, such as ("CUDAExecutionProvider", "CPUExecutionProvider").
+        providers: execution provider of onnxruntime or several, such as ("CUDAExecutionProvider", "CPUExecutionProvider").
 
     Raises:
         ModuleNotFoundError: onnxruntime or NumPy is not installed.
@@ -66,7 +66,7 @@ class OnnxFunction:
         aux: Sequence[str] = (),
         output: str | None = None,
         threads: int | None = None,
-        providers: Sequence[str] = ("CPUExecutionProvider",),
+        providers: str | Sequence[Any] = ("CPUExecutionProvider",),
     ) -> None:
         if hasattr(model, "SerializeToString"):
             model = model.SerializeToString()
@@ -252,7 +252,7 @@ def _again(*arguments: Any) -> OnnxFunction:
     )
 
 
-def _session(model: Any, threads: int | None, providers: Sequence[str]) -> Any:
+def _session(model: Any, threads: int | None, providers: str | Sequence[Any]) -> Any:
     if hasattr(model, "run_with_ort_values"):
         return model
     if not isinstance(model, (str, bytes, os.PathLike)):
@@ -268,9 +268,11 @@ def _session(model: Any, threads: int | None, providers: Sequence[str]) -> Any:
         ) from error
     options = onnxruntime.SessionOptions()
     if threads is not None:
-        options.intra_op_num_threads = options.inter_op_num_threads = threads
+        options.intra_op_num_threads = options.inter_op_num_threads = checked_integer("threads", threads, 1)
     source = os.fspath(model) if isinstance(model, os.PathLike) else model
-    return onnxruntime.InferenceSession(source, options, providers=list(providers))
+    return onnxruntime.InferenceSession(
+        source, options, providers=[providers] if isinstance(providers, str) else list(providers)
+    )
 
 
 def _value(array: Any) -> Any:

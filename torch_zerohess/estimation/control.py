@@ -74,6 +74,11 @@ class Control:
         encoded = 2 if coordinates_of(self.memory.surrogate, self.outer) is not None else 0
         return aux[: len(aux) - encoded], aux[len(aux) - encoded :], scales
 
+    def keep(self, points: Tensor, outputs: Tensor) -> None:
+        """Add new evaluations, points [B, E, n] and outputs [B, E, *outputs], to the memory of a layer that learns."""
+        if self.learning:
+            self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
+
     def explain(
         self,
         values: Tensor,
@@ -84,7 +89,9 @@ class Control:
         added: Callable[[Tensor], list[Tensor]],
         kept: Tensor | None,
     ) -> Tensor | None:
-        """Keep new evaluations and return their predictions by the surrogate, float64 [B, E, *out], if it is used.
+        """Return predictions of new evaluations by the surrogate, float64 [B, E, *out], if it is used.
+
+        A layer that learns compares them with the values.
 
         Args:
             values: [B, E, *out].
@@ -95,8 +102,6 @@ class Control:
             added: what values [B, E, *out] add to the derivatives of the estimate, by order.
             kept: which values were not left out [B, E]; all of them if None.
         """
-        if self.learning:
-            self.memory.add(points.flatten(0, 1), outputs.flatten(0, 1))
         predicted = None
         if self.memory.ready:
             with torch.no_grad():  # a module has parameters that require grad

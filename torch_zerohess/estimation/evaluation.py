@@ -1,5 +1,6 @@
 """One batch of black-box evaluations: the points, the call, the checks, and the coefficients of the Stein sums."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -92,12 +93,20 @@ class BlackBoxCall:
         """Return whether each of `count` points of a batch is a call of fn of its own."""
         return not self.vectorized or count <= max(getattr(self.evaluator, "single_points", 1), 1)
 
-    def values(self, points: Tensor, aux: Sequence[Tensor], *, spare: bool = False) -> tuple[Tensor, Tensor]:
+    def values(
+        self,
+        points: Tensor,
+        aux: Sequence[Tensor],
+        *,
+        spare: bool = False,
+        receive: Callable[[Tensor], None] | None = None,
+    ) -> tuple[Tensor, Tensor]:
         """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
 
         Without a head they are the same.
 
         spare: nobody needs the points again; else the black box gets a copy, because it may write to its input.
+        receive: called with the outputs before anything else can fail.
         """
         B, E = points.shape[:2]
         if self.joint:
@@ -106,9 +115,13 @@ class BlackBoxCall:
         if self.outer.head is None:
             values = self(flat, [one.repeat_interleave(E, 0) for one in aux])
             values = values.reshape(B, E, *values.shape[1:])
+            if receive:
+                receive(values)
             self._lost(flat)
             return values, values
         outputs = self(flat, []).unflatten(0, (B, E))
+        if receive:
+            receive(outputs)
         before = times_changed(outputs)
         values, lost = apply_head(self.outer.head, outputs, aux), self._lost(flat)
         if times_changed(outputs) != before:
@@ -187,7 +200,8 @@ def evaluate(
         return perturbations.points if again is None else again.points(x, sigma, with_center)
 
     references, encoded, scales = control.parted(aux) if control else (aux, (), None)
-    values, outputs = call.values(perturbations.points, references, spare=again is not None)
+    receive = None if control is None else functools.partial(control.keep, perturbations.points)
+    values, outputs = call.values(perturbations.points, references, spare=again is not None, receive=receive)
     remaining = values
     kept: Tensor | None = None
     baseline: Tensor | None = None

@@ -5,6 +5,7 @@ inputs are never copied: the head is called once per sample with the whole batch
 expanded views, whichever takes fewer calls.
 """
 
+import inspect
 from collections.abc import Callable, Sequence
 
 import torch
@@ -40,7 +41,14 @@ def apply_head(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
 def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
     graph, before = any(one.requires_grad for one in (outputs, *aux)), [times_changed(one) for one in aux]
     with without_autocast(outputs.device):
-        losses = head(outputs, *aux)
+        try:
+            losses = head(outputs, *aux)
+        except TypeError as error:
+            if (takes := _other_arguments(head, len(aux))) is None:
+                raise
+            raise TypeError(
+                f"head takes {takes}, but the call has {len(aux)} auxiliary inputs: they follow x, layer(x, references)"
+            ) from error
     for number, one in enumerate(aux):
         if times_changed(one) != before[number]:
             raise ValueError(
@@ -57,3 +65,15 @@ def _called(head: Head, outputs: Tensor, aux: Sequence[Tensor]) -> Tensor:
             f"got {list(losses.shape)}"
         )
     return losses
+
+
+def _other_arguments(head: Head, count: int) -> str | None:
+    """Return the signature of a head that cannot be called with `count` auxiliary inputs, None where it can be."""
+    try:
+        signature = inspect.signature(head.forward if isinstance(head, torch.nn.Module) else head)
+        signature.bind(*[None] * (1 + count))
+    except TypeError:
+        return str(signature.replace(return_annotation=inspect.Signature.empty))
+    except ValueError:  # a head without a signature
+        return None
+    return None

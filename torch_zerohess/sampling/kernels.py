@@ -84,7 +84,7 @@ def _compiled(tensor: Tensor) -> bool:
 
 def _draws_on(tensor: Tensor) -> bool:
     """Whether there is an operator that draws on this device."""
-    return extension.available and (tensor.is_cpu or (tensor.is_cuda and _triton))
+    return extension.available and (tensor.is_cpu or (tensor.is_cuda and _by_triton(tensor.device)))
 
 
 def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: torch.device) -> Tensor:
@@ -254,8 +254,14 @@ def _total(pieces: Iterator[Tensor]) -> Tensor:
     return total
 
 
-_triton = importlib.util.find_spec("triton") is not None
+_TRITON = importlib.util.find_spec("triton") is not None
 """Whether tensors on CUDA devices are drawn by `triton_kernels`, which the first of them imports."""
+_refused: set[torch.device] = set()
+"""Devices on which it has failed."""
+
+
+def _by_triton(device: torch.device) -> bool:
+    return _TRITON and device not in _refused
 
 
 @functools.cache
@@ -274,17 +280,16 @@ def _on_cuda(function: Callable[..., Any]) -> None:
     """Register the function of `triton_kernels` with the name of this one, and this one for where it fails."""
 
     def run(*arguments: Any) -> Any:
-        global _triton
-        if _triton:
+        device = next(one.device for one in arguments if isinstance(one, Tensor))
+        if _by_triton(device):
             try:
-                device = next(one.device for one in arguments if isinstance(one, Tensor))
                 return getattr(_triton_kernels(device), function.__name__)(*arguments)
             except torch.OutOfMemoryError:
                 raise
             except Exception as error:  # no compiler for its launcher, a device that is too old
-                _triton = False
+                _refused.add(device)
                 warnings.warn(
-                    f"torch_zerohess draws with torch instead of Triton, the same numbers but slower: {error!r}",
+                    f"torch_zerohess draws with torch instead of Triton on {device}, the same numbers but slower: {error!r}",
                     RuntimeWarning,
                     stacklevel=2,
                 )

@@ -106,7 +106,10 @@ def test_the_inputs_of_a_deployed_model_are_found():
 
 def test_a_copy_for_another_process(tmp_path):
     onnx.save(model(), tmp_path / "model.onnx")
-    f = OnnxFunction(tmp_path / "model.onnx", constants={"c": C[0]}, output="y", threads=1)
+    how = {"constants": {"c": C[0]}, "output": "y"}
+    f = OnnxFunction(tmp_path / "model.onnx", threads=1, providers="CPUExecutionProvider", **how)
+    with pytest.raises(ValueError, match="threads must be at least 1, got 0"):
+        OnnxFunction(tmp_path / "model.onnx", threads=0, **how)
     assert torch.equal(pickle.loads(pickle.dumps(f))(Z), f(Z))
     with pytest.raises(TypeError, match="must be a path or bytes"):
         pickle.dumps(OnnxFunction(f.session, constants={"c": C[0]}, output="y"))

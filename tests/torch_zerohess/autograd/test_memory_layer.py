@@ -377,6 +377,40 @@ def test_fresh_counts_evaluations() -> None:
         layer(zh.Memory(fresh=0))(x.clone().requires_grad_(), r)
 
 
+def test_evaluations_of_a_call_that_fails_are_kept() -> None:
+    x, r = point()
+    memory = zh.Memory()
+
+    def holes(z: Tensor) -> Tensor:
+        outputs = render(z)
+        outputs[1] = torch.nan
+        return outputs
+
+    box = zh.BlackBox(holes, zh.Smoothing(sigma=SIGMA, samples=3), head=zh.heads.SquaredError(), memory=memory)
+    with pytest.raises(ValueError, match="choose on_nonfinite"):
+        box(x.clone().requires_grad_(), r)
+    assert (memory.evaluations, len(memory)) == (4 * 7, 4 * 7 - 1)
+    wrong = zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=3), head=lambda y, one: y, memory=memory)
+    with pytest.raises(ValueError, match="head must return one loss per output"):
+        wrong(x.clone().requires_grad_(), r)
+    assert memory.evaluations == 2 * 4 * 7
+
+
+def test_a_head_without_its_reference_says_what_it_takes() -> None:
+    x, r = point()
+    modules = (zh.heads.SquaredError(), nn.MSELoss(), lambda outputs, reference: (outputs - reference).sum(1))
+    for head in modules:
+        box = zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=3), head=head)
+        with pytest.raises(TypeError, match=r"head takes \(.*\), but the call has 0 auxiliary inputs"):
+            box(x.clone().requires_grad_())
+
+    def broken(outputs: Tensor, reference: Tensor) -> Tensor:
+        raise TypeError("an error of its own")
+
+    with pytest.raises(TypeError, match=r"^an error of its own"):
+        zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=3), head=broken)(x, r)
+
+
 def test_center_is_the_value_at_the_center() -> None:
     x, r = point()
     box = layer(remembering(SURROGATES["bad"]()), value="center").eval()
@@ -443,6 +477,9 @@ def test_state_dict_carries_the_memory() -> None:
     torch.testing.assert_close(*results, rtol=1e-6, atol=1e-9)
     with pytest.raises((ValueError, RuntimeError), match="memory"):
         layer(None).load_state_dict(first.state_dict())
+    kept = len(second.memory)
+    second.load_state_dict(layer(None).state_dict())
+    assert len(second.memory) == kept
 
 
 def test_a_state_whose_memory_is_wrong_changes_nothing() -> None:
@@ -451,6 +488,8 @@ def test_a_state_whose_memory_is_wrong_changes_nothing() -> None:
     settings = {**next(iter(state.values())), "sigma": 0.2, "memory": {"points": torch.zeros(0, 0)}}
     with pytest.raises(KeyError):
         second.set_extra_state(settings)
+    with pytest.raises(KeyError, match="this one lacks sigma"):
+        second.set_extra_state({"samples": 3})
     assert second.smoothing.sigma == SIGMA
 
 

@@ -182,10 +182,13 @@ def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(
         kernels._on_cuda(function)
     assert {device for device, _ in registered.values()} == {"cuda"}
     rows = proposals.pick_rows(3, 0, 4, 5, proposals.SECOND_ORDER)
-    monkeypatch.setattr(kernels, "_triton", True)
+    monkeypatch.setattr(kernels, "_TRITON", True)
+    monkeypatch.setattr(kernels, "_refused", set())
     monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", module)
     _, run = registered["torch_zerohess::draw"]
-    with pytest.warns(RuntimeWarning, match=f"torch instead of Triton.*{message}"):
+    with pytest.warns(RuntimeWarning, match=f"torch instead of Triton on cpu.*{message}"):
         got = run(rows, 5, False)
     assert torch.equal(got, proposals.draw(rows, 5))
     assert torch.equal(run(rows, 5, False), got)  # and no second warning
+    assert not kernels._by_triton(rows.device)
+    assert kernels._by_triton(torch.device("cuda", 1))  # another device may have it

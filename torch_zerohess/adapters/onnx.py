@@ -46,7 +46,7 @@ class OnnxFunction:
         aux: names of the inputs that auxiliary inputs of the black box fill, in this order.
         output: name of the output; may be None if the model has one.
         threads: of onnxruntime; its own choice if None. Take 1 in worker processes.
-        providers: execution provider of onnxruntime or several, such as ("CUDAExecutionProvider", "CPUExecutionProvider").
+        providers: execution provider of onnxruntime, or several: ("CUDAExecutionProvider", "CPUExecutionProvider").
 
     Raises:
         ModuleNotFoundError: onnxruntime or NumPy is not installed.
@@ -270,9 +270,8 @@ def _session(model: Any, threads: int | None, providers: str | Sequence[Any]) ->
     if threads is not None:
         options.intra_op_num_threads = options.inter_op_num_threads = checked_integer("threads", threads, 1)
     source = os.fspath(model) if isinstance(model, os.PathLike) else model
-    return onnxruntime.InferenceSession(
-        source, options, providers=[providers] if isinstance(providers, str) else list(providers)
-    )
+    names = [providers] if isinstance(providers, str) else list(providers)
+    return onnxruntime.InferenceSession(source, options, providers=names)
 
 
 def _value(array: Any) -> Any:

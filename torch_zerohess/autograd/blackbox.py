@@ -66,8 +66,8 @@ class BlackBox(nn.Module):
     and so does "different" where neither x nor aux is mapped over.
 
     `state_dict` has all settings of the smoothing, not sigma alone, and the contents of the memory. `load_state_dict`
-    replaces the settings that the layer was made with; a state without a memory leaves the memory as it is. To change a setting, set it after loading:
-    `layer.smoothing = layer.smoothing.replace(samples=16)`.
+    replaces the settings that the layer was made with, so set others after it: `layer.smoothing =
+    layer.smoothing.replace(samples=16)`. A state without a memory leaves the memory of the layer as it is.
 
     Every layer has a compiled graph of its own. `torch.compile` makes at most 8 of one function in one process, its
     `recompile_limit`, layers that no longer live included. Layers of one model are one graph. Beyond 8 models use

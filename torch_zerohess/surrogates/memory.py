@@ -141,14 +141,14 @@ class Memory:
     @property
     @_locked
     def points(self) -> Tensor:
-        """Points of the evaluations that are kept, [P, n]: the memory's own tensor, so clone it before you change it."""
+        """Points of the evaluations that are kept, [P, n]; not a copy: clone it before you change it."""
         self._points = _joined(self._points)
         return self._points[0] if self._points else torch.empty(0, 0, device="cpu")
 
     @property
     @_locked
     def outputs(self) -> Tensor:
-        """Outputs there, [P, *out]: the memory's own tensor, like the points."""
+        """Outputs there, [P, *out]; not a copy, either."""
         self._outputs = _joined(self._outputs)
         return self._outputs[0] if self._outputs else torch.empty(0, device="cpu")
 

@@ -186,7 +186,7 @@ def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(
     monkeypatch.setattr(kernels, "_refused", set())
     monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", module)
     _, run = registered["torch_zerohess::draw"]
-    with pytest.warns(RuntimeWarning, match=f"torch instead of Triton on cpu.*{message}"):
+    with pytest.warns(RuntimeWarning, match=f"torch, not Triton, on cpu.*{message}"):
         got = run(rows, 5, False)
     assert torch.equal(got, proposals.draw(rows, 5))
     assert torch.equal(run(rows, 5, False), got)  # and no second warning

@@ -145,6 +145,8 @@ def _fitted(table: pd.DataFrame, query: Query) -> tuple[str, pd.DataFrame, str]:
     worst = query.take("worst", "hide", ("hide", "show")) == "show"
     titles = query.take("titles", "show", ("show", "hide")) == "show"
     query.end()
+    if show == "evaluations":
+        table = table.drop(columns="clock", errors="ignore")  # that of the seconds
     table = table[(table["metric"] == metric) & (table["level"] == float(level))]
     records = table.to_dict("records")
     cells = {(row["task"], row["method"]): _cell(row, show, interval, quartiles, worst) for row in records}

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.magnitudes import power_of_two
 from torch_zerohess.linalg.step import Step
 
 
@@ -31,7 +32,7 @@ def steihaug(
     what follows would be fitted to the noise, and grows without limit in flat directions. If the curvature of the very
     first direction is that uncertain, it is taken at the upper end of its error.
     """
-    scale = _power_of_two(gradient)  # squares of small and of large gradients are no numbers
+    scale = power_of_two(gradient)  # squares of small and of large gradients are no numbers
     residuals = gradient.reshape(-1, gradient.shape[-1]) / scale
     residual = residuals.mean(0)
     g, s = residual, torch.zeros_like(residual)
@@ -89,12 +90,6 @@ def noise_level(estimates: Tensor, noise: float) -> float:
     deviations = estimates - estimates.mean(0)
     gram = deviations @ deviations.mT / (R * (R - 1))  # trace(gram) = tr C, |gram|^2 = tr C^2
     return float((gram.trace() + noise * math.sqrt(2) * gram.norm()).sqrt())
-
-
-def _power_of_two(gradient: Tensor) -> float:
-    """Return the power of two by which the largest entry of g is divided exactly, so that it is of the size of one."""
-    largest = float(gradient.abs().max())
-    return math.ldexp(1.0, math.frexp(largest)[1] - 1) if 0.0 < largest < math.inf else 1.0
 
 
 def _to_boundary(s: Tensor, direction: Tensor, radius: float) -> Tensor:

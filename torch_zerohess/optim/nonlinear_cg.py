@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.flat import widest_type
+from torch_zerohess.linalg.magnitudes import power_of_two
 from torch_zerohess.optim import processes
 from torch_zerohess.optim.second_order import TRIALS, Closure, Model, SecondOrder, checked_lr
 
@@ -137,15 +138,18 @@ class NonlinearCG(SecondOrder):
 
     def _direction(self, g: Tensor, group: dict[str, Any]) -> Tensor:
         """Return the next conjugate direction [N], a unit vector or zero."""
-        first, norm = self.state[self._parameters[0]], float(g.norm())
+        scale = power_of_two(g)  # squares of small and of large gradients are no numbers
+        g = g / scale
+        first, norm = self.state[self._parameters[0]], scale * float(g.norm())
         previous, count, d = first.get("norm", 0.0), first.get("count", 0), self._get("direction")
         conjugate = None
         if d is not None and 0 < count < group["recompute"] and previous > 0.0:
-            conjugate = -g + (norm / previous) ** 2 * d
+            ratio = norm / previous
+            conjugate = -g + ratio * (ratio * (d / scale))
         if conjugate is None or not float(conjugate.dot(g)) < 0.0:
             conjugate, count = -g, 0
         first["norm"], first["count"] = norm, count + 1
-        self._set("direction", conjugate)
+        self._set("direction", scale * conjugate)
         length = conjugate.norm()
         return conjugate / length if float(length) > 0.0 else torch.zeros_like(conjugate)
 

@@ -289,7 +289,7 @@ def _on_cuda(function: Callable[..., Any]) -> None:
             except Exception as error:  # no compiler for its launcher, a device that is too old
                 _refused.add(device)
                 warnings.warn(
-                    f"torch_zerohess draws with torch, not Triton, on {device}: the same numbers, but slower. {error!r}",
+                    f"torch_zerohess draws with torch, not Triton, on {device}: the same numbers, slower. {error!r}",
                     RuntimeWarning,
                     stacklevel=2,
                 )

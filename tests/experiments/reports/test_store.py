@@ -314,6 +314,7 @@ def test_a_table_of_fits(folder):
     short = table_of("bowls", Query.of(["titles=hide", "origin=commit"])).splitlines()
     assert short[0] == "| method | uses | BOWL, n = 2 |"
     assert short[-1].endswith("Seconds are processor time. Commit `012345678`.")
+    assert "Seconds are" not in table_of("bowls", Query.of(["show=evaluations"]))
 
 
 def test_a_table_says_which_runs_the_time_ended(folder, results):

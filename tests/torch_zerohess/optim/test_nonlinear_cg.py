@@ -69,6 +69,18 @@ def test_negative_curvature_is_left_downhill_at_any_scale(scale):
         assert float(x.detach()) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("exponent", [-900, -600, 600, 900])
+def test_steps_are_the_same_for_a_loss_of_any_size(exponent):
+    ends = []
+    for factor in (1.0, 2.0**exponent):
+        x = vector(-1.2, 1.0, 0.5).requires_grad_()
+        optimizer = NonlinearCG([x], radius=0.3)
+        for _ in range(4):  # conjugate directions need several
+            optimizer.step(lambda x=x, factor=factor: factor * (x**4 + 3 * x.roll(1) * x).sum())
+        ends.append(x.detach())
+    assert torch.equal(*ends)
+
+
 def test_a_saddle_is_escaped():
     x = vector(2.0, 1e-3).requires_grad_()
     optimizer = NonlinearCG([x], radius=0.5, recompute=5)

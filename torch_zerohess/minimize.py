@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, check_callable, checked_file, checked_integer, checked_number
@@ -23,6 +22,7 @@ from torch_zerohess.minimization.separate import separated
 from torch_zerohess.minimization.stopping import Stopping
 from torch_zerohess.search.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
+from torch_zerohess.smoothing import random_seed
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 __all__ = ["Iterate", "Minimum", "Observation", "minimize"]
@@ -114,7 +114,7 @@ def minimize(
             search has come to an end by those in the file. A file that cannot be written later on, or that another
             process writes, too, is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. 0 ends it there: give it for a function
-            that has only one minimum. At a kink of a loss alone the engine "descent" first looks for a direction in
+            that has only one minimum. At a kink of a loss alone, as of a penalty, the search first looks for a direction in
             which the loss falls. It may miss one, and with `ftol` or beside a bound it does not look: give the output
             and `loss=` where you can. If None, until max_evaluations are used up, or three rounds in a row have arrived
             at the same point, or at points with the same loss. Two are enough where the loss has fallen to zero, but
@@ -164,7 +164,7 @@ def minimize(
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
     start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
     rounds = max(max_evaluations, 0) if restarts is None else restarts
-    seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else seed
+    seed = random_seed() if seed is None else seed
 
     def make(noise: float) -> TrustRegion:
         given: dict[str, Any] = settings | {

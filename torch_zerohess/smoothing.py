@@ -236,7 +236,7 @@ class Smoothing:
         taken: evaluations that a memory, or an earlier sparse Jacobian, has taken before the call.
         """
         if self.seed is None:
-            return int(torch.randint(2**63 - 1, (), device="cpu"))
+            return random_seed()
         return following_seed(self.seed, taken)
 
     def sigma_vector(self, n: int, device: torch.device) -> Tensor:
@@ -266,6 +266,11 @@ def check_smoothing(value: Any) -> None:
     """Raise TypeError for what is no `Smoothing`."""
     if not isinstance(value, Smoothing):
         raise TypeError(f"smoothing must be a Smoothing, got {type(value).__name__}")
+
+
+def random_seed() -> int:
+    """Return a seed that torch's generator of the CPU draws."""
+    return int(torch.randint(2**63 - 1, (), device="cpu"))
 
 
 def following_seed(seed: int, number: int) -> int:

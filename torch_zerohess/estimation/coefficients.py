@@ -32,7 +32,7 @@ def coefficients_of(
     return total(baseline * share), (f - baseline) * share
 
 
-def baseline_of(values: Tensor, mean: Tensor | None, K: int, smoothing: Smoothing) -> Tensor:
+def baseline_of(values: Tensor, mean: Tensor | None, smoothing: Smoothing) -> Tensor:
     """Return the mean baseline [B, 1, P] of values [B, E, *out], where `mean` is the first of `coefficients_of`."""
     if mean is not None:
         return mean

@@ -242,7 +242,7 @@ def evaluate(
         base = values.select(1, K).double()
     else:
         rest = remaining[:, :K]
-        subtracted = baseline_of(remaining, baseline, K, smoothing)[:, 0]
+        subtracted = baseline_of(remaining, baseline, smoothing)[:, 0]
         base = stein.smoothed(rest.reshape(B, K, -1), subtracted, coefficients.mT).reshape((B, *rest.shape[2:]))
     expansion = Expansion(base, coefficients, sigma, outer.kept(scales, values, K), stein)
     kept_points = None if again is not None else perturbations.points

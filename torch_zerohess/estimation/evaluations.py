@@ -64,7 +64,7 @@ class Evaluations(NamedTuple):
     @property
     def baseline(self) -> Tensor:
         """What was subtracted from `rest`, its mean over the rows, [B, 1, P]."""
-        return baseline_of(self.remaining, self.mean, self.K, self.smoothing)
+        return baseline_of(self.remaining, self.mean, self.smoothing)
 
     @property
     def smoothed(self) -> Tensor:

@@ -22,9 +22,8 @@ from torch import Tensor
 from torch_zerohess.evaluators.batch import MOST, Batch
 from torch_zerohess.evaluators.factory import same
 from torch_zerohess.evaluators.finished import keep_finished
-from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
+from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
 from torch_zerohess.evaluators.transfer import Part
-from torch_zerohess.evaluators.values import checked_values
 
 
 @dataclass(eq=False)
@@ -112,7 +111,7 @@ class Ahead(Closing, ABC):
         """Return fn(points [K, n], *aux [K, ...]), values [K, *out] on the device of the points."""
         self._check_open()
         if len(points) == 0:
-            return checked_values(Inline()(fn, points.detach(), *aux), points)
+            return values_without_points(fn, points, aux)
         if threading.current_thread() is self._thread:
             raise RuntimeError(f"a callback of a future may submit to the {type(self).__name__}, but not wait for it")
         job = self._job(fn, points, aux)
@@ -141,7 +140,7 @@ class Ahead(Closing, ABC):
         """
         self._check_open()
         if len(points) == 0:
-            return Evaluation.of(lambda: checked_values(Inline()(fn, points.detach(), *aux), points))
+            return Evaluation.of(lambda: values_without_points(fn, points, aux))
         job = self._job(fn, points.clone(), [one.clone() for one in aux])  # the caller may write to them
         self._queue(job)
         return job.future

@@ -16,7 +16,7 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
-from torch_zerohess.evaluators.inline import Closing, Evaluation, Inline
+from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
 from torch_zerohess.evaluators.random_numbers import draw_apart
@@ -84,7 +84,7 @@ class Executor(Closing):
         if self._closed:
             raise RuntimeError("the Executor is closed: make another one")
         if len(points) == 0:
-            return checked_values(Inline()(fn, points.detach(), *aux), points)
+            return values_without_points(fn, points, aux)
         batch, tasks = self._tasks(fn, points, aux)
         try:
             return _joined(batch, tasks).to(points.device)
@@ -100,7 +100,7 @@ class Executor(Closing):
         if self._closed:
             raise RuntimeError("the Executor is closed: make another one")
         if len(points) == 0:
-            return Evaluation.of(lambda: checked_values(Inline()(fn, points.detach(), *aux), points))
+            return Evaluation.of(lambda: values_without_points(fn, points, aux))
         batch, tasks = self._tasks(fn, points, aux)
         future, device = Evaluation(), points.device
         future.set_running_or_notify_cancel()  # what was given to the executor is its own

@@ -1,7 +1,7 @@
 """Evaluation in this process, and the interface of every evaluator."""
 
 import concurrent.futures
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
@@ -89,3 +89,8 @@ class Inline(Closing):
         """
         own = [one.detach().clone() for one in (points, *aux)]
         return Evaluation.of(lambda: checked_values(self(fn, *own), points).clone())
+
+
+def values_without_points(fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> Tensor:
+    """Return values [0, *out] of fn, called in this process: points [0, n] and aux [0, ...] need no worker."""
+    return checked_values(Inline()(fn, points.detach(), *aux), points)

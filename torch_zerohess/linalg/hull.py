@@ -5,8 +5,8 @@ from torch import Tensor
 
 _STEPS = 100
 """Corners of the hull that are added one after the other, at most."""
-_PRECISE, _ROUNDING = 1e-4, 1e-14
-"""Relative precision of the squared length; and of products of vectors."""
+_PRECISE, _ROUNDING = 1e-4, 1e-26
+"""Relative precision of the squared length; and its size, relative to the longest vector, below which it is zero."""
 
 
 def shortest(vectors: Tensor) -> Tensor:
@@ -43,10 +43,11 @@ def _nearest(corners: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     becomes zero on the way is left out.
     """
     while True:
-        products = corners @ corners.mT
-        products.diagonal().add_(_ROUNDING * products.diagonal().max())
-        wanted = torch.linalg.solve(products, torch.ones_like(weights))
-        wanted = wanted / wanted.sum()
+        base = int(corners.norm(dim=1).argmin())  # the shortest one: its rounding is the smallest
+        spread = (corners - corners[base]).mT
+        wanted = torch.linalg.lstsq(spread, -corners[base][:, None], driver="gelsd").solution[:, 0]
+        wanted[base] = 0.0
+        wanted[base] = 1.0 - wanted.sum()
         used = wanted <= 0.0
         if not bool(used.any()):
             return corners, wanted

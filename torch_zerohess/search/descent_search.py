@@ -34,7 +34,7 @@ class Descent(AskTell[Any]):
     Where a loss alone is not finite, a plane between evaluations with and without a value bounds the step, so that the
     search follows the border of the region that fails. Up to 100 steps in a row may fail there.
 
-    At a kink of a loss alone, slopes at up to 4 (n + 1) points around it tell whether it is a minimum: up to
+    At a kink of a loss alone, slopes at up to 6 (n + 1) points around it tell whether it is a minimum: up to
     (n + 1)(4 n + 7) evaluations, if no bound is near. If they do not tell, the search has not arrived.
 
     After a round two evaluations tell whether a loss alone is a sum of functions of one parameter each (in a box, for

@@ -4,6 +4,9 @@ Near a kink the quadratics of a loss predict nothing, and their region shrinks w
 as steeply beside the best point as farther away, slopes are measured at random points around it, and their convex hull
 is looked at (gradient sampling: Burke, Lewis and Overton 2005). If the shortest vector of the hull is zero, the best
 point is stationary. Otherwise its opposite is a direction of descent, and the search goes on from a lower point there.
+
+A penalty may be 10 000 times as steep on one side of a kink as the loss on the other side. The gentle slopes then tell
+whether the best point is a minimum, and long steps keep to their side.
 """
 
 import math
@@ -20,19 +23,28 @@ from torch_zerohess.search.state import Evaluated
 _BESIDE, _APART = 1e-4, ((1e-2, 1.0), (1.0, math.inf))
 """Distances over the tolerance up to which an evaluation is beside the best point, and between which it is apart; the
 second ones where there are none between the first ones."""
-_STEEP, _JUMP = 0.1, 100.0
-"""How steeply the loss rises beside a kink, over how steeply it rises apart from it, at least; and beside a jump."""
+_STEEP = 1e-2
+"""How steeply the loss rises beside a kink, over how steeply it rises apart from it, at least. Of all slopes there, a
+slope that is less steep than this share of the steepest one is gentle."""
+_BENT = 30.0
+"""How steeply the loss rises to the first corner, over how steeply it rises beside a kink in the same direction, at
+most; at least the inverse. Without a kink it is 100 times as steep, and 100 times less steep beside a jump."""
+_STRADDLED = 0.1
+"""Error of a slope that is not gentle, over its length, at most. Differences across a kink tell no slope."""
 _ROUNDING = 1e4 * torch.finfo(torch.float64).eps
 """Rise, relative to the loss, up to which it may be rounding."""
 _AROUND, _CLOSE = 1e-2, 1e-2
 """Distance over the tolerance of the points whose slopes are measured; that of the differences, over this distance."""
-_MOST = 4
+_MOST = 6
 """Slopes that are measured, over n + 1, at most."""
 _UNKNOWN = "the slopes around a kink do not tell whether it is a minimum"
 _ZERO = 1e-3
-"""Length of a vector in the hull that counts as zero, over the mean length of the slopes."""
-_LENGTHS = (0.3, 1.0, 3.0)
-"""Steps that are tried, over the distance of the points whose slopes are measured."""
+"""Length of a vector in the hull that counts as zero, over the length of the shortest slope."""
+_NEAR, _FAR = (0.3, 1.0, 3.0), (10.0, 100.0, 1e3, 1e4)
+"""Steps that are tried, over the distance of the points whose slopes are measured: against the shortest vector of the
+hull; and turned away from the steep side of the kink, which may be curved."""
+_TURNED = 0.3
+"""How far they are turned: share of their decrease that this costs, at most."""
 _WIDER = 2.0
 """Sigma with which the search goes on, over the length of the step that has found a lower point."""
 
@@ -54,18 +66,19 @@ class KinkedQuadratics(MetricQuadratics):
             return self.plan(after, generator)
         known = replace(known, evaluations=after.evaluations)
         simplex = evaluated.needed.those(slice(-n - 1, None))
-        complete = len(evaluated.needed) == n + 1 + (len(_LENGTHS) if len(sampled) >= n else 0)
+        complete = len(evaluated.needed) == n + 1 + (len(_NEAR + _FAR) if len(sampled) >= n else 0)
         if not bool(evaluated.finite.all()):  # it is a border
             return self._arrived(known, known.reason, generator)
         if not complete:
             return self._ended(replace(known, slopes=None), None, _UNKNOWN, generator)
         rises = simplex.losses[1:] - simplex.losses[0]
         slope = rises / (simplex.points[1:] - simplex.points[0]).diagonal()
-        slopes = torch.cat([sampled, slope[None]])
-        known = replace(known, slopes=slopes)
-        if float(slope.norm()) < _STEEP * _steepness(known, 0.0, self._beside):  # it is no kink
-            return self._arrived(known, known.reason, generator)
-        return self._measuring(known, generator)
+        if not len(sampled):
+            if not self._is_straight(known, simplex):
+                return self._arrived(known, known.reason, generator)
+        elif self._is_straddled(known, simplex, slope):
+            slope = sampled[-1]  # nothing new
+        return self._measuring(replace(known, slopes=torch.cat([sampled, slope[None]])), generator)
 
     def more(self, known: MetricProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         return points[:0] if known.slopes is not None else super().more(known, points, count, generator)
@@ -86,10 +99,24 @@ class KinkedQuadratics(MetricQuadratics):
         """Whether the loss rises as steeply next to the best point as farther away, and no bound is near."""
         x, settings, tolerance = known.lowest.point, self.settings, self.settings.tolerance
         room = float(torch.minimum(x - settings.lower, settings.upper - x).min())
-        if known.lowest.loss > known.best.loss or room <= max(_LENGTHS) * _AROUND * tolerance:
+        if known.lowest.loss > known.best.loss or room <= max(_NEAR) * _AROUND * tolerance:
             return False
-        apart = next(filter(None, (_steepness(known, a * tolerance, b * tolerance) for a, b in _APART)), 0.0)
-        return _JUMP * apart > _steepness(known, 0.0, self._beside) > _STEEP * apart > 0.0
+        apart = next(filter(None, (_steepest(known, a * tolerance, b * tolerance)[1] for a, b in _APART)), 0.0)
+        return _steepest(known, 0.0, self._beside)[1] > _STEEP * apart > 0.0
+
+    def _is_straddled(self, known: MetricProgress, simplex: Evaluated, slope: Tensor) -> bool:
+        """Whether a slope [n] does not lead back to the best loss: its corners are on two sides of a kink."""
+        away = simplex.points[0] - known.lowest.point
+        error = float(simplex.losses[0]) - known.lowest.loss - float(slope @ away)
+        steep = float(slope.norm()) > _STEEP * _steepest(known, 0.0, self._beside)[1]
+        return steep and abs(error) > _STRADDLED * float(slope.norm() * away.norm())
+
+    def _is_straight(self, known: MetricProgress, simplex: Evaluated) -> bool:
+        """Whether the loss rises as steeply to the first corner as next to the best point, in the same direction."""
+        rise = float(simplex.losses[0]) - known.lowest.loss
+        steepness = rise / float((simplex.points[0] - known.lowest.point).norm())
+        beside = _steepest(known, 0.0, self._beside)[1]
+        return beside / _BENT < steepness < _BENT * beside
 
     def _measuring(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Ask for steps against the shortest vector of the hull, and for a further slope; end where it is zero."""
@@ -98,19 +125,32 @@ class KinkedQuadratics(MetricQuadratics):
         steps = x[None][:0]
         if len(slopes) >= n:
             least = shortest(slopes)
-            if float(least.norm()) <= _ZERO * float(slopes.norm(dim=1).mean()):
+            if float(least.norm()) <= _ZERO * float(slopes.norm(dim=1).min()):
                 return self._arrived(known, known.reason, generator)
             if len(slopes) >= _MOST * (n + 1):
                 return self._ended(replace(known, slopes=None), None, _UNKNOWN, generator)
-            lengths = torch.tensor(_LENGTHS, dtype=x.dtype, device=x.device)
-            steps = x - distance * lengths[:, None] * torch.nn.functional.normalize(least, dim=0)
-        corner = x + distance / math.sqrt(n) * normal(generator, x, n)
+            steps = x - distance * _steps(least, slopes)
+        towards = normal(generator, x, n) / math.sqrt(n)
+        if not len(slopes):
+            towards = torch.nn.functional.normalize(_steepest(known, 0.0, self._beside)[0] - x, dim=0)
+        corner = x + distance * towards
         sides = corner + _CLOSE * distance * torch.eye(n, dtype=x.dtype, device=x.device)
         return replace(known, phase="slope"), self.settings.inside(torch.cat([steps, corner[None], sides]))
 
 
-def _steepness(known: MetricProgress, nearest: float, farthest: float) -> float:
-    """Return how steeply the loss rises from the best point to evaluations between two distances, at most; or 0."""
+def _steps(least: Tensor, slopes: Tensor) -> Tensor:
+    """Return steps [k, n] along the shortest vector [n] of the hull of slopes [m, n], in units of the distance."""
+    lengths = slopes.norm(dim=1)
+    along, across = (torch.nn.functional.normalize(one, dim=0) for one in (least, slopes[int(lengths.argmax())]))
+    aside = torch.nn.functional.normalize(along + _TURNED * float(least.norm() / lengths.min()) * across, dim=0)
+    near, far = (torch.tensor(one, dtype=least.dtype, device=least.device)[:, None] for one in (_NEAR, _FAR))
+    return torch.cat([near * along, far * aside])
+
+
+def _steepest(known: MetricProgress, nearest: float, farthest: float) -> tuple[Tensor, float]:
+    """Return to which of the evaluations between two distances the loss rises most steeply, and how steeply; or 0."""
     distance, rise = (known.points - known.lowest.point).norm(dim=1), known.values - known.lowest.loss
     told = (distance > nearest) & (distance <= farthest) & (rise > _ROUNDING * abs(known.lowest.loss))
-    return float((rise[told] / distance[told]).max()) if bool(told.any()) else 0.0
+    steepness = torch.where(told, rise / distance, 0.0)
+    k = int(steepness.argmax())
+    return known.points[k], float(steepness[k])

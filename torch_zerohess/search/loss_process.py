@@ -17,8 +17,9 @@ from torch import Tensor
 from torch_zerohess.search.axis_search import AxisLines, AxisSearch
 from torch_zerohess.search.gaussian_process_finish import PATIENCE, FinishedProcess, FinishedProgress
 from torch_zerohess.search.gaussian_process_method import APART, ROUND
+from torch_zerohess.search.kinked_descent import KinkedQuadratics
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.metric_descent import MetricProgress, MetricQuadratics
+from torch_zerohess.search.metric_descent import MetricProgress
 from torch_zerohess.search.random_points import uniform
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
@@ -67,11 +68,11 @@ class LossProcess(FinishedProcess[LossProgress]):
     """A process of the loss and quadratics in turn."""
 
     progress = LossProgress
-    local: MetricQuadratics
+    local: KinkedQuadratics
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        self.local = MetricQuadratics(replace(settings, restarts=0))
+        self.local = KinkedQuadratics(replace(settings, restarts=0))
         self._axes = AxisSearch(settings)
 
     def model_at_best(self, known: LossProgress) -> tuple[LocalModel, float] | None:
@@ -171,7 +172,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = self.told(known, now, evaluated)
         best = known.best
         plateau = now.wide is not None  # the process leaves it sooner
-        patient = known.waited < _PATIENCE * (self.settings.n + 1)
+        patient = now.slopes is not None or known.waited < _PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
         converged = now.done and not now.is_lost

@@ -23,6 +23,7 @@ from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.state import Evaluated, P, State, plain, restored_progress
 from torch_zerohess.search.told import as_evaluated, check_start, converted, joined
 from torch_zerohess.search.white_box import checked_loss
+from torch_zerohess.smoothing import random_seed
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.version import VERSION
 
@@ -67,7 +68,7 @@ class AskTell(ABC, Generic[P]):
         if not 0 <= checked_number("noise", noise) < math.inf:
             raise ValueError(f"noise must be finite and at least 0, got {noise}")
         checked_number("tolerance", tolerance, above=0.0, below=1.0)
-        seed = int(torch.randint(2**63 - 1, (), device="cpu")) if seed is None else checked_seed(seed)
+        seed = random_seed() if seed is None else checked_seed(seed)
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
         self._method = self._make(Settings(start, lower, upper, white_box, restarts, tolerance, float(noise), pool))

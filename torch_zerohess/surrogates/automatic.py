@@ -22,6 +22,8 @@ _HELD_OUT = 5
 """One point in so many is held out to compare the two."""
 _WIDE = 64
 """Elements of an output above which it is represented by coordinates."""
+_RANK = 128
+"""Coordinates of an output, at most; for an affine map of more parameters, whose outputs may have that rank, more."""
 _EXACT = 1e-6
 """Share of the change of held-out outputs that a sparse map may leave, where the map of least norm leaves less: the
 sparse one takes far less time, and images have larger rounding."""
@@ -33,12 +35,11 @@ class AutomaticSurrogate:
     """The surrogate of a `Memory` that was given none; a `Surrogate` itself.
 
     Args:
-        rank: coordinates of an output, at most.
         capacity: points that are used, the latest ones; at least 2.
     """
 
-    def __init__(self, *, rank: int = 128, capacity: int = 4000) -> None:
-        self.rank, self.capacity = checked_integer("rank", rank, 1), checked_integer("capacity", capacity, 2)
+    def __init__(self, *, capacity: int = 4000) -> None:
+        self.capacity = checked_integer("capacity", capacity, 2)
         self.space: LowRank | None = None
         """The coordinates of the latest fit; None where outputs have few elements."""
         self.model: Surrogate | None = None
@@ -46,10 +47,10 @@ class AutomaticSurrogate:
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
-        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        points, outputs = checked(points, outputs, self.capacity)
         if self._takes_sparse(points, outputs):
             return
-        space = LowRank.of(outputs, self._rank(points)) if outputs[0].numel() > _WIDE else None
+        space = LowRank.of(outputs, _rank(points)) if outputs[0].numel() > _WIDE else None
         known = outputs if space is None else space.encode(outputs)
         models = self._candidates(points)
         if len(models) > 1:
@@ -82,10 +83,6 @@ class AutomaticSurrogate:
         self.space, self.model = None, sparse
         return True
 
-    def _rank(self, points: Tensor) -> int:
-        """An affine map in n dimensions has outputs of rank n, which may be more than `rank`."""
-        return self.rank if points.shape[1] <= _PROCESS else max(self.rank, min(len(points), points.shape[1] + 1))
-
     def _candidates(self, points: Tensor) -> list[Surrogate]:
         linear = LinearSurrogate(capacity=self.capacity)
         if points.shape[1] > _PROCESS:
@@ -101,3 +98,8 @@ class AutomaticSurrogate:
         """Expected outputs [K, *out] at z [K, n], in the type of z, with derivatives in z."""
         known = self.coordinates(z)
         return known if self.space is None else self.space.decode(known).to(z.dtype)
+
+
+def _rank(points: Tensor) -> int:
+    """Return how many coordinates outputs at points [P, n] have at most: those of an affine map have rank n + 1."""
+    return _RANK if points.shape[1] <= _PROCESS else max(_RANK, min(len(points), points.shape[1] + 1))

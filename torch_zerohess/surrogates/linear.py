@@ -43,7 +43,7 @@ class LinearSurrogate:
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
-        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        points, outputs = checked(points, outputs, self.capacity)
         self._shape = outputs.shape[1:]
         z, y = points.double(), outputs.reshape(len(outputs), -1).double()
         self._middle, self._mean = z.mean(0), y.mean(0)

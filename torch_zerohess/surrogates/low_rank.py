@@ -86,7 +86,7 @@ class LowRankSurrogate:
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
-        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        points, outputs = checked(points, outputs, self.capacity)
         self._space = LowRank.of(outputs, self.rank)
         self.model.fit(points, self._space.encode(outputs))
 

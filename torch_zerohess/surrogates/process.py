@@ -50,7 +50,7 @@ class ProcessSurrogate:
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
-        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        points, outputs = checked(points, outputs, self.capacity)
         self._shape = outputs.shape[1:]
         z, y = points.double(), outputs.reshape(len(outputs), -1).double()
         spread = z.std(0)

@@ -50,7 +50,7 @@ class SparseSurrogate:
 
     def fit(self, points: Tensor, outputs: Tensor) -> None:
         """Fit to outputs [P, *out] at points [P, n], P >= 2; what was fitted before is forgotten."""
-        points, outputs = (one[-self.capacity :] for one in checked(points, outputs))
+        points, outputs = checked(points, outputs, self.capacity)
         shape, (P, n) = outputs.shape[1:], points.shape
         # Differences to the means have the digits that float32 would round away where the means are large.
         z, y = (one if one.dtype == torch.float64 else one.float() for one in (points, outputs.reshape(P, -1)))

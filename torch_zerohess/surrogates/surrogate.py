@@ -28,8 +28,8 @@ class Surrogate(Protocol):
         ...
 
 
-def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return points [P, n] and outputs [P, *out] as floating numbers without their graphs.
+def checked(points: Tensor, outputs: Tensor, capacity: int) -> tuple[Tensor, Tensor]:
+    """Return the latest points [P, n] and outputs [P, *out], up to `capacity`, as floating numbers without graphs.
 
     Raises ValueError if a shape is wrong, TypeError for complex numbers.
     """
@@ -37,7 +37,7 @@ def checked(points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
         raise ValueError(f"points must be [P, n] with P >= 2, got {list(points.shape)}")
     if outputs.ndim < 1 or len(outputs) != len(points):
         raise ValueError(f"outputs must be [{len(points)}, *out], one per point, got {list(outputs.shape)}")
-    return floating("points", points), floating("outputs", outputs)
+    return floating("points", points[-capacity:]), floating("outputs", outputs[-capacity:])
 
 
 def floating(name: str, numbers: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import nn
 
 import torch_zerohess as zh
 from torch_zerohess.autograd import sparse_layer
+from torch_zerohess.evaluators.inline import Inline
 
 SIDE, N = 12, 144
 SMOOTHING = zh.Smoothing(sigma=0.1, samples=64, seed=0)
@@ -54,6 +55,43 @@ def test_gradient_and_gauss_newton_product():
     dense = gradient_and_product(zh.BlackBox(blurred, SMOOTHING), v)
     assert relative(dense[0], slope) > 0.5
     assert relative(dense[1], product) > 5.0
+
+
+def test_points_one_at_a_time_where_the_evaluator_says():
+    class Counting:
+        calls = 0
+
+        def __call__(self, fn, points, *aux):
+            self.calls += 1
+            return Inline()(fn, points, *aux)
+
+    def one(z):
+        assert z.shape == (N,)
+        return blurred(z[None])[0]
+
+    whole, evaluator = zh.SparseBlackBox(blurred, SMOOTHING), Counting()
+    single = zh.SparseBlackBox(one, SMOOTHING, vectorized=False, evaluator=evaluator)
+    v = drawn(3, N, seed=2)
+    for found, expected in zip(*(gradient_and_product(layer, v) for layer in (single, whole)), strict=True):
+        torch.testing.assert_close(found, expected)
+    assert evaluator.calls == 4  # the values, and the samples around each of three points
+
+
+def test_samples_without_a_value():
+    v = drawn(3, N, seed=2)
+
+    def holes(z):
+        outputs = blurred(z).clone()
+        if len(z) > len(X):  # samples, not the points themselves
+            outputs[7] = math.nan
+        return outputs
+
+    with pytest.raises(ValueError, match="choose on_nonfinite"):
+        gradient_and_product(zh.SparseBlackBox(holes, SMOOTHING), v)
+    slope, _ = gradient_and_product(zh.SparseBlackBox(holes, SMOOTHING, on_nonfinite="drop"), v)
+    assert relative(slope, gradient_and_product(zh.SparseBlackBox(blurred, SMOOTHING), v)[0]) < 0.05
+    slope, _ = gradient_and_product(zh.SparseBlackBox(holes, SMOOTHING, on_nonfinite=1e3), v)
+    assert relative(slope, gradient_and_product(zh.SparseBlackBox(blurred, SMOOTHING), v)[0]) > 0.5
 
 
 def test_second_derivatives_of_first_ones_in_a_batch():

@@ -413,4 +413,4 @@ def test_a_head_that_changes_the_outputs_is_refused() -> None:
             head=lambda y, r: y.sub_(r).square().mean(1),
             memory=memory,
         )
-    assert len(memory) == 0
+    assert torch.equal(memory.outputs, parabolas(memory.points))  # as they were before the head

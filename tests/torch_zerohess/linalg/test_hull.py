@@ -16,6 +16,13 @@ def test_the_shortest_vector_of_a_hull_is_a_corner_a_point_of_a_side_or_zero() -
     assert float(shortest(torch.zeros(3, 2, dtype=torch.float64)).norm()) == 0.0
 
 
+def test_lengths_may_differ_by_ten_orders() -> None:
+    gentle, normal = torch.tensor([[1.0, 1.0], [1.0, 0.5]], dtype=torch.float64)
+    for ratio in (1e2, 1e6, 1e10):
+        found = shortest(torch.stack([gentle, gentle - ratio * normal, gentle + 0.1 * normal]))
+        assert torch.allclose(found, torch.tensor([-0.2, 0.4], dtype=torch.float64), rtol=1e-4)
+
+
 def test_it_makes_no_acute_angle_with_what_is_shorter_along_it() -> None:
     """The condition of optimality: v g >= |v|^2 for every vector g of the hull."""
     generator = torch.Generator().manual_seed(0)

@@ -39,6 +39,46 @@ def test_a_kink_may_be_a_minimum(n) -> None:
         assert fit.value < 1e-4
 
 
+def half_space(z: Tensor, weight: float) -> Tensor:
+    """The minimum 3 of the distance to (1, 2, 3) is where x1 + x2 + x3 = 3."""
+    return (z - torch.tensor([1.0, 2.0, 3.0]).double()).square().sum(1) + weight * (z.sum(1) - 3).clamp(min=0)
+
+
+def hyperbola(z: Tensor, weight: float) -> Tensor:
+    """The minimum 2 of x1 + x2 is where x1 x2 = 1."""
+    return z.sum(1) + weight * (1 - z[:, 0] * z[:, 1]).clamp(min=0)
+
+
+@pytest.mark.parametrize(
+    ("f", "weight", "bounds", "start", "least"),
+    [
+        (half_space, 1e2, None, [0.0] * 3, 3.0),
+        (half_space, 1e4, None, [0.0] * 3, 3.0),
+        (half_space, 1e2, (-5, 5), [0.0] * 3, 3.0),
+        (hyperbola, 1e2, None, [2.0] * 2, 2.0),
+        (hyperbola, 1e4, None, [2.0] * 2, 2.0),
+    ],
+)
+def test_along_a_penalty_the_loss_falls(f, weight, bounds, start, least) -> None:
+    """The slopes on its steep side are thousands of times as long as those on the other side."""
+    values = []
+    for seed in range(5):
+        settings = {"sigma": 0.5, "seed": seed, "restarts": 0, "max_evaluations": 600, "bounds": bounds}
+        fit = zh.minimize(lambda z: f(z, weight), torch.tensor(start).double(), **settings)
+        assert not fit.success or fit.value < least + 0.01
+        values.append(fit.value - least)
+    assert sorted(values)[2] < 0.03
+
+
+def test_a_penalty_may_have_its_minimum_at_the_kink() -> None:
+    for seed in range(3):
+        fit = zh.minimize(
+            lambda z: z.square().sum(1) + 100 * z[:, 0].clamp(min=0), [0.7, -0.6], sigma=0.5, restarts=0, seed=seed
+        )
+        assert fit.success
+        assert fit.value < 1e-9
+
+
 def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
     """The evaluations end while slopes are measured."""
     f, _ = kinked(18, 4)
@@ -63,6 +103,19 @@ def test_a_smooth_function_is_not_searched_for_kinks() -> None:
         while not search.done:
             search.tell(f(search.ask()))
             assert search._state.progress.slopes is None
+
+
+def test_one_slope_tells_a_narrow_smooth_valley_from_a_kink() -> None:
+    measured = 0
+    for seed in range(4):
+        search = Descent(torch.full((2,), -0.5).double(), sigma=0.5, seed=seed, restarts=0)
+        while not search.done:
+            search.tell((search.ask() - 0.3).square() @ torch.tensor([1.0, 1e6]).double())
+            slopes = search._state.progress.slopes
+            measured += slopes is not None
+            assert slopes is None or not len(slopes)
+        assert search.solved
+    assert measured
 
 
 def test_a_measurement_of_slopes_survives_in_a_state() -> None:

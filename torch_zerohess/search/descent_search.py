@@ -27,9 +27,9 @@ class Descent(AskTell[Any]):
       while. Where a step was predicted well (up to 40 parameters, no noise), Gauss-Newton by interpolation goes on in a
       trust region, until its steps fail.
       With one or two parameters Gauss-Newton comes first, and after it the loss alone is modelled.
-    - The smoothed loss is modelled in three cases: on a plateau, with the loss alone and more than 200 parameters (in
-      noise 40), and with an output in noise. On a plateau sigma grows. New samples around x are asked for where the
-      model has predicted badly.
+    - The smoothed loss is modelled in three cases: on a plateau of a loss alone, with the loss alone and more than 200
+      parameters (in noise 40), and with an output in noise of one or two parameters. On a plateau sigma grows. New
+      samples around x are asked for where the model has predicted badly.
 
     Where a loss alone is not finite, a plane between evaluations with and without a value bounds the step, so that the
     search follows the border of the region that fails. Up to 100 steps in a row may fail there.
@@ -47,10 +47,11 @@ class Descent(AskTell[Any]):
     within their errors and the quadratic takes no more evaluations. The search then starts again, up to `restarts`
     times: from a random point, or in turn from a random point and around the best one with more samples per iteration.
 
-    It has the settings of `AskTell`. With an output and with more than 40 parameters, decreases below twice the `noise`
-    do not count. By default the pool keeps max(60, 6 n) evaluations of an output. Of a loss alone it keeps three
-    times as many as the quadratic is fitted to, and at least 200; in noise twice as many; with more than 200
-    parameters (in noise 40) max(500, 6 n).
+    It has the settings of `AskTell`. With an output of one or two parameters, and with the loss alone and more than 40
+    parameters, decreases below twice the `noise` do not count. With an output of more parameters `noise` only says
+    whether there is noise. By default the pool keeps max(60, 6 n) evaluations of an output. Of a loss alone it
+    keeps three times as many as the quadratic is fitted to, and at least 200; in noise twice as many; with more than
+    200 parameters (in noise 40) max(500, 6 n).
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
     order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation; Burke, Lewis and Overton (2005) for

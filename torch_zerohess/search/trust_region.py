@@ -29,10 +29,10 @@ class TrustRegion(AskTell[Any]):
     """A search that counts evaluations: `GaussianProcessSearch`, `Descent` or `LocalGaussNewton`. The caller evaluates.
 
     - Up to four parameters in a finite box: a Gaussian process, which escapes plateaus and local minima.
-    - 5 to 19 parameters in a finite box, an output and a `loss`, and `restarts`: descent and the Gaussian process in
-      turn. Descent begins, and stays where its Gauss-Newton makes good steps. Elsewhere the process has its turn when
-      n + 1 evaluations of the descent take away less than a fifth of the loss. The descent has its turn again when
-      8 (n + 1) evaluations of the process take away less than a tenth.
+    - 5 to 19 parameters in a finite box, an output and a `loss`, `restarts`, and no `noise`: descent and the Gaussian
+      process in turn. Descent begins, and stays where its Gauss-Newton makes good steps. Elsewhere the process has its
+      turn when n + 1 evaluations of the descent take away less than a fifth of the loss. The descent has its turn again
+      when 8 (n + 1) evaluations of the process take away less than a tenth.
     - 20 parameters or more, an output of many numbers and a `loss`: the evaluations tell whether these numbers depend
       on few parameters each. If they do: Gauss-Newton on a sparse Jacobian. The search asks this after its first batch
       and, where the answer is not clear, each time that its evaluations have doubled.

@@ -52,7 +52,7 @@ class TrustRegion(AskTell[Any]):
         tolerance: length, in units of the first sigma, below which the search has arrived; 0.01 if None, for the
             engine "local" 0.0005.
         noise: standard deviation of repeated losses at one point, if it is known.
-        pool: evaluations kept; a default by the number of parameters if None.
+        pool: evaluations kept; a default by the number of parameters if None. Not for the engine "local".
         grid: rows and columns in which the parameters lie, for the engine "local": see `LocalGaussNewton`.
         seed: of the samples; from torch's global generator if None.
 
@@ -122,6 +122,8 @@ class TrustRegion(AskTell[Any]):
     def _make(self, settings: Settings) -> Method[Any]:
         if self._grid is not None and self._wanted in ("descent", "gaussian_process"):
             raise ValueError(f"grid is for the engines 'local' and 'auto', got {self._grid} with {self._wanted!r}")
+        if settings.pool is not None and self._wanted == "local":
+            raise ValueError(f"pool is for the other engines, got {settings.pool} with 'local'")
         engine, self._reason = _chosen(settings) if self._wanted == "auto" else (self._wanted, "the caller chose it")
         if engine == "gaussian_process":
             return process_method(settings)

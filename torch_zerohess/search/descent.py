@@ -143,15 +143,9 @@ class LocalQuadratics(Method[DescentProgress]):
             drawn = (evaluated.points[0], _BESIDE * known.sigma) if trial else (known.center, known.sigma)
             pool = pool.add(more.points, more.losses, more.outputs, *drawn)
         lowest = known.lowest.or_lower(new, known.sigma)
-        return replace(
-            known,
-            pool=pool.latest(self.capacity, None if self.settings.noise else lowest.point),
-            best=known.best.or_lower(new, known.sigma),
-            lowest=lowest,
-            shape=evaluated.shape,
-            evaluations=known.evaluations + len(evaluated),
-            lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,
-        )
+        pool = pool.latest(self.capacity, None if self.settings.noise else lowest.point)
+        known = known.told(evaluated, lost=evaluated.lacking)
+        return replace(known, pool=pool, best=known.best.or_lower(new, known.sigma), lowest=lowest)
 
     def _judged(self, known: DescentProgress, evaluated: Evaluated, loss: float) -> DescentProgress:
         """Decide by the end of a step what to do next."""

@@ -71,12 +71,9 @@ class ProcessMethod(Method[Q]):
         """Return the progress after an evaluation."""
         finite, trial = evaluated.finite, known.phase == "trial"
         known = replace(
-            known,
+            known.told(evaluated, lost=evaluated.lacking),
             room=max(known.room, _BATCHES * len(evaluated) if evaluated.extra else 0),
-            shape=evaluated.shape,
-            evaluations=known.evaluations + len(evaluated),
             iterations=known.iterations + trial,
-            lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,
         )
         before = known.best.point
         if known.lost >= LOST:

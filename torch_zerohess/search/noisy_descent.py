@@ -196,13 +196,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         points = torch.cat([known.points, new.points])
         values = torch.cat([known.values, new.losses.clamp(-_LARGEST, _LARGEST)])
         which = latest(points, known.center, self._capacity)
-        return replace(
-            known,
-            points=points[which],
-            values=values[which],
-            evaluations=known.evaluations + len(evaluated),
-            lost=0 if len(new) else known.lost + 1,
-        )
+        return replace(known.told(evaluated, lost=not len(new)), points=points[which], values=values[which])
 
     def _stepped(self, known: NoisyProgress) -> NoisyProgress:
         """Fit a quadratic, judge the last step, learn the metric, and move the center."""

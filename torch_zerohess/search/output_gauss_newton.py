@@ -75,18 +75,14 @@ class OutputProgress(RegionProgress):
     def remembered(self, evaluated: Evaluated, capacity: int) -> "OutputProgress":
         """Add evaluations whose values are finite."""
         new = evaluated.those(evaluated.finite)
-        known = super().remembered(new, capacity)
-        outputs = self.outputs
+        known, outputs = super().remembered(new, capacity), self.outputs
+        known = known.taking(self.told(evaluated, lost=evaluated.lacking), "evaluations", "lost", "shape")
         if new.outputs is not None and len(new):
             outputs = torch.cat([outputs, new.outputs]) if len(outputs) else new.outputs
-        lost = 0 if bool(evaluated.needed.finite.all()) else self.lost + 1
         return replace(
             known,
             outputs=outputs[latest(torch.cat([self.points, new.points]), known.lowest.point, capacity)],
-            shape=evaluated.shape,
-            evaluations=self.evaluations + len(evaluated),
-            lost=lost,
-            failed=lost >= _HOLES,
+            failed=known.lost >= _HOLES,
         )
 
 

@@ -74,6 +74,11 @@ class Progress:
         """Return this progress with fields of another one: those of the names, or all that every search has."""
         return replace(self, **{name: getattr(other, name) for name in names or _COMMON})
 
+    def told(self: "P", evaluated: "Evaluated", *, lost: bool) -> "P":
+        """Count a batch, which is lost or not, and note the shape of its outputs."""
+        evaluations, lost_in_a_row = self.evaluations + len(evaluated), self.lost + 1 if lost else 0
+        return replace(self, evaluations=evaluations, lost=lost_in_a_row, shape=evaluated.shape)
+
     def is_at_arrival(self, tolerance: float) -> bool:
         """Whether the best point is one at which the search has arrived; tolerance: see `are_same`."""
         end = self.arrived
@@ -170,6 +175,11 @@ class Evaluated:
         """Which of the points have finite values [K]."""
         finite = torch.isfinite(self.losses)
         return finite if self.outputs is None else finite & torch.isfinite(self.outputs).all(1)
+
+    @property
+    def lacking(self) -> bool:
+        """Whether a point that the method itself asked for has no finite value."""
+        return not bool(self.needed.finite.all())
 
     @property
     def usable(self) -> Tensor:

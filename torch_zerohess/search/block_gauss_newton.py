@@ -126,8 +126,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         size = _largest(known.jacobian)
         jacobian = known.jacobian / size  # squares of float32 do not overflow
         directions = jacobian.view(-1, *known.shape)
-        assert self.settings.loss is not None
-        loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
+        loss = loss_curvature(self.settings.white_box, known.output.view(known.shape))
         _, unit = scaled(loss.product(alternating(loss.slope)))  # a second derivative may be beyond float32
         slope, bend = loss.slope.flatten(), loss.products(directions, unit)
         steep, bent = _largest(slope), _largest(bend)

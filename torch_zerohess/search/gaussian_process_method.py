@@ -235,8 +235,7 @@ class ProcessMethod(Method[Q]):
     def _through_output(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
         known, process, output = self._predicted(known)
-        loss, at = self.settings.loss, torch.full_like(known.center, math.inf)
-        assert loss is not None
+        loss, at = self.settings.white_box, torch.full_like(known.center, math.inf)
         for _ in range(_EXPANSIONS):
             model = self._expanded(known, process, output)
             x = self._lowest(known, model, generator)
@@ -252,8 +251,7 @@ class ProcessMethod(Method[Q]):
 
     def _predicted(self, known: Q) -> tuple[Q, GaussianProcess, Tensor]:
         """Return the process of the output, and the output [m] with the lowest loss."""
-        loss, pool = self.settings.loss, known.pool
-        assert loss is not None
+        loss, pool = self.settings.white_box, known.pool
         assert pool.outputs is not None
         known, process = self._fitted(known, pool.outputs)
         outputs, values = pool.outputs, pool.values
@@ -266,9 +264,8 @@ class ProcessMethod(Method[Q]):
 
     def _expanded(self, known: Q, process: GaussianProcess, output: Tensor) -> LossModel:
         """Return the model of the loss that is expanded at an output [m]."""
-        assert self.settings.loss is not None
         optimism = _EXPLORING if known.exploring else _OPTIMISM
-        return LossModel(process, output, self.settings.loss, known.shape, optimism)
+        return LossModel(process, output, self.settings.white_box, known.shape, optimism)
 
     def _of_losses(self, known: Q) -> tuple[Q, LossModel]:
         values = known.pool.values

@@ -191,9 +191,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
         if last is not None and last[0] is known and torch.equal(last[1], radii):
             return last[2]
         assert known.jacobian is not None
-        assert settings.loss is not None
         box = settings.lower - known.center, settings.upper - known.center
-        found = local_steps(settings.loss, known.output.view(known.shape), known.jacobian, radii, *box)
+        found = local_steps(settings.white_box, known.output.view(known.shape), known.jacobian, radii, *box)
         self._last = known, radii, found
         return found
 
@@ -316,5 +315,4 @@ class LocalMethod(GaussNewton[LocalProgress]):
     def _derivatives(self, known: LocalProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
         assert known.jacobian is not None
-        assert self.settings.loss is not None
-        return derivatives(loss_curvature(self.settings.loss, known.output.view(known.shape)), known.jacobian)
+        return derivatives(loss_curvature(self.settings.white_box, known.output.view(known.shape)), known.jacobian)

@@ -41,6 +41,12 @@ class Settings:
         return len(self.start)
 
     @property
+    def white_box(self) -> Callable[[Tensor], Tensor]:
+        """The loss, for a search that has one."""
+        assert self.loss is not None
+        return self.loss
+
+    @property
     def bounded(self) -> bool:
         """Whether every bound is finite."""
         return bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())

@@ -24,9 +24,8 @@ _ITERATIONS = 100
 
 def step_in_noise(known: LocalProgress, settings: Settings) -> Tensor:
     """Return the step from the center to the minimum of the model within the radius [n]."""
-    jacobian, x, loss = known.jacobian, known.center, settings.loss
+    jacobian, x, loss = known.jacobian, known.center, settings.white_box
     assert jacobian is not None
-    assert loss is not None
     output, radii = known.output.view(known.shape), x.new_tensor([known.radius * math.sqrt(settings.n)])
     lower, upper = settings.lower - x, settings.upper - x
     kinked = local_steps(loss, output, jacobian, radii, lower, upper)

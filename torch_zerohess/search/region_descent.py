@@ -95,10 +95,14 @@ class RegionDescent(Method[R]):
 
     def _step(self, known: R) -> tuple[Tensor, float]:
         """Return the step [n] to the minimum of the quadratic within the region, and the decrease that it promises."""
-        x, settings = known.lowest.point, self.settings
-        root, lower, upper = known.sigma * known.root, settings.lower - x, settings.upper - x
-        s = region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
+        s = self._minimum(known)
         return s, -known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
+
+    def _minimum(self, known: R, factor: float = 1.0) -> Tensor:
+        """Return the step [n] to the minimum of the quadratic within the region, or within one larger by a factor."""
+        x, settings = known.lowest.point, self.settings
+        root, lower, upper = factor * known.sigma * known.root, settings.lower - x, settings.upper - x
+        return region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
 
     # The search.
 
@@ -156,8 +160,7 @@ class RegionDescent(Method[R]):
         """Return ends of shorter and longer steps, then points of the region around the end of the step."""
         trial, x, ends = known.phase == "trial", known.lowest.point, points[:1]
         for factor in _OTHER_LENGTHS[: (count + 1) // 2] if trial else ():
-            root, lower, upper = factor * known.sigma * known.root, self.settings.lower - x, self.settings.upper - x
-            step = region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
+            step = self._minimum(known, factor)
             if float((ends - x - step).norm(dim=1).min()) > _STILL * known.sigma:
                 ends = torch.cat([ends, (x + step)[None]])
         steps = normal(generator, x, count + 1 - len(ends), self._n) @ (known.sigma / math.sqrt(self._n) * known.root)

@@ -33,7 +33,7 @@ APART = 0.05
 _OPTIMISM = 0.3
 """Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
 _EXPLORING = 2.0
-"""The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
+"""`_OPTIMISM` in the steps after an arrival, and in all steps where the loss itself is predicted."""
 _BESIDE, _EVERY = 0.5, 4
 """Spread of points around the end of a step, over the distance of the nearest evaluation. One in so many lies there."""
 _SETTLED = 3

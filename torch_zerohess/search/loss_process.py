@@ -24,17 +24,17 @@ from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
 _NEAR = 0.1
-"""Steps of the process below this length, in units of the first sigma sqrt(n),"""
+"""Length below which a step of the process is short, in units of the first sigma sqrt(n)."""
 _STEPS = 2
-"""this many in a row, have found a basin."""
+"""Short steps in a row that have found a basin."""
 _FORETOLD = 0.1
-"""Or one step whose end a quadratic has predicted, with at most this error relative to the change of the loss."""
+"""Error of a predicted loss, over the change of the loss, up to which one step has found a basin."""
 _WIDTH = 0.3
 """First sigma of the quadratics."""
 _HOPS = (0.5, 2.0)
-"""Shortest and longest standard deviation of a hop from the best point, in units of the first sigma,"""
+"""Shortest and longest standard deviation of a hop from the best point, in units of the first sigma."""
 _HOP_WIDTH = 0.3
-"""and first sigma of the quadratics that begin there, over this deviation."""
+"""First sigma of the quadratics that begin after a hop, over the standard deviation of the hop."""
 _PATIENCE = 5
 """Evaluations over n + 1 in which the quadratics must find something better: a curved valley refuses several steps."""
 

@@ -29,7 +29,7 @@ MOST = 40
 _FITTED = 3
 """Evaluations per coefficient that a quadratic is fitted to, at least."""
 _MORE, _ENOUGH = 60, 3000
-"""Evaluations in the region that it is fitted to, at most: per coefficient, and in all."""
+"""Evaluations in the region that a quadratic is fitted to, at most: per coefficient, and in all."""
 _LARGEST = 1e100
 """Magnitude at which values and the noise are cut: squares of larger numbers would be infinite."""
 _PROPORTION = 1e3

@@ -28,7 +28,7 @@ _PATIENCE = 2
 _WORTH = 0.1
 """Part of the loss that the first step of Gauss-Newton must promise to take away."""
 _WORTH_EARLY = 0.3
-"""The same right after the first samples. Where outputs have nothing in common, as images of objects that do not
+"""`_WORTH` right after the first samples. Where outputs have nothing in common, as images of objects that do not
 overlap, an affine output promises to fade the object out: up to a quarter."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""

@@ -35,7 +35,8 @@ _OTHER_LENGTHS = (2.0, 0.5, 4.0, 0.25)
 _STILL, _CLOSING = 1e-3, 0.3
 """Length of a step that is not worth an evaluation, and the factor for sigma after it."""
 _LEAPING, _CONFIRMED = 1e-3, 0.1
-"""The same where a point of the region was as predicted, within this part of its difference from the best point."""
+"""Factor for sigma after a step that is not worth an evaluation, where the loss at a point of the region was predicted;
+error of such a prediction, over the change of the loss from the best point, at most."""
 _CLOSE, NEAR = 1.5, 2.0
 """Distance within which n + 1 evaluations allow sigma to shrink after a rejected step, and after one of no length."""
 _ROUNDING = 4 * torch.finfo(torch.float64).eps

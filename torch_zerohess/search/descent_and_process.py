@@ -28,7 +28,7 @@ _SLOW = 0.2
 """Part of the lowest loss that n + 1 evaluations of a descent that follows must take away."""
 _STUCK, _PATIENCE = 0.1, 8
 """Part of the lowest loss that evaluations of the process must take away, and their number over n + 1."""
-_SHARED = "best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart"
+_SHARED = "best", "evaluations", "iterations", "arrivals"
 """What the descent learns about a turn of the process."""
 
 

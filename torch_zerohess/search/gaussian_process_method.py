@@ -181,7 +181,7 @@ class ProcessMethod(Method[Q]):
 
     def arrived(self, known: Q, reason: str, end: Best | None = None) -> Q:
         """End, or explore, after an arrival at the best point, or at `end`."""
-        known = replace(known, settled=0, exploring=ROUND * self.settings.n).agreeing(self.settings.tolerance, end)
+        known = replace(known, settled=0, exploring=ROUND * self.settings.n).arriving_here(self.settings.tolerance, end)
         return known.ended_round(reason, self.settings.restarts)
 
     def _settled(self, known: Q) -> Q:

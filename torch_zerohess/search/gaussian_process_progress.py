@@ -7,7 +7,7 @@ from typing import Literal, TypeVar
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.state import Best, Progress, agreeing, arriving
+from torch_zerohess.search.state import Best, Progress
 from torch_zerohess.surrogates.pool import Pool
 
 _LOOKING = 10
@@ -49,7 +49,7 @@ class ProcessProgress(Progress):
     counted: int = 0
     """Evaluations at the latest arrival that has counted as a round of those that agree."""
 
-    def agreeing(self: Q, tolerance: float, end: Best | None = None) -> Q:
+    def arriving_here(self: Q, tolerance: float, end: Best | None = None) -> Q:
         """Count an arrival at the best point, or at `end`.
 
         It agrees with earlier arrivals if the search has since evaluated elsewhere as often as it had evaluated until
@@ -57,10 +57,10 @@ class ProcessProgress(Progress):
         """
         found = self.is_minimum(tolerance)
         if found or (self.noisy and not self.pool.ties(self.best.point, self.best.loss, tolerance)):
-            self = arriving(self, self.best)
+            self = self.arriving(self.best)
         if not found:  # a plateau, or no minimum of the quadratics
             return self
-        known = agreeing(self, end or self.best, tolerance, self.pool.values)
+        known = self.agreeing(end or self.best, tolerance, self.pool.values)
         if known.agreed > 1 and not self.has_looked:
             return self
         return replace(known, counted=self.evaluations)

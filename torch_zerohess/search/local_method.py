@@ -31,7 +31,7 @@ from torch_zerohess.search.local_progress import LocalProgress, in_range
 from torch_zerohess.search.local_steps import LocalSteps, derivatives, local_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal
-from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_choices import fit_chosen
@@ -64,7 +64,7 @@ _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
 _SHARED = (
-    *("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost", "evidence", "grid"),
+    *("best", "evaluations", "iterations", "arrivals", "lost", "evidence", "grid"),
     *("points", "outputs", "variance", "pairs"),
 )
 """What a search that returns from a hop keeps."""
@@ -234,7 +234,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         if not (known.predicts and self._is_minimum(known)):
             return super().arrived(known)
         end = Best(known.center, known.loss, known.sigma)
-        known = super().arrived(agreeing(arriving(known, end), end, self.settings.tolerance))
+        known = super().arrived(known.arriving(end).agreeing(end, self.settings.tolerance))
         return known if known.done else self._hopping(replace(known, finished=True))
 
     def _is_minimum(self, known: LocalProgress) -> bool:
@@ -278,7 +278,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         if not home.finished:
             return known
         end = Best(known.center, known.loss, known.sigma)
-        known = agreeing(known, end, self.settings.tolerance) if same else replace(known, agreed=0)
+        known = known.agreeing(end, self.settings.tolerance) if same else known.with_arrivals(agreed=0)
         known = super().arrived(known)
         return known if known.done else self._hopping(known)
 

@@ -186,7 +186,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = self.arrived(known, "quadratics have arrived or found nothing better for a while", end)
         known = replace(known, several=known.several or (end is not None and known.agreed == 0))
         if known.beside or (elsewhere and not converged):
-            return replace(known, agreed=0), points
+            return known.with_arrivals(agreed=0), points
         return known, points
 
 

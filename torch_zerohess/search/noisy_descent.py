@@ -19,7 +19,7 @@ from torch import Tensor
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import further_start, normal
-from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, arriving, not_finite
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, not_finite
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.pool import latest
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
@@ -181,12 +181,12 @@ class NoisyQuadratics(Method[NoisyProgress]):
     ) -> tuple[NoisyProgress, Tensor]:
         """End, or start another round at a random point."""
         settings = self.settings
-        known = arriving(known, known.best).ended_round(reason, 0 if last else settings.restarts)
+        known = known.arriving(known.best).ended_round(reason, 0 if last else settings.restarts)
         if known.done:
             return known, known.points[:0]
         center = further_start(generator, known.first, settings.lower, settings.upper)
         fresh = self._begun(center, known.best)
-        return self._started(fresh.taking(known, "first", "evaluations", "iterations", "rounds", "arrived"), generator)
+        return self._started(fresh.taking(known, "first", "evaluations", "iterations", "arrivals"), generator)
 
     # An iteration.
 

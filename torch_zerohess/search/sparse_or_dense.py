@@ -148,7 +148,8 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         self, known: SparseOrDenseProgress, start: LocalProgress, reason: str, generator: torch.Generator
     ) -> tuple[SparseOrDenseProgress, Tensor]:
         """Go on by the sparse Jacobian."""
-        local, points = self.local.asked(start.taking(known, "iterations", "rounds"), generator)
+        begun = start.taking(known, "iterations").with_arrivals(rounds=known.rounds)
+        local, points = self.local.asked(begun, generator)
         known = replace(known, chosen="local", reason=reason, descent=None, local=local).taking(local)
         assert start.jacobian is not None
         return self._decided(known, final=start.jacobian.explained > _MOST), points

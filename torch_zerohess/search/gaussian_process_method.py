@@ -147,9 +147,7 @@ class ProcessMethod(Method[Q]):
             "center": start,
             "pool": Pool.empty(len(start), start.device),
             "expands": self.settings.loss is not None,
-            "expanded": torch.full_like(start, math.inf),
             "holes": start[None][:0],
-            "solved": torch.full_like(start, math.inf),
         }
 
     def tells_noise(self, known: Q) -> bool:
@@ -228,14 +226,14 @@ class ProcessMethod(Method[Q]):
         if not known.expands:
             return self._of_losses(known)[1]
         _, process, output = self._predicted(known)
-        if bool(torch.isfinite(known.expanded).all()):
+        if known.expanded is not None:
             output = process.predict(known.expanded[None])[0]
         return self._expanded(known, process, output)
 
     def _through_output(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
         known, process, output = self._predicted(known)
-        loss, at = self.settings.white_box, torch.full_like(known.center, math.inf)
+        loss, at = self.settings.white_box, None
         for _ in range(_EXPANSIONS):
             model = self._expanded(known, process, output)
             x = self._lowest(known, model, generator)

@@ -128,7 +128,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         if self._axes.may_begin(known.lines, several=known.several):
             lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values)
             return replace(known, lines=lines, steps=0), points
-        if bool(known.finished.isfinite().all()) and known.agreed == 0 and not known.beside:
+        if known.finished is not None and known.agreed == 0 and not known.beside:
             return _finishing(known, *self._hop(known, generator), beside=True)
         return self._elsewhere(known, generator)
 
@@ -176,8 +176,7 @@ class LossProcess(FinishedProcess[LossProgress]):
             return known, points
         converged = now.done and not now.is_lost
         if best is now.best:
-            solved = best.point if converged else torch.full_like(best.point, math.inf)
-            known = replace(known, finished=best.point, solved=solved)
+            known = replace(known, finished=best.point, solved=best.point if converged else None)
         known = replace(known, finishing=False, waited=0)
         if plateau or (best is not now.best and not converged):  # they have found no minimum
             return replace(known, settled=0, exploring=ROUND * self.settings.n), points

@@ -109,12 +109,12 @@ class ProcessMethod(Method[Q]):
         lower, upper = self.settings.lower, self.settings.upper
         near = count // _EVERY
         if known.phase == "start" or len(known.pool) < 2:
-            around = self._drawn(known.center, 1.0, near, generator)
+            around = self.settings.drawn(known.center, 1.0, near, generator)
             return torch.cat([around, farthest(torch.cat([points, around]), count - near, lower, upper, generator)])
         model = self._model(known)
         reach = _BESIDE * float((known.pool.points - points[0]).norm(dim=1).min()) / math.sqrt(self.settings.n)
         near = near if 0.0 < reach < math.inf else 0
-        every = [*points, *self._drawn(points[0], reach, near, generator)]
+        every = [*points, *self.settings.drawn(points[0], reach, near, generator)]
         for one in every[:-1]:
             model = model.pending(one)
         while len(every) < len(points) + count:
@@ -201,11 +201,6 @@ class ProcessMethod(Method[Q]):
         """Draw n orthogonal steps of length sqrt(n), mirrored into the box."""
         n = len(x)
         return self.settings.inside(x + math.sqrt(n) * orthonormal(normal(generator, x, n, n)).mT)
-
-    def _drawn(self, x: Tensor, sigma: float, count: int, generator: torch.Generator) -> Tensor:
-        """Draw points [count, n] from N(x, sigma^2), mirrored into the box."""
-        steps = sigma * normal(generator, x, count, len(x))
-        return self.settings.inside(x + steps)
 
     def _length(self, step: Tensor) -> float:
         """Length of a step [n] in units of the first sigma sqrt(n)."""

@@ -144,9 +144,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
             assert known.evidence is not None
             step = _HOP * known.evidence.found * normal(generator, known.center, self.settings.n)
             known = replace(known, center=self.settings.inside(known.center + step))
-        points = self.settings.inside(
-            known.center + known.sigma * normal(generator, known.center, known.samples, self.settings.n)
-        )
+        points = self.settings.drawn(known.center, known.sigma, known.samples, generator)
         return known, torch.cat([known.center[None], points]) if hops else points
 
     def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:

@@ -159,7 +159,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         """Let quadratics begin beside the best point."""
         shortest, longest = _HOPS
         hop = shortest * (longest / shortest) ** float(torch.rand((), generator=generator, device="cpu"))
-        (center,) = self._drawn(known.best.point, hop, 1, generator)
+        (center,) = self.settings.drawn(known.best.point, hop, 1, generator)
         return self.local.begin(center, _HOP_WIDTH * hop, generator)
 
     def after_local(

@@ -22,7 +22,7 @@ from torch_zerohess.search.axis_search import AxisLines
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.random_points import further_start, normal
+from torch_zerohess.search.random_points import further_start
 from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import Best, Evaluated, are_same
@@ -149,8 +149,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Ask for another point along every axis, twice as far if the first one was better, else on the other side."""
         if not len(known.values):
-            start = known.center + known.sigma * normal(generator, known.center, 1, self._n)
-            return known, self.settings.inside(start)
+            return known, self.settings.drawn(known.center, known.sigma, 1, generator)
         losses = evaluated.losses
         if len(losses) > 1 and int((losses[1:] == losses[0]).sum()) > len(losses[1:]) // 2:
             return self._on_plateau(known, generator)

@@ -24,7 +24,6 @@ from torch_zerohess.search.local_method import LocalMethod, LocalSettings
 from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_step import alternating, constants, step_in_noise
-from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.sparse_choices import kept
@@ -76,8 +75,8 @@ class NoisyLocalMethod(LocalMethod):
             after, points = super().samples(known, generator)
             return after, torch.cat([known.center[None], points]) if len(known.output) else points
         count = max(known.samples, len(known.points) // _GROWTH)
-        u = normal(generator, known.center, count, self.settings.n)
-        return known, torch.cat([known.center.expand(2, -1), self.settings.inside(known.center + known.sigma * u)])
+        points = self.settings.drawn(known.center, known.sigma, count, generator)
+        return known, torch.cat([known.center.expand(2, -1), points])
 
     def next(
         self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator

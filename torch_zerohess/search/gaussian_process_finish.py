@@ -59,7 +59,7 @@ class FinishedProcess(ProcessMethod[F]):
         """Let the local search learn, and return its next points if it is still its turn."""
 
     def first(self, generator: torch.Generator) -> tuple[F, Tensor]:
-        return self.points(self.progress(**self.begun()), generator)
+        return self.points(self.begun(), generator)
 
     def next(self, known: F, evaluated: Evaluated, generator: torch.Generator) -> tuple[F, Tensor]:
         after = self.after_local if known.finishing else self.after_process

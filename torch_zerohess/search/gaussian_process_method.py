@@ -11,7 +11,7 @@ In noise the best point is the one whose *predicted* output has the lowest loss.
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -138,17 +138,11 @@ class ProcessMethod(Method[Q]):
             sigma *= _WIDENING
         return None
 
-    def begun(self) -> dict[str, Any]:
-        """Return the fields of a progress before anything was evaluated."""
-        start = self.settings.start
-        return {
-            "best": Best(start),
-            "record": Best(start),
-            "center": start,
-            "pool": Pool.empty(len(start), start.device),
-            "expands": self.settings.loss is not None,
-            "holes": start[None][:0],
-        }
+    def begun(self) -> Q:
+        """Return the progress before anything was evaluated."""
+        start, expands = self.settings.start, self.settings.loss is not None
+        best, pool = Best(start), Pool.empty(len(start), start.device)
+        return self.progress(best=best, record=best, center=start, pool=pool, expands=expands, holes=start[None][:0])
 
     def tells_noise(self, known: Q) -> bool:
         """Whether noise is declared, or there are enough outputs to tell noise from fast variation."""

@@ -72,7 +72,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         self, other: Progress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[OutputProcessProgress, Tensor]:
         """Begin with evaluations of another search; return the next points, too."""
-        known = self.progress(**self.begun(), phase="trial").taking(other)
+        known = replace(self.begun(), phase="trial").taking(other)
         return self.points(self.remembered(known, evaluated), generator)
 
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:

@@ -114,12 +114,12 @@ def minimize(
             search has come to an end by those in the file. A file that cannot be written later on, or that another
             process writes, too, is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. 0 ends it there: give it for a function
-            that has only one minimum. At a kink of a loss alone, as of a penalty, the search first looks for a direction in
-            which the loss falls. It may miss one, and with `ftol` or beside a bound it does not look: give the output
-            and `loss=` where you can. If None, until max_evaluations are used up, or three rounds in a row have arrived
-            at the same point, or at points with the same loss. Two are enough where the loss has fallen to zero, but
-            for rounding, and no loss was negative. A later round counts as arrived as soon as the quadratic at a known
-            minimum predicts its losses.
+            that has only one minimum. At a kink of a loss alone, as of a penalty, the search first looks for a
+            direction in which the loss falls. It may miss one, and with `ftol` or beside a bound it does not look: give
+            the output and `loss=` where you can. If None, until max_evaluations are used up, or three rounds in a row
+            have arrived at the same point, or at points with the same loss. Two are enough where the loss has fallen to
+            zero, but for rounding, and no loss was negative. A later round counts as arrived as soon as the quadratic
+            at a known minimum predicts its losses.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
             evaluations, and six more if the two differ. For that, a `batch` that takes all evaluations is made shorter;
             the message says so where they are too few to measure it. Where losses are counts, which may be equal by

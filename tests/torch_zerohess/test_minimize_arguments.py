@@ -161,6 +161,11 @@ def test_a_grid_is_refused_where_no_engine_uses_it(engine):
         zh.minimize(tilted, zeros(2), sigma=1.0, bounds=(-1, 1), engine=engine, grid=(1, 2))
 
 
+def test_a_pool_is_refused_where_the_engine_keeps_none():
+    with pytest.raises(ValueError, match="pool is for the other engines, got 50 with 'local'"):
+        zh.minimize(tilted, zeros(2), sigma=1.0, engine="local", pool=50, loss=torch.sum)
+
+
 def test_points_whose_values_differ_in_shape_are_named():
     def one_or_two(x):
         return torch.ones(1 if x[0] <= 0 else 2)

@@ -49,3 +49,8 @@ def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: T
     size = float(curvature.max()) or length
     low, high = _SHIFTS
     return levenberg_steps(slope, curvature, radii, (low * size, high * size), _BISECTIONS) @ vectors.mT @ known
+
+
+def are_free(s: Tensor, slope: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Return 0 for parameters [n] that a bound holds at s [n] against the slope, and 1 for the others."""
+    return (~(((s <= lower) & (slope > 0)) | ((s >= upper) & (slope < 0)))).to(slope)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.krylov import krylov_steps
+from torch_zerohess.linalg.krylov import are_free, krylov_steps
 
 _OFFSETS = 8
 """Points of a mean."""
@@ -108,7 +108,7 @@ def _newton(
 ) -> Tensor:
     """Return the step from s [n] to the minimum of a quadratic within ball and box; held parameters stay."""
     slope = outputs.rmatvec(now.slope)
-    free = (~(((s <= lower) & (slope > 0)) | ((s >= upper) & (slope < 0)))).to(slope)
+    free = are_free(s, slope, lower, upper)
 
     def product(v: Tensor) -> Tensor:
         return free * outputs.rmatvec(curvature * outputs.matvec(free * v))

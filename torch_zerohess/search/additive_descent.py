@@ -9,7 +9,7 @@ from torch_zerohess.search.axis_search import AxisSearch
 from torch_zerohess.search.kinked_descent import KinkedQuadratics
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_descent import MetricProgress
-from torch_zerohess.search.state import Evaluated, agreeing
+from torch_zerohess.search.state import Evaluated
 
 
 class AdditiveQuadratics(KinkedQuadratics):
@@ -36,7 +36,7 @@ class AdditiveQuadratics(KinkedQuadratics):
         if known.best is not before:
             return self._round_at(known, known.best.point, 1.0, generator)
         if lines.stage == "level":  # as good as a round that has arrived at the best point
-            known = agreeing(known, known.best, self.settings.tolerance, known.values)
+            known = known.agreeing(known.best, self.settings.tolerance, known.values)
             known = known.ended_round("nothing is lower along the axes", self.settings.restarts)
         return (known, points) if known.done else self._further(known, generator)
 
@@ -54,4 +54,4 @@ class AdditiveQuadratics(KinkedQuadratics):
 
 def _are_several(known: MetricProgress) -> bool:
     """Whether rounds have arrived at several minima."""
-    return known.arrived is not None and known.agreed == 0
+    return known.arrivals.lowest is not None and known.agreed == 0

@@ -30,7 +30,7 @@ from torch_zerohess.search.noisy_step import alternating
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
-from torch_zerohess.search.state import Best, Evaluated, arriving
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.surrogate import scaled
 
@@ -111,7 +111,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         return replace(known, jacobian=broyden_update(known.jacobian, step[None], change[None]))
 
     def arrived(self, known: BlockProgress) -> BlockProgress:
-        known = arriving(known, Best(known.center, known.loss, known.sigma))
+        known = known.arriving(Best(known.center, known.loss, known.sigma))
         return super().arrived(replace(known, wanted=self.settings.n))
 
     def distance(self, radius: float) -> float:
@@ -126,8 +126,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         size = _largest(known.jacobian)
         jacobian = known.jacobian / size  # squares of float32 do not overflow
         directions = jacobian.view(-1, *known.shape)
-        assert self.settings.loss is not None
-        loss = loss_curvature(self.settings.loss, known.output.view(known.shape))
+        loss = loss_curvature(self.settings.white_box, known.output.view(known.shape))
         _, unit = scaled(loss.product(alternating(loss.slope)))  # a second derivative may be beyond float32
         slope, bend = loss.slope.flatten(), loss.products(directions, unit)
         steep, bent = _largest(slope), _largest(bend)

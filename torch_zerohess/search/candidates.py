@@ -11,11 +11,11 @@ from torch_zerohess.surrogates.gaussian_process import GaussianProcess
 _SCALES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
 """Distances of candidates from the best point."""
 _CANDIDATES = 24
-"""At each of these distances; four times as many all over the box."""
+"""Candidates at each of `_SCALES`; four times as many are all over the box."""
 _REFINEMENTS = 6
-"""Further sets of candidates around the best one,"""
+"""Further sets of candidates around the best one."""
 _WIDTH, _NARROWING = 0.3, 0.4
-"""at this distance, which shrinks by this factor where none is better."""
+"""Distance of candidates in a further set from the best one, and its factor after a set in which none is better."""
 _MANY, _ALONG = 4, 4
 """Parameters from which on there are further candidates: so many along each axis through the best one."""
 _SAME = 1e-4

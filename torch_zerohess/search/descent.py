@@ -12,7 +12,7 @@ from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
 from torch_zerohess.search.random_points import further_start, normal, orthonormal
-from torch_zerohess.search.state import LOST, Best, Evaluated, agreeing, arriving, not_finite
+from torch_zerohess.search.state import LOST, Best, Evaluated, not_finite
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
@@ -143,15 +143,9 @@ class LocalQuadratics(Method[DescentProgress]):
             drawn = (evaluated.points[0], _BESIDE * known.sigma) if trial else (known.center, known.sigma)
             pool = pool.add(more.points, more.losses, more.outputs, *drawn)
         lowest = known.lowest.or_lower(new, known.sigma)
-        return replace(
-            known,
-            pool=pool.latest(self.capacity, None if self.settings.noise else lowest.point),
-            best=known.best.or_lower(new, known.sigma),
-            lowest=lowest,
-            shape=evaluated.shape,
-            evaluations=known.evaluations + len(evaluated),
-            lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,
-        )
+        pool = pool.latest(self.capacity, None if self.settings.noise else lowest.point)
+        known = known.told(evaluated, lost=evaluated.lacking)
+        return replace(known, pool=pool, best=known.best.or_lower(new, known.sigma), lowest=lowest)
 
     def _judged(self, known: DescentProgress, evaluated: Evaluated, loss: float) -> DescentProgress:
         """Decide by the end of a step what to do next."""
@@ -167,7 +161,7 @@ class LocalQuadratics(Method[DescentProgress]):
         """End, or start another round: at a random point and around the best one in turn."""
         settings = self.settings
         if self._arrives and known.lost < LOST and known.sigma < settings.tolerance:
-            known = arriving(self._agreeing(known), known.lowest)
+            known = self._agreeing(known).arriving(known.lowest)
         known = known.ended_round(reason, 0 if last else settings.restarts)
         if known.done:
             return known
@@ -194,10 +188,10 @@ class LocalQuadratics(Method[DescentProgress]):
         """Count a round that has arrived. A round around the best point, or on a plateau, confirms nothing."""
         end, tolerance = known.lowest, self.settings.tolerance
         if known.pool.ties(end.point, end.loss, tolerance):
-            return replace(known, agreed=0)
-        counted = agreeing(known, end, tolerance, known.pool.values)
+            return known.with_arrivals(agreed=0)
+        counted = known.agreeing(end, tolerance, known.pool.values)
         random = known.rounds == 0 or known.rounds % 2 == 1
-        return counted if random else replace(counted, agreed=min(counted.agreed, known.agreed))
+        return counted if random else counted.with_arrivals(agreed=min(counted.agreed, known.agreed))
 
     # Samples and steps.
 

@@ -27,8 +27,8 @@ from torch_zerohess.search.state import Best, Evaluated, Progress
 _SLOW = 0.2
 """Part of the lowest loss that n + 1 evaluations of a descent that follows must take away."""
 _STUCK, _PATIENCE = 0.1, 8
-"""Part of it that evaluations of the process must take away, and their number over n + 1."""
-_SHARED = "best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart"
+"""Part of the lowest loss that evaluations of the process must take away, and their number over n + 1."""
+_SHARED = "best", "evaluations", "iterations", "arrivals"
 """What the descent learns about a turn of the process."""
 
 
@@ -42,9 +42,9 @@ class TurnsProgress(Progress):
     planned: Tensor
     """Points [r, n] that the descent asks for next, when its turn comes again."""
     record: Best
-    """The lowest loss that was evaluated: in noise the best point of the process is one that it predicts"""
+    """The point with the lowest loss that was evaluated: in noise the process predicts the loss of its best point."""
     output: Tensor
-    """and the output there [m]."""
+    """At `record` [m]."""
     smooth: bool = False
     """Whether Gauss-Newton has arrived or taken away as much as `_SLOW`: a descent that follows may then be slow."""
     resumed: bool = False

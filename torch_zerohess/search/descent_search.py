@@ -14,43 +14,46 @@ from torch_zerohess.search.protocol import AskTell
 class Descent(AskTell[Any]):
     """Second-order descent on a smoothed black box, for any number of parameters, with or without bounds.
 
-    Each iteration fits a quadratic model to the evaluations made so far, minimises it within a region around x and
-    within the bounds, and asks for that one point.
+    Each iteration fits a model to the evaluations made so far, minimises it within a region around x and within the
+    bounds, and asks for that one point. The model follows from what is given:
 
-    - With the loss alone (up to 200 parameters, no noise), the quadratic is the one of least change through the nearest
-      evaluations, and region and samples follow the metric of its Hessian: narrow valleys are as wide as long there.
-    - With the loss alone and `noise` (up to 40 parameters), the quadratic is a regression through all evaluations near
-      by, with standard errors. No single value decides: x is the center of the region, and the value what the quadratic
-      says there.
-    - With an output [K, *out] and a white-box `loss`, every evaluation is many equations: it follows the minimum of
-      loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises for a
-      while. Where a step was predicted well (up to 40 parameters, no noise), Gauss-Newton by interpolation goes on in a
-      trust region, until its steps fail.
-      With one or two parameters Gauss-Newton comes first, and after it the loss alone is modelled.
-    - The smoothed loss is modelled in three cases: on a plateau, with the loss alone and more than 200 parameters (in
-      noise 40), and with an output in noise. On a plateau sigma grows. New samples around x are asked for where the
-      model has predicted badly.
+    | given        | parameters    | model                             | arrived: sigma below | evaluations kept     |
+    |--------------|---------------|-----------------------------------|----------------------|----------------------|
+    | loss         | up to 200     | quadratic of least change         | 1e-6 tolerance       | 3 fits, at least 200 |
+    | loss         | more than 200 | smoothed loss                     | never                | 6 n                  |
+    | loss, noise  | up to 40      | regression                        | 1e-3 tolerance       | 2 fits               |
+    | loss, noise  | more than 40  | smoothed loss                     | tolerance            | max(500, 6 n)        |
+    | output       | 1 or 2        | Gauss-Newton, then smoothed loss  | tolerance            | 60                   |
+    | output       | 3 and more    | smoothed output, and Gauss-Newton | tolerance            | max(60, 6 n)         |
+
+    - The quadratic of least change goes through the nearest evaluations. Region and samples follow the metric of its
+      Hessian: narrow valleys are as wide as long there. On a plateau the smoothed loss is modelled, and sigma grows.
+    - The regression is a quadratic through all evaluations near by, with standard errors. No single value decides: x is
+      the center of the region, and `value` is what the quadratic says there. The search has also arrived where three
+      steps in a row are within their errors and the quadratic takes no more evaluations.
+    - With the smoothed loss, decreases below twice the `noise` do not count. New samples around x are asked for where
+      the model has predicted badly. With more than 200 parameters nothing tells whether x is a minimum.
+    - With an output [K, *out] and a white-box `loss`, every evaluation is many equations. The search follows the
+      minimum of loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises
+      for a while. It uses only whether there is `noise`, not how much.
+    - Gauss-Newton by interpolation, in a trust region, goes on where a step was predicted well, until its steps fail.
+      With one or two parameters it begins. It takes up to 40 parameters, and no noise.
+
+    "3 fits" are three times as many evaluations as a fit takes. After an arrival, possibly at a local minimum, the
+    search starts again, up to `restarts` times: from a random point, or in turn from a random point and around the best
+    one with more samples per iteration.
 
     Where a loss alone is not finite, a plane between evaluations with and without a value bounds the step, so that the
     search follows the border of the region that fails. Up to 100 steps in a row may fail there.
 
     At a kink of a loss alone, slopes at up to 6 (n + 1) points around it tell whether it is a minimum: up to
-    (n + 1)(4 n + 7) evaluations, if no bound is near. If they do not tell, the search has not arrived.
+    6 (n + 1)(n + 8) evaluations, if no bound is near. If they do not tell, the search has not arrived.
 
     After a round two evaluations tell whether a loss alone is a sum of functions of one parameter each (in a box, for
     2 to 200 parameters). If such a sum has several minima, its lowest one is sought along all axes at once, and the
     next round begins there: some 40 n evaluations, and 7 if it is convex.
 
-    Where sigma is below `tolerance` (with the loss alone a millionth of it, in noise a thousandth) the search has
-    arrived at a minimum, possibly a local one. With the loss alone and more than 200 parameters nothing tells whether x
-    is a minimum, and the search never counts as arrived. In noise it has also arrived where three steps in a row are
-    within their errors and the quadratic takes no more evaluations. The search then starts again, up to `restarts`
-    times: from a random point, or in turn from a random point and around the best one with more samples per iteration.
-
-    It has the settings of `AskTell`. With an output and with more than 40 parameters, decreases below twice the `noise`
-    do not count. By default the pool keeps max(60, 6 n) evaluations of an output. Of a loss alone it keeps three
-    times as many as the quadratic is fitted to, and at least 200; in noise twice as many; with more than 200
-    parameters (in noise 40) max(500, 6 n).
+    It has the settings of `AskTell`.
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
     order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation; Burke, Lewis and Overton (2005) for

@@ -44,9 +44,8 @@ class JacobianProgress(Progress):
 
     def counted(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with a batch counted; it is done after too many batches without a finite value."""
-        lost = 0 if bool(evaluated.finite.any()) else self.lost + 1
-        known = replace(self, shape=evaluated.shape, evaluations=self.evaluations + len(evaluated), lost=lost)
-        return known if lost < LOST else known.ended_round(f"{LOST} batches in a row had no finite value", 0)
+        known = self.told(evaluated, lost=not bool(evaluated.finite.any()))
+        return known if known.lost < LOST else known.ended_round(f"{LOST} batches in a row had no finite value", 0)
 
     def recorded(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with the lowest loss so far as the best one. Samples count as steps do."""

@@ -31,8 +31,8 @@ class FinishedProgress(ProcessProgress):
     """Of the local search, also when it has ended."""
     finishing: bool = False
     """Whether it is the turn of the local search."""
-    finished: Tensor
-    """Where the local search has ended [n]; infinite before."""
+    finished: Tensor | None = None
+    """Where the local search has ended [n]; None before."""
     waited: int = 0
     """Evaluations since something better was found, or since the turn has changed."""
 
@@ -59,8 +59,7 @@ class FinishedProcess(ProcessMethod[F]):
         """Let the local search learn, and return its next points if it is still its turn."""
 
     def first(self, generator: torch.Generator) -> tuple[F, Tensor]:
-        nowhere = torch.full_like(self.settings.start, math.inf)
-        return self.points(self.progress(**self.begun(), finished=nowhere), generator)
+        return self.points(self.begun(), generator)
 
     def next(self, known: F, evaluated: Evaluated, generator: torch.Generator) -> tuple[F, Tensor]:
         after = self.after_local if known.finishing else self.after_process
@@ -90,7 +89,7 @@ class FinishedProcess(ProcessMethod[F]):
 
     def is_new(self, known: F) -> bool:
         """Whether the best point is apart from the point where the local search has ended last."""
-        return float((known.best.point - known.finished).norm()) > APART
+        return known.finished is None or float((known.best.point - known.finished).norm()) > APART
 
     def learned(self, known: F, evaluated: Evaluated) -> F:
         """Let the process learn evaluations of another search that are apart from its own."""

@@ -11,7 +11,7 @@ In noise the best point is the one whose *predicted* output has the lowest loss.
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -33,7 +33,7 @@ APART = 0.05
 _OPTIMISM = 0.3
 """Standard deviations of the output by which a prediction may be wrong in favour of the loss."""
 _EXPLORING = 2.0
-"""The same in the steps after an arrival, and in all steps where the loss itself is predicted."""
+"""`_OPTIMISM` in the steps after an arrival, and in all steps where the loss itself is predicted."""
 _BESIDE, _EVERY = 0.5, 4
 """Spread of points around the end of a step, over the distance of the nearest evaluation. One in so many lies there."""
 _SETTLED = 3
@@ -71,12 +71,9 @@ class ProcessMethod(Method[Q]):
         """Return the progress after an evaluation."""
         finite, trial = evaluated.finite, known.phase == "trial"
         known = replace(
-            known,
+            known.told(evaluated, lost=evaluated.lacking),
             room=max(known.room, _BATCHES * len(evaluated) if evaluated.extra else 0),
-            shape=evaluated.shape,
-            evaluations=known.evaluations + len(evaluated),
             iterations=known.iterations + trial,
-            lost=0 if bool(evaluated.needed.finite.all()) else known.lost + 1,
         )
         before = known.best.point
         if known.lost >= LOST:
@@ -112,12 +109,12 @@ class ProcessMethod(Method[Q]):
         lower, upper = self.settings.lower, self.settings.upper
         near = count // _EVERY
         if known.phase == "start" or len(known.pool) < 2:
-            around = self._drawn(known.center, 1.0, near, generator)
+            around = self.settings.drawn(known.center, 1.0, near, generator)
             return torch.cat([around, farthest(torch.cat([points, around]), count - near, lower, upper, generator)])
         model = self._model(known)
         reach = _BESIDE * float((known.pool.points - points[0]).norm(dim=1).min()) / math.sqrt(self.settings.n)
         near = near if 0.0 < reach < math.inf else 0
-        every = [*points, *self._drawn(points[0], reach, near, generator)]
+        every = [*points, *self.settings.drawn(points[0], reach, near, generator)]
         for one in every[:-1]:
             model = model.pending(one)
         while len(every) < len(points) + count:
@@ -141,19 +138,11 @@ class ProcessMethod(Method[Q]):
             sigma *= _WIDENING
         return None
 
-    def begun(self) -> dict[str, Any]:
-        """Return the fields of a progress before anything was evaluated."""
-        start = self.settings.start
-        return {
-            "best": Best(start),
-            "record": Best(start),
-            "center": start,
-            "pool": Pool.empty(len(start), start.device),
-            "expands": self.settings.loss is not None,
-            "expanded": torch.full_like(start, math.inf),
-            "holes": start[None][:0],
-            "solved": torch.full_like(start, math.inf),
-        }
+    def begun(self) -> Q:
+        """Return the progress before anything was evaluated."""
+        start, expands = self.settings.start, self.settings.loss is not None
+        best, pool = Best(start), Pool.empty(len(start), start.device)
+        return self.progress(best=best, record=best, center=start, pool=pool, expands=expands, holes=start[None][:0])
 
     def tells_noise(self, known: Q) -> bool:
         """Whether noise is declared, or there are enough outputs to tell noise from fast variation."""
@@ -184,7 +173,7 @@ class ProcessMethod(Method[Q]):
 
     def arrived(self, known: Q, reason: str, end: Best | None = None) -> Q:
         """End, or explore, after an arrival at the best point, or at `end`."""
-        known = replace(known, settled=0, exploring=ROUND * self.settings.n).agreeing(self.settings.tolerance, end)
+        known = replace(known, settled=0, exploring=ROUND * self.settings.n).arriving_here(self.settings.tolerance, end)
         return known.ended_round(reason, self.settings.restarts)
 
     def _settled(self, known: Q) -> Q:
@@ -207,11 +196,6 @@ class ProcessMethod(Method[Q]):
         n = len(x)
         return self.settings.inside(x + math.sqrt(n) * orthonormal(normal(generator, x, n, n)).mT)
 
-    def _drawn(self, x: Tensor, sigma: float, count: int, generator: torch.Generator) -> Tensor:
-        """Draw points [count, n] from N(x, sigma^2), mirrored into the box."""
-        steps = sigma * normal(generator, x, count, len(x))
-        return self.settings.inside(x + steps)
-
     def _length(self, step: Tensor) -> float:
         """Length of a step [n] in units of the first sigma sqrt(n)."""
         return float(step.norm()) / math.sqrt(self.settings.n)
@@ -231,15 +215,14 @@ class ProcessMethod(Method[Q]):
         if not known.expands:
             return self._of_losses(known)[1]
         _, process, output = self._predicted(known)
-        if bool(torch.isfinite(known.expanded).all()):
+        if known.expanded is not None:
             output = process.predict(known.expanded[None])[0]
         return self._expanded(known, process, output)
 
     def _through_output(self, known: Q, generator: torch.Generator) -> tuple[Q, LossModel, Tensor]:
         """Predict the output, expand the loss, and return the point [n] that is lowest."""
         known, process, output = self._predicted(known)
-        loss, at = self.settings.loss, torch.full_like(known.center, math.inf)
-        assert loss is not None
+        loss, at = self.settings.white_box, None
         for _ in range(_EXPANSIONS):
             model = self._expanded(known, process, output)
             x = self._lowest(known, model, generator)
@@ -255,8 +238,7 @@ class ProcessMethod(Method[Q]):
 
     def _predicted(self, known: Q) -> tuple[Q, GaussianProcess, Tensor]:
         """Return the process of the output, and the output [m] with the lowest loss."""
-        loss, pool = self.settings.loss, known.pool
-        assert loss is not None
+        loss, pool = self.settings.white_box, known.pool
         assert pool.outputs is not None
         known, process = self._fitted(known, pool.outputs)
         outputs, values = pool.outputs, pool.values
@@ -269,9 +251,8 @@ class ProcessMethod(Method[Q]):
 
     def _expanded(self, known: Q, process: GaussianProcess, output: Tensor) -> LossModel:
         """Return the model of the loss that is expanded at an output [m]."""
-        assert self.settings.loss is not None
         optimism = _EXPLORING if known.exploring else _OPTIMISM
-        return LossModel(process, output, self.settings.loss, known.shape, optimism)
+        return LossModel(process, output, self.settings.white_box, known.shape, optimism)
 
     def _of_losses(self, known: Q) -> tuple[Q, LossModel]:
         values = known.pool.values

@@ -7,7 +7,7 @@ from typing import Literal, TypeVar
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.state import Best, Progress, agreeing, arriving
+from torch_zerohess.search.state import Best, Progress
 from torch_zerohess.surrogates.pool import Pool
 
 _LOOKING = 10
@@ -32,8 +32,8 @@ class ProcessProgress(Progress):
     """The lowest loss that was evaluated."""
     expands: bool
     """Whether the loss of a predicted output is expanded; otherwise the process is one of the loss itself."""
-    expanded: Tensor
-    """Point [n] at whose predicted output the loss was last expanded; infinite if at the best evaluated output."""
+    expanded: Tensor | None = None
+    """Point [n] at whose predicted output the loss was last expanded; None if at the best evaluated output."""
     noisy: bool = False
     """Whether outputs differ from call to call."""
     moved: float = math.inf
@@ -44,12 +44,12 @@ class ProcessProgress(Progress):
     """Steps that are still to be more optimistic than others."""
     holes: Tensor
     """Points [H, n] whose values were not finite."""
-    solved: Tensor
-    """A minimum that is known to the last digit [n]; infinite if none is."""
+    solved: Tensor | None = None
+    """A minimum that is known to the last digit [n]; None if none is."""
     counted: int = 0
     """Evaluations at the latest arrival that has counted as a round of those that agree."""
 
-    def agreeing(self: Q, tolerance: float, end: Best | None = None) -> Q:
+    def arriving_here(self: Q, tolerance: float, end: Best | None = None) -> Q:
         """Count an arrival at the best point, or at `end`.
 
         It agrees with earlier arrivals if the search has since evaluated elsewhere as often as it had evaluated until
@@ -57,10 +57,10 @@ class ProcessProgress(Progress):
         """
         found = self.is_minimum(tolerance)
         if found or (self.noisy and not self.pool.ties(self.best.point, self.best.loss, tolerance)):
-            self = arriving(self, self.best)
+            self = self.arriving(self.best)
         if not found:  # a plateau, or no minimum of the quadratics
             return self
-        known = agreeing(self, end or self.best, tolerance, self.pool.values)
+        known = self.agreeing(end or self.best, tolerance, self.pool.values)
         if known.agreed > 1 and not self.has_looked:
             return self
         return replace(known, counted=self.evaluations)
@@ -73,7 +73,7 @@ class ProcessProgress(Progress):
     @property
     def is_solved(self) -> bool:
         """Whether the best point is a minimum that is known to the last digit."""
-        return torch.equal(self.solved, self.best.point)
+        return self.solved is not None and torch.equal(self.solved, self.best.point)
 
     def is_minimum(self, tolerance: float) -> bool:
         """Whether neither noise nor a plateau has chosen the best point."""

@@ -63,8 +63,8 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         restarts: how often to hop after the search has arrived; 0: it does not hop at all. Where the Jacobian predicts
             less than half of the held-out change, it begins again with the first radius instead.
         tolerance: radius, in units of sigma, at which the search has arrived.
-        noise: standard deviation of repeated losses at one point, if they differ. Above 0 it says that there is noise;
-            how much, repeated outputs tell.
+        noise: standard deviation of repeated losses at one point, if they differ. The search uses only whether it is
+            above 0: repeated outputs tell how large the noise is.
         seed: of the samples; from torch's global generator if None.
 
     Outputs of two dimensions or more are images, whose neighbouring pixels share evidence: see `sparse_jacobian`.

@@ -31,7 +31,7 @@ from torch_zerohess.search.local_progress import LocalProgress, in_range
 from torch_zerohess.search.local_steps import LocalSteps, derivatives, local_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal
-from torch_zerohess.search.state import Best, Evaluated, agreeing, arriving
+from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_choices import fit_chosen
@@ -64,7 +64,7 @@ _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
 _SHARED = (
-    *("best", "evaluations", "iterations", "rounds", "arrived", "agreed", "place", "apart", "lost", "evidence", "grid"),
+    *("best", "evaluations", "iterations", "arrivals", "lost", "evidence", "grid"),
     *("points", "outputs", "variance", "pairs"),
 )
 """What a search that returns from a hop keeps."""
@@ -144,9 +144,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
             assert known.evidence is not None
             step = _HOP * known.evidence.found * normal(generator, known.center, self.settings.n)
             known = replace(known, center=self.settings.inside(known.center + step))
-        points = self.settings.inside(
-            known.center + known.sigma * normal(generator, known.center, known.samples, self.settings.n)
-        )
+        points = self.settings.drawn(known.center, known.sigma, known.samples, generator)
         return known, torch.cat([known.center[None], points]) if hops else points
 
     def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
@@ -191,9 +189,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
         if last is not None and last[0] is known and torch.equal(last[1], radii):
             return last[2]
         assert known.jacobian is not None
-        assert settings.loss is not None
         box = settings.lower - known.center, settings.upper - known.center
-        found = local_steps(settings.loss, known.output.view(known.shape), known.jacobian, radii, *box)
+        found = local_steps(settings.white_box, known.output.view(known.shape), known.jacobian, radii, *box)
         self._last = known, radii, found
         return found
 
@@ -235,7 +232,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         if not (known.predicts and self._is_minimum(known)):
             return super().arrived(known)
         end = Best(known.center, known.loss, known.sigma)
-        known = super().arrived(agreeing(arriving(known, end), end, self.settings.tolerance))
+        known = super().arrived(known.arriving(end).agreeing(end, self.settings.tolerance))
         return known if known.done else self._hopping(replace(known, finished=True))
 
     def _is_minimum(self, known: LocalProgress) -> bool:
@@ -279,7 +276,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         if not home.finished:
             return known
         end = Best(known.center, known.loss, known.sigma)
-        known = agreeing(known, end, self.settings.tolerance) if same else replace(known, agreed=0)
+        known = known.agreeing(end, self.settings.tolerance) if same else known.with_arrivals(agreed=0)
         known = super().arrived(known)
         return known if known.done else self._hopping(known)
 
@@ -316,5 +313,4 @@ class LocalMethod(GaussNewton[LocalProgress]):
     def _derivatives(self, known: LocalProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
         assert known.jacobian is not None
-        assert self.settings.loss is not None
-        return derivatives(loss_curvature(self.settings.loss, known.output.view(known.shape)), known.jacobian)
+        return derivatives(loss_curvature(self.settings.white_box, known.output.view(known.shape)), known.jacobian)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.krylov import krylov_steps
+from torch_zerohess.linalg.krylov import are_free, krylov_steps
 from torch_zerohess.linalg.smoothed_newton import LinearOutputs, smoothed_minimum
 from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature, value_and_slope
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -57,8 +57,7 @@ def local_steps(
         upper: at least 0.
     """
     gradient, product = derivatives(loss_curvature(loss, output), jacobian)
-    # Parameters that a bound holds stay.
-    free = (~(((lower >= 0) & (gradient > 0)) | ((upper <= 0) & (gradient < 0)))).to(gradient)
+    free = are_free(torch.zeros_like(gradient), gradient, lower, upper)
     steps = krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
 
     def valued(y: Tensor) -> tuple[float, Tensor]:

@@ -25,17 +25,17 @@ from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
 _NEAR = 0.1
-"""Steps of the process below this length, in units of the first sigma sqrt(n),"""
+"""Length below which a step of the process is short, in units of the first sigma sqrt(n)."""
 _STEPS = 2
-"""this many in a row, have found a basin."""
+"""Short steps in a row that have found a basin."""
 _FORETOLD = 0.1
-"""Or one step whose end a quadratic has predicted, with at most this error relative to the change of the loss."""
+"""Error of a predicted loss, over the change of the loss, up to which one step has found a basin."""
 _WIDTH = 0.3
 """First sigma of the quadratics."""
 _HOPS = (0.5, 2.0)
-"""Shortest and longest standard deviation of a hop from the best point, in units of the first sigma,"""
+"""Shortest and longest standard deviation of a hop from the best point, in units of the first sigma."""
 _HOP_WIDTH = 0.3
-"""and first sigma of the quadratics that begin there, over this deviation."""
+"""First sigma of the quadratics that begin after a hop, over the standard deviation of the hop."""
 _PATIENCE = 5
 """Evaluations over n + 1 in which the quadratics must find something better: a curved valley refuses several steps."""
 
@@ -129,7 +129,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         if self._axes.may_begin(known.lines, several=known.several):
             lines, points = self._axes.begin(known.lines, known.best, known.pool.points, known.pool.values)
             return replace(known, lines=lines, steps=0), points
-        if bool(known.finished.isfinite().all()) and known.agreed == 0 and not known.beside:
+        if known.finished is not None and known.agreed == 0 and not known.beside:
             return _finishing(known, *self._hop(known, generator), beside=True)
         return self._elsewhere(known, generator)
 
@@ -160,7 +160,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         """Let quadratics begin beside the best point."""
         shortest, longest = _HOPS
         hop = shortest * (longest / shortest) ** float(torch.rand((), generator=generator, device="cpu"))
-        (center,) = self._drawn(known.best.point, hop, 1, generator)
+        (center,) = self.settings.drawn(known.best.point, hop, 1, generator)
         return self.local.begin(center, _HOP_WIDTH * hop, generator)
 
     def after_local(
@@ -177,8 +177,7 @@ class LossProcess(FinishedProcess[LossProgress]):
             return known, points
         converged = now.done and not now.is_lost
         if best is now.best:
-            solved = best.point if converged else torch.full_like(best.point, math.inf)
-            known = replace(known, finished=best.point, solved=solved)
+            known = replace(known, finished=best.point, solved=best.point if converged else None)
         known = replace(known, finishing=False, waited=0)
         if plateau or (best is not now.best and not converged):  # they have found no minimum
             return replace(known, settled=0, exploring=ROUND * self.settings.n), points
@@ -187,7 +186,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = self.arrived(known, "quadratics have arrived or found nothing better for a while", end)
         known = replace(known, several=known.several or (end is not None and known.agreed == 0))
         if known.beside or (elsewhere and not converged):
-            return replace(known, agreed=0), points
+            return known.with_arrivals(agreed=0), points
         return known, points
 
 

@@ -13,7 +13,7 @@ from typing import ClassVar, Generic
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.random_points import reflect
+from torch_zerohess.search.random_points import normal, reflect
 from torch_zerohess.search.state import Evaluated, P
 from torch_zerohess.search.told import moderate
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -41,6 +41,12 @@ class Settings:
         return len(self.start)
 
     @property
+    def white_box(self) -> Callable[[Tensor], Tensor]:
+        """The loss, for a search that has one."""
+        assert self.loss is not None
+        return self.loss
+
+    @property
     def bounded(self) -> bool:
         """Whether every bound is finite."""
         return bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())
@@ -48,6 +54,10 @@ class Settings:
     def inside(self, points: Tensor) -> Tensor:
         """Mirror points [K, n] into the bounds."""
         return reflect(points, self.lower, self.upper)
+
+    def drawn(self, x: Tensor, sigma: float, count: int, generator: torch.Generator) -> Tensor:
+        """Draw points [count, n] from N(x, sigma^2), mirrored into the bounds."""
+        return self.inside(x + sigma * normal(generator, x, count, self.n))
 
 
 class Method(ABC, Generic[P]):

@@ -22,10 +22,10 @@ from torch_zerohess.search.axis_search import AxisLines
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.random_points import further_start, normal
+from torch_zerohess.search.random_points import further_start
 from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
-from torch_zerohess.search.state import Best, Evaluated, agreeing, are_same, arriving
+from torch_zerohess.search.state import Best, Evaluated, are_same
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.plateau import is_plateau
@@ -58,7 +58,7 @@ points."""
 _SURE = 0.1
 """Largest relative error of a fitted Hessian that replaces the last one of the round."""
 
-_SHARED = ("best", "evaluations", "rounds", "arrived", "agreed", "place", "apart")
+_SHARED = ("best", "evaluations", "arrivals")
 """What further rounds, and isotropic quadratics on a plateau, go on with."""
 _QUADRATIC = ("bottom", "slope", "bend")
 """The quadratic that is kept, which predicts the losses of later rounds."""
@@ -149,8 +149,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Ask for another point along every axis, twice as far if the first one was better, else on the other side."""
         if not len(known.values):
-            start = known.center + known.sigma * normal(generator, known.center, 1, self._n)
-            return known, self.settings.inside(start)
+            return known, self.settings.drawn(known.center, known.sigma, 1, generator)
         losses = evaluated.losses
         if len(losses) > 1 and int((losses[1:] == losses[0]).sum()) > len(losses[1:]) // 2:
             return self._on_plateau(known, generator)
@@ -200,8 +199,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         if end is not None:
             distance = (known.points - end.point).square().mean(1).sqrt()
             plateau = is_plateau(distance, known.values, end.loss, beyond=settings.tolerance)
-            known = agreeing(known, end, settings.tolerance, None if plateau else known.values)
-            known = arriving(known, end)
+            known = known.agreeing(end, settings.tolerance, None if plateau else known.values)
+            known = known.arriving(end)
         known = known.ended_round(reason, 0 if last else settings.restarts)
         return (known, known.points[:0]) if known.done else self._further(known, generator)
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.random_points import further_start, normal
-from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, arriving, not_finite
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, not_finite
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.pool import latest
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
@@ -29,7 +29,7 @@ MOST = 40
 _FITTED = 3
 """Evaluations per coefficient that a quadratic is fitted to, at least."""
 _MORE, _ENOUGH = 60, 3000
-"""Evaluations in the region that it is fitted to, at most: per coefficient, and in all."""
+"""Evaluations in the region that a quadratic is fitted to, at most: per coefficient, and in all."""
 _LARGEST = 1e100
 """Magnitude at which values and the noise are cut: squares of larger numbers would be infinite."""
 _PROPORTION = 1e3
@@ -181,12 +181,12 @@ class NoisyQuadratics(Method[NoisyProgress]):
     ) -> tuple[NoisyProgress, Tensor]:
         """End, or start another round at a random point."""
         settings = self.settings
-        known = arriving(known, known.best).ended_round(reason, 0 if last else settings.restarts)
+        known = known.arriving(known.best).ended_round(reason, 0 if last else settings.restarts)
         if known.done:
             return known, known.points[:0]
         center = further_start(generator, known.first, settings.lower, settings.upper)
         fresh = self._begun(center, known.best)
-        return self._started(fresh.taking(known, "first", "evaluations", "iterations", "rounds", "arrived"), generator)
+        return self._started(fresh.taking(known, "first", "evaluations", "iterations", "arrivals"), generator)
 
     # An iteration.
 
@@ -196,13 +196,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
         points = torch.cat([known.points, new.points])
         values = torch.cat([known.values, new.losses.clamp(-_LARGEST, _LARGEST)])
         which = latest(points, known.center, self._capacity)
-        return replace(
-            known,
-            points=points[which],
-            values=values[which],
-            evaluations=known.evaluations + len(evaluated),
-            lost=0 if len(new) else known.lost + 1,
-        )
+        return replace(known.told(evaluated, lost=not len(new)), points=points[which], values=values[which])
 
     def _stepped(self, known: NoisyProgress) -> NoisyProgress:
         """Fit a quadratic, judge the last step, learn the metric, and move the center."""

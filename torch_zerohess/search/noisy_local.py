@@ -24,7 +24,6 @@ from torch_zerohess.search.local_method import LocalMethod, LocalSettings
 from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_step import alternating, constants, step_in_noise
-from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.sparse_choices import kept
@@ -76,8 +75,8 @@ class NoisyLocalMethod(LocalMethod):
             after, points = super().samples(known, generator)
             return after, torch.cat([known.center[None], points]) if len(known.output) else points
         count = max(known.samples, len(known.points) // _GROWTH)
-        u = normal(generator, known.center, count, self.settings.n)
-        return known, torch.cat([known.center.expand(2, -1), self.settings.inside(known.center + known.sigma * u)])
+        points = self.settings.drawn(known.center, known.sigma, count, generator)
+        return known, torch.cat([known.center.expand(2, -1), points])
 
     def next(
         self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
@@ -154,16 +153,14 @@ class NoisyLocalMethod(LocalMethod):
 
     def _error(self, known: LocalProgress, variance: float) -> float:
         """Return the standard error of the loss at the center if the numbers of the output have a variance."""
-        assert self.settings.loss is not None
-        slope = loss_curvature(self.settings.loss, known.output.view(known.shape)).slope
+        slope = loss_curvature(self.settings.white_box, known.output.view(known.shape)).slope
         return math.sqrt(variance) * float(slope.norm())
 
     def _raised(self, known: LocalProgress, variance: float) -> float:
         """Return by how much noise with a variance raises the loss of the output at the center, about."""
-        assert self.settings.loss is not None
         output = known.output.view(known.shape)
         noise = math.sqrt(variance) * alternating(output)
-        around = [float(self.settings.loss(one)) for one in (output + noise, output - noise)]
+        around = [float(self.settings.white_box(one)) for one in (output + noise, output - noise)]
         return max(0.5 * sum(around) - known.loss, 0.0)
 
     def _averaging(self, known: LocalProgress) -> LocalProgress:
@@ -222,9 +219,8 @@ class NoisyLocalMethod(LocalMethod):
         self, known: LocalProgress, fitted: LocalProgress, rest: float, count: float, centers: Tensor
     ) -> LocalProgress:
         """Judge the last step by what `_regressed` has returned, and take the next one; centers: see `_averaged`."""
-        assert self.settings.loss is not None
         output, variance = self._combined(fitted, count, centers)
-        after = replace(fitted, output=output, loss=float(self.settings.loss(output.view(known.shape))))
+        after = replace(fitted, output=output, loss=float(self.settings.white_box(output.view(known.shape))))
         before, error = known.before, self._error(after, variance) + self._raised(after, variance)
         if before is not None and (not math.isfinite(after.loss) or after.loss - before.loss > _WORSE * error):
             return self._undone(after, before)
@@ -296,8 +292,7 @@ class NoisyLocalMethod(LocalMethod):
     def _stepped(self, known: LocalProgress) -> LocalProgress:
         """Go to the end of a step."""
         assert known.jacobian is not None
-        assert self.settings.loss is not None
         end = (known.center + step_in_noise(known, self.settings)).clamp(self.settings.lower, self.settings.upper)
         output = known.output + known.jacobian.matvec(end - known.center).flatten()
-        loss, before = float(self.settings.loss(output.view(known.shape))), known.best
+        loss, before = float(self.settings.white_box(output.view(known.shape))), known.best
         return replace(known, center=end, output=output, loss=loss, before=before, iterations=known.iterations + 1)

@@ -9,7 +9,7 @@ import math
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.krylov import krylov_steps
+from torch_zerohess.linalg.krylov import are_free, krylov_steps
 from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.local_steps import derivatives, local_steps
 from torch_zerohess.search.method import Settings
@@ -24,9 +24,8 @@ _ITERATIONS = 100
 
 def step_in_noise(known: LocalProgress, settings: Settings) -> Tensor:
     """Return the step from the center to the minimum of the model within the radius [n]."""
-    jacobian, x, loss = known.jacobian, known.center, settings.loss
+    jacobian, x, loss = known.jacobian, known.center, settings.white_box
     assert jacobian is not None
-    assert loss is not None
     output, radii = known.output.view(known.shape), x.new_tensor([known.radius * math.sqrt(settings.n)])
     lower, upper = settings.lower - x, settings.upper - x
     kinked = local_steps(loss, output, jacobian, radii, lower, upper)
@@ -34,7 +33,7 @@ def step_in_noise(known: LocalProgress, settings: Settings) -> Tensor:
         return kinked.steps[0]
     expanded = loss_curvature(loss, output)
     gradient, product = derivatives(expanded, jacobian)
-    free = (~(((lower >= 0) & (gradient > 0)) | ((upper <= 0) & (gradient < 0)))).to(gradient)
+    free = are_free(torch.zeros_like(x), gradient, lower, upper)
     own = uncertain(expanded, jacobian, output)
 
     def bent(v: Tensor) -> Tensor:

@@ -65,7 +65,8 @@ class OutputDescent(Relay[OutputDescentProgress]):
         self, other: Progress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[OutputDescentProgress, Tensor]:
         """Begin with the evaluations of another search, the best one first; return the next points, too."""
-        descent = self._follow.begun(Best(evaluated.points[0])).taking(other, "iterations", "rounds")
+        descent = self._follow.begun(Best(evaluated.points[0]))
+        descent = descent.taking(other, "iterations").with_arrivals(rounds=other.rounds)
         known = OutputDescentProgress(best=descent.best, center=descent.center, descent=descent)
         return self.next(known, evaluated, generator)
 
@@ -106,7 +107,7 @@ class OutputDescent(Relay[OutputDescentProgress]):
         """Return the progress of Gauss-Newton and its points, or of the descent where Gauss-Newton is at its end."""
         if not (smooth.done or smooth.failed):
             now = replace(known, smooth=smooth).taking(smooth)
-            return now.taking(known, "rounds", "arrived", "agreed", "place", "apart"), points
+            return now.taking(known, "arrivals"), points
         descent = self._told(known.descent, smooth)
         if smooth.done:
             descent = replace(descent, sigma=min(smooth.sigma, 0.5 * self.settings.tolerance))

@@ -75,18 +75,14 @@ class OutputProgress(RegionProgress):
     def remembered(self, evaluated: Evaluated, capacity: int) -> "OutputProgress":
         """Add evaluations whose values are finite."""
         new = evaluated.those(evaluated.finite)
-        known = super().remembered(new, capacity)
-        outputs = self.outputs
+        known, outputs = super().remembered(new, capacity), self.outputs
+        known = known.taking(self.told(evaluated, lost=evaluated.lacking), "evaluations", "lost", "shape")
         if new.outputs is not None and len(new):
             outputs = torch.cat([outputs, new.outputs]) if len(outputs) else new.outputs
-        lost = 0 if bool(evaluated.needed.finite.all()) else self.lost + 1
         return replace(
             known,
             outputs=outputs[latest(torch.cat([self.points, new.points]), known.lowest.point, capacity)],
-            shape=evaluated.shape,
-            evaluations=self.evaluations + len(evaluated),
-            lost=lost,
-            failed=lost >= _HOLES,
+            failed=known.lost >= _HOLES,
         )
 
 
@@ -164,11 +160,10 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         return torch.nn.functional.one_hot(unseen.nonzero()[0, 0], self._n).to(x)
 
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
-        assert self.settings.loss is not None
         nearest = self._nearest(known, self._n + 1)
         center, others = known.outputs[nearest[0]], nearest[1:]
         outputs = LeastNorm.through(known.scaled[others], known.outputs[others] - center)
-        expanded = loss_curvature(self.settings.loss, center.view(known.shape))
+        expanded = loss_curvature(self.settings.white_box, center.view(known.shape))
         slope = expanded.slope.flatten()
         gradient = outputs.jacobian @ slope / known.sigma
         size = float(gradient.abs().max()) or 1.0
@@ -209,9 +204,8 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     def _of_linear(self, known: OutputProgress, curvature: Tensor, s: Tensor) -> tuple[float, Tensor]:
         """Return the loss of the linear outputs at a step [n], with the curvature of the outputs, and its slope."""
         assert self._linear is not None
-        assert self.settings.loss is not None
         output, jacobian = self._linear
-        loss, slope = value_and_slope(self.settings.loss, (output + s @ jacobian).view(known.shape))
+        loss, slope = value_and_slope(self.settings.white_box, (output + s @ jacobian).view(known.shape))
         bent = curvature @ s
         return loss + 0.5 * float(s @ bent), jacobian @ slope.flatten() + bent
 

@@ -28,7 +28,7 @@ _PATIENCE = 2
 _WORTH = 0.1
 """Part of the loss that the first step of Gauss-Newton must promise to take away."""
 _WORTH_EARLY = 0.3
-"""The same right after the first samples. Where outputs have nothing in common, as images of objects that do not
+"""`_WORTH` right after the first samples. Where outputs have nothing in common, as images of objects that do not
 overlap, an affine output promises to fade the object out: up to a quarter."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""
@@ -72,8 +72,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         self, other: Progress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[OutputProcessProgress, Tensor]:
         """Begin with evaluations of another search; return the next points, too."""
-        nowhere = torch.full_like(self.settings.start, math.inf)
-        known = self.progress(**self.begun(), finished=nowhere, phase="trial").taking(other)
+        known = replace(self.begun(), phase="trial").taking(other)
         return self.points(self.remembered(known, evaluated), generator)
 
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:
@@ -108,7 +107,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             alone=known.alone + count,
         )
         turn = bool(known.due) or known.waited >= PATIENCE * (self.settings.n + 1)
-        early = bool(known.finished.isinf().all()) and len(known.pool) > self.settings.n and not self.settings.noise
+        early = known.finished is None and len(known.pool) > self.settings.n and not self.settings.noise
         if not known.noisy and not known.done:
             if (turn or early) and self.is_new(known):
                 known = replace(known, finished=known.best.point, early=early)
@@ -131,7 +130,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         if not now.done and not now.failed:
             return known, points
         best = known.best.point
-        solved = best if now.done else torch.full_like(best, math.inf)
+        solved = best if now.done else None
         failures = 0 if self.is_new(known) else known.failures + 1
         known = replace(known, finishing=False, waited=0, finished=best, solved=solved, failures=failures)
         if not known.due and not now.done:

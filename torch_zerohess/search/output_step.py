@@ -16,7 +16,7 @@ _FAITHFUL = 0.25
 _TOLERABLE = 5.0
 """Misfit up to which a step that lowers the loss is itself what the model needs to know."""
 _GAIN = 0.02
-"""Part of the loss by which such a step lowers it."""
+"""Part of the loss that a step with a misfit up to `_TOLERABLE` must take away."""
 _MISLED = 2.0
 """Misfit beyond which the next step needs more samples than the last one."""
 _NARROW, _BY_LENGTH, _WIDER = 0.85, 0.3, 1.05
@@ -28,17 +28,18 @@ _FEWER = 8
 _RETRIES = 2
 """Shorter steps tried in a row before samples are drawn."""
 _SHORTER, _RETRY = 0.4, 0.9
-"""Length of such a step in units of the one before, and its factor for sigma."""
+"""Length of a shorter step in units of the step before, and its factor for sigma."""
 _STALLED = 8
-"""Steps in which the smoothed loss must have fallen"""
+"""Latest steps, in which the smoothed loss must have fallen."""
 _FALL, _HURRY = 0.95, 0.8
-"""to this part of what it was, or sigma shrinks by another factor."""
+"""If the lowest smoothed loss of the latest steps is above this part of the lowest one before, sigma shrinks more, by
+the second factor."""
 _FLAT = 0.03
 """Relative change of the loss below which a step has stayed on a plateau."""
 _PLATEAU, _PATIENCE = 1.3, 4
-"""On a plateau sigma grows by this factor, this often,"""
+"""Factor for sigma on a plateau, and how often sigma grows there."""
 _BETTER = 0.9
-"""unless the best point of the round has less than this part of the loss: then the search returns to it."""
+"""If the best point of the round has less than this part of the loss, the search returns to it from a plateau."""
 
 
 def after_output(known: DescentProgress, point: Tensor, loss: float, output: Tensor) -> DescentProgress:

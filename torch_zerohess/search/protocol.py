@@ -150,7 +150,7 @@ class AskTell(ABC, Generic[P]):
     @property
     def apart(self) -> bool:
         """Whether these rounds have arrived at several points."""
-        return self._state.progress.apart
+        return self._state.progress.arrivals.apart
 
     @property
     def promise(self) -> float:

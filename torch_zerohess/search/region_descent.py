@@ -35,7 +35,8 @@ _OTHER_LENGTHS = (2.0, 0.5, 4.0, 0.25)
 _STILL, _CLOSING = 1e-3, 0.3
 """Length of a step that is not worth an evaluation, and the factor for sigma after it."""
 _LEAPING, _CONFIRMED = 1e-3, 0.1
-"""The same where a point of the region was as predicted, within this part of its difference from the best point."""
+"""Factor for sigma after a step that is not worth an evaluation, where the loss at a point of the region was predicted;
+error of such a prediction, over the change of the loss from the best point, at most."""
 _CLOSE, NEAR = 1.5, 2.0
 """Distance within which n + 1 evaluations allow sigma to shrink after a rejected step, and after one of no length."""
 _ROUNDING = 4 * torch.finfo(torch.float64).eps
@@ -95,10 +96,14 @@ class RegionDescent(Method[R]):
 
     def _step(self, known: R) -> tuple[Tensor, float]:
         """Return the step [n] to the minimum of the quadratic within the region, and the decrease that it promises."""
-        x, settings = known.lowest.point, self.settings
-        root, lower, upper = known.sigma * known.root, settings.lower - x, settings.upper - x
-        s = region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
+        s = self._minimum(known)
         return s, -known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
+
+    def _minimum(self, known: R, factor: float = 1.0) -> Tensor:
+        """Return the step [n] to the minimum of the quadratic within the region, or within one larger by a factor."""
+        x, settings = known.lowest.point, self.settings
+        root, lower, upper = factor * known.sigma * known.root, settings.lower - x, settings.upper - x
+        return region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
 
     # The search.
 
@@ -156,8 +161,7 @@ class RegionDescent(Method[R]):
         """Return ends of shorter and longer steps, then points of the region around the end of the step."""
         trial, x, ends = known.phase == "trial", known.lowest.point, points[:1]
         for factor in _OTHER_LENGTHS[: (count + 1) // 2] if trial else ():
-            root, lower, upper = factor * known.sigma * known.root, self.settings.lower - x, self.settings.upper - x
-            step = region_step(known.gradient, known.hessian, root, lower, upper, self._singular, known.border)
+            step = self._minimum(known, factor)
             if float((ends - x - step).norm(dim=1).min()) > _STILL * known.sigma:
                 ends = torch.cat([ends, (x + step)[None]])
         steps = normal(generator, x, count + 1 - len(ends), self._n) @ (known.sigma / math.sqrt(self._n) * known.root)

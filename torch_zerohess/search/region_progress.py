@@ -85,13 +85,11 @@ class RegionProgress(Progress):
             holes = torch.cat([holes, holes.new_ones(len(failed))])
         which = latest(points, lowest.point, capacity)
         return replace(
-            self,
+            self.told(evaluated, lost=evaluated.lacking),
             best=self.best.or_lower(new, self.sigma),
             lowest=lowest,
             center=lowest.point,
             points=points[which],
             values=values[which],
             holes=holes[which],
-            evaluations=self.evaluations + len(evaluated),
-            lost=0 if bool(evaluated.needed.finite.all()) else self.lost + 1,
         )

@@ -33,7 +33,7 @@ _FIRST = 32
 _MOST = 0.5
 """Share of the held-out change from which on a sparse Jacobian is chosen for good: early, or in place of descent."""
 _DETERMINED = 0.7, 0.9
-"""The same where the whole batch determines a dense Jacobian: after its first part, and after all of it."""
+"""`_MOST` where the whole batch determines a dense Jacobian: after its first part, and after all of it."""
 _MORE = 0.1
 """Share by which one Jacobian must predict more than the other one."""
 _HELD = 1 << 25
@@ -148,7 +148,8 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         self, known: SparseOrDenseProgress, start: LocalProgress, reason: str, generator: torch.Generator
     ) -> tuple[SparseOrDenseProgress, Tensor]:
         """Go on by the sparse Jacobian."""
-        local, points = self.local.asked(start.taking(known, "iterations", "rounds"), generator)
+        begun = start.taking(known, "iterations").with_arrivals(rounds=known.rounds)
+        local, points = self.local.asked(begun, generator)
         known = replace(known, chosen="local", reason=reason, descent=None, local=local).taking(local)
         assert start.jacobian is not None
         return self._decided(known, final=start.jacobian.explained > _MOST), points

@@ -38,6 +38,22 @@ class Best:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Arrivals:
+    """The rounds of a search that have ended, and where it has arrived."""
+
+    rounds: int = 0
+    """Rounds that have ended, most of them where the search has arrived."""
+    lowest: Best | None = None
+    """The lowest point at which it has arrived."""
+    agreed: int = 0
+    """Rounds in a row that have arrived at the best point, or at other points with the same loss."""
+    place: Best | None = None
+    """The best point when the first of them arrived."""
+    apart: bool = False
+    """Whether some of them arrived at another point: there are several minima, or the floor of a valley."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Progress:
     """What a search knows after the values that it was told. A search adds its own fields in a subclass.
 
@@ -51,16 +67,7 @@ class Progress:
     evaluations: int = 0
     iterations: int = 0
     """Steps tried."""
-    rounds: int = 0
-    """Rounds that have ended, most of them where the search has arrived."""
-    arrived: Best | None = None
-    """The lowest point at which it has arrived."""
-    agreed: int = 0
-    """Rounds in a row that have arrived at the best point, or at other points with the same loss."""
-    place: Best | None = None
-    """The best point when the first of them arrived."""
-    apart: bool = False
-    """Whether some of them arrived at another point: there are several minima, or the floor of a valley."""
+    arrivals: Arrivals = Arrivals()
     lost: int = 0
     """Batches in a row that were lost: with values that are not finite at points that the search needed; in noise, and
     for Gauss-Newton, without any finite value."""
@@ -70,23 +77,73 @@ class Progress:
     shape: torch.Size = _SCALAR
     """Of an output, [*out]; empty before the first one and where the black box returns the loss."""
 
+    @property
+    def rounds(self) -> int:
+        """Rounds that have ended."""
+        return self.arrivals.rounds
+
+    @property
+    def agreed(self) -> int:
+        """Rounds in a row that agree."""
+        return self.arrivals.agreed
+
     def taking(self: "P", other: "Progress", *names: str) -> "P":
         """Return this progress with fields of another one: those of the names, or all that every search has."""
         return replace(self, **{name: getattr(other, name) for name in names or _COMMON})
 
+    def told(self: "P", evaluated: "Evaluated", *, lost: bool) -> "P":
+        """Count a batch, which is lost or not, and note the shape of its outputs."""
+        evaluations, lost_in_a_row = self.evaluations + len(evaluated), self.lost + 1 if lost else 0
+        return replace(self, evaluations=evaluations, lost=lost_in_a_row, shape=evaluated.shape)
+
     def is_at_arrival(self, tolerance: float) -> bool:
         """Whether the best point is one at which the search has arrived; tolerance: see `are_same`."""
-        end = self.arrived
+        end = self.arrivals.lowest
         if end is None or self.rounds == 0 or self.best.loss > end.loss:
             return False
         return are_same(self.best.point, end.point, tolerance)
 
     def ended_round(self: "P", reason: str, restarts: int) -> "P":
         """Count a round that ends. The search is done after `restarts` further rounds."""
-        rounds = self.rounds + 1
-        if rounds <= restarts:
-            return replace(self, rounds=rounds)
-        return replace(self, rounds=rounds, done=True, message=f"{reason}, in round {rounds}")
+        known = self.with_arrivals(rounds=self.rounds + 1)
+        if known.rounds <= restarts:
+            return known
+        return replace(known, done=True, message=f"{reason}, in round {known.rounds}")
+
+    def arriving(self: "P", end: Best) -> "P":
+        """Note that the search has arrived."""
+        lowest = self.arrivals.lowest
+        lower = end.loss < (math.inf if lowest is None else lowest.loss)
+        return self.with_arrivals(lowest=end) if lower else self
+
+    def agreeing(self: "P", end: Best, tolerance: float, losses: Tensor | None = None) -> "P":
+        """Count a round that has arrived.
+
+        It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point; or if
+        its loss, and theirs, is the best one.
+
+        Args:
+            end: the lowest point of the round.
+            tolerance: see `are_same`.
+            losses: evaluations [P], against whose lower quartile two losses are the same: penalties are above it. None
+                if losses are not to be compared.
+        """
+        best, place, apart = self.best, self.arrivals.place, self.arrivals.apart
+        slack = -math.inf if losses is None else _EQUAL * (float(losses.quantile(0.25)) - best.loss)
+
+        def is_best(one: Best) -> bool:
+            return are_same(one.point, best.point, tolerance) or one.loss - best.loss <= slack
+
+        if not is_best(end):
+            return self.with_arrivals(agreed=0)
+        if place is None or self.agreed == 0 or not is_best(place):
+            return self.with_arrivals(agreed=1, place=best, apart=not are_same(end.point, best.point, tolerance))
+        apart = apart or not are_same(end.point, place.point, tolerance)
+        return self.with_arrivals(agreed=self.agreed + 1, apart=apart)
+
+    def with_arrivals(self: "P", **changes: Any) -> "P":
+        """Return the progress with changes of its arrivals."""
+        return replace(self, arrivals=replace(self.arrivals, **changes))
 
 
 _COMMON = tuple(field.name for field in fields(Progress))
@@ -99,42 +156,9 @@ def not_finite(batches: int) -> str:
     return f"{batches} batches in a row had values that are not finite"
 
 
-def arriving(known: P, end: Best) -> P:
-    """Note that the search has arrived."""
-    lower = end.loss < (math.inf if known.arrived is None else known.arrived.loss)
-    return replace(known, arrived=end) if lower else known
-
-
 def are_same(one: Tensor, other: Tensor, tolerance: float) -> bool:
     """Whether points [n] are within the tolerance, root mean square over the parameters."""
     return float((one - other).norm()) < tolerance * math.sqrt(len(one))
-
-
-def agreeing(known: P, end: Best, tolerance: float, losses: Tensor | None = None) -> P:
-    """Count a round that has arrived.
-
-    It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point; or if its
-    loss, and theirs, is the best one.
-
-    Args:
-        known: the progress.
-        end: the lowest point of the round.
-        tolerance: see `are_same`.
-        losses: evaluations [P], against whose lower quartile two losses are the same: penalties are above it. None if
-            losses are not to be compared.
-    """
-    best = known.best
-    slack = -math.inf if losses is None else _EQUAL * (float(losses.quantile(0.25)) - best.loss)
-
-    def is_best(one: Best) -> bool:
-        return are_same(one.point, best.point, tolerance) or one.loss - best.loss <= slack
-
-    if not is_best(end):
-        return replace(known, agreed=0)
-    if known.place is None or known.agreed == 0 or not is_best(known.place):
-        return replace(known, agreed=1, place=best, apart=not are_same(end.point, best.point, tolerance))
-    apart = known.apart or not are_same(end.point, known.place.point, tolerance)
-    return replace(known, agreed=known.agreed + 1, apart=apart)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +194,11 @@ class Evaluated:
         """Which of the points have finite values [K]."""
         finite = torch.isfinite(self.losses)
         return finite if self.outputs is None else finite & torch.isfinite(self.outputs).all(1)
+
+    @property
+    def lacking(self) -> bool:
+        """Whether a point that the method itself asked for has no finite value."""
+        return not bool(self.needed.finite.all())
 
     @property
     def usable(self) -> Tensor:

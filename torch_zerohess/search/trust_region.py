@@ -29,10 +29,10 @@ class TrustRegion(AskTell[Any]):
     """A search that counts evaluations: `GaussianProcessSearch`, `Descent` or `LocalGaussNewton`. The caller evaluates.
 
     - Up to four parameters in a finite box: a Gaussian process, which escapes plateaus and local minima.
-    - 5 to 19 parameters in a finite box, an output and a `loss`, and `restarts`: descent and the Gaussian process in
-      turn. Descent begins, and stays where its Gauss-Newton makes good steps. Elsewhere the process has its turn when
-      n + 1 evaluations of the descent take away less than a fifth of the loss. The descent has its turn again when
-      8 (n + 1) evaluations of the process take away less than a tenth.
+    - 5 to 19 parameters in a finite box, an output and a `loss`, `restarts`, and no `noise`: descent and the Gaussian
+      process in turn. Descent begins, and stays where its Gauss-Newton makes good steps. Elsewhere the process has its
+      turn when n + 1 evaluations of the descent take away less than a fifth of the loss. The descent has its turn again
+      when 8 (n + 1) evaluations of the process take away less than a tenth.
     - 20 parameters or more, an output of many numbers and a `loss`: the evaluations tell whether these numbers depend
       on few parameters each. If they do: Gauss-Newton on a sparse Jacobian. The search asks this after its first batch
       and, where the answer is not clear, each time that its evaluations have doubled.
@@ -51,8 +51,9 @@ class TrustRegion(AskTell[Any]):
         restarts: how often to go on after the search has arrived at a minimum. 0 for a local search.
         tolerance: length, in units of the first sigma, below which the search has arrived; 0.01 if None, for the
             engine "local" 0.0005.
-        noise: standard deviation of repeated losses at one point, if it is known.
-        pool: evaluations kept; a default by the number of parameters if None.
+        noise: standard deviation of repeated losses at one point, if it is known. The engine "local", and descent on
+            the output of more than two parameters, use only whether it is above 0.
+        pool: evaluations kept; a default by the number of parameters if None. Not for the engine "local".
         grid: rows and columns in which the parameters lie, for the engine "local": see `LocalGaussNewton`.
         seed: of the samples; from torch's global generator if None.
 
@@ -122,6 +123,8 @@ class TrustRegion(AskTell[Any]):
     def _make(self, settings: Settings) -> Method[Any]:
         if self._grid is not None and self._wanted in ("descent", "gaussian_process"):
             raise ValueError(f"grid is for the engines 'local' and 'auto', got {self._grid} with {self._wanted!r}")
+        if settings.pool is not None and self._wanted == "local":
+            raise ValueError(f"pool is for the other engines, got {settings.pool} with 'local'")
         engine, self._reason = _chosen(settings) if self._wanted == "auto" else (self._wanted, "the caller chose it")
         if engine == "gaussian_process":
             return process_method(settings)

@@ -361,7 +361,7 @@ def test_a_round_without_finite_values_has_not_arrived(lost, arrives):
     search.tell(bowl(search.ask())[:, None])
     method, known = search._method._follow, search._state.progress.descent
     ended = method.arrive(replace(known, lost=lost, sigma=1e-9), "it ends", torch.Generator())
-    assert (ended.arrived is not None) == arrives
+    assert (ended.arrivals.lowest is not None) == arrives
     assert (ended.rounds, ended.lost) == (1, 0)
 
 

@@ -11,7 +11,7 @@ from searches import texels as image
 import torch_zerohess as zh
 from torch_zerohess.optim import LocalGaussNewton
 from torch_zerohess.search.gauss_newton import LENGTHS
-from torch_zerohess.search.state import Evaluated
+from torch_zerohess.search.state import Arrivals, Evaluated
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from truths import normal, vector
 
@@ -153,7 +153,8 @@ def test_a_hop_that_returns_to_a_minimum_confirms_it(above, agreed):
     search = search_for(image, normal(N))
     known = hopping(search, finished=True)
     home = replace(known.home, best=replace(known.best, point=known.home.center))
-    known = replace(known, home=home, best=home.best, place=home.best, agreed=1, loss=(1.0 + above) * home.loss)
+    arrivals, loss = Arrivals(place=home.best, agreed=1), (1.0 + above) * home.loss
+    known = replace(known, home=home, best=home.best, arrivals=arrivals, loss=loss)
     after = search._method.arrived(known)
     assert after.agreed == agreed
     assert after.rounds == 1
@@ -468,7 +469,7 @@ def test_short_steps_at_a_kink_are_an_arrival_where_the_loss_of_linear_outputs_p
     known = replace(known, best=replace(known.best, point=known.center, loss=known.loss))
     after = method.arrived(known)
     assert after.agreed == agreed
-    assert (after.arrived is not None) == (agreed == 1)
+    assert (after.arrivals.lowest is not None) == (agreed == 1)
 
 
 def test_at_a_kink_nearer_samples_are_asked_for_before_it_arrives():

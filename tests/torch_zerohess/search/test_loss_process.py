@@ -223,7 +223,7 @@ def test_a_minimum_elsewhere_that_is_higher_agrees_with_nothing():
             now = search.state_dict()["progress"]
             if before["finishing"] and not now["finishing"] and now["local"]["best"]["loss"] > 0.9:
                 higher += now["local"]["done"]
-                assert now["agreed"] == 0 or not now["local"]["done"]
+                assert now["arrivals"]["agreed"] == 0 or not now["local"]["done"]
         assert search.value == 0.0  # where it has begun
     assert higher >= 1
 
@@ -265,6 +265,6 @@ def test_an_arrival_is_a_minimum_of_the_quadratics():
     method, points = LossProcess(settings), normal(12, 2, seed=0)
     known, _ = method.first(torch.Generator().manual_seed(0))
     known = method.remembered(known, Evaluated(points, points.square().sum(1), None))
-    assert known.agreeing(settings.tolerance).arrived is None
-    solved = replace(known, solved=known.best.point).agreeing(settings.tolerance)
-    assert solved.arrived is known.best
+    assert known.arriving_here(settings.tolerance).arrivals.lowest is None
+    solved = replace(known, solved=known.best.point).arriving_here(settings.tolerance)
+    assert solved.arrivals.lowest is known.best

@@ -8,7 +8,7 @@ from searches import zeros
 
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.loss_step import after_loss
-from torch_zerohess.search.state import Best
+from torch_zerohess.search.state import Arrivals, Best
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
@@ -59,7 +59,7 @@ def test_a_better_sample_is_preferred():
 @pytest.mark.parametrize(("rounds", "need"), [(0, 1), (1, 2), (2, 4), (5, 4)])
 def test_a_step_that_does_not_is_refused(loss, rounds, need):
     """Sigma shrinks, and samples are asked for: more in later rounds, n at most."""
-    after = after_loss(step(rounds=rounds), END, loss, 0.0)
+    after = after_loss(step(arrivals=Arrivals(rounds=rounds)), END, loss, 0.0)
     assert torch.equal(after.center, zeros(4))
     assert (after.value, after.sigma, after.phase) == (10.0, 0.75, "sample")
     assert (after.need, after.paired) == (need, need > 1)

@@ -10,7 +10,7 @@ from searches import plateau, rosenbrock, run, zeros
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import metric_descent
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Arrivals, Best, Evaluated
 from truths import vector
 
 
@@ -284,6 +284,7 @@ def test_a_round_that_ends_on_a_floor_agrees_with_none(others, agreed):
     search.tell(search.ask()[:, 0])
     end, elsewhere = Best(vector(5.0), 0.0), Best(vector(9.0), 0.0)
     points, values = vector(5.0, 6.0, 7.0, 8.0, 9.0)[:, None], vector(0.0, *others)
-    known = replace(search._state.progress, best=elsewhere, place=elsewhere, agreed=1, lowest=end, points=points)
+    arrivals = Arrivals(place=elsewhere, agreed=1)
+    known = replace(search._state.progress, best=elsewhere, arrivals=arrivals, lowest=end, points=points)
     after, _ = search._method._arrived(replace(known, values=values), "it ends", torch.Generator())
     assert after.agreed == agreed

@@ -149,7 +149,7 @@ def test_outputs_without_noise_are_not_averaged():
 @pytest.mark.parametrize(("agreed", "averages"), [(2, False), (3, True)])
 def test_averaging_begins_after_three_rounds_that_agree(agreed, averages):
     search = search_for()
-    known = replace(begun(search), agreed=agreed)
+    known = begun(search).with_arrivals(agreed=agreed)
     after = search._method._hopping(known)
     assert (after.averaging, after.home is None) == (averages, averages)
     assert after.best.loss == known.best.loss

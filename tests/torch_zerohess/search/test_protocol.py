@@ -475,7 +475,7 @@ def test_a_start_that_is_not_finite_can_be_told_again():
 
 
 @pytest.mark.parametrize("written", ["0.0.9", None])
-@pytest.mark.parametrize(("change", "wrong"), [("agreed", "lacks agreed"), (None, "has later")])
+@pytest.mark.parametrize(("change", "wrong"), [("arrivals", "lacks arrivals"), (None, "has later")])
 def test_a_state_of_another_version_is_named_and_changes_nothing(written, change, wrong):
     search = Descent(zeros(2), sigma=1.0, seed=0)
     search.tell(bowl(search.ask()))

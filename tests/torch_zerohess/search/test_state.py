@@ -12,7 +12,7 @@ from torch_zerohess.optim import (
     Descent,
     TrustRegion,
 )
-from torch_zerohess.search.state import Best, Evaluated, Progress, agreeing
+from torch_zerohess.search.state import Best, Evaluated, Progress
 from truths import vector
 
 
@@ -119,31 +119,32 @@ def test_a_state_in_noise_is_of_another_search():
 
 def test_rounds_agree_that_arrive_at_one_point_which_is_the_best_one():
     """Within 0.05 of each parameter, root mean square."""
-    first = agreeing(Progress(best=Best(vector(1.0, 0.0)), center=zeros(2)), Best(vector(1.0, 0.0)), 0.05)
-    second = agreeing(first, Best(vector(1.07, 0.0)), 0.05)
-    assert (first.agreed, second.agreed, second.apart) == (1, 2, False)
-    assert agreeing(second, Best(vector(1.08, 0.0)), 0.05).agreed == 0
-    moved = agreeing(replace(second, best=Best(vector(3.0, 0.0))), Best(vector(3.0, 0.0)), 0.05)
-    assert (moved.agreed, moved.place.point.tolist()) == (1, [3.0, 0.0])
+    first = Progress(best=Best(vector(1.0, 0.0)), center=zeros(2)).agreeing(Best(vector(1.0, 0.0)), 0.05)
+    second = first.agreeing(Best(vector(1.07, 0.0)), 0.05)
+    assert (first.agreed, second.agreed, second.arrivals.apart) == (1, 2, False)
+    assert second.agreeing(Best(vector(1.08, 0.0)), 0.05).agreed == 0
+    moved = replace(second, best=Best(vector(3.0, 0.0))).agreeing(Best(vector(3.0, 0.0)), 0.05)
+    assert (moved.agreed, moved.arrivals.place.point.tolist()) == (1, [3.0, 0.0])
 
 
 def test_rounds_agree_that_arrive_at_one_loss():
     """Equal within 1e-4 of the distance of the lower quartile, 6, from the lowest loss, 1: 5e-4."""
     losses, tolerance = vector(1.0, 6.0, 1e9, 1e12, 1e12), 0.05
-    first = agreeing(Progress(best=Best(vector(0.0), 1.0), center=zeros(1)), Best(vector(0.0), 1.0), tolerance, losses)
-    second = agreeing(first, Best(vector(3.0), 1.0 + 4e-4), tolerance, losses)
-    assert (second.agreed, second.apart) == (2, True)
-    assert agreeing(second, Best(vector(0.0), 1.0), tolerance, losses).agreed == 3
-    assert agreeing(first, Best(vector(3.0), 1.0 + 6e-4), tolerance, losses).agreed == 0
-    assert agreeing(first, Best(vector(3.0), 1.0 + 4e-4), tolerance).agreed == 0
+    begun = Progress(best=Best(vector(0.0), 1.0), center=zeros(1))
+    first = begun.agreeing(Best(vector(0.0), 1.0), tolerance, losses)
+    second = first.agreeing(Best(vector(3.0), 1.0 + 4e-4), tolerance, losses)
+    assert (second.agreed, second.arrivals.apart) == (2, True)
+    assert second.agreeing(Best(vector(0.0), 1.0), tolerance, losses).agreed == 3
+    assert first.agreeing(Best(vector(3.0), 1.0 + 6e-4), tolerance, losses).agreed == 0
+    assert first.agreeing(Best(vector(3.0), 1.0 + 4e-4), tolerance).agreed == 0
     lower = replace(second, best=Best(vector(5.0), 0.0))
-    after = agreeing(lower, Best(vector(5.0), 0.0), tolerance, losses)
-    assert (after.agreed, after.apart) == (1, False)
+    after = lower.agreeing(Best(vector(5.0), 0.0), tolerance, losses)
+    assert (after.agreed, after.arrivals.apart) == (1, False)
     # A round elsewhere comes between: the first round after it counts like all others.
-    broken = agreeing(second, Best(vector(8.0), 9.0), tolerance, losses)
-    again = agreeing(broken, Best(vector(3.0), 1.0 + 4e-4), tolerance, losses)
-    again = agreeing(again, Best(vector(0.0), 1.0), tolerance, losses)
-    assert (broken.agreed, again.agreed, again.apart) == (0, 2, True)
+    broken = second.agreeing(Best(vector(8.0), 9.0), tolerance, losses)
+    again = broken.agreeing(Best(vector(3.0), 1.0 + 4e-4), tolerance, losses)
+    again = again.agreeing(Best(vector(0.0), 1.0), tolerance, losses)
+    assert (broken.agreed, again.agreed, again.arrivals.apart) == (0, 2, True)
 
 
 def test_an_output_that_is_not_finite_is_no_value_whatever_its_loss():

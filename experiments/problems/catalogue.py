@@ -13,12 +13,13 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Preset, Task
 from torch_zerohess.adapters.mitsuba_variants import find_llvm, probe
 
+MESHES = ("meshfit", "meshfit_color", "suzanne", "banana")
+"""Fitting tasks whose unknowns are the vertices of a mesh."""
 FITTING = {
     name: f"experiments.problems.tasks.{name}"
     for name in (
         *("quad", "box2", "box10", "texture", "texture100", "texture317", "dense", "brdf", "nonpsd", "throw"),
-        *("caustic", "caustic64", "discs", "hexagon"),
-        *("meshfit", "meshfit_color", "suzanne", "banana"),
+        *("caustic", "caustic64", "discs", "hexagon", *MESHES),
     )
 }
 """Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""

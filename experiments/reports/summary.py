@@ -9,12 +9,11 @@ import statistics
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import pandas as pd
-import tyro
 
+from experiments.arguments import Folder
 from experiments.problems.catalogue import chosen
 from experiments.reports import source_table
 from experiments.reports.medians import MEASURES, medians, objects, reached
@@ -194,7 +193,7 @@ def _speed_up_text(summary: Summary) -> str:
 
 
 def table(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
+    folder: Folder,
     /,
     format: Literal["text", "csv", "json", "table_2"] = "text",
     reference: str | None = None,

@@ -58,8 +58,7 @@ def bench_device(
         if value < 1:
             raise SystemExit(f"{name} must be at least 1, got {value}")
     check_file(out)
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     rows = [
         row
         for dtype in (torch.float32, torch.float64)

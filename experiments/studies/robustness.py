@@ -9,11 +9,11 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pandas as pd
-import tyro
 
+from experiments.arguments import OptionalTasks
 from experiments.ensembles.ensemble import Ensemble, not_run, ordered, settings_by_method
 from experiments.ensembles.processes import Job
 from experiments.ensembles.provenance import register
@@ -108,7 +108,7 @@ class Row:
 
 
 def robustness(
-    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK...]")] = ("mug", "shad"),
+    tasks: OptionalTasks = ("mug", "shad"),
     /,
     methods: str = "gaussian_process,our_hvpa",
     over: tuple[str, ...] = tuple(SWEEPS),

@@ -78,6 +78,8 @@ def lowest(function: Function, n: int) -> float:
         step = torch.linalg.solve(torch.func.hessian(loss)(x), torch.func.grad(loss)(x))
         while float(loss(x - step)) > float(loss(x)) and float(step.norm()) > 1e-12:
             step = 0.5 * step
+        if torch.equal(x - step, x):  # all further steps are the same
+            break
         x = x - step
     return float(loss(x))
 

@@ -280,7 +280,7 @@ def following(progress):
 @pytest.mark.parametrize(
     ("n", "with_loss", "pool", "expected"),
     [
-        *[(2, False, None, 200), (9, False, None, 200), (10, False, None, 228), (300, False, None, 1800)],
+        *[(2, False, None, 200), (9, False, None, 200), (10, False, None, 228), (201, False, None, 1206)],
         *[(3, True, None, 60), (20, True, None, 120), (2, False, 7, 7)],
     ],
 )

@@ -156,8 +156,6 @@ def robustness(
         register(out, settings_by_method(todo.values()))
         wanted_runs = ordered(todo.values())
         outcomes = ensemble.run(wanted_runs)
-    except ImportError as error:
-        raise SystemExit(str(error)) from None
     except KeyboardInterrupt:
         raise SystemExit(f"\ninterrupted; the same command goes on where it was, logs are in {out}") from None
     missing = not_run(wanted_runs, outcomes)

@@ -128,6 +128,7 @@ def test_tasks_that_mujoco_simulates_say_that_it_is_missing(monkeypatch) -> None
         ["tune", "mug", "--method", "our_g"],
         ["losses", "--tasks", "mug"],
         ["gradients", "mug"],
+        ["robustness", "mug"],
     ],
     ids=" ".join,
 )

@@ -1,10 +1,8 @@
 """`python -m experiments list`: what there is, what goes with what, and what is missing."""
 
 from collections.abc import Sequence
-from typing import Annotated
 
-import tyro
-
+from experiments.arguments import Tasks
 from experiments.methods import METHODS
 from experiments.problems import catalogue
 from experiments.problems.network_task import NetworkTask
@@ -12,7 +10,7 @@ from experiments.problems.task import Task
 from experiments.reports.tables import table
 
 
-def list_(tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="TASK...")] = (), /) -> None:
+def list_(tasks: Tasks = (), /) -> None:
     """Print tasks and methods, which methods can be run on which tasks, and what must be installed for the rest.
 
     Args:

@@ -3,10 +3,8 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from experiments.arguments import Tasks
 from experiments.ensembles.ensemble import Ensemble, not_run
 from experiments.ensembles.processes import Job
 from experiments.methods import METHODS
@@ -23,7 +21,7 @@ RUNS, NETWORK_RUNS = 20, 1
 
 
 def run(
-    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="TASK...")],
+    tasks: Tasks,
     /,
     methods: str = "all",
     runs: int | None = None,

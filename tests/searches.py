@@ -52,6 +52,13 @@ def rays_loss(n, dtype=torch.float64):
     return lambda output: (output - target).square().mean()
 
 
+def bent(x):
+    """Residuals [K, n + 2] whose sum of squares is 1 at its minimum 0, and curved there by the last residual."""
+    k = torch.arange(1, x.shape[1] + 1, dtype=x.dtype)
+    linear = (x + 0.3 * x.sum(1, keepdim=True)) / k
+    return torch.cat([linear, (x * k).sum(1, keepdim=True), 1 + 0.5 * x.square().sum(1, keepdim=True)], 1)
+
+
 def waves(x):
     """Smooth outputs [K, 5] of points [K, n]."""
     k = torch.arange(1, 6, dtype=torch.float64)

@@ -33,7 +33,8 @@ LAYERS = {
         *("search", "optim", "minimization", "minimize", "adapters", "doctor"),
     ],
     "experiments": [
-        *("problems", "runs", "methods", "ensembles", "reports", "studies", "listing", "run", "commands", "__main__"),
+        *("arguments", "problems", "runs", "methods", "ensembles", "reports", "studies"),
+        *("listing", "run", "commands", "__main__"),
     ],
 }
 MOST_LINES = 320

@@ -173,7 +173,6 @@ def ordered(jobs: Iterable[Job]) -> list[Job]:
     position: dict[str, int] = {}
 
     def key(job: Job) -> tuple[int, bool, int]:
-        method = METHODS[job.method] if isinstance(job.method, str) else job.method
-        return position.setdefault(job.task_name, len(position)), method.another_scene, job.run
+        return position.setdefault(job.task_name, len(position)), job.resolved_method.another_scene, job.run
 
     return sorted(jobs, key=key)

@@ -60,6 +60,10 @@ class Job:
         return self.method if isinstance(self.method, str) else self.method.name
 
     @property
+    def resolved_method(self) -> Method:
+        return METHODS[self.method] if isinstance(self.method, str) else self.method
+
+    @property
     def files(self) -> Files:
         return Files(self.folder / self.task_name / self.method_name, self.run)
 
@@ -175,7 +179,7 @@ def _execute(job: Job, connection: Connection) -> Message:
         task = catalogue.budgeted(task, job.budget)
         if job.workers is not None:
             task = spread(task, *_carrier(job.workers, job.task, job.preset, job.variant, job.threads))
-        method = METHODS[job.method] if isinstance(job.method, str) else job.method
+        method = job.resolved_method
         method.load()
         outcome = attempt(
             task,

@@ -50,7 +50,7 @@ def bfgs_adaptive_fd(
         frozen: the same samples for all values.
     """
     sampled = SampledGradient(trial, samples, frozen=frozen)
-    annealing = Annealing(start * trial.task.sigma, end * trial.task.sigma, steps)
+    annealing = Annealing.of(trial.task, start, end, steps)
     rng = np.random.default_rng(trial.seed)
     x, iteration, n = trial.start, 0, trial.task.n
     curvature, interval, sigma = _fresh(n), None, annealing(0)

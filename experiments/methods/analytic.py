@@ -21,7 +21,7 @@ from experiments.runs.trial import Trial
 def analytic_1(trial: Trial, *, rate: float = 0.1, start: float = 1.0, end: float = 0.01, steps: int = 300) -> None:
     """First order: Adam with learning rate `rate` in units of `Task.sigma`, sigma annealed as for sampled gradients."""
     x = trial.start.clone().requires_grad_()
-    loss, annealing = _counted(trial), Annealing(start * trial.task.sigma, end * trial.task.sigma, steps)
+    loss, annealing = _counted(trial), Annealing.of(trial.task, start, end, steps)
     optimizer = torch.optim.Adam([x], lr=rate * trial.task.sigma)
     iteration = 0
     while True:
@@ -37,7 +37,7 @@ def analytic_1(trial: Trial, *, rate: float = 0.1, start: float = 1.0, end: floa
 def analytic_2(trial: Trial, *, radius: float = 2.0, start: float = 1.0, end: float = 0.01, steps: int = 10) -> None:
     """Second order: `zh.optim.Newton` with shifted eigenvalues; `radius` is that at the start, in units of sigma."""
     x = trial.start.clone().requires_grad_()
-    loss, annealing = _counted(trial), Annealing(start * trial.task.sigma, end * trial.task.sigma, steps)
+    loss, annealing = _counted(trial), Annealing.of(trial.task, start, end, steps)
     optimizer = zh.optim.Newton([x], radius=radius * annealing(0))
     iteration = 0
     while True:

@@ -5,6 +5,8 @@
 
 from dataclasses import dataclass
 
+from experiments.problems.task import Task
+
 
 def linear(ends: tuple[float, float], share: float) -> float:
     """Return a number that goes from the first to the last one, by equal differences."""
@@ -25,6 +27,11 @@ class Annealing:
     start: float
     end: float
     steps: int
+
+    @classmethod
+    def of(cls, task: Task, start: float, end: float, steps: int) -> "Annealing":
+        """Return the one between two multiples of `Task.sigma`."""
+        return cls(start * task.sigma, end * task.sigma, steps)
 
     def __call__(self, iteration: int) -> float:
         return linear((self.start, self.end), min(iteration / self.steps, 1.0))

@@ -59,7 +59,7 @@ def bfgs(
             update.
     """
     sampled = SampledGradient(trial, samples, frozen=frozen)
-    annealing = Annealing(start * trial.task.sigma, end * trial.task.sigma, steps)
+    annealing = Annealing.of(trial.task, start, end, steps)
     curvature = _curvature(trial.task.n, damped)
     x, iteration, sigma = trial.start, 0, annealing(0)
     value, gradient = sampled(x, sigma)
@@ -135,7 +135,7 @@ def lbfgs(
         frozen: the same samples for all estimates.
     """
     sampled = SampledGradient(trial, samples, frozen=frozen)
-    annealing = Annealing(start * trial.task.sigma, end * trial.task.sigma, steps)
+    annealing = Annealing.of(trial.task, start, end, steps)
     x = trial.start.clone().requires_grad_()
     # Tolerances of zero: the search goes on as long as there are evaluations.
     optimizer = torch.optim.LBFGS(

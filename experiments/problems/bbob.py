@@ -28,19 +28,19 @@ TARGETS = tuple(float(10.0**k) for k in np.linspace(2.0, -8.0, 51))
 
 
 def check(n: Sequence[int], functions: Sequence[int], instances: Sequence[int]) -> None:
-    """ValueError for a number that the platform does not have, or if there are none."""
+    """SystemExit for a number that the platform does not have, or if there are none."""
     if not n or not set(n) <= set(DIMENSIONS):
-        raise ValueError(f"n must be some of {_text(DIMENSIONS)}, got {_text(n)}")
+        raise SystemExit(f"n must be some of {_text(DIMENSIONS)}, got {_text(n)}")
     if not functions or not set(functions) <= set(FUNCTIONS):
-        raise ValueError(f"functions must be from 1 to {len(FUNCTIONS)}, got {_text(functions)}")
+        raise SystemExit(f"functions must be from 1 to {len(FUNCTIONS)}, got {_text(functions)}")
     if min(instances, default=0) < 1:
-        raise ValueError(f"instances must be at least 1, got {_text(instances)}")
+        raise SystemExit(f"instances must be at least 1, got {_text(instances)}")
 
 
 def task(function: int, instance: int, n: int, evaluations: int) -> Task:
     """Return a function of BBOB, with uniform starts. A run ends at the finest target.
 
-    ValueError for a number that the platform does not have; ImportError says what to install.
+    SystemExit for a number that the platform does not have; ImportError says what to install.
     """
     check((n,), (function,), (instance,))
     problem = _suite(instance, n)[function - 1]

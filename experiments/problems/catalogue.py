@@ -13,12 +13,13 @@ from experiments.problems.network_task import NetworkTask
 from experiments.problems.task import Preset, Task
 from torch_zerohess.adapters.mitsuba_variants import find_llvm, probe
 
+MESHES = ("meshfit", "meshfit_color", "suzanne", "banana")
+"""Fitting tasks whose unknowns are the vertices of a mesh."""
 FITTING = {
     name: f"experiments.problems.tasks.{name}"
     for name in (
         *("quad", "box2", "box10", "texture", "texture100", "texture317", "dense", "brdf", "nonpsd", "throw"),
-        *("caustic", "caustic64", "discs", "hexagon"),
-        *("meshfit", "meshfit_color", "suzanne", "banana"),
+        *("caustic", "caustic64", "discs", "hexagon", *MESHES),
     )
 }
 """Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
@@ -101,11 +102,10 @@ def check_variant(variant: str, tasks: Iterable[str]) -> None:
 def chosen(what: str, names: Iterable[str], known: Sequence[str]) -> list[str]:
     """Return known names in any case without repetition; SystemExit says which are unknown, and what may be meant."""
     folded = {one.casefold(): one for one in known}
-    given = (name.strip() for name in names)
-    found = list(dict.fromkeys(name if name in known else folded.get(name.casefold(), name) for name in given if name))
-    unknown = [name for name in found if name not in known]
-    if not found or unknown:
+    given = dict.fromkeys(name.strip() for name in names if name.strip())
+    unknown = [name for name in given if name.casefold() not in folded]
+    if unknown or not given:
         near = [folded[match] for name in unknown for match in difflib.get_close_matches(name.casefold(), folded, n=2)]
         guess = f" (did you mean {' or '.join(near)}?)" if near else ""
         raise SystemExit(f"{what} must be some of {', '.join(known)}, got {', '.join(unknown) or 'none'}{guess}")
-    return found
+    return list(dict.fromkeys(name if name in known else folded[name.casefold()] for name in given))

@@ -6,12 +6,12 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import matplotlib.image
-import tyro
 from torch import Tensor
 
+from experiments.arguments import Folder
 from experiments.ensembles.provenance import flat, preset_and_variant, read_command
 from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING
@@ -34,11 +34,7 @@ pre { background: #f5f5f5; padding: .6em; white-space: pre-wrap } summary { curs
 """
 
 
-def report(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
-    /,
-    out: Path | None = None,
-) -> None:
+def report(folder: Folder, /, out: Path | None = None) -> None:
     """Write one self-contained HTML page: tables, curves, pictures of start, result and target, settings and machine.
 
     Args:

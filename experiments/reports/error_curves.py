@@ -3,14 +3,14 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from experiments.arguments import Folder
 from experiments.reports.results import METRICS, Results, Run, load
 from experiments.runs.trial import LEVELS
 
@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 Style = Mapping[str, Any]
 
 
-def plot(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")], /) -> None:
+def plot(folder: Folder, /) -> None:
     """Draw both errors of every task against run time and evaluations into DIR, with quartile bands.
 
     Args:

@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from experiments.ensembles import provenance
+from experiments.reports.tables import table as text_table
 
 RESULTS = Path(__file__).parents[1] / "results"
 ORIGIN = ("preset", "limit", "clock", "first_run", "commit", "date", "machine", "command")
@@ -42,15 +43,26 @@ def write(table: pd.DataFrame, name: str) -> Path:
     return path
 
 
+def show(headers: Sequence[str], rows: Sequence[Sequence[object]], store: str | None) -> None:
+    """Print the table of a study, and keep it under a name if there is one."""
+    print(text_table(headers, rows))
+    if store is not None:
+        print(keep(headers, rows, store))
+
+
 def keep(headers: Sequence[str], rows: Sequence[Sequence[object]], name: str) -> Path:
     """Write the table of a study that this process has made; SystemExit as `may_keep`."""
     return write(pd.DataFrame(rows, columns=list(headers)).assign(**_this_origin()), name)
 
 
-def may_keep(name: str) -> None:
-    """SystemExit, before a measurement, if the code differs from the commit or the name is no name of a table."""
-    _check(name)
-    _this_origin()
+def may_keep(name: str | None) -> None:
+    """SystemExit, before a measurement, if a table of this name could not be kept; None keeps none.
+
+    The name must be a word, and the code the code of the commit.
+    """
+    if name is not None:
+        _check(name)
+        _this_origin()
 
 
 def _this_origin() -> dict[str, str]:

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Number
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pandas as pd
 import torch
-import tyro
 
+from experiments.arguments import Folder
 from experiments.ensembles.provenance import read_command
 from experiments.methods import METHODS
 from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, chosen, fitting
@@ -27,7 +26,7 @@ _ALIKE = ("preset", "limit", "clock", "first_run", "runs", "commit", "machine")
 
 
 def store(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
+    folder: Folder,
     /,
     name: str,
     tasks: tuple[str, ...] = (),

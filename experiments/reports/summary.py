@@ -9,12 +9,11 @@ import statistics
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import pandas as pd
-import tyro
 
+from experiments.arguments import Folder
 from experiments.problems.catalogue import chosen
 from experiments.reports import source_table
 from experiments.reports.medians import MEASURES, medians, objects, reached
@@ -84,9 +83,7 @@ class Summary:
 def summarize(results: Results, reference: str | None = None, methods: Collection[str] | None = None) -> Summary:
     """Return the tables, with ratios to a method, by default the first of `REFERENCES`; of some methods, or of all."""
     if methods is not None:
-        runs = {task: {m: r for m, r in mine.items() if m in methods} for task, mine in results.runs.items()}
-        unfinished = Counter({name: count for name, count in results.unfinished.items() if name in methods})
-        results = replace(results, runs={task: mine for task, mine in runs.items() if mine}, unfinished=unfinished)
+        results = _of_methods(results, methods)
     there = {method for runs in results.runs.values() for method in runs}
     reference = reference or next((name for name in REFERENCES if name in there), None)
     cells = [((task, name), runs) for task, methods in results.runs.items() for name, runs in methods.items()]
@@ -102,6 +99,13 @@ def summarize(results: Results, reference: str | None = None, methods: Collectio
         [failure for cell, runs in cells for failure in _failures(*cell, runs)],
         results.unfinished.total(),
     )
+
+
+def _of_methods(results: Results, methods: Collection[str]) -> Results:
+    """Return the runs of some methods, without tasks that have none."""
+    runs = {task: {name: mine[name] for name in mine if name in methods} for task, mine in results.runs.items()}
+    unfinished = Counter({name: count for name, count in results.unfinished.items() if name in methods})
+    return replace(results, runs={task: mine for task, mine in runs.items() if mine}, unfinished=unfinished)
 
 
 def _overhead(task: str, method: str, runs: Sequence[Run]) -> Overhead:
@@ -194,7 +198,7 @@ def _speed_up_text(summary: Summary) -> str:
 
 
 def table(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
+    folder: Folder,
     /,
     format: Literal["text", "csv", "json", "table_2"] = "text",
     reference: str | None = None,

@@ -11,19 +11,18 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-import tyro
 
 import torch_zerohess as zh
+from experiments.arguments import OptionalTasks
 from experiments.methods import METHODS
 from experiments.methods.settings import settings
 from experiments.problems import catalogue
 from experiments.problems.task import Task
 from experiments.reports import result_files
 from experiments.reports.progress import progress
-from experiments.reports.tables import table
 from experiments.studies.workers import images_of
 from torch_zerohess.evaluators import Factory, Inline, ProcessPool
 
@@ -68,7 +67,7 @@ class Row:
 
 
 def batches(
-    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK...]")] = TASKS,
+    tasks: OptionalTasks = TASKS,
     /,
     sizes: tuple[int, ...] = (1, 4, 16),
     workers: int = 2,
@@ -95,8 +94,7 @@ def batches(
         task = catalogue.fitting(name)
         if reason := METHODS[METHOD].unusable(task) or (None if task.output else "its black box returns the loss only"):
             raise SystemExit(f"tasks must be such that {METHOD} searches them by their images, got {name}: {reason}")
-    if store:
-        result_files.may_keep(store)
+    result_files.may_keep(store)
     torch.set_num_threads(1)
     ways = [(size, count) for size in sizes for count in ((0,) if size == 1 or not workers else (0, workers))]
     rows = []
@@ -111,9 +109,7 @@ def batches(
             rows += _rows(name, ways, found)
             if task.renderer is not None:  # two loaded scenes slow each other down
                 task.renderer.release()
-    print(table(HEADERS, [list(astuple(row)) for row in rows]))
-    if store:
-        print(result_files.keep(HEADERS, [list(astuple(row)) for row in rows], store))
+    result_files.show(HEADERS, [list(astuple(row)) for row in rows], store)
     return rows
 
 

@@ -100,8 +100,7 @@ def bench(
         if value < least:
             raise SystemExit(f"{name} must be at least {least}, got {value}")
     check_file(out)
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     threads, available = torch.get_num_threads(), extension.available
     torch.set_num_threads(1)
     timed = [(*size, name, operation) for size in sizes for name, operation in _operations(*size).items()]

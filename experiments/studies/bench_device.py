@@ -58,8 +58,7 @@ def bench_device(
         if value < 1:
             raise SystemExit(f"{name} must be at least 1, got {value}")
     check_file(out)
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     rows = [
         row
         for dtype in (torch.float32, torch.float64)
@@ -69,25 +68,13 @@ def bench_device(
     rows += [hessian(wide, repeats, device), redrawn(n, repeats, device), _layer(repeats, device)]
     where = torch.cuda.get_device_name() if device == "cuda" else device
     headers = [
-        "device",
-        "operation",
-        "compared with",
-        "parameters",
-        "samples",
-        "package [us]",
-        "compared [us]",
-        "ratio",
+        *("device", "operation", "compared with", "parameters", "samples"),
+        *("package [us]", "compared [us]", "ratio"),
     ]
     cells: list[list[object]] = [
         [
-            where,
-            r.operation,
-            r.compared_with,
-            r.n,
-            r.samples,
-            round(1e6 * r.seconds, 1),
-            round(1e6 * r.compared, 1),
-            r.ratio,
+            *(where, r.operation, r.compared_with, r.n, r.samples),
+            *(round(1e6 * r.seconds, 1), round(1e6 * r.compared, 1), r.ratio),
         ]
         for r in rows
     ]

@@ -6,14 +6,14 @@ which depends on the angle, and its photons are random.
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-import tyro
 from torch import Tensor
 
+from experiments.arguments import Folder
 from experiments.problems.catalogue import RENDERED, check_variant
 from experiments.problems.scenes.caustic import COEFFICIENTS, INDEX, basis
 from experiments.problems.scenes.meshes import Surface, grid
@@ -32,7 +32,7 @@ DEPTH = 4
 
 
 def check_caustic(
-    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")],
+    folder: Folder,
     /,
     method: str = "local",
     run: int = 0,

@@ -18,7 +18,6 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.reports import result_files
 from experiments.reports.progress import progress
-from experiments.reports.tables import table
 
 METHODS = ("restarts=0", "default", "cobyqa", "py_bobyqa")
 HEADERS = ("function", "parameters", "box", *METHODS, "ratio", "worst ratio", "error left", "error of cobyqa", "runs")
@@ -79,6 +78,8 @@ def lowest(function: Function, n: int) -> float:
         step = torch.linalg.solve(torch.func.hessian(loss)(x), torch.func.grad(loss)(x))
         while float(loss(x - step)) > float(loss(x)) and float(step.norm()) > 1e-12:
             step = 0.5 * step
+        if torch.equal(x - step, x):  # all further steps are the same
+            break
         x = x - step
     return float(loss(x))
 
@@ -131,14 +132,11 @@ def endings(
     """
     if not n or min(n) < 2 or runs < 1:
         raise SystemExit(f"n must be 2 or more and runs at least 1, got {n} and {runs}")
-    if store:
-        result_files.may_keep(store)
+    result_files.may_keep(store)
     torch.set_num_threads(1)
     cases = [(name, size, box) for size in n for box in (False, True) for name in functions(size, 0)]
     rows = [row(name, size, runs, seed, box=box) for name, size, box in progress(cases, "cases")]
-    print(table(HEADERS, rows))
-    if store:
-        print(result_files.keep(HEADERS, rows, store))
+    result_files.show(HEADERS, rows, store)
     return rows
 
 

@@ -9,12 +9,11 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
+from experiments.arguments import Folder
 from experiments.ensembles.provenance import preset_and_variant, read_command
 from experiments.problems import catalogue
 from experiments.problems.catalogue import FITTING
@@ -26,7 +25,7 @@ POINTS = 6
 """Points on the line from start to result, both ends included."""
 
 
-def full_setting(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")], /) -> None:
+def full_setting(folder: Folder, /) -> None:
     """Measure those tasks of a folder that leave out something of the source's setting; each is measured once.
 
     Args:

@@ -23,7 +23,7 @@ from experiments.ensembles.provenance import machine
 from experiments.methods import METHODS, Method
 from experiments.methods.settings import settings
 from experiments.problems import catalogue
-from experiments.problems.catalogue import FITTING, NETWORKS, RENDERED, chosen
+from experiments.problems.catalogue import FITTING, MESHES, NETWORKS, RENDERED, chosen
 from experiments.problems.task import Preset, Task
 from experiments.reports import supplement_figures
 from experiments.reports.animation import Look, Trace, error_percent, finer, frames, look, save, shown_rows, together
@@ -43,7 +43,7 @@ METHOD, WIDER = "gaussian_process", "auto"
 OWN = {
     **dict.fromkeys(("quad", "box10", "dense", "brdf", "discs", "hexagon"), "descent"),
     **dict.fromkeys(("texture", "texture100", "texture317", "poster", "caustic", "caustic64"), "local"),
-    **dict.fromkeys(("meshfit", "meshfit_color", "suzanne", "banana"), "handles_newton"),
+    **dict.fromkeys(MESHES, "handles_newton"),
 }
 """Tasks for which another method is recommended."""
 OTHER = "cma_es_bounded"

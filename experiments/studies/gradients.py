@@ -17,13 +17,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.arguments import Tasks
 from experiments.ensembles.kept_parts import KeptParts
 from experiments.problems import catalogue
 from experiments.problems.rendered import RenderedTask
@@ -57,12 +56,7 @@ class GradientError:
 
 
 def gradients(
-    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="TASK...")] = (
-        "mug",
-        "shad",
-        "bunny",
-        "mirror",
-    ),
+    tasks: Tasks = ("mug", "shad", "bunny", "mirror"),
     /,
     repeats: int = 7,
     spp: int = 256,

@@ -116,8 +116,7 @@ def least_squares(
         raise SystemExit(
             f"budget and runs must be at least 1, run 0, limit positive, got {budget}, {runs}, {run} and {limit:g}"
         )
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     torch.set_num_threads(1)
     there = {one.name: one for one in more_wild.PROBLEMS}
     names = chosen("problems", problems or tuple(there), list(there))

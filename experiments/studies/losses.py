@@ -141,8 +141,7 @@ def losses(
         store: name of the table of errors of gradients that is kept under experiments/results, for the documents.
     """
     torch.set_num_threads(1)
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     least = 4 * _SCRAMBLES
     if runs < 2 or min(samples, default=0) < 1 or min(truth, sweep) < least or evaluations < 0:
         raise SystemExit(

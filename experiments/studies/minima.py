@@ -16,7 +16,6 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.reports import result_files
 from experiments.reports.progress import progress
-from experiments.reports.tables import table
 
 HEADERS = ("function", "parameters", "evaluations", "value", "gradient", "Hessian", "error of the Hessian", "runs")
 _START = 1.5
@@ -89,15 +88,11 @@ def minima(
     """
     if not n or min(n) < 2 or not evaluations or runs < 1:
         raise SystemExit(f"n must be 2 or more and runs at least 1, got {n}, {evaluations} and {runs}")
-    if store:
-        result_files.may_keep(store)
+    result_files.may_keep(store)
     torch.set_num_threads(1)
     cases = [(name, size, count) for size in n for count in evaluations for name in problems(size)]
     rows = [judged(name, size, count, runs, seed) for name, size, count in progress(cases, "cases")]
-    cells = [list(astuple(row)) for row in rows]
-    print(table(HEADERS, cells))
-    if store:
-        print(result_files.keep(HEADERS, cells, store))
+    result_files.show(HEADERS, [list(astuple(row)) for row in rows], store)
     return rows
 
 

@@ -27,8 +27,7 @@ from experiments.ensembles.kept_parts import KeptParts
 from experiments.problems import bbob
 from experiments.problems.catalogue import chosen
 from experiments.reports.progress import progress
-from experiments.reports.result_files import keep, may_keep
-from experiments.reports.tables import table
+from experiments.reports.result_files import may_keep, show
 
 FUNCTIONS: Mapping[int, str] = {
     1: "sphere",
@@ -95,12 +94,8 @@ def noise(
     """
     if runs < 1 or budget < 1 or not size > 0:
         raise SystemExit(f"runs and budget must be at least 1, size positive, got {runs}, {budget} and {size:g}")
-    try:
-        bbob.check(n, functions, instances)
-    except ValueError as error:
-        raise SystemExit(str(error)) from None
-    if store is not None:
-        may_keep(store)
+    bbob.check(n, functions, instances)
+    may_keep(store)
     torch.set_num_threads(1)
     names = METHODS if methods.strip() == "all" else chosen("methods", methods.split(","), tuple(METHODS))
     parts, done = KeptParts(out), dict[Job, End]()
@@ -110,10 +105,7 @@ def noise(
     ]
     for job in progress(jobs, "runs"):
         (done[job],) = parts.rows(asdict(job), End, partial(_run, job))
-    found = rows(done)
-    print(table(HEADERS, found))
-    if store is not None:
-        print(keep(HEADERS, found, store))
+    show(HEADERS, rows(done), store)
 
 
 def rows(done: Mapping[Job, End]) -> list[list[object]]:
@@ -132,10 +124,7 @@ def rows(done: Mapping[Job, End]) -> list[list[object]]:
 
 
 def _run(job: Job) -> list[End]:
-    try:
-        task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
-    except ImportError as error:
-        raise SystemExit(str(error)) from error
+    task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
     generator, count = torch.Generator().manual_seed(job.run), 0
 
     def noisy(x: Tensor) -> Tensor:

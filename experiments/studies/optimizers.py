@@ -111,12 +111,8 @@ def optimizers(
     """
     if runs < 1 or budget < 1 or not limit > 0:
         raise SystemExit(f"runs and budget must be at least 1, limit positive, got {runs}, {budget} and {limit:g}")
-    try:
-        bbob.check(n, functions, instances)
-    except ValueError as error:
-        raise SystemExit(str(error)) from None
-    if store is not None:
-        may_keep(store)
+    bbob.check(n, functions, instances)
+    may_keep(store)
     torch.set_num_threads(1)
     wanted = SUITE.wanted(methods, over)
     jobs = [
@@ -132,10 +128,7 @@ def optimizers(
 
 
 def _run(job: Job, limit: float) -> list[Reached]:
-    try:
-        task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
-    except ImportError as error:
-        raise SystemExit(str(error)) from error
+    task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
     return [reached(task, SUITE.method(job.method), job.run, limit, dict(job.settings))]
 
 

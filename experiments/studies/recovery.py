@@ -22,7 +22,6 @@ import torch_zerohess as zh
 from experiments.problems import catalogue
 from experiments.problems.task import Task
 from experiments.reports import result_files
-from experiments.reports.tables import table
 from experiments.runs.outputs import check_folder
 
 PENALTIES = (0.3, 0.1, 0.03, 0.01)
@@ -76,13 +75,12 @@ def recovery(
     """
     if not n or not pairs or min(n) <= entries or min(pairs) < 16 or entries < 1:
         raise SystemExit(f"n must exceed entries, and pairs be at least 16, got {n}, {entries} and {pairs}")
-    if store:
-        result_files.may_keep(store)
+    result_files.may_keep(store)
     check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     rows = [row for size in n for count in pairs for row in compared(size, entries, count, seed, lasso)]
-    print(table(HEADERS, [list(astuple(row)) for row in rows]))
+    result_files.show(HEADERS, [list(astuple(row)) for row in rows], store)
     for size in n:
         counts = [row.pairs for row in rows if (row.method, row.n) == ("ours", size) and row.found >= _LIKELY]
         told = f"{min(counts)} pairs" if counts else f"more than {max(pairs)} pairs"
@@ -90,8 +88,6 @@ def recovery(
     drawn = draw_jacobian(catalogue.fitting("caustic"), out / "jacobian.png", seed=seed)
     for path in (_draw_curves(rows, out / "recovery.png"), drawn):
         print(path)
-    if store:
-        print(result_files.keep(HEADERS, [list(astuple(row)) for row in rows], store))
     return rows
 
 

@@ -9,11 +9,11 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pandas as pd
-import tyro
 
+from experiments.arguments import OptionalTasks
 from experiments.ensembles.ensemble import Ensemble, not_run, ordered, settings_by_method
 from experiments.ensembles.processes import Job
 from experiments.ensembles.provenance import register
@@ -108,7 +108,7 @@ class Row:
 
 
 def robustness(
-    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK...]")] = ("mug", "shad"),
+    tasks: OptionalTasks = ("mug", "shad"),
     /,
     methods: str = "gaussian_process,our_hvpa",
     over: tuple[str, ...] = tuple(SWEEPS),
@@ -156,8 +156,6 @@ def robustness(
         register(out, settings_by_method(todo.values()))
         wanted_runs = ordered(todo.values())
         outcomes = ensemble.run(wanted_runs)
-    except ImportError as error:
-        raise SystemExit(str(error)) from None
     except KeyboardInterrupt:
         raise SystemExit(f"\ninterrupted; the same command goes on where it was, logs are in {out}") from None
     missing = not_run(wanted_runs, outcomes)

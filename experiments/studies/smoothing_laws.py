@@ -162,8 +162,7 @@ def smoothing_laws(
             raise SystemExit(f"{name} must be at least {least}, got {value}")
     if evaluations % 2:
         raise SystemExit(f"evaluations must be even, got {evaluations}")
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     rows = [
         row_of(law, n, profile, evaluations, runs, seed)
         for n in progress(sizes, "sizes")

@@ -17,7 +17,6 @@ import torch_zerohess as zh
 from experiments.problems import catalogue
 from experiments.problems.task import Task
 from experiments.reports import result_files
-from experiments.reports.tables import table
 
 _BATCH, _INPUTS = 4, 16
 _SPREAD, _SIGMA = 0.2, 0.1
@@ -52,14 +51,11 @@ def sparse_layers(
         seed: of the network and of the samples.
         store: name under which the table is kept.
     """
-    if store:
-        result_files.may_keep(store)
+    result_files.may_keep(store)
     torch.set_num_threads(1)
     task = catalogue.fitting("poster")
     rows = compared(task, samples, calls, seed)
-    print(table(HEADERS, [list(astuple(row)) for row in rows]))
-    if store:
-        print(result_files.keep(HEADERS, [list(astuple(row)) for row in rows], store))
+    result_files.show(HEADERS, [list(astuple(row)) for row in rows], store)
     return rows
 
 

@@ -77,8 +77,7 @@ def stability(
         SystemExit: with status 1, if something is wrong.
     """
     check_file(out)
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     rows = [row for case in progress(cases(largest), "cases") for row in _rows(case, seed)]
     shares = coverage(seed=seed, repeats=repeats)
     wrong = [row for row in rows if row.verdict.startswith("WRONG")]

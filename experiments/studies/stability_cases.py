@@ -141,13 +141,18 @@ def _offsets() -> list[Case]:
     ]
 
 
+def tilted_axes(n: int, decades: int) -> tuple[Tensor, Tensor]:
+    """Return eigenvalues [n] from 1 to 10^-decades, and eigenvectors [n, n], in no way aligned with the axes."""
+    w = torch.nn.functional.normalize(torch.arange(1.0, n + 1, dtype=torch.float64), dim=0)
+    reflection = torch.eye(n, dtype=torch.float64) - 2 * torch.outer(w, w)
+    return torch.logspace(0, -decades, n, dtype=torch.float64), reflection
+
+
 def _conditioning() -> list[Case]:
     cases = []
     for decades in (0, 6, 12):
         for n in (2, 10):
-            spectrum = torch.logspace(0, -decades, n, dtype=torch.float64)
-            w = torch.nn.functional.normalize(torch.arange(1.0, n + 1, dtype=torch.float64), dim=0)
-            reflection = torch.eye(n, dtype=torch.float64) - 2 * torch.outer(w, w)
+            spectrum, reflection = tilted_axes(n, decades)
             one = torch.ones(n, dtype=torch.float64)
             form = Quadratic(reflection @ torch.diag(spectrum) @ reflection, one)
             cases.append(Case(f"quadratic, condition 1e{decades}, n = {n}", form, 0.3 * one, one))

@@ -18,6 +18,7 @@ from torch import Tensor
 
 import torch_zerohess as zh
 from experiments.reports.progress import progress
+from experiments.studies.stability_cases import tilted_axes
 
 Function = Callable[[Tensor], Tensor]
 ENDLESS = "plateau without an end"
@@ -140,10 +141,8 @@ def _row(case: HardCase, engine: Any, runs: int, max_evaluations: int, seed: int
 
 
 def _stiff(n: int, decades: int) -> Function:
-    """A quadratic with eigenvalues from 1 to 10^-decades, in no way aligned with the axes; 1 at ones."""
-    spectrum = torch.logspace(0, -decades, n, dtype=torch.float64)
-    w = torch.nn.functional.normalize(torch.arange(1.0, n + 1, dtype=torch.float64), dim=0)
-    turn = torch.eye(n, dtype=torch.float64) - 2 * torch.outer(w, w)
+    """A quadratic with the eigenvalues and eigenvectors of `tilted_axes`; 1 at ones."""
+    spectrum, turn = tilted_axes(n, decades)
     size = float(((turn @ torch.ones(n, dtype=torch.float64)).square() * spectrum).sum())
     return lambda z: ((z @ turn).square() * spectrum).sum(1) / size
 

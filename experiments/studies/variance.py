@@ -103,8 +103,7 @@ def variance(
     ):
         if value < least:
             raise SystemExit(f"{argument} must be at least {least}, got {value}")
-    if store is not None:
-        may_keep(store)
+    may_keep(store)
     names = chosen("problems", [name.upper() for name in problems], list(PROBLEMS))
     known = {method.name: method for method in (*ESTIMATORS, *ALONE)}
     picked = chosen("methods", methods, list(known))

@@ -128,6 +128,7 @@ def test_tasks_that_mujoco_simulates_say_that_it_is_missing(monkeypatch) -> None
         ["tune", "mug", "--method", "our_g"],
         ["losses", "--tasks", "mug"],
         ["gradients", "mug"],
+        ["robustness", "mug"],
     ],
     ids=" ".join,
 )
@@ -153,7 +154,7 @@ def test_list_and_gallery_show_what_is_missing(monkeypatch, tmp_path, capsys) ->
 
 
 def test_a_reader_that_has_enough_ends_a_command_without_a_traceback() -> None:
-    command = [sys.executable, "-m", "experiments", "list"]
+    command = [sys.executable, "-m", "experiments", "list", "quad"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
         assert running.stderr is not None

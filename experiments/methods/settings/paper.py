@@ -20,6 +20,8 @@ TEXTURE). That our_h and our_hvp needed another search on BOX2 was seen on the r
 
 from typing import Any
 
+from experiments.problems.catalogue import MESHES
+
 Settings = dict[str, Any]
 
 CHOSEN: dict[str, dict[str, Settings]] = {
@@ -222,6 +224,6 @@ RETUNED: dict[str, dict[str, Settings]] = {
     #   --over learning_rate=0.1,0.3,1.0 samples=1,2,4 sigma=(1.0,0.3),(1.0,0.1),(0.3,0.1)
     "caustic64": {"our_g": {"learning_rate": 0.3, "sigma": (1.0, 0.1), "samples": 2}},
     # Single trials; the methods for meshes (`experiments.methods.mesh_handles`) have their defaults.
-    **{name: dict.fromkeys(("fr22", "our_g"), _MESH) for name in ("meshfit", "meshfit_color", "suzanne", "banana")},
+    **{name: dict.fromkeys(("fr22", "our_g"), _MESH) for name in MESHES},
 }
 """What replaces Table 3, or stands for it; `tune` is `python -m experiments tune`."""

@@ -276,7 +276,7 @@ def test_chunks_are_tried_again_and_then_cut():
     torch.testing.assert_close(batch.result(), torch.tensor([0.5, math.nan, 2.5]), equal_nan=True)
 
 
-@pytest.mark.parametrize("retries", [0, 2, 8])
+@pytest.mark.parametrize("retries", [0, 2, 12])
 def test_before_the_first_value_every_point_is_tried_before_one_is_tried_again(retries):
     """After more than 9 failures, and more than there are retries, a call without a value is hopeless."""
     most = max(9, retries)

@@ -10,6 +10,8 @@ from searches import TARGET, bowl, plateau, rays, rays_loss, rosenbrock, run, ze
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import descent
 from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.method import Settings
+from torch_zerohess.search.state import Evaluated
 from truths import vector
 
 # Functions with known minima.
@@ -182,27 +184,30 @@ def test_a_step_without_a_value_is_shortened(noise):
     assert torch.equal(search.center, x)
 
 
+def isotropic(n):
+    """The method of isotropic samples, from zero and without bounds."""
+    x0 = zeros(n)
+    return LocalQuadratics(Settings(x0, x0 - math.inf, x0 + math.inf, None, 10, 1e-2, 0.0, None))
+
+
 def test_an_isotropic_step_without_a_value_halves_sigma():
-    search = Descent(zeros(2), sigma=1.0, seed=0)
-    search._method = LocalQuadratics(search._method.settings)
-    search._state = search._after(*search._method.first(torch.Generator().manual_seed(0)), torch.Generator())
-    while search._state.progress.phase != "trial":
-        search.tell(bowl(search.ask()))
-    before = search.sigma
-    search.tell(torch.full((len(search.ask()),), math.nan))
-    assert search.sigma == 0.5 * before
+    method, generator = isotropic(2), torch.Generator().manual_seed(0)
+    known, points = method.first(generator)
+    while known.phase != "trial":
+        known, points = method.next(known, Evaluated(points, bowl(points)), generator)
+    after, _ = method.next(known, Evaluated(points, zeros(len(points)) + math.nan), generator)
+    assert after.sigma == 0.5 * known.sigma
 
 
 @pytest.mark.parametrize(("finite", "asked"), [(4, 2), (5, 1)])
 def test_a_model_takes_four_evaluations_besides_the_center(finite, asked):
     """With fewer of seven, a pair of samples is asked for before the end of a step."""
-    search = Descent(zeros(6), sigma=1.0, seed=0)
-    search._method = LocalQuadratics(search._method.settings)
-    search._state = search._after(*search._method.first(torch.Generator().manual_seed(0)), torch.Generator())
-    values = bowl(search.ask())
+    method, generator = isotropic(6), torch.Generator().manual_seed(0)
+    known, points = method.first(generator)
+    values = bowl(points)
     values[finite:] = math.nan
-    search.tell(values)
-    assert len(search.ask()) == asked
+    _, points = method.next(known, Evaluated(points, values), generator)
+    assert len(points) == asked
 
 
 def test_finite_only_at_the_start():
@@ -275,7 +280,7 @@ def following(progress):
 @pytest.mark.parametrize(
     ("n", "with_loss", "pool", "expected"),
     [
-        *[(2, False, None, 200), (9, False, None, 200), (10, False, None, 228), (300, False, None, 1800)],
+        *[(2, False, None, 200), (9, False, None, 200), (10, False, None, 228), (201, False, None, 1206)],
         *[(3, True, None, 60), (20, True, None, 120), (2, False, 7, 7)],
     ],
 )

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from every_search import same, saved
-from searches import points_of, run, square
+from searches import bent, points_of, run, square
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import descent_and_process
@@ -55,20 +55,13 @@ def test_without_additive_kernels_the_process_is_not_so_fast(monkeypatch):
     assert sum(evaluations(door(10, seed), 100) for seed in range(3)) > 250
 
 
-def smooth(x):
-    """Residuals [K, n + 2] whose sum of squares is 1 at its minimum 0."""
-    k = torch.arange(1, x.shape[1] + 1, dtype=x.dtype)
-    linear = (x + 0.3 * x.sum(1, keepdim=True)) / k
-    return torch.cat([linear, (x * k).sum(1, keepdim=True), 1 + 0.5 * x.square().sum(1, keepdim=True)], 1)
-
-
 @pytest.mark.parametrize("n", [5, 8])
 def test_smooth_outputs_are_left_to_the_descent(n):
     """The points equal the points of `Descent`, to the last bit, also after it has arrived."""
     settings = {"sigma": 0.5, "bounds": (-3.0, 3.0), "loss": lambda y: y.square().sum(), "seed": 0}
     x0 = normal(1, n, seed=3)[0]
     search = TrustRegion(x0, **settings)
-    assert torch.equal(points_of(search, smooth, 300), points_of(Descent(x0, **settings), smooth, 300))
+    assert torch.equal(points_of(search, bent, 300), points_of(Descent(x0, **settings), bent, 300))
     assert search.engine == "descent"
     assert search.rounds
 
@@ -76,11 +69,11 @@ def test_smooth_outputs_are_left_to_the_descent(n):
 def test_a_descent_that_has_arrived_is_not_replaced(monkeypatch):
     """However little it gains afterwards. Before it has, the same limit replaces it."""
     settings = {"sigma": 0.5, "bounds": (-3.0, 3.0), "loss": lambda y: y.square().sum(), "seed": 0}
-    search = run(TrustRegion(normal(1, 5, seed=3)[0], **settings), smooth, 200, target=1 + 1e-9)
+    search = run(TrustRegion(normal(1, 5, seed=3)[0], **settings), bent, 200, target=1 + 1e-9)
     while search.rounds == 0:
-        search.tell(smooth(search.ask()))
+        search.tell(bent(search.ask()))
     monkeypatch.setattr(descent_and_process, "_SLOW", 2.0)
-    assert run(search, smooth, search.evaluations + 100).engine == "descent"
+    assert run(search, bent, search.evaluations + 100).engine == "descent"
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ CASES = {
     # A process of the loss, and quadratics.
     "a well": Case(process(vector(-2.0, 1.5), sigma=1.0, bounds=(-4.0, 4.0)), well, 1e-6, 215),
     "a curved valley in a box": Case(process(zeros(2) - 1.2, sigma=0.5, bounds=(-2.0, 2.0)), rosenbrock, 1e-6, 270),
-    "ripples": Case(process(vector(-4.0, 4.0), sigma=1.0, bounds=(-5.0, 5.0)), ripples, 1e-3, 1000, 24),
+    "ripples": Case(process(vector(-4.0, 4.0), sigma=1.0, bounds=(-5.0, 5.0)), ripples, 1e-3, 380, 8),
     "a bowl in a box": Case(process(zeros(3), sigma=1.0, bounds=(-4.0, 5.0)), bowl, 1e-6, 140),
 }
 

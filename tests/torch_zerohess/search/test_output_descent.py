@@ -3,20 +3,13 @@
 import pytest
 import torch
 from every_search import same, saved
-from searches import plateau, rays, rays_loss, run, zeros
+from searches import bent, plateau, rays, rays_loss, run, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent
 from torch_zerohess.search import output_descent, output_gauss_newton
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton
 from truths import vector
-
-
-def bent(x):
-    """Residuals [K, n + 2] whose sum of squares is 1 at its minimum 0, and curved there by the last residual."""
-    k = torch.arange(1, x.shape[1] + 1, dtype=x.dtype)
-    linear = (x + 0.3 * x.sum(1, keepdim=True)) / k
-    return torch.cat([linear, (x * k).sum(1, keepdim=True), 1 + 0.5 * x.square().sum(1, keepdim=True)], 1)
 
 
 def squares(y):

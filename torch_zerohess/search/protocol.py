@@ -310,8 +310,7 @@ class AskTell(ABC, Generic[P]):
             return points
         generator = torch.Generator()
         generator.set_state(self._state.random)
-        own = int(torch.randint(2**63 - 1, (), generator=generator, device="cpu"))
-        generator.manual_seed(own)
+        generator.manual_seed(int(torch.randint(2**63 - 1, (), generator=generator, device="cpu")))
         further = self._method.more(self._state.progress, points, batch - len(points), generator)
         return torch.cat([points, self._space.rounded(further)])
 

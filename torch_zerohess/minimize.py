@@ -108,11 +108,11 @@ def minimize(
             prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
             from it, with its samples, whatever the seed: the function must be the same, and so must x0, sigma, bounds
-            and engine. Another `noise` than that of the file, given or measured, begins a new search from x0, which
-            keeps the evaluations; None goes on with that of the file. All other settings hold from then on. ValueError
-            if it is no such file, if what must be the same differs, or for other `restarts` or `tolerance` where the
-            search has come to an end by those in the file. A file that cannot be written later on, or that another
-            process writes, too, is a `UserWarning`, once.
+            and engine. `noise` where the file has none, or 0 where it has noise, begins a new search from x0, which
+            keeps the evaluations; None goes on with the noise of the file. All other settings hold from then on.
+            ValueError if it is no such file, if what must be the same differs, or for other `restarts` or `tolerance`
+            where the search has come to an end by those in the file. A file that cannot be written later on, or that
+            another process writes, too, is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. 0 ends it there: give it for a function
             that has only one minimum. At a kink of a loss alone, as of a penalty, the search first looks for a
             direction in which the loss falls. It may miss one, and with `ftol` or beside a bound it does not look: give

@@ -219,7 +219,6 @@ class Running:
         (x, value, error), (points, losses) = self._best(), self.record.told
         around = quadratic_at(x, search, points, losses, self.noise or 0.0)
         equal = self.evaluations if self.record.flat and len(search.unit) < self.evaluations else 0
-        why = "" if self.noise else self.doubt
         if self._verbose:
             self._say(value)
         success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
@@ -234,7 +233,7 @@ class Running:
                 message,
                 status,
                 equal,
-                why,
+                "" if self.noise else self.doubt,
                 search.untouched,
                 arrived=search.solved,
                 success=success,
@@ -253,7 +252,8 @@ class Running:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
         names = "noise", "sure", "decided", "deciding", "search", *self.record.state_dict(), "version"
         check_state(saved, dict.fromkeys(names), "minimize")
-        given, self.noise = self.noise, saved["noise"]
+        given, before = self.noise, saved["noise"]
+        self.noise = given if given and before else before  # noise of another size is no other search
         self.search = self._make(self.noise or 0.0)
         self.record.load_state_dict(saved, x := self.search.x)
         self.search.load_state_dict(saved["search"])

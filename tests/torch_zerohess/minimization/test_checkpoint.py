@@ -163,7 +163,7 @@ def test_a_write_that_was_interrupted_is_none_of_another_process(tmp_path, monke
 
 
 @pytest.mark.parametrize(("before", "noise"), [(None, 0.3), (0.1, 0.3), (0.1, 0.0), (0.1, 0.1), (0.1, None)])
-def test_another_noise_begins_a_new_search_that_keeps_the_evaluations(before, noise, tmp_path):
+def test_noise_where_there_was_none_begins_a_new_search_that_keeps_the_evaluations(before, noise, tmp_path):
     """The file has noise that was measured, none, or noise that was given."""
     path, fewer = tmp_path / "search.pt", {**SETTINGS, "checkpoint": tmp_path / "search.pt"}
     part = zh.minimize(tilted, zeros(2), noise=before, **fewer)
@@ -173,7 +173,7 @@ def test_another_noise_begins_a_new_search_that_keeps_the_evaluations(before, no
     assert (fit.value_error > 0) == (fit.noise > 0)
     assert torch.equal(fit.points[: part.evaluations], part.points)
     again = fit.points[part.evaluations].tolist() == [0.0, 0.0]
-    assert again == (noise not in (None, before))
+    assert again == (noise is not None and bool(noise) != bool(before))
     assert torch.load(path)["noise"] == fit.noise
     assert torch.equal(zh.minimize(tilted, zeros(2), noise=noise, **more).points, fit.points)
 

@@ -124,7 +124,7 @@ def test_a_checkpoint_that_is_none(tmp_path):
     for name, content in (("corrupt", b"example"), ("empty", b""), ("cut", good.read_bytes()[:500])):
         path = tmp_path / name
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=f"checkpoint must be a new file, or.*{name}: torch.load says"):
+        with pytest.raises(ValueError, match=f"checkpoint must be a new file, or.*{name}: torch.load cannot read it"):
             zh.minimize(tilted, zeros(2), checkpoint=path, **settings)
         assert path.read_bytes() == content
     torch.save({"noise": 0.0}, tmp_path / "other.pt")

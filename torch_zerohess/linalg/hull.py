@@ -43,11 +43,8 @@ def _nearest(corners: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     becomes zero on the way is left out.
     """
     while True:
-        base = int(corners.norm(dim=1).argmin())  # the shortest one: its rounding is the smallest
-        spread = (corners - corners[base]).mT
-        wanted = torch.linalg.lstsq(spread, -corners[base][:, None], driver="gelsd").solution[:, 0]
-        wanted[base] = 0.0
-        wanted[base] = 1.0 - wanted.sum()
+        others = torch.linalg.lstsq((corners[1:] - corners[0]).mT, -corners[0][:, None], driver="gelsd").solution[:, 0]
+        wanted = torch.cat([1.0 - others.sum(0, keepdim=True), others])
         used = wanted <= 0.0
         if not bool(used.any()):
             return corners, wanted

@@ -32,8 +32,7 @@ class Checkpoint:
         try:
             return torch.load(self._path, map_location="cpu", weights_only=True)
         except Exception as error:  # it raises any, for a file of another kind
-            message = f"torch.load says {type(error).__name__}: {str(error)[:100]}"
-            raise ValueError(self._wrong(message)) from error
+            raise ValueError(self._wrong(f"torch.load cannot read it ({type(error).__name__})")) from error
 
     @contextlib.contextmanager
     def going_on(self) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""The searches where optimization is hard: stiff, flat, indefinite, partly undefined, and as noisy as it is high.
+"""The searches where optimization is hard: stiff, flat, indefinite, kinked, partly undefined, as noisy as it is high.
 
 Every case is a function of two or ten parameters in units of sigma, with a start of value 1 and a minimum of value 0.
 A run succeeds if the noiseless value at its result is at most `aim`. A run is wrong if `Minimum.success` is true and
@@ -78,6 +78,19 @@ def hard_cases() -> list[HardCase]:
         value = (z.square().sum(1) - 0.5) / 5.625
         return torch.where(z.sum(1) < 1.0, beyond, value)
 
+    def line(z: Tensor, weight: float) -> Tensor:
+        value = (z - 1.5).square().sum(1) + weight * (z.sum(1) - 1.5).clamp(min=0)
+        return (value - 1.125) / 7.375
+
+    def hyperbola(z: Tensor, weight: float) -> Tensor:
+        return (z.sum(1) + weight * (1 - z[:, 0] * z[:, 1]).clamp(min=0) - 2) / 2
+
+    penalties = [
+        HardCase(f"penalty of weight {weight:g} beyond a {name}", partial(fn, weight=weight), start)
+        for weight in (1e2, 1e4)
+        for name, fn, start in (("line", line, torch.tensor([0.0, -1.0]).double()), ("hyperbola", hyperbola, 2 * two))
+    ]
+
     def bowl(z: Tensor) -> Tensor:
         return z.square().sum(1) / 18
 
@@ -90,6 +103,7 @@ def hard_cases() -> list[HardCase]:
         HardCase("NaN between start and minimum", beside, two),
         HardCase("NaN beyond the minimum", partial(cut, beyond=torch.nan), 1.75 * two, bounds=(-4.0, 4.0)),
         HardCase("jump beyond the minimum", partial(cut, beyond=2.0), 1.75 * two, bounds=(-4.0, 4.0)),
+        *penalties,
         HardCase("noise as large as the signal, not told", bowl, 3 * two, 0.1, 1.0),
         HardCase("noise as large as the signal, told", bowl, 3 * two, 0.1, 1.0, settings={"noise": 1.0}),
     ]

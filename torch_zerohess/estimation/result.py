@@ -139,11 +139,10 @@ class Estimate:
         within four points from four draws up. Draws are skewed, many small ones and a few large ones, if the curvature
         of f has one sign, and more so the wider the tails of the kernel ("gaussian" more than "aggregate" and
         "optimal", the Hessian more than the gradient). With "gaussian" the draws of the gradient of a linear f are
-        skewed, too: they are squares. Where few large draws were met, the estimate and its standard
-        error are both too small. From four draws up the interval therefore reaches up to three times as far on that
-        side, see `skewness`. Few draws seldom meet large ones, and do not tell that there are any. Of 2 000 intervals
-        of 95 % for exp(x_1 + x_2) with sigma 0.3 and random antithetic pairs these shares contain the truth, the lowest
-        of all entries:
+        skewed, too: they are squares. Where few large draws were met, the estimate and its standard error are both too
+        small. From four draws up the interval therefore reaches up to three times as far on that side, see `skewness`.
+        Few draws seldom meet large ones, and do not tell that there are any. Of 2 000 intervals of 95 % for exp(x_1 +
+        x_2) with sigma 0.3 and random antithetic pairs these shares contain the truth, the lowest of all entries:
 
         | proposal | draws | value | gradient | Hessian |
         |---|---|---|---|---|

@@ -175,7 +175,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         patient = now.slopes is not None or known.waited < _PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
-        converged = now.done and not now.is_lost
+        converged = now.done and now.arrivals.lowest is not None
         if best is now.best:
             known = replace(known, finished=best.point, solved=best.point if converged else None)
         known = replace(known, finishing=False, waited=0)

@@ -113,6 +113,16 @@ def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
     assert "do not tell" in search.message
 
 
+def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
+    """The evaluations end while slopes are measured."""
+    start = torch.zeros(3).double()
+    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=2, restarts=0)
+    while (local := search._state.progress.local) is None or local.slopes is None:
+        search.tell(half_space(search.ask(), 1e4))
+    search.tell(half_space(search.ask(limit=2), 1e4))
+    assert not search.solved
+
+
 def test_a_smooth_function_is_not_searched_for_kinks() -> None:
     """Not in a narrow valley, beside a bound, or where the loss is flat."""
     cases = [

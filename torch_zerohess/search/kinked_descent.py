@@ -24,13 +24,14 @@ _BESIDE, _APART = 1e-4, ((1e-2, 1.0), (1.0, math.inf))
 """Distances over the tolerance up to which an evaluation is beside the best point, and between which it is apart; the
 second ones where there are none between the first ones."""
 _STEEP = 1e-2
-"""How steeply the loss rises beside a kink, over how steeply it rises apart from it, at least. Of all slopes there, a
-slope that is less steep than this share of the steepest one is gentle."""
+"""There is no kink where the loss rises less steeply beside the best point than this share of the steepest rise apart
+from it. A slope is gentle if its length is less than this share of the steepest rise beside the best point."""
 _BENT = 30.0
-"""How steeply the loss rises to the first corner, over how steeply it rises beside a kink in the same direction, at
-most; at least the inverse. Without a kink it is 100 times as steep, and 100 times less steep beside a jump."""
+"""The rise to the first corner is compared with the rise to an evaluation beside the best point, in the same direction.
+At a kink the first is at most 30 times as steep as the second, and at least a thirtieth. A smooth loss rises 100 times
+as steeply to the corner, and a loss that jumps a hundredth."""
 _STRADDLED = 0.1
-"""Error of a slope that is not gentle, over its length, at most. Differences across a kink tell no slope."""
+"""Error of a slope over its length, at most, unless the slope is gentle. Differences across a kink tell no slope."""
 _ROUNDING = 1e4 * torch.finfo(torch.float64).eps
 """Rise, relative to the loss, up to which it may be rounding."""
 _AROUND, _CLOSE = 1e-2, 1e-2
@@ -44,7 +45,7 @@ _NEAR, _FAR = (0.3, 1.0, 3.0), (10.0, 100.0, 1e3, 1e4)
 """Steps that are tried, over the distance of the points whose slopes are measured: against the shortest vector of the
 hull; and turned away from the steep side of the kink, which may be curved."""
 _TURNED = 0.3
-"""How far they are turned: share of their decrease that this costs, at most."""
+"""The turn of the long steps costs at most this share of their decrease."""
 _WIDER = 2.0
 """Sigma with which the search goes on, over the length of the step that has found a lower point."""
 

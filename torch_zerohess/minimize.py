@@ -1,6 +1,5 @@
 """Minimise a plain function from a start, without a torch model: `TrustRegion` with its evaluations done for you."""
 
-import contextlib
 import difflib
 import inspect
 import os
@@ -9,14 +8,16 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool, check_callable, checked_file, checked_integer, checked_number
+from torch_zerohess.arguments import check_bool, check_callable, checked_file, checked_integer
 from torch_zerohess.estimation.evaluation import BlackBoxCall
 from torch_zerohess.estimation.inputs import working
-from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
-from torch_zerohess.minimization.blame import blamed
-from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation, Status
+from torch_zerohess.minimization.callback import Callback
+from torch_zerohess.minimization.evaluating import evaluating
+from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation
+from torch_zerohess.minimization.outcome import outcome
+from torch_zerohess.minimization.run import run
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.separate import separated
 from torch_zerohess.minimization.stopping import Stopping
@@ -155,26 +156,17 @@ def minimize(
     check_memory(memory)
     max_evaluations = checked_integer("max_evaluations", max_evaluations)
     batch = checked_integer("batch", batch, 1)
-    target = None if target is None else checked_number("target", target)
-    xtol = None if xtol is None else checked_number("xtol", xtol, 0.0)
-    ftol = None if ftol is None else checked_number("ftol", ftol, 0.0)
-    time_limit = None if time_limit is None else checked_number("time_limit", time_limit, 0.0)
+    stopping = Stopping.checked(target, xtol, ftol, time_limit, agrees=restarts is None)
     path = None if checkpoint is None else checked_file("checkpoint", checkpoint)
     if evaluator is not None and workers is not None:
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
     start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
     rounds = max(max_evaluations, 0) if restarts is None else restarts
-    seed = random_seed() if seed is None else seed
+    given = {**settings, "loss": loss, "engine": engine, "restarts": rounds}
+    given |= {"seed": random_seed() if seed is None else seed}
 
     def make(noise: float) -> TrustRegion:
-        given: dict[str, Any] = settings | {
-            "loss": loss,
-            "engine": engine,
-            "seed": seed,
-            "restarts": rounds,
-            "noise": noise,
-        }
-        return TrustRegion(start, sigma=sigma, bounds=bounds, **given)
+        return TrustRegion(start, sigma=sigma, bounds=bounds, noise=noise, **given)
 
     smallest = len(make(noise or 0.0).ask()) + 1
     if max_evaluations < smallest:
@@ -189,71 +181,21 @@ def minimize(
         "tolerance": None if tolerance is None else float(tolerance),
     }
     own = None if workers is None else ProcessPool(workers)
-    call = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
-
-    def evaluated(points: Tensor) -> tuple[list[int], Tensor, BaseException | None]:
-        given, failure = points.clone(), None
-        numbers = list(range(len(points)))
-        try:
-            values = call(given, ())
-        except BaseException as error:  # Ctrl-C, too: the values known so far are kept
-            failure = error
-            numbers, values = finished_values(error, given)
-        if loss is None and numbers and values.shape[1:] not in ((), (1,)):
-            raise failure or ValueError(
-                f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
-                f"{len(points)} points"
-            )
-        if memory is not None and numbers:
-            with memory.lock:
-                memory.add(points[numbers], values)
-        return numbers, values, failure
-
-    black_box = caller = "fn" if loss is None else "fn or loss"
-    asked: tuple[Status, str] | None = None
-
-    def called() -> None:
-        nonlocal asked, caller
-        caller = "callback"
-        if callback is not None and _is_true(callback(running.iterate)):
-            asked = "callback", "the callback asked to end"
-        caller = black_box
-
-    apart = separated(evaluated, call.separates)
-    running = Running(make, apart, noise, batch, smallest, max_evaluations, path, limits, called, verbose=verbose)
-    stopping = Stopping(target, xtol, ftol, time_limit, agrees=restarts is None)
-    end: tuple[Status, str]
+    black_box = BlackBoxCall(fn, vectorized=vectorized, evaluator=own or evaluator)
+    call = separated(evaluating(black_box, memory, scalar=loss is None), black_box.separates)
+    noted = None if callback is None else Callback(callback)
+    running = Running(make, call, noise, batch, smallest, max_evaluations, path, limits, noted, verbose=verbose)
     try:
-        while True:
-            running.look_again()
-            reached = stopping.reason(running) or asked
-            if reached is None:
-                running.step()
-                continue
-            end = reached
-            if end[0] != "time":
-                running.decide()
-            decided = stopping.reason(running)  # in noise the decision may refute the target, or find it reached
-            if decided is not None and decided[0] == "target" and end[0] != "callback":
-                end = decided
-            if end[0] != "target" or decided == end:
-                break
-    except KeyboardInterrupt:
-        if not running.evaluations:
-            raise
-        end = "interrupted", "interrupted"
-    except (Exception, SystemExit) as error:  # a simulator may end by sys.exit
-        if running.evaluations:
-            with contextlib.suppress(Exception):  # nothing takes the place of the caller's own error
-                error.minimum = running.minimum("failed", f"{blamed(error, caller)} raised {error!r}")  # type: ignore[union-attr]
-        raise
+        end = run(running, stopping, noted, "fn" if loss is None else "fn or loss")
     finally:
         try:
             _despite_ctrl_c(running.write)
         finally:
             if own is not None:
                 _despite_ctrl_c(own.close)
-    return running.minimum(*end)
+    found = outcome(running, *end)
+    running.say()
+    return found
 
 
 def _check_names(settings: dict[str, Any]) -> None:
@@ -273,8 +215,3 @@ def _despite_ctrl_c(finish: Callable[[], None]) -> None:
         finish()
     except KeyboardInterrupt:
         finish()
-
-
-def _is_true(answer: object) -> bool:
-    """Whether a callback returned True. Other truthy values, such as the count of bytes it wrote, do not end."""
-    return str(getattr(answer, "dtype", type(answer).__name__)) in ("bool", "torch.bool") and bool(answer)

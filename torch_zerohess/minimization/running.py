@@ -1,4 +1,4 @@
-"""A search that goes on: its evaluations, noise, history, file, and what it returns."""
+"""A search that goes on: its evaluations, noise, history, and file."""
 
 import sys
 import time
@@ -13,13 +13,12 @@ from torch_zerohess.arguments import check_state
 from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.checkpoint import Checkpoint, check_limits
 from torch_zerohess.minimization.decision import Decision, decide
-from torch_zerohess.minimization.derivatives import is_flat, quadratic_at
 from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.first_batch import evaluate_first_batch
-from torch_zerohess.minimization.minimum import Iterate, Minimum, Status
+from torch_zerohess.minimization.minimum import Iterate
 from torch_zerohess.minimization.noise import REPEATED, noise_of_counts, opening, reserved
 from torch_zerohess.minimization.record import Call, Record
-from torch_zerohess.minimization.wording import budget, worded
+from torch_zerohess.minimization.wording import budget
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.version import VERSION
 
@@ -41,7 +40,7 @@ class Running:
         most: evaluations that there may be.
         path: of the file, or None.
         limits: settings by name that end the search by itself, as the caller gave them.
-        noted: called after every batch.
+        noted: called after every batch, with what it has led to; or None.
         verbose: whether to write a line to stderr every second, and one at the end.
     """
 
@@ -55,7 +54,7 @@ class Running:
         most: int,
         path: Path | None,
         limits: Mapping[str, float | None],
-        noted: Callable[[], None],
+        noted: Callable[[Iterate], None] | None,
         *,
         verbose: bool,
     ) -> None:
@@ -111,17 +110,42 @@ class Running:
     @property
     def budget(self) -> str:
         """Why there is no further step where the evaluations are `spent`."""
-        return budget(self._most, self.evaluations, rest=bool(self.record.due) or self._last is not None)
+        return budget(self._most, self.evaluations, rest=bool(self.record.due) or self.decision is not None)
 
     @property
     def doubt(self) -> str:
         """Why the best point may be no minimum; empty if there is no doubt."""
-        return doubt(*self.record.told, *self._best()[:2], self.search.unit)
+        return doubt(*self.record.told, *self.best[:2], self.search.unit)
+
+    @property
+    def best(self) -> Belief:
+        """The best point, its value and the error of the value; in noise from all evaluations together."""
+        if self.decision is not None:
+            return Belief(self.decision.x, self.decision.value, self.decision.error)
+        search = self.search
+        points, losses = self.record.keeping(search.untouched, search.x)  # with what was not told to the search
+        if self.noise and bool(torch.isfinite(losses).any()):
+            return self._believed(self.evaluations)
+        found = lowest(points, losses, search.x)
+        of_search = search.evaluations and self.record.requested is None and not self.record.flat
+        # What the search takes for the best may be a prediction, where fn varies as if it was noisy.
+        return Belief(search.x, found.value, 0.0) if of_search and search.value == found.value else found
+
+    @property
+    def decision(self) -> Decision | None:
+        """The decision, unless the search has gone on since."""
+        decided = self._decided
+        return decided if decided is not None and decided.evaluations == self.evaluations else None
+
+    @property
+    def needed_for_noise(self) -> int:
+        """With how many evaluations the noise would have been measured; 0 if they were not too few for that."""
+        return self._least + 1 if self._unmeasured else 0
 
     @property
     def iterate(self) -> Iterate:
         """The best point and the values of the latest batch."""
-        x, value, _ = self._best()
+        x, value, _ = self.best
         points, losses = self.record.last
         return Iterate(self.evaluations, value, x, points.clone(), losses.clone())
 
@@ -166,26 +190,21 @@ class Running:
         self._unmeasured, self._looking = self._unmeasured and found is None, None
         self._sure = True
 
-    def ending(self, *, arrived: bool) -> Status:
-        """Return the status when the search ends by itself: a small region is no evidence in noise and in doubt."""
-        elsewhere = not torch.equal(self._best().x, self.search.x)
-        return "stalled" if not arrived or self.noise or self.record.flat or elsewhere or self.doubt else "solved"
-
     def reaches(self, target: float) -> bool:
         """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.
 
         That loss is the value of the search. After an earlier decision it is the lowest loss since then.
         """
-        if self._last is not None:
-            return self._last.value <= target
-        value, decided = self.search.value if self.noise else self._best().value, self._decided
+        if self.decision is not None:
+            return self.decision.value <= target
+        value, decided = self.search.value if self.noise else self.best.value, self._decided
         if decided is not None:
             value = float(self.record.told[1][decided.evaluations :].nan_to_num(nan=torch.inf).min())
         return value <= target - _LUCK * (self.noise or 0.0)
 
     def decide(self) -> None:
         """In noise, find out which of the best points has the lowest mean, with the evaluations kept for that."""
-        if not self.noise or not self.begun or self._last is not None:
+        if not self.noise or not self.begun or self.decision is not None:
             return
         self.record.note_known()
         before, most = self._deciding or (self.evaluations, 0)
@@ -213,41 +232,6 @@ class Running:
         own |= {"looking": self._looking, "unmeasured": self._unmeasured, "limits": self._limits, "version": VERSION}
         self._file.write({**own, "search": self.search.state_dict(), **self.record.state_dict()})
 
-    def minimum(self, status: Status, message: str) -> Minimum:
-        """Return the result."""
-        search = self.search
-        (x, value, error), (points, losses) = self._best(), self.record.told
-        around = quadratic_at(x, search, points, losses, self.noise or 0.0)
-        equal = self.evaluations if self.record.flat and len(search.unit) < self.evaluations else 0
-        if self._verbose:
-            self._say(value)
-        success = status in ("target", "solved") or self.ending(arrived=search.solved) == "solved"
-        return Minimum(
-            x=x,
-            value=value,
-            **around._asdict(),
-            evaluations=self.evaluations,
-            points=points,
-            values=losses,
-            message=worded(
-                message,
-                status,
-                equal,
-                "" if self.noise else self.doubt,
-                search.untouched,
-                arrived=search.solved,
-                success=success,
-                flat=not self.noise and search.untouched is None and is_flat(around, search.unit),
-                measuring=self._least + 1 if self._unmeasured else 0,
-                failed=int((~torch.isfinite(losses)).sum()),
-            ),
-            engine=search.engine,
-            success=success,
-            status=status,
-            value_error=error,
-            noise=self.noise or 0.0,
-        )
-
     def _resume(self, saved: dict[str, Any]) -> None:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
         names = "noise", "sure", "decided", "deciding", "search", *self.record.state_dict(), "version"
@@ -267,25 +251,6 @@ class Running:
         elif self.search.done:
             check_limits(self._limits, saved.get("limits", self._limits), self.search.message)
         self._sure = saved["sure"] or given is not None
-
-    @property
-    def _last(self) -> Decision | None:
-        """The decision, unless the search has gone on since."""
-        decided = self._decided
-        return decided if decided is not None and decided.evaluations == self.evaluations else None
-
-    def _best(self) -> Belief:
-        """Return the best point, its value and the error of the value; in noise from all evaluations together."""
-        if self._last is not None:
-            return Belief(self._last.x, self._last.value, self._last.error)
-        search = self.search
-        points, losses = self.record.keeping(search.untouched, search.x)  # with what was not told to the search
-        if self.noise and bool(torch.isfinite(losses).any()):
-            return self._believed(self.evaluations)
-        found = lowest(points, losses, search.x)
-        of_search = search.evaluations and self.record.requested is None and not self.record.flat
-        # What the search takes for the best may be a prediction, where fn varies as if it was noisy.
-        return Belief(search.x, found.value, 0.0) if of_search and search.value == found.value else found
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
@@ -310,11 +275,15 @@ class Running:
         now = time.monotonic()
         if self._verbose and now - self._said >= _PAUSE:
             self._said = now
-            self._say(self._best().value)
+            self.say()
         if now - self._written >= _PAUSE:
             self.write()
-        self._then()
+        if self._then is not None:
+            self._then(self.iterate)
 
-    def _say(self, value: float) -> None:
-        said = f"{self.evaluations} evaluations, value {value:.6g}, sigma {self.search.sigma:.3g}"
+    def say(self) -> None:
+        """Write a line on how far the search is to stderr, if it is `verbose`."""
+        if not self._verbose:
+            return
+        said = f"{self.evaluations} evaluations, value {self.best.value:.6g}, sigma {self.search.sigma:.3g}"
         print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)

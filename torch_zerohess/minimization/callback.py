@@ -1,0 +1,26 @@
+"""The callback of a caller, and whether it has asked for the end."""
+
+from collections.abc import Callable
+
+from torch_zerohess.minimization.minimum import Iterate
+
+
+class Callback:
+    """A callback that is called once after every batch."""
+
+    def __init__(self, function: Callable[[Iterate], object]) -> None:
+        self._function = function
+        self.asked = False
+        """Whether it has returned True."""
+        self.running = False
+        """Whether it is being called, or has raised."""
+
+    def __call__(self, iterate: Iterate) -> None:
+        self.running = True
+        self.asked = self.asked or _is_true(self._function(iterate))
+        self.running = False
+
+
+def _is_true(answer: object) -> bool:
+    """Whether a callback returned True. Other truthy values, such as the count of bytes it wrote, do not end."""
+    return str(getattr(answer, "dtype", type(answer).__name__)) in ("bool", "torch.bool") and bool(answer)

@@ -1,0 +1,38 @@
+"""The black box as a search calls it: what is known stays known, and goes into a memory."""
+
+from torch import Tensor
+
+from torch_zerohess.estimation.evaluation import BlackBoxCall
+from torch_zerohess.evaluators.finished import finished_values
+from torch_zerohess.minimization.record import Call
+from torch_zerohess.surrogates.memory import Memory
+
+
+def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Call:
+    """Return a call that keeps the values of an interrupted batch, those that are known.
+
+    Args:
+        call: the black box.
+        memory: gets every evaluation; or None.
+        scalar: whether each value must be one number. The call raises ValueError for others.
+    """
+
+    def evaluated(points: Tensor) -> tuple[list[int], Tensor, BaseException | None]:
+        given, failure = points.clone(), None
+        numbers = list(range(len(points)))
+        try:
+            values = call(given, ())
+        except BaseException as error:  # Ctrl-C, too: the values known so far are kept
+            failure = error
+            numbers, values = finished_values(error, given)
+        if scalar and numbers and values.shape[1:] not in ((), (1,)):
+            raise failure or ValueError(
+                f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
+                f"{len(points)} points"
+            )
+        if memory is not None and numbers:
+            with memory.lock:
+                memory.add(points[numbers], values)
+        return numbers, values, failure
+
+    return evaluated

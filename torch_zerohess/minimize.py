@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, check_callable, checked_file, checked_integer
-from torch_zerohess.estimation.evaluation import BlackBoxCall
+from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.inputs import working
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool

@@ -15,8 +15,8 @@ from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.limit import limited
 from torch_zerohess.autograd.linear_map import product, project
 from torch_zerohess.autograd.marker import Input
+from torch_zerohess.estimation.call import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.control import Control
-from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working

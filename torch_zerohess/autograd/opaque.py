@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
+from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.control import Control
-from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate, evaluate_center
+from torch_zerohess.estimation.evaluation import evaluate, evaluate_center
 from torch_zerohess.estimation.expansion import Expansion
 from torch_zerohess.estimation.stein import Layout
 from torch_zerohess.estimation.surrogate_mean import nodes as nodes_of

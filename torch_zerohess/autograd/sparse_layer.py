@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import transforms
 from torch_zerohess.autograd.marker import Input
-from torch_zerohess.estimation.evaluation import BlackBoxCall, evaluate_center
+from torch_zerohess.estimation.call import BlackBoxCall
+from torch_zerohess.estimation.evaluation import evaluate_center
 from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
 from torch_zerohess.evaluators.inline import Evaluator

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.adaptive import MOST, Derivative, check_limits, draw_until
+from torch_zerohess.estimation.call import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.control import Control
-from torch_zerohess.estimation.evaluation import BlackBoxCall, ValueMode, evaluate
+from torch_zerohess.estimation.evaluation import evaluate
 from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored

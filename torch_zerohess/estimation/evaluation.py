@@ -1,172 +1,24 @@
-"""One batch of black-box evaluations: the points, the call, the checks, and the coefficients of the Stein sums."""
+"""One batch of black-box evaluations: the points, the values, and the coefficients of the Stein sums."""
 
 import functools
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool, check_evaluator, check_head
-from torch_zerohess.estimation.advice import add_advice
+from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.coefficients import baseline_of, coefficients_of, share_of, without_useless_center
 from torch_zerohess.estimation.contributions import contributions
 from torch_zerohess.estimation.control import Control
 from torch_zerohess.estimation.evaluations import Evaluations
 from torch_zerohess.estimation.expansion import Expansion
-from torch_zerohess.estimation.head import Head, apply_head
-from torch_zerohess.estimation.inputs import all_finite, check_finite, times_changed
+from torch_zerohess.estimation.inputs import all_finite, check_finite
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values, replaced
-from torch_zerohess.estimation.outer import Outer, outer_of
-from torch_zerohess.estimation.perturbations import draws, perturb
-from torch_zerohess.evaluators.batch import loss_error
-from torch_zerohess.evaluators.factory import Each
-from torch_zerohess.evaluators.inline import Evaluator, Inline
-from torch_zerohess.evaluators.payload import RemoteTraceback
-from torch_zerohess.evaluators.values import checked_values
+from torch_zerohess.estimation.perturbations import Perturbations, draws, perturb
 from torch_zerohess.smoothing import Smoothing
-
-ValueMode = Literal["center", "smoothed"]
-
-
-@dataclass(frozen=True)
-class BlackBoxCall:
-    """How to call a black box: the function, and what to do with what it returns.
-
-    fn: [K, n], *aux [K, ...] -> [K, *out], or of one point [n] -> [*out] where not `vectorized`. Without aux if there
-        is a head.
-    head: white box after fn, see `estimation.head`; None: the outputs of fn are the values.
-    joint: one evaluation takes a point of every batch element: [K, B, n], *aux [K, B, ...] -> [K, B, *out].
-    on_nonfinite: "raise", "drop" (leave out the whole antithetic pair), or a number to put in its place.
-    """
-
-    fn: Callable[..., Any]
-    vectorized: bool = True
-    evaluator: Evaluator | None = None
-    value: ValueMode = "center"
-    on_nonfinite: str | float = "raise"
-    head: Head | None = None
-    joint: bool = False
-    outer: Outer = field(init=False, repr=False, compare=False)
-    """The function outside of the expectation of the values."""
-    answered: bool = field(default=False, init=False, repr=False, compare=False)
-    """Whether a call has given values."""
-
-    def __post_init__(self) -> None:
-        if not callable(self.fn):
-            raise TypeError(f"fn must be callable, got {self.fn!r}")
-        if self.evaluator is None:
-            object.__setattr__(self, "evaluator", Inline())
-        else:
-            check_evaluator(self.evaluator)
-        check_bool(vectorized=self.vectorized)
-        object.__setattr__(self, "outer", outer_of(self.head))
-        if self.outer.head is not None:
-            check_head(self.outer.head)
-        if self.value not in ("center", "smoothed"):
-            raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
-        rule = self.on_nonfinite
-        if rule not in ("raise", "drop") and not _finite_number(rule):
-            raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
-
-    def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
-        """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
-        fn = self.fn if self.vectorized else Each(self.fn)
-        assert self.evaluator is not None
-        try:
-            with torch.no_grad():
-                result = self.evaluator(fn, points, *aux)
-        except (IndexError, RuntimeError, TypeError, ValueError) as error:
-            raised = isinstance(self.evaluator, Inline) or isinstance(error.__cause__, RemoteTraceback)
-            if raised and self.vectorized and not self.answered:
-                add_advice(error, self.fn, points, aux)
-            raise
-        values = checked_values(result, points, self.vectorized)
-        object.__setattr__(self, "answered", True)
-        # A copy: the black box may go on writing to what it returned.
-        return _copied(values) if values.device == points.device else values.to(points.device).contiguous()
-
-    def separates(self, count: int) -> bool:
-        """Return whether each of `count` points of a batch is a call of fn of its own."""
-        return not self.vectorized or count <= max(getattr(self.evaluator, "single_points", 1), 1)
-
-    def values(
-        self,
-        points: Tensor,
-        aux: Sequence[Tensor],
-        *,
-        spare: bool = False,
-        receive: Callable[[Tensor], None] | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Return values [B, E, *out] at points [B, E, n] with aux [B, ...], and the outputs of fn [B, E, *outputs].
-
-        Without a head they are the same.
-
-        spare: nobody needs the points again; else the black box gets a copy, because it may write to its input.
-        receive: called with the outputs before anything else can fail.
-        """
-        B, E = points.shape[:2]
-        if self.joint:
-            return (self._jointly(_copied(points.transpose(0, 1)), aux),) * 2
-        flat = points.flatten(0, 1) if spare else _copied(points.flatten(0, 1))
-        if self.outer.head is None:
-            values = self(flat, [one.repeat_interleave(E, 0) for one in aux])
-            values = values.reshape(B, E, *values.shape[1:])
-            if receive:
-                receive(values)
-            self._lost(flat)
-            return values, values
-        outputs = self(flat, []).unflatten(0, (B, E))
-        if receive:
-            receive(outputs)
-        before = times_changed(outputs)
-        values, lost = apply_head(self.outer.head, outputs, aux), self._lost(flat)
-        if times_changed(outputs) != before:
-            raise ValueError("head must not change the outputs of the black box, which are kept: use a copy of them")
-        if lost:  # a head may make a number of NaN
-            values = values.clone()
-            values[[k // E for k in lost], [k % E for k in lost]] = torch.nan
-        if self.on_nonfinite == "raise" and aux and E > 1 and not all_finite(values):
-            self._check_head(values, outputs)
-        return values, outputs
-
-    def _check_head(self, values: Tensor, outputs: Tensor) -> None:
-        """Raise ValueError if no loss of an element is finite and its outputs are: its aux, or the head, is wrong."""
-        sound = torch.isfinite(outputs.reshape(*outputs.shape[:2], -1)).all(2)
-        wrong = (sound & ~torch.isfinite(values)).all(1)
-        if bool(wrong.any()):
-            b = int(wrong.nonzero()[0])
-            raise ValueError(
-                f"head returned {float(values[b, 0])} for every output of batch element {b}, and all these outputs are "
-                f"finite: look at element {b} of aux for values that are not finite, or at the head"
-            )
-
-    def _jointly(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
-        """Return values [B, E, *out] of points [E, B, n], of which each row is one evaluation."""
-        E, B = points.shape[:2]
-        values = self(points, [_copied(one.expand(E, *one.shape)) for one in aux])
-        if values.shape[1:2] != (B,):
-            raise ValueError(
-                f"fn must return one value per batch element, [{E}, {B}, *out] for points {list(points.shape)}, "
-                f"got {list(values.shape)}"
-            )
-        self._lost(points.flatten(1))
-        return values.transpose(0, 1)
-
-    def _lost(self, points: Tensor) -> list[int]:
-        """Return which of the points [K, n] of the last call the evaluator has no value of."""
-        lost = getattr(self.evaluator, "lost", None) or {}
-        if lost and self.on_nonfinite == "raise":
-            raise loss_error(lost, points)
-        return sorted(lost)
-
-    def why_lost(self, E: int) -> Callable[[int, int], str | None]:
-        """Return a function that says why the evaluator has no value of point e of element b, in the last call."""
-        lost: dict[int, str] = getattr(self.evaluator, "lost", None) or {}
-        return lambda b, e: lost.get(e if self.joint else b * E + e)
 
 
 def evaluate(
@@ -191,62 +43,139 @@ def evaluate(
     seed = smoothing.drawn_seed(0 if control is None else control.taken)
     with_center = call.value == "center" or smoothing.baseline == "center"
     perturbations = perturb(x, smoothing, seed, keep, with_center)
-    stein, sigma, outer = perturbations.stein, perturbations.sigma, call.outer
-    (B, n), K = x.shape, perturbations.points.shape[1] - with_center
+    stein = perturbations.stein
     # Points that can be made again are not copied for fn, which may write to them.
     again = stein if isinstance(stein, LikelihoodRatio) and control is None else None
-
-    def points() -> Tensor:
-        return perturbations.points if again is None else again.points(x, sigma, with_center)
-
     references, encoded, scales = control.parted(aux) if control else (aux, (), None)
     receive = None if control is None else functools.partial(control.keep, perturbations.points)
     values, outputs = call.values(perturbations.points, references, spare=again is not None, receive=receive)
-    remaining = values
-    kept: Tensor | None = None
-    baseline: Tensor | None = None
-    coefficients: Tensor | None = None
-    if control is None and outer.linear and smoothing.baseline == "center":
-        _, coefficients = coefficients_of(values, None, K, smoothing, n)
-    if coefficients is None or not all_finite(coefficients):  # differences to f(x) are finite only if all values are
-        values, kept = finite_values(
-            values, outputs, points, call.on_nonfinite, K, smoothing, stein, call.why_lost(K + with_center)
-        )
-        share = share_of(kept, B, K, x.device)
+    batch = _Batch(call, x, smoothing, perturbations, with_center, again, values, outputs)
+    reduced = batch.from_center() if control is None else None
+    if reduced is None:
+        reduced = batch.reduced(control, references, encoded, scales)
+    constants = call.outer.kept(reduced.scales, reduced.values, batch.K)
+    expansion = Expansion(batch.base(reduced), reduced.coefficients, perturbations.sigma, constants, stein)
+    points = None if again is not None else perturbations.points
+    told = reduced.values, reduced.kept, reduced.remaining, reduced.baseline
+    return Evaluations(x, batch.K, points, *told, smoothing, expansion)
 
-        def added(all_values: Tensor) -> list[Tensor]:
-            a = coefficients_of(all_values, share, K, smoothing, n)[1]
-            return contributions(stein, a, draws(smoothing, n), n, smoothing.order)
 
-        def mean(losses: Tensor) -> Tensor:
-            return (stein.value(losses[:, None] * share.mT) / stein.value(share.mT))[:, 0]
+class _Reduced(NamedTuple):
+    """What a batch comes down to. `remaining`, `kept` and `baseline` (the mean one): see `Evaluations`."""
 
-        counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(with_center)), value=True)
+    values: Tensor
+    """[B, E, *out], finite."""
+    kept: Tensor | None
+    remaining: Tensor
+    baseline: Tensor | None
+    coefficients: Tensor
+    """Of the Stein sums, [B, K, P]."""
+    scales: Tensor | None
+    """[B, 2], see `Outer.scales`."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """The points of one call, and what the black box returned there."""
+
+    call: BlackBoxCall
+    x: Tensor
+    """[B, n]."""
+    smoothing: Smoothing
+    perturbations: Perturbations
+    with_center: bool
+    """Whether x was evaluated, too."""
+    again: LikelihoodRatio | None
+    """Makes the points again, where fn may have written to them."""
+    values: Tensor
+    """[B, E, *out]."""
+    outputs: Tensor
+    """Of fn, before the head [B, E, *outputs]."""
+
+    @property
+    def K(self) -> int:
+        """Number of perturbations for each x."""
+        return self.perturbations.points.shape[1] - self.with_center
+
+    def points(self) -> Tensor:
+        """Return the points that were evaluated [B, E, n]."""
+        perturbations, again = self.perturbations, self.again
+        if again is None:
+            return perturbations.points
+        return again.points(self.x, perturbations.sigma, self.with_center)
+
+    def from_center(self) -> _Reduced | None:
+        """Reduce differences to f(x); None with another baseline, or if a difference is not finite."""
+        if not self.call.outer.linear or self.smoothing.baseline != "center":
+            return None
+        _, coefficients = coefficients_of(self.values, None, self.K, self.smoothing, self.x.shape[1])
+        if not all_finite(coefficients):  # differences to f(x) are finite only if all values are
+            return None
+        return _Reduced(self.values, None, self.values, None, coefficients, None)
+
+    def reduced(
+        self, control: Control | None, references: Sequence[Tensor], encoded: Sequence[Tensor], scales: Tensor | None
+    ) -> _Reduced:
+        """Replace or drop values that are not finite, subtract what a control variate explains, and reduce the rest.
+
+        For references, encoded and scales see `Control.parted`.
+        """
+        call, smoothing, K, outer = self.call, self.smoothing, self.K, self.call.outer
+        why_lost = call.why_lost(K + self.with_center)
+        stein, given, rule = self.perturbations.stein, (self.values, self.outputs, self.points), call.on_nonfinite
+        values, kept = finite_values(*given, rule, K, smoothing, stein, why_lost)
+        share = share_of(kept, len(self.x), K, self.x.device)
         losses = values if kept is None else outer.filled(values, kept)
         if scales is None:
-            scales = outer.scales(lambda: losses[:, :K].double(), mean)
+            scales = outer.scales(lambda: losses[:, :K].double(), lambda of: self._mean(of, share))
         remaining = outer.inner(losses, scales)
         if control is not None:
-            predicted = control.explain(values, points(), outputs, references, encoded, added, counted)
+            predicted = self._explained(control, references, encoded, values, kept, share)
             if predicted is not None:
                 remaining = remaining.double() - control.coefficient * outer.inner(predicted, scales)
         if not outer.linear and smoothing.baseline == "center":
             remaining = without_useless_center(remaining, share[..., 0])
-        baseline, coefficients = coefficients_of(remaining, share, K, smoothing, n)
+        baseline, coefficients = coefficients_of(remaining, share, K, smoothing, self.x.shape[1])
         if not all_finite(coefficients):
             raise ValueError(
                 f"fn returned values up to {float(values[:, :K].abs().max()):.3g}, whose differences are not finite in "
                 "float64: scale what fn returns"
             )
-    if call.value == "center" and outer.linear:
-        base = values.select(1, K).double()
-    else:
-        rest = remaining[:, :K]
-        subtracted = baseline_of(remaining, baseline, smoothing)[:, 0]
-        base = stein.smoothed(rest.reshape(B, K, -1), subtracted, coefficients.mT).reshape((B, *rest.shape[2:]))
-    expansion = Expansion(base, coefficients, sigma, outer.kept(scales, values, K), stein)
-    kept_points = None if again is not None else perturbations.points
-    return Evaluations(x, K, kept_points, values, kept, remaining, baseline, smoothing, expansion)
+        return _Reduced(values, kept, remaining, baseline, coefficients, scales)
+
+    def base(self, reduced: _Reduced) -> Tensor:
+        """Return the value of the expansion at x, float64 [B, *out]: f(x), or the smoothed values."""
+        K, remaining = self.K, reduced.remaining
+        if self.call.value == "center" and self.call.outer.linear:
+            return reduced.values.select(1, K).double()
+        rest, stein = remaining[:, :K], self.perturbations.stein
+        subtracted = baseline_of(remaining, reduced.baseline, self.smoothing)[:, 0]
+        smoothed = stein.smoothed(rest.reshape(len(rest), K, -1), subtracted, reduced.coefficients.mT)
+        return smoothed.reshape((len(rest), *rest.shape[2:]))
+
+    def _mean(self, losses: Tensor, share: Tensor) -> Tensor:
+        """Return the mean [B] of losses [B, K] under the Gaussian."""
+        stein = self.perturbations.stein
+        return (stein.value(losses[:, None] * share.mT) / stein.value(share.mT))[:, 0]
+
+    def _explained(
+        self,
+        control: Control,
+        references: Sequence[Tensor],
+        encoded: Sequence[Tensor],
+        values: Tensor,
+        kept: Tensor | None,
+        share: Tensor,
+    ) -> Tensor | None:
+        """Return what the control variate predicts for the values, float64 [B, E, *out], if it is used."""
+        smoothing, n, outputs = self.smoothing, self.x.shape[1], self.outputs
+        counted = None if kept is None else torch.nn.functional.pad(kept, (0, int(self.with_center)), value=True)
+
+        def added(of: Tensor) -> list[Tensor]:
+            a = coefficients_of(of, share, self.K, smoothing, n)[1]
+            return contributions(self.perturbations.stein, a, draws(smoothing, n), n, smoothing.order)
+
+        return control.explain(values, self.points(), outputs, references, encoded, added, counted)
 
 
 def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
@@ -260,12 +189,3 @@ def evaluate_center(call: BlackBoxCall, x: Tensor, aux: Sequence[Tensor]) -> Ten
     if bool(bad.any()):
         values = replaced(values, outputs, bad.nonzero()[0], x, call.on_nonfinite, call.why_lost(1))
     return values
-
-
-def _finite_number(rule: Any) -> bool:
-    return isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
-
-
-def _copied(tensor: Tensor) -> Tensor:
-    """Return a contiguous copy: who gets it may write to it, and read it from its pointer."""
-    return tensor.clone(memory_format=torch.contiguous_format)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
-from torch_zerohess.estimation.evaluation import ValueMode
+from torch_zerohess.estimation.call import ValueMode
 from torch_zerohess.estimation.inputs import all_finite, short
 from torch_zerohess.estimation.skewness import Shape, extension
 from torch_zerohess.estimation.stein import Quantity

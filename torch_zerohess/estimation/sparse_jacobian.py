@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluation import BlackBoxCall
+from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.likelihood_ratio import LikelihoodRatio
 from torch_zerohess.estimation.nonfinite import finite_values

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluation import BlackBoxCall
+from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.minimization.record import Call
 from torch_zerohess.surrogates.memory import Memory

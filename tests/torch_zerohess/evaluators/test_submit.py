@@ -9,7 +9,7 @@ import torch
 from black_boxes import points
 
 import torch_zerohess as zh
-from torch_zerohess.estimation.evaluation import BlackBoxCall
+from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.evaluators import Executor, Inline, ProcessPool
 from truths import vector
 

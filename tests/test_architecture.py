@@ -37,7 +37,7 @@ LAYERS = {
         *("listing", "run", "commands", "__main__"),
     ],
 }
-MOST_LINES = 320
+MOST_LINES = 300
 MAKERS = {
     f"torch.{one}"
     for one in (

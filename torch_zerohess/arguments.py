@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torch_zerohess.version import written_by
@@ -133,3 +134,30 @@ def checked_file(name: str, value: Any) -> Path:
     if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
         raise ValueError(f"{name} must be a file in a folder that exists and can be written to, got {str(value)!r}")
     return path
+
+
+def _numbers(given: Any) -> Tensor:
+    """Return numbers of Python, or of an array of any strides and bytes, as a tensor; float64 if they are real."""
+    if hasattr(given, "tolist"):
+        given = given.tolist()
+    tensor = torch.as_tensor(given, device="cpu")
+    real = not (tensor.is_complex() or tensor.dtype == torch.bool)
+    return torch.as_tensor(given, dtype=torch.float64, device="cpu") if real else tensor
+
+
+def checked_sigma(sigma: Any, name: str = "sigma") -> float | Tensor:
+    """Return a number, or a copy [n] in float64. TypeError if sigma is neither, ValueError if it is out of range."""
+    if isinstance(sigma, Tensor) and sigma.requires_grad:
+        raise ValueError(f"{name} must not require grad: pass {name}.detach()")
+    try:
+        values = sigma if isinstance(sigma, Tensor) else _numbers(sigma)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}") from error
+    if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:
+        raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}")
+    with torch.inference_mode(False):  # also if it was made or loaded in inference mode, graphs keep it
+        values = values.detach().double().clone()
+    wrong = values[~(torch.isfinite(values) & (values > 0))]
+    if len(wrong):
+        raise ValueError(f"{name} must be positive and finite, got {float(wrong.flatten()[0])}")
+    return float(values) if values.dim() == 0 else values

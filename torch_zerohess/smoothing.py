@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer, checked_seed
+from torch_zerohess.arguments import checked_integer, checked_seed, checked_sigma
 from torch_zerohess.choice import chosen_baseline, chosen_sampler, chosen_signs, scrambles_of
 
 Proposal = Literal["aggregate", "gaussian", "optimal", "uniform", "fr22", "auto"]
@@ -280,30 +280,3 @@ def following_seed(seed: int, number: int) -> int:
 
 def _sampling(proposal: str, sampler: str, antithetic: Signs, baseline: str, **_: Any) -> str:
     return f"{proposal}, {sampler}, {'pairs' if antithetic else 'single'}, {baseline}"
-
-
-def _numbers(given: Any) -> Tensor:
-    """Return numbers of Python, or of an array of any strides and bytes, as a tensor; float64 if they are real."""
-    if hasattr(given, "tolist"):
-        given = given.tolist()
-    tensor = torch.as_tensor(given, device="cpu")
-    real = not (tensor.is_complex() or tensor.dtype == torch.bool)
-    return torch.as_tensor(given, dtype=torch.float64, device="cpu") if real else tensor
-
-
-def checked_sigma(sigma: Any, name: str = "sigma") -> float | Tensor:
-    """Return a number, or a copy [n] in float64. TypeError if sigma is neither, ValueError if it is out of range."""
-    if isinstance(sigma, Tensor) and sigma.requires_grad:
-        raise ValueError(f"{name} must not require grad: pass {name}.detach()")
-    try:
-        values = sigma if isinstance(sigma, Tensor) else _numbers(sigma)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}") from error
-    if values.is_complex() or values.dtype == torch.bool or values.dim() > 1 or values.numel() == 0:
-        raise TypeError(f"{name} must be a positive number or a tensor [n], got {sigma!r}")
-    with torch.inference_mode(False):  # also if it was made or loaded in inference mode, graphs keep it
-        values = values.detach().double().clone()
-    wrong = values[~(torch.isfinite(values) & (values > 0))]
-    if len(wrong):
-        raise ValueError(f"{name} must be positive and finite, got {float(wrong.flatten()[0])}")
-    return float(values) if values.dim() == 0 else values

@@ -25,7 +25,8 @@ from typing import Annotated
 
 import tyro
 
-from experiments.reports.document_tables import Query, number, rows_of, table_of
+from experiments.reports.document_tables import Query, rows_of, table_of
+from experiments.reports.markdown import number
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", "experiments/README.md", "torch_zerohess/README.md", "tests/README.md")

@@ -15,7 +15,7 @@ The truth about a gradient is a far larger sample of scrambled Sobol points; its
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -39,6 +39,7 @@ from experiments.runs.base_trial import Finished
 from experiments.runs.records import Record
 from experiments.runs.trial import Trial, reduced
 from experiments.studies.loss_objectives import FORMS, Moments, Pictures, normal, pictures_of
+from experiments.studies.loss_report import Fit, GradientError, LossReport, Reached
 from experiments.studies.loss_sweeps import (
     POSITIONS,
     SCALES,
@@ -58,57 +59,6 @@ _ERRORS = ["task", "loss", "where", "evaluations", "inside", "image", "truth: in
 """Headers: the loss inside of the black box, or after the image; then the errors of what both are compared with."""
 _SCRAMBLES = 4
 _Row = TypeVar("_Row")
-
-
-@dataclass(frozen=True)
-class GradientError:
-    """Relative RMSE of the estimated gradient of an objective."""
-
-    task: str
-    loss: str
-    form: str
-    where: str
-    evaluations: int
-    rmse: float
-    truth_error: float
-    """Relative standard error of what it is compared with."""
-
-
-@dataclass(frozen=True)
-class Fit:
-    """The trust region from all starts, until an error is reduced by 99 %."""
-
-    task: str
-    loss: str
-    form: str
-    metric: str
-    """image: mean squared error of the picture, whatever the loss; parameter: mean squared error of x."""
-    evaluations: float | None
-    """Median over the runs that get there, if they are at least half of all."""
-    evaluations_low: float | None
-    evaluations_high: float | None
-    """Quartiles over the same."""
-    share: float
-    seconds: float | None
-    runs: int
-
-
-@dataclass(frozen=True)
-class Reached:
-    """When a run of the trust region has reduced an error by 99 %; None if it never has."""
-
-    metric: str
-    evaluations: int | None
-    seconds: float | None
-
-
-@dataclass(frozen=True)
-class LossReport:
-    """Everything that `losses` measured."""
-
-    biases: list[Bias]
-    errors: list[GradientError]
-    fits: list[Fit]
 
 
 def losses(

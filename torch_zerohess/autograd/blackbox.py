@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import control_variate, opaque, tracing, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
-from torch_zerohess.autograd.limit import limited
-from torch_zerohess.autograd.linear_map import product, project
+from torch_zerohess.autograd.expanded import general, tangent
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.call import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.control import Control
@@ -132,7 +131,7 @@ class BlackBox(nn.Module):
         if len(center) and alone and not watched and not transforms.forward_mode_active():
             expansion = self._evaluate(center, others)
             settings = self.smoothing.resolved(n)
-            result = ClosedForm.apply(x, expansion, settings, stored(settings, len(center), n), _general)
+            result = ClosedForm.apply(x, expansion, settings, stored(settings, len(center), n), general)
             return result.to(dtype)
         if x.requires_grad and not watched and not transforms.has_tangent(x):
             x = Input.apply(x)
@@ -208,8 +207,8 @@ class BlackBox(nn.Module):
         expansion = self._evaluate(center, aux)
         active = self.control is not None and self.control.active
         if active and self.memory is not None and self.memory.order == 1:
-            return functools.partial(_tangent, expansion, center=center), expansion.constants
-        return functools.partial(_general, expansion, center=center, zero=zero), expansion.constants
+            return functools.partial(tangent, expansion, center=center), expansion.constants
+        return functools.partial(general, expansion, center=center, zero=zero), expansion.constants
 
     def _evaluate(self, x: Tensor, aux: list[Tensor]) -> Expansion:
         B, n = x.shape
@@ -287,27 +286,6 @@ def smooth(
         value=value,
         on_nonfinite=on_nonfinite,
     )
-
-
-def _general(expansion: Expansion, x: Tensor, *, center: Tensor, zero: bool) -> Tensor:
-    """Return the expansion around `center` at x [B, n], with a graph; zero: says that x equals `center` in value."""
-    stein, c = expansion.stein, expansion.coefficients
-
-    def ratios(d: Tensor, zero: bool) -> Tensor:
-        d = d if stein.highest is None else limited(d, stein.highest)
-        return product(stein.ratio(d, functools.partial(project, zero=zero))[:, None], c.mT)[:, 0]
-
-    d = (x.double() - center.double()) / expansion.sigma
-    total = ratios(d, zero)
-    change = total - (total if zero else ratios(torch.zeros_like(d), True)).detach()
-    return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
-
-
-def _tangent(expansion: Expansion, x: Tensor, center: Tensor) -> Tensor:
-    """Return the expansion around `center` at x [B, n], to first order."""
-    slope = expansion.stein.scaled_gradient(expansion.coefficients.mT.contiguous(), expansion.sigma)
-    change = (slope @ (x.double() - center.double())[..., None])[..., 0]
-    return (expansion.base + change.reshape(expansion.base.shape)).to(x.dtype)
 
 
 def _without_grad(aux: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -14,21 +14,14 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
-from torch.autograd.graph import Node
 
 from torch_zerohess.arguments import check_tensors
-from torch_zerohess.autograd.closed_form import ClosedForm
-from torch_zerohess.autograd.marker import Input
+from torch_zerohess.autograd.graph import COMPILED, black_box_inputs, check_twice, edge_of, edges_before
 from torch_zerohess.autograd.tracing import never_compiled
-from torch_zerohess.autograd.transforms import compiled, made_by
 from torch_zerohess.linalg.flat import flattened, split_like, widest_type
 
 _DENSE = 10_000
 """Parameters beyond which `to_dense` refuses: the matrix would take 800 MB in float64."""
-_COMPILED = (
-    "the loss must be computed outside of torch.compile, got one with a compiled backward, which torch neither keeps "
-    "nor differentiates again: do not compile the model, nor the function that calls it"
-)
 
 
 class CurvatureOperator:
@@ -100,8 +93,8 @@ class CurvatureOperator:
 
     def _check_path(self, outputs: Tensor) -> None:
         """Raise ValueError if the loss does not go through any of the tensors at which the white box ends."""
-        ends = {_edge(one) for one in self._through if one.requires_grad}
-        if not ends & {_edge(outputs), *_edges_before(outputs.grad_fn)}:
+        ends = {edge_of(one) for one in self._through if one.requires_grad}
+        if not ends & {edge_of(outputs), *edges_before(outputs.grad_fn)}:
             raise ValueError(
                 f"outputs must be computed from through, but no tensor of {[list(one.shape) for one in self._through]} "
                 "is on the path to the loss: give the tensors themselves, not copies and not a second forward pass"
@@ -201,75 +194,6 @@ def hvp(
     return result[0] if isinstance(inputs, Tensor) else result
 
 
-def black_box_inputs(outputs: Tensor) -> list[Tensor]:
-    """Return the inputs of the `BlackBox` layers on the way to `outputs`, each tensor once.
-
-    Raises ValueError if there is none, or if one black box depends on another.
-    """
-    found = {_edge(one): one for one in _entries(outputs.grad_fn)}
-    if not found:
-        raise ValueError(
-            "mode 'gauss_newton' found no BlackBox layer between inputs and outputs: name the tensors at which the "
-            "white box ends in `through` (a compiled layer is neither found nor differentiated twice)"
-        )
-    for one in found.values():
-        if _entries(one.grad_fn):
-            raise ValueError(
-                "mode 'gauss_newton' needs black boxes side by side, but one stands behind another: use mode 'exact'"
-            )
-        if _edges_before(one.grad_fn) & found.keys():
-            raise ValueError(
-                "mode 'gauss_newton' found a black box whose input is computed from the input of another: name in "
-                "`through` the tensors that both come from"
-            )
-    return list(found.values())
-
-
-def _entries(node: Node | None) -> list[Tensor]:
-    seen, stack, found = {node}, [node], []
-    while stack:
-        current = stack.pop()
-        if current is None:
-            continue
-        if made_by(current, Input) or made_by(current, ClosedForm):
-            found.append(current.saved_tensors[0])  # type: ignore[attr-defined]
-        for following, _ in current.next_functions:
-            if following not in seen:
-                seen.add(following)
-                stack.append(following)
-    return found
-
-
-def _edges_before(node: Node | None) -> set[tuple[Node, int]]:
-    """Return all gradient edges that can be reached from a node, (node, number of its output) each."""
-    seen: set[tuple[Node, int]] = set()
-    stack = [node]
-    while stack:
-        current = stack.pop()
-        for following, number in current.next_functions if current is not None else ():
-            if following is not None and (following, number) not in seen:
-                seen.add((following, number))
-                stack.append(following)
-    return seen
-
-
-def check_twice(outputs: Sequence[Tensor], ends: Sequence[Tensor]) -> None:
-    """Raise RuntimeError if a backward of `torch.compile` is on the way from outputs to one of the ends.
-
-    Derivatives of its result are errors of torch, or zeros where unused tensors are allowed.
-    """
-    before = {_edge(one) for one in ends if one.requires_grad}
-    for output in outputs:
-        nodes = {output.grad_fn, *(node for node, _ in _edges_before(output.grad_fn))}
-        if any(node and compiled(node) and before & _edges_before(node) for node in nodes):
-            raise RuntimeError(_COMPILED)
-
-
-def _edge(tensor: Tensor) -> tuple[Node, int]:
-    edge = torch.autograd.graph.get_gradient_edge(tensor)
-    return edge.node, edge.output_nr
-
-
 def _listed(name: str, tensors: Tensor | Sequence[Tensor]) -> list[Tensor]:
     parts = list(tensors) if isinstance(tensors, Iterable) and not isinstance(tensors, Tensor) else [tensors]
     check_tensors(**{name: parts})
@@ -305,5 +229,5 @@ def _derivatives(
         )
     except RuntimeError as error:
         if "donated buffers" in str(error):  # memory that a compiled backward uses again
-            raise RuntimeError(_COMPILED) from error
+            raise RuntimeError(COMPILED) from error
         raise

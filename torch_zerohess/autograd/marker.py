@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class Input(torch.autograd.Function):
-    """The identity. It marks in the graph where a black box begins: see `curvature.black_box_inputs`."""
+    """The identity. It marks in the graph where a black box begins: see `graph.black_box_inputs`."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:

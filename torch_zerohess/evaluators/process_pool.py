@@ -25,6 +25,7 @@ from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.payload import dumped, loaded_error
 from torch_zerohess.evaluators.worker import ERROR, VALUES
+from torch_zerohess.evaluators.worker_errors import unmade, unstarted
 from torch_zerohess.evaluators.worker_process import Process, ready
 
 _STARTS = 25
@@ -231,7 +232,7 @@ class ProcessPool(Ahead):
             if making:  # calls with other black boxes go on
                 number, one.number = one.number, None
                 for each in [each for each in jobs if each.function.number == number]:
-                    each.error = _unmade(error)
+                    each.error = unmade(error)
                 return
             assert job is not None
             assert chunk is not None
@@ -258,7 +259,7 @@ class ProcessPool(Ahead):
         self._failed_starts += 1
         error = None
         if number is None and how.startswith("exit code"):
-            error = _unstarted(how)
+            error = unstarted(how)
         elif self._failed_starts > (_STARTS if number is None else _MAKES) or reason is not None:
             when = "at its start" if number is None else "while it made the black box"
             error = RuntimeError(
@@ -276,31 +277,6 @@ class ProcessPool(Ahead):
 def cores() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _unstarted(how: str) -> RuntimeError:
-    """Return the error for a worker that ended before it got a black box, with what to do about it."""
-    main = getattr(sys.modules["__main__"], "__file__", None)
-    what = "put the main part of the script"
-    if main is not None and not os.path.isfile(main):  # "<stdin>"
-        what = "this program is in no file, as if read from the standard input: write it into one, its main part"
-    return RuntimeError(
-        f"a worker process ended with {how} at its start, see its messages above. Workers import the main program: "
-        f'{what} under `if __name__ == "__main__":`'
-    )
-
-
-def _unmade(error: BaseException) -> BaseException:
-    """Return an error of a worker that could not make the black box, with what to do about it."""
-    text = str(error)
-    if isinstance(error, AttributeError) and "main__" in text:
-        hint = RuntimeError(
-            f"fn could not be loaded in a worker ({text}): put it into a module, a .py file that is imported here, or "
-            "to the top of the script, outside of functions and of `if`"
-        )
-        hint.__cause__ = error
-        return hint
-    return error
 
 
 def _again(workers: int, settings: dict[str, Any]) -> ProcessPool:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_tensors, checked_integer, checked_number
-from torch_zerohess.autograd.curvature import check_twice
+from torch_zerohess.autograd.graph import check_twice
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.magnitudes import magnitudes
 

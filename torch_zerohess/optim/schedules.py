@@ -5,10 +5,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from torch_zerohess.arguments import check_state, checked_integer
+from torch_zerohess.arguments import check_state, checked_integer, checked_sigma
 from torch_zerohess.autograd.blackbox import BlackBox
 from torch_zerohess.autograd.sparse_layer import SparseBlackBox
-from torch_zerohess.smoothing import checked_sigma
 
 
 class LinearSigma:

@@ -7,17 +7,15 @@ All other tensors go to the reference, and so do CPU tensors without the extensi
 Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
 """
 
-import functools
-import importlib.util
 import itertools
-import warnings
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.sampling import extension, philox, proposals
+from torch_zerohess.sampling.on_cuda import by_triton, on_cuda
 
 MANY_VECTORS = 8  # beyond this, a matrix product of the BLAS is faster than a pass per vector
 _WIDE = 64  # parameters beyond which the same holds for the outer products of a Hessian
@@ -84,7 +82,7 @@ def _compiled(tensor: Tensor) -> bool:
 
 def _draws_on(tensor: Tensor) -> bool:
     """Whether there is an operator that draws on this device."""
-    return extension.available and (tensor.is_cpu or (tensor.is_cuda and _by_triton(tensor.device)))
+    return extension.available and (tensor.is_cpu or (tensor.is_cuda and by_triton(tensor.device)))
 
 
 def pick_rows(seed: int, first: int, count: int, n: int, proposal: int, device: torch.device) -> Tensor:
@@ -254,50 +252,6 @@ def _total(pieces: Iterator[Tensor]) -> Tensor:
     return total
 
 
-_TRITON = importlib.util.find_spec("triton") is not None
-"""Whether tensors on CUDA devices are drawn by `triton_kernels`, which the first of them imports."""
-_refused: set[torch.device] = set()
-"""Devices on which it has failed."""
-
-
-def _by_triton(device: torch.device) -> bool:
-    return _TRITON and device not in _refused
-
-
-@functools.cache
-def _triton_kernels(device: torch.device) -> Any:
-    """Import `triton_kernels`; RuntimeError if it does not draw on this device what the reference draws."""
-    module = importlib.import_module("torch_zerohess.sampling.triton_kernels")
-    n = 8
-    rows = proposals.pick_rows(0, 0, 64, n, proposals.SECOND_ORDER)
-    for single in (False, True):
-        if not torch.equal(module.draw(rows.to(device), n, single).cpu(), proposals.draw(rows, n, single)):
-            raise RuntimeError(f"its numbers on {device} differ from the reference")
-    return module
-
-
-def _on_cuda(function: Callable[..., Any]) -> None:
-    """Register the function of `triton_kernels` with the name of this one, and this one for where it fails."""
-
-    def run(*arguments: Any) -> Any:
-        device = next(one.device for one in arguments if isinstance(one, Tensor))
-        if _by_triton(device):
-            try:
-                return getattr(_triton_kernels(device), function.__name__)(*arguments)
-            except torch.OutOfMemoryError:
-                raise
-            except Exception as error:  # no compiler for its launcher, a device that is too old
-                _refused.add(device)
-                warnings.warn(
-                    f"torch_zerohess draws with torch, not Triton, on {device}: the same numbers, slower. {error!r}",
-                    RuntimeWarning,
-                    stacklevel=2,
-                )
-        return function(*arguments)
-
-    torch.library.impl(f"torch_zerohess::{function.__name__}", "cuda", run)
-
-
 if extension.available:
     for _function in (draw, uniforms, sample, project_drawn, accumulate_drawn):
-        _on_cuda(_function)
+        on_cuda(_function)

@@ -20,13 +20,13 @@ from torch_zerohess.search.candidates import farthest, is_known, least_known, lo
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.pool_quadratic import quadratic_around
 from torch_zerohess.search.random_points import normal, orthonormal
 from torch_zerohess.search.state import LOST, Best, Evaluated, not_finite
-from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
 from torch_zerohess.surrogates.kernels import structures
 from torch_zerohess.surrogates.pool import Pool
-from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
+from torch_zerohess.surrogates.quadratic import LocalModel
 
 APART = 0.05
 """Distance from a minimum that is known to the last digit within which the process has nothing to add."""
@@ -50,8 +50,6 @@ _EXPANSIONS = 3
 """Expansions of the loss around predicted minima. If none predicts the loss there, the loss itself is modelled."""
 _POOL, _BATCHES = 60, 8
 """Evaluations kept, and batches of several points kept at least, unless `pool` says it."""
-_NEAR, _WIDENING, _WIDEST = 1e-3, 1.5, 10.0
-"""Weight from which an evaluation counts as near the best point; sigma is widened by the factor up to the last one."""
 
 Q = TypeVar("Q", bound=ProcessProgress)
 
@@ -124,19 +122,8 @@ class ProcessMethod(Method[Q]):
         return torch.stack(every[len(points) :])
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
-        pool, best, sigma = known.pool, known.best.point, known.best.sigma
-        while len(pool) and sigma < _WIDEST:
-            weights = torch.exp(-0.5 * ((pool.points - best) / sigma).square().sum(1))
-            near = weights > _NEAR
-            if int(near.sum()) > min(self.settings.n, self.capacity - 2):
-                u = (pool.points[near] - best) / sigma
-                if self.settings.loss is None or pool.outputs is None:
-                    model = fit_values(u, pool.values[near], weights[near])
-                else:
-                    model = fit_outputs(u, pool.outputs[near], weights[near], self.settings.loss, known.shape)
-                return with_true_errors(model, u, weights[near]), sigma
-            sigma *= _WIDENING
-        return None
+        least = min(self.settings.n, self.capacity - 2) + 1
+        return quadratic_around(known.best, known.pool, self.settings.loss, known.shape, least)
 
     def begun(self) -> Q:
         """Return the progress before anything was evaluated."""

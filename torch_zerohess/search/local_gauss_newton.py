@@ -8,8 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalMethod, LocalSettings
+from torch_zerohess.search.local_method import LocalMethod
 from torch_zerohess.search.local_progress import LocalProgress
+from torch_zerohess.search.local_settings import LOCAL_TOLERANCE, LocalSettings
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_local import local_method
 from torch_zerohess.search.protocol import AskTell

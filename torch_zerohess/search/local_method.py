@@ -19,15 +19,14 @@ else to its slow steps until it arrives (monotonic basin hopping: Wales and Doye
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
 from torch_zerohess.search.local_progress import LocalProgress, in_range
+from torch_zerohess.search.local_settings import LocalSettings
 from torch_zerohess.search.local_steps import LocalSteps, derivatives, local_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal
@@ -36,7 +35,7 @@ from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_choices import fit_chosen
 from torch_zerohess.surrogates.sparse_evidence import Evidence
-from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, SparseSettings, check_samples
+from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
 
 _TRUSTED = 0.9
 """Share of the held-out change. If the Jacobian predicts more, the first radius is at least 1, as for the samples."""
@@ -51,8 +50,6 @@ _HOP = 0.3
 """Standard deviation of a hop, in units of the first sigma."""
 _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
-LOCAL_TOLERANCE = 5e-4
-"""Radius, in units of sigma, at which the search has arrived, if the caller says nothing."""
 _FOUND = 0.3
 """Share of the entries that must be of parameters that were found, before steps follow, or else more samples."""
 _NOTHING, _LITTLE = 1e-8, 1e-5
@@ -68,40 +65,6 @@ _SHARED = (
     *("points", "outputs", "variance", "pairs"),
 )
 """What a search that returns from a hop keeps."""
-
-
-@dataclass(frozen=True)
-class LocalSettings:
-    """Settings that only this search has; see `LocalGaussNewton`."""
-
-    sparse: SparseSettings
-    samples: int = 32
-    radius: float = 0.5
-    share: float = 0.35
-    least_sigma: float = 0.03
-
-    @classmethod
-    def checked(
-        cls,
-        settings: Settings,
-        *,
-        keep: int | None = None,
-        rate: float = 0.1,
-        grid: tuple[int, ...] | None = None,
-        **own: Any,
-    ) -> "LocalSettings":
-        """Check what a caller gave; ValueError for a setting out of range."""
-        if not callable(settings.loss):
-            raise ValueError(
-                f"loss must be a function of one output for the engine 'local', got {settings.loss!r}: without one use "
-                "engine='descent'"
-            )
-        sparse = SparseSettings.checked(settings.n, keep=keep, rate=rate, grid=grid)
-        result = cls(replace(sparse, robust=False, grows=keep is None), **own)  # samples have one variance
-        for name, most in (("radius", math.inf), ("share", 1.0), ("least_sigma", 1.0)):
-            checked_number(name, getattr(result, name), above=0.0, most=most, below=math.inf)
-        check_samples(checked_integer("samples", result.samples, 1), result.sparse.keep)
-        return result
 
 
 class LocalMethod(GaussNewton[LocalProgress]):

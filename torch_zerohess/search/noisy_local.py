@@ -20,8 +20,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LocalMethod, LocalSettings
+from torch_zerohess.search.local_method import LocalMethod
 from torch_zerohess.search.local_progress import LocalProgress
+from torch_zerohess.search.local_settings import LocalSettings
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_step import alternating, constants, step_in_noise
 from torch_zerohess.search.state import Best, Evaluated

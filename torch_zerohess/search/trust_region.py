@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_zerohess.search.descent_and_process import DescentAndProcess, TurnsProgress
 from torch_zerohess.search.descent_search import descent_method
 from torch_zerohess.search.gaussian_process_search import process_method
-from torch_zerohess.search.local_method import LOCAL_TOLERANCE, LocalSettings
+from torch_zerohess.search.local_settings import LOCAL_TOLERANCE, LocalSettings
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.noisy_local import local_method
 from torch_zerohess.search.protocol import AskTell

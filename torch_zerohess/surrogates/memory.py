@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess.arguments import check_state, checked_integer
-from torch_zerohess.evaluation_mode import mixes_in_evaluation
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
 from torch_zerohess.surrogates.coefficient import Coefficient
-from torch_zerohess.surrogates.surrogate import Surrogate, floating, outside_inference
+from torch_zerohess.surrogates.surrogate import Surrogate, check_surrogate, floating, outside_inference
+from torch_zerohess.surrogates.thinning import farthest_from_later
 from torch_zerohess.version import VERSION
 
 _GROWTH = 1.3
@@ -22,8 +22,6 @@ _FEWEST = 8
 """Evaluations at the first fit, and the least capacity: with less there would never be a fit."""
 _EXCESS = 1.05
 """Evaluations over the capacity at which they are thinned."""
-_BLOCK = 1024
-"""Points whose distances to others are held at once."""
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -105,12 +103,7 @@ class Memory:
         capacity = checked_integer("capacity", capacity, _FEWEST)
         fresh = None if fresh is None else checked_integer("fresh", fresh, 0)
         draws = None if draws is None else checked_integer("draws", draws, 3)
-        if surrogate is not None and not callable(surrogate):
-            raise TypeError(f"surrogate must have fit(points, outputs) and __call__(z), got {surrogate!r}")
-        if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):
-            raise TypeError(f"surrogate must have fit(points, outputs), got {type(surrogate).__name__} without it")
-        if isinstance(surrogate, nn.Module) and (mixing := mixes_in_evaluation(surrogate)) is not None:
-            raise ValueError(f"surrogate has {mixing}, too: its output at a point would depend on the other points")
+        check_surrogate(surrogate)
         self.surrogate: Any = AutomaticSurrogate(capacity=capacity) if surrogate is None else surrogate
         if checked_integer("order", order) not in (1, 2):
             raise ValueError(f"order must be 1 or 2, got {order}")
@@ -231,13 +224,9 @@ class Memory:
         return 1.0 if self.fresh == 0 else self.regression.value
 
     def _thin(self) -> None:
-        """Drop points whose nearest neighbour among later ones is closest, until the capacity is kept."""
+        """Drop points until the capacity is kept."""
         first = max(self._size - 2 * self.capacity, 0)  # older ones go first, so that distances are few
-        points = self.points[first:]
-        deviation = points.std(0)
-        scaled = (points - points.mean(0)) / torch.where(deviation > 0, deviation, 1.0)
-        nearest = torch.cat([_to_later(scaled, row) for row in range(0, len(scaled), _BLOCK)])
-        kept = first + nearest.argsort()[len(points) - self.capacity :].sort().values
+        kept = first + farthest_from_later(self.points[first:], self.capacity)
         with outside_inference():
             self._points, self._outputs = [self.points[kept]], [self.outputs[kept]]
         self._size, self._rows = len(kept), int((kept < self._rows).sum())
@@ -298,14 +287,6 @@ class Memory:
 def _joined(parts: list[Tensor]) -> list[Tensor]:
     with outside_inference():
         return [torch.cat(parts)] if len(parts) > 1 else parts
-
-
-def _to_later(points: Tensor, first: int) -> Tensor:
-    """Return the distances of a block of points [P, n] to the nearest of those after them; infinite for the last."""
-    block = points[first : first + _BLOCK]
-    apart = torch.cdist(block, points[first:], compute_mode="donot_use_mm_for_euclid_dist")
-    later = torch.ones_like(apart, dtype=torch.bool).triu(1)
-    return apart.masked_fill(~later, float("inf")).min(1).values
 
 
 def check_memory(memory: Any) -> None:

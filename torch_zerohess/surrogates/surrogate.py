@@ -3,10 +3,12 @@
 import contextlib
 import math
 from contextlib import AbstractContextManager
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+
+from torch_zerohess.evaluation_mode import mixes_in_evaluation
 
 T = TypeVar("T")
 _MIDDLING = 2.0**30
@@ -26,6 +28,16 @@ class Surrogate(Protocol):
     def __call__(self, z: Tensor) -> Tensor:
         """Expected outputs [K, *out] at z [K, n], differentiable in z."""
         ...
+
+
+def check_surrogate(surrogate: Any) -> None:
+    """Raise TypeError for what is neither None nor a surrogate, ValueError for a module that mixes points."""
+    if surrogate is not None and not callable(surrogate):
+        raise TypeError(f"surrogate must have fit(points, outputs) and __call__(z), got {surrogate!r}")
+    if not (surrogate is None or hasattr(surrogate, "fit") or isinstance(surrogate, nn.Module)):
+        raise TypeError(f"surrogate must have fit(points, outputs), got {type(surrogate).__name__} without it")
+    if isinstance(surrogate, nn.Module) and (mixing := mixes_in_evaluation(surrogate)) is not None:
+        raise ValueError(f"surrogate has {mixing}, too: its output at a point would depend on the other points")
 
 
 def checked(points: Tensor, outputs: Tensor, capacity: int) -> tuple[Tensor, Tensor]:

@@ -14,8 +14,9 @@ from experiments.ensembles import provenance
 from experiments.problems import catalogue
 from experiments.problems.tasks import cnn
 from experiments.reports import result_files
-from experiments.reports.document_tables import SPEED_UP, Query, number, table_of
+from experiments.reports.document_tables import SPEED_UP, Query, table_of
 from experiments.reports.documents import filled, readme
+from experiments.reports.markdown import number
 from experiments.reports.networks import HELD_OUT, _remember, held_out
 from experiments.reports.speed_ups import speed_ups, with_ratios
 from experiments.reports.store import store

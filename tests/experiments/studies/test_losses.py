@@ -17,7 +17,8 @@ from experiments.problems.tasks.box2 import fitting
 from experiments.reports import result_files
 from experiments.runs.attempt import attempt
 from experiments.studies.loss_objectives import pictures_of
-from experiments.studies.losses import LossReport, losses
+from experiments.studies.loss_report import LossReport
+from experiments.studies.losses import losses
 
 
 def normal(count: int, n: int) -> torch.Tensor:

@@ -10,7 +10,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 import torch_zerohess as zh
 from torch_zerohess.autograd import transforms
-from torch_zerohess.autograd.curvature import black_box_inputs
+from torch_zerohess.autograd.graph import black_box_inputs
 from torch_zerohess.autograd.marker import Input
 from truths import spread, vector
 

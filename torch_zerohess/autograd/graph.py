@@ -1,0 +1,85 @@
+"""The graph behind a loss: the black boxes in it, and backwards that `torch.compile` made."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd.graph import Node
+
+from torch_zerohess.autograd.closed_form import ClosedForm
+from torch_zerohess.autograd.marker import Input
+from torch_zerohess.autograd.transforms import compiled, made_by
+
+COMPILED = (
+    "the loss must be computed outside of torch.compile, got one with a compiled backward, which torch neither keeps "
+    "nor differentiates again: do not compile the model, nor the function that calls it"
+)
+
+
+def black_box_inputs(outputs: Tensor) -> list[Tensor]:
+    """Return the inputs of the `BlackBox` layers on the way to `outputs`, each tensor once.
+
+    Raises ValueError if there is none, or if one black box depends on another.
+    """
+    found = {edge_of(one): one for one in _entries(outputs.grad_fn)}
+    if not found:
+        raise ValueError(
+            "mode 'gauss_newton' found no BlackBox layer between inputs and outputs: name the tensors at which the "
+            "white box ends in `through` (a compiled layer is neither found nor differentiated twice)"
+        )
+    for one in found.values():
+        if _entries(one.grad_fn):
+            raise ValueError(
+                "mode 'gauss_newton' needs black boxes side by side, but one stands behind another: use mode 'exact'"
+            )
+        if edges_before(one.grad_fn) & found.keys():
+            raise ValueError(
+                "mode 'gauss_newton' found a black box whose input is computed from the input of another: name in "
+                "`through` the tensors that both come from"
+            )
+    return list(found.values())
+
+
+def _entries(node: Node | None) -> list[Tensor]:
+    seen, stack, found = {node}, [node], []
+    while stack:
+        current = stack.pop()
+        if current is None:
+            continue
+        if made_by(current, Input) or made_by(current, ClosedForm):
+            found.append(current.saved_tensors[0])  # type: ignore[attr-defined]
+        for following, _ in current.next_functions:
+            if following not in seen:
+                seen.add(following)
+                stack.append(following)
+    return found
+
+
+def edges_before(node: Node | None) -> set[tuple[Node, int]]:
+    """Return all gradient edges that can be reached from a node, (node, number of its output) each."""
+    seen: set[tuple[Node, int]] = set()
+    stack = [node]
+    while stack:
+        current = stack.pop()
+        for following, number in current.next_functions if current is not None else ():
+            if following is not None and (following, number) not in seen:
+                seen.add((following, number))
+                stack.append(following)
+    return seen
+
+
+def check_twice(outputs: Sequence[Tensor], ends: Sequence[Tensor]) -> None:
+    """Raise RuntimeError if a backward of `torch.compile` is on the way from outputs to one of the ends.
+
+    Derivatives of its result are errors of torch, or zeros where unused tensors are allowed.
+    """
+    before = {edge_of(one) for one in ends if one.requires_grad}
+    for output in outputs:
+        nodes = {output.grad_fn, *(node for node, _ in edges_before(output.grad_fn))}
+        if any(node and compiled(node) and before & edges_before(node) for node in nodes):
+            raise RuntimeError(COMPILED)
+
+
+def edge_of(tensor: Tensor) -> tuple[Node, int]:
+    edge = torch.autograd.graph.get_gradient_edge(tensor)
+    return edge.node, edge.output_nr

@@ -69,7 +69,7 @@ class AxisLines:
         apart = (self.places - self.lowest[:, None]).abs()
         return float(apart.masked_fill(apart == 0.0, math.inf).amin(1).mean())
 
-    def told(self, evaluated: Evaluated) -> "AxisLines":
+    def adding(self, evaluated: Evaluated) -> "AxisLines":
         """Add points [K, n], one on every axis in turn. A loss that is not finite counts as the highest one."""
         n, count = len(self.places), len(evaluated)
         numbers = torch.arange(count, device=self.places.device)
@@ -132,7 +132,7 @@ class AxisSearch:
         """Return the lines after an evaluation, and the next points [K, n]; none where the search has ended."""
         nothing = evaluated.points[:0]
         if lines.stage == "axes":
-            return self._along(lines.told(evaluated))
+            return self._along(lines.adding(evaluated))
         if lines.stage == "exchanged":
             if len(evaluated) < 2 or not _is_sum(lines, evaluated.usable):
                 return replace(lines, stage="over"), nothing

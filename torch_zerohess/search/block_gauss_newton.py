@@ -88,12 +88,12 @@ class BlockMethod(GaussNewton[BlockProgress]):
 
     def renewed(self, known: BlockProgress, evaluated: Evaluated) -> BlockProgress:
         """Correct the Jacobian along the samples; steps follow when no more are wanted."""
-        count, told = len(evaluated), evaluated.those(evaluated.finite)
-        assert told.outputs is not None
+        count, sound = len(evaluated), evaluated.those(evaluated.finite)
+        assert sound.outputs is not None
         jacobian = (
             known.jacobian if len(known.jacobian) else known.jacobian.new_zeros(self.settings.n, len(known.output))
         )
-        jacobian = broyden_update(jacobian, told.points - known.center, told.outputs - known.output)
+        jacobian = broyden_update(jacobian, sound.points - known.center, sound.outputs - known.output)
         wanted = known.wanted - count
         phase: Literal["sample", "trial"] = "sample" if wanted > 0 else "trial"
         return replace(known, jacobian=jacobian, unused=known.unused[count:], wanted=wanted, phase=phase)

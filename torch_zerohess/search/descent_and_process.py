@@ -136,15 +136,15 @@ class DescentAndProcess(Relay[TurnsProgress]):
         """Let the process begin with what the descent knows, and with the lowest point."""
         pool, best = known.descent.descent.pool, known.record
         assert pool.outputs is not None
-        told = Evaluated(
+        given = Evaluated(
             torch.cat([pool.points, best.point[None]]),
             torch.cat([pool.values, pool.values.new_tensor([best.loss])]),
             torch.cat([pool.outputs, known.output[None]]),
             known.shape,
         )
         apart = (pool.points - best.point).norm(dim=1) > 0.0
-        told = told.those(torch.cat([apart, apart.new_ones(1)]))
-        process, asked = self._process.taking_over(known, told, generator)
+        given = given.those(torch.cat([apart, apart.new_ones(1)]))
+        process, asked = self._process.taking_over(known, given, generator)
         known = replace(known, process=process, planned=points, counted=0, before=best.loss)
         return known.taking(process), asked
 
@@ -155,9 +155,9 @@ class DescentAndProcess(Relay[TurnsProgress]):
         known = replace(known, best=known.record)
         descent, points, pool = known.descent, known.planned, process.pool
         if known.best.loss < descent.best.loss - _STUCK * abs(descent.best.loss):
-            told = Evaluated(pool.points, pool.values, pool.outputs, known.shape)
-            told = told.those(pool.values.argsort(stable=True))
-            descent, points = self._descent.taking_over(known, told, generator)
+            given = Evaluated(pool.points, pool.values, pool.outputs, known.shape)
+            given = given.those(pool.values.argsort(stable=True))
+            descent, points = self._descent.taking_over(known, given, generator)
         inner = descent.descent.taking(known, *_SHARED)
         descent = replace(descent, descent=inner).taking(known, *_SHARED)
         known = replace(known, descent=descent, process=None, counted=0, before=known.best.loss, resumed=True)

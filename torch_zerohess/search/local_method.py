@@ -119,12 +119,12 @@ class LocalMethod(GaussNewton[LocalProgress]):
 
     def renewed(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Fit the Jacobian to samples; too few of them are drawn again."""
-        first, told = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
-        assert told.outputs is not None
-        if len(told) < FEWEST_SAMPLES:
+        first, sound = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
+        assert sound.outputs is not None
+        if len(sound) < FEWEST_SAMPLES:
             return known
-        known.check_outputs(told.outputs)
-        u, changes = known.relative(told.points, told.outputs)
+        known.check_outputs(sound.outputs)
+        u, changes = known.relative(sound.points, sound.outputs)
         fitted, grid = fit_chosen(u, changes, known.shape, self.own.sparse, known.fitted, known.grid)
         known = replace(known, grid=grid)
         evidence = known.evidence or Evidence.none(self.settings.n, u.device)

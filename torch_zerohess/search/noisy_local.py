@@ -143,11 +143,11 @@ class NoisyLocalMethod(LocalMethod):
 
     def _keeping(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Keep the evaluations with finite values, as far as there is room."""
-        told = evaluated.those(evaluated.finite)
-        assert told.outputs is not None
-        held = max(told.points.shape[1] + told.outputs.shape[1], 1)
+        sound = evaluated.those(evaluated.finite)
+        assert sound.outputs is not None
+        held = max(sound.points.shape[1] + sound.outputs.shape[1], 1)
         most = max(min(_KEPT, _HELD // held), 2 * self.own.samples)
-        points, outputs = told.points[:most], told.outputs[:most]
+        points, outputs = sound.points[:most], sound.outputs[:most]
         if len(known.points):
             points, outputs = torch.cat([known.points, points]), torch.cat([known.outputs, outputs])
         return replace(known, points=points[-most:], outputs=outputs[-most:])
@@ -178,16 +178,16 @@ class NoisyLocalMethod(LocalMethod):
             sigma *= _NEARER
         return known
 
-    def _averaged(self, known: LocalProgress, told: Evaluated, centers: Tensor) -> LocalProgress:
+    def _averaged(self, known: LocalProgress, sound: Evaluated, centers: Tensor) -> LocalProgress:
         """Fit the Jacobian and the output at the center; judge the last step, and take the next one.
 
         centers: outputs [k, m] of the center, up to two.
         """
         if not len(centers) and known.before is not None:
             return self._undone(known, known.before)
-        if not len(told):
+        if not len(sound):
             return known
-        fitted, rest, count = self._regressed(known, len(told))
+        fitted, rest, count = self._regressed(known, len(sound))
         return self._went_on(known, fitted, rest, count, centers) if count else known
 
     def _regressed(self, known: LocalProgress, new: int) -> tuple[LocalProgress, float, float]:
@@ -284,10 +284,10 @@ class NoisyLocalMethod(LocalMethod):
         if not known.pairs:
             return known.sigma
         explained = known.jacobian.explained
-        told = rest * explained / max(1.0 - explained, torch.finfo(torch.float32).eps)
-        if rest > _CURVED * known.variance and told > known.variance:
+        predicted = rest * explained / max(1.0 - explained, torch.finfo(torch.float32).eps)
+        if rest > _CURVED * known.variance and predicted > known.variance:
             return max(self._least_sigma(known), _NEARER * known.sigma)
-        wider = rest <= _STRAIGHT * known.variance or told < known.variance
+        wider = rest <= _STRAIGHT * known.variance or predicted < known.variance
         return min(1.0, known.sigma / _NEARER) if wider else known.sigma
 
     def _stepped(self, known: LocalProgress) -> LocalProgress:

@@ -78,8 +78,9 @@ def constants(predicted: Tensor, left: Tensor, entries: int) -> tuple[Tensor, fl
     square = square - middle
     length = square.square().sum(0).clamp_min(least)
     bend = (square * rest).sum(0) / length
-    told, total, free = float((bend.square() * length).sum()), float(rest.square().sum()), max(K - 1 - entries / m, 2.0)
-    variance = (total - told) / ((free - 1.0) * m)
-    if told <= (m + _CURVED * math.sqrt(2.0 * m)) * variance:
+    curved, total = float((bend.square() * length).sum()), float(rest.square().sum())
+    free = max(K - 1 - entries / m, 2.0)
+    variance = (total - curved) / ((free - 1.0) * m)
+    if curved <= (m + _CURVED * math.sqrt(2.0 * m)) * variance:
         return mean, total / (free * m), float(K)
     return mean - bend * middle, variance, K / (1.0 + K * float((middle.square() / length).mean()))

@@ -88,7 +88,7 @@ class OutputDescent(Relay[OutputDescentProgress]):
         return (self._follow, known.descent) if known.smooth is None else (self._smooth, known.smooth)
 
     def model_at_best(self, known: OutputDescentProgress) -> tuple[LocalModel, float] | None:
-        descent = known.descent if known.smooth is None else self._told(known.descent, known.smooth)
+        descent = known.descent if known.smooth is None else self._with_evaluations(known.descent, known.smooth)
         return self._follow.model_at_best(replace(descent, best=known.best))
 
     def _is_smooth(self, before: DescentProgress, descent: DescentProgress, evaluated: Evaluated) -> bool:
@@ -108,7 +108,7 @@ class OutputDescent(Relay[OutputDescentProgress]):
         if not (smooth.done or smooth.failed):
             now = replace(known, smooth=smooth).taking(smooth)
             return now.taking(known, "arrivals"), points
-        descent = self._told(known.descent, smooth)
+        descent = self._with_evaluations(known.descent, smooth)
         if smooth.done:
             descent = replace(descent, sigma=min(smooth.sigma, 0.5 * self.settings.tolerance))
             descent = self._follow.arrive(descent, smooth.message, generator)
@@ -117,7 +117,7 @@ class OutputDescent(Relay[OutputDescentProgress]):
             descent = descent.sampling(2)
         return replace(known, descent=descent, smooth=None).taking(descent), self._follow.points(descent, generator)
 
-    def _told(self, descent: DescentProgress, smooth: OutputProgress) -> DescentProgress:
+    def _with_evaluations(self, descent: DescentProgress, smooth: OutputProgress) -> DescentProgress:
         """Return the descent with the evaluations of Gauss-Newton."""
         pool = Pool.empty(descent.n, smooth.points.device)
         outputs = smooth.outputs if len(smooth.points) else None

@@ -173,10 +173,10 @@ def _predicted(start: LocalProgress | None) -> tuple[float, float, str]:
     if start is None or start.jacobian is None:
         return 0.0, 0.0, "a sparse Jacobian predicts nothing: the output is one number, or too few outputs are finite"
     sparse, dense = start.jacobian.explained, max(start.jacobian.explained_dense, 0.0)
-    told = (
+    words = (
         f"a sparse Jacobian predicts {max(sparse, 0.0):.0%} of the change of held-out outputs, a dense one {dense:.0%}"
     )
-    return sparse, dense, told
+    return sparse, dense, words
 
 
 def _gathered(known: SparseOrDenseProgress, evaluated: Evaluated) -> SparseOrDenseProgress:

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from torch_zerohess.sampling import extension, kernels, proposals
+from torch_zerohess.sampling import extension, kernels, on_cuda, proposals
 
 FOLDER = Path(extension.__file__).parents[2]  # of the package under test: a checkout or an installation
 needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
@@ -175,20 +175,20 @@ def test_float32_holds_what_is_compared() -> None:
 def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(
     module: SimpleNamespace | None, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernels._triton_kernels.cache_clear()
+    on_cuda._triton_kernels.cache_clear()
     registered = {}
     monkeypatch.setattr(torch.library, "impl", lambda name, device, run: registered.update({name: (device, run)}))
     for function in (kernels.draw, kernels.uniforms, kernels.sample):
-        kernels._on_cuda(function)
+        on_cuda.on_cuda(function)
     assert {device for device, _ in registered.values()} == {"cuda"}
     rows = proposals.pick_rows(3, 0, 4, 5, proposals.SECOND_ORDER)
-    monkeypatch.setattr(kernels, "_TRITON", True)
-    monkeypatch.setattr(kernels, "_refused", set())
+    monkeypatch.setattr(on_cuda, "_TRITON", True)
+    monkeypatch.setattr(on_cuda, "_refused", set())
     monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", module)
     _, run = registered["torch_zerohess::draw"]
     with pytest.warns(RuntimeWarning, match=f"torch, not Triton, on cpu.*{message}"):
         got = run(rows, 5, False)
     assert torch.equal(got, proposals.draw(rows, 5))
     assert torch.equal(run(rows, 5, False), got)  # and no second warning
-    assert not kernels._by_triton(rows.device)
-    assert kernels._by_triton(torch.device("cuda", 1))  # another device may have it
+    assert not on_cuda.by_triton(rows.device)
+    assert on_cuda.by_triton(torch.device("cuda", 1))  # another device may have it

@@ -15,7 +15,9 @@ Z = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.fl
 
 @pytest.fixture(scope="module")
 def actors():
-    with warnings.catch_warnings():
+    """Ray lets other processes go first. Where they take all cores, actors need minutes to import torch."""
+    with pytest.MonkeyPatch.context() as patched, warnings.catch_warnings():
+        patched.setenv("RAY_worker_niceness", "0")
         warnings.simplefilter("ignore")  # Ray's own
         with Ray(2, retries=1) as one:
             yield one

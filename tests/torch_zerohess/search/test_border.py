@@ -69,9 +69,10 @@ def test_a_minimum_on_a_border_is_found(problem, n, bounds, excess):
         def fn(z, allowed=allowed, f=f):
             return [f(x) if allowed(x) else float("nan") for x in z.numpy()]
 
-        settings = {"sigma": 0.7, "seed": seed, "max_evaluations": 60 * (n + 1), "engine": "descent"}
+        near = least * (1.0 + excess)
+        settings = {"sigma": 0.7, "seed": seed, "max_evaluations": 60 * (n + 1), "engine": "descent", "target": near}
         fit = zh.minimize(fn, x0, bounds=bounds, **settings)
         assert allowed(fit.x.numpy())
         assert fit.value >= least * (1.0 - 1e-9)
-        found += fit.value < least * (1.0 + excess)
+        found += fit.value <= near
     assert found >= 3

@@ -67,7 +67,7 @@ def test_a_loss_may_have_kinks(name, bounds, monkeypatch):
 
     assert max(evaluations(search(seed), decays, least + 1e-6) for seed in range(3)) < 100
     monkeypatch.setattr(output_gauss_newton, "_EXPANDED", float("inf"))
-    assert min(evaluations(search(seed), decays, least + 1e-6) for seed in range(3)) > 300
+    assert min(evaluations(search(seed), decays, least + 1e-6, 301) for seed in range(3)) > 300
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -110,8 +110,8 @@ def test_rounded_outputs_do_not_keep_it_from_arriving(monkeypatch):
     assert all(one.value == pytest.approx(1.0, abs=1e-8) for one in searches)
     assert sum(one.done and one.evaluations < 100 for one in searches) >= 4
     monkeypatch.setattr(output_gauss_newton, "_NOTHING", 0.0)
-    taken = sum(one.evaluations for one in searches)
-    assert sum(found(seed).evaluations for seed in range(50, 60)) > 1.5 * taken
+    taken = sum(one.evaluations for one in searches[:5])
+    assert sum(found(seed).evaluations for seed in range(50, 55)) > 1.5 * taken
 
 
 def test_the_hessian_of_an_output_is_not_damped():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_zerohess.evaluators import Executor, Factory, ProcessPool, random_numbers
+from torch_zerohess.evaluators import Executor, Factory, random_numbers
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.random_numbers import draw_apart
 
@@ -33,19 +33,22 @@ BOXES = {
 }
 
 
+@pytest.fixture(scope="module")
+def executor():
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as workers:
+        yield Executor(workers)
+
+
 @pytest.mark.parametrize("name", BOXES)
-def test_workers_of_a_pool_draw_different_numbers(name):
-    with ProcessPool(2) as pool:
-        values = torch.cat([pool(BOXES[name], Z) for _ in range(3)])
+def test_workers_of_a_pool_draw_different_numbers(name, pool):
+    values = torch.cat([pool(BOXES[name], Z) for _ in range(3)])
     assert len(values.unique()) == len(values)
 
 
 @pytest.mark.parametrize("name", BOXES)
-def test_workers_of_an_executor_draw_different_numbers(name):
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as workers:
-        executor = Executor(workers)
-        values = torch.cat([executor(BOXES[name], Z) for _ in range(3)])
+def test_workers_of_an_executor_draw_different_numbers(name, executor):
+    values = torch.cat([executor(BOXES[name], Z) for _ in range(3)])
     assert len(values.unique()) == len(values)
 
 

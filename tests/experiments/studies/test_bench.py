@@ -33,6 +33,7 @@ def costs(tmp_path_factory) -> BenchReport:
     before, threads = extension.available, torch.get_num_threads()
     kept = {}
     with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("experiments.studies.bench_memory.SIZES", ((1, False), (5, False), (40, False), (40, True)))
         patched.setattr("experiments.studies.bench.may_keep", lambda name: None)
         patched.setattr("experiments.studies.bench.keep", lambda headers, rows, name: kept.update({name: rows}))
         result = bench(

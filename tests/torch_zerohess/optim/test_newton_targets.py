@@ -239,8 +239,7 @@ LAYERS = {
 HEADS = {"squares": zh.heads.SquaredError(), "entropy": zh.heads.LocalEntropy(zh.heads.SquaredError(), 0.5)}
 
 
-@pytest.mark.parametrize("n", [3, 20])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "dtype"), [(3, torch.float32), (20, torch.float64)])
 def test_sampled_losses_are_of_their_own_elements(n: int, dtype: torch.dtype) -> None:
     """No layer is refused, from the first call to the last, near a minimum."""
     torch.manual_seed(0)

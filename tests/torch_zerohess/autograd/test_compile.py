@@ -68,8 +68,7 @@ def test_compiled_inside_a_network(backend: str) -> None:
         close(p.grad, gradient)
 
 
-@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
-@pytest.mark.parametrize("value", ["center", "smoothed"])
+@pytest.mark.parametrize(("value", "backend"), [("center", "aot_eager"), ("smoothed", "inductor")])
 def test_a_compiled_layer_refuses_a_trainable_head_where_gradients_are_wanted(value: str, backend: str) -> None:
     """Compiled code runs its graph without autograd, whatever the caller wants."""
     w = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)

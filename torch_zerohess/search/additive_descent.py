@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_zerohess.search.axis_search import AxisSearch
 from torch_zerohess.search.kinked_descent import KinkedQuadratics
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.metric_descent import MetricProgress
+from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.state import Evaluated
 
 

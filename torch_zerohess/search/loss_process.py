@@ -19,7 +19,7 @@ from torch_zerohess.search.gaussian_process_finish import PATIENCE, FinishedProc
 from torch_zerohess.search.gaussian_process_method import APART, ROUND
 from torch_zerohess.search.kinked_descent import KinkedQuadratics
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.metric_descent import MetricProgress
+from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.random_points import uniform
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients

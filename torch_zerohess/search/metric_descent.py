@@ -12,19 +12,18 @@ losses: it would arrive at the same minimum.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
-from torch_zerohess.search.axis_search import AxisLines
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
+from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.random_points import further_start
 from torch_zerohess.search.region_descent import RegionDescent
-from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import Best, Evaluated, are_same
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.local_fit import quadratic_around
@@ -40,9 +39,9 @@ _KEPT, _LEAST_KEPT = 3, 200
 """Evaluations kept, over those that are fitted, and at least."""
 _FEW = 2
 """Parameters up to which a step is tried before there are two points along every axis."""
-_RATE, _FIRST_RATE = 0.3, 0.7
+RATE, _FIRST_RATE = 0.3, 0.7
 """Rate at which the metric is learned from a full quadratic, and from the first one."""
-_CURVED = 1e-3
+CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
 _LATEST = 2
 """Evaluations over n + 1 that must have gained no more than the model promises, for the promise to count."""
@@ -62,30 +61,6 @@ _SHARED = ("best", "evaluations", "arrivals")
 """What further rounds, and isotropic quadratics on a plateau, go on with."""
 _QUADRATIC = ("bottom", "slope", "bend")
 """The quadratic that is kept, which predicts the losses of later rounds."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MetricProgress(RegionProgress):
-    """The progress of a descent in a learned metric."""
-
-    wide: DescentProgress | None = None
-    """Isotropic descent on the smoothed loss, which takes over on a plateau."""
-    bottom: Best | None = None
-    """The lowest point at which a round has arrived; None if there is none, or if no quadratic is kept."""
-    slope: Tensor | None = None
-    """Gradient there [n]."""
-    bend: Tensor | None = None
-    """Hessian there [n, n]."""
-    above: float = math.inf
-    """Loss of this round above `bottom`, where it was last predicted."""
-    times: int = 0
-    """Predictions in a row that were right."""
-    slopes: Tensor | None = None
-    """Gradients [m, n] at random points around a kink, see `KinkedQuadratics`; None where there is none."""
-    reason: str = ""
-    """Why the round has come to it."""
-    lines: AxisLines | None = None
-    """What is known along the axes, see `AdditiveQuadratics`; None before rounds are compared with it."""
 
 
 class MetricQuadratics(RegionDescent[MetricProgress]):
@@ -278,5 +253,5 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _learned(self, known: MetricProgress, count: int) -> Tensor:
         if len(known.values) <= 2 * self._n:
             return known.root
-        rate = _FIRST_RATE if known.phase == "axes" else _RATE * min(1.0, count / self._coefficients)
-        return learned(known.root, known.hessian, rate, _CURVED * float(known.gradient.norm()) / known.sigma)
+        rate = _FIRST_RATE if known.phase == "axes" else RATE * min(1.0, count / self._coefficients)
+        return learned(known.root, known.hessian, rate, CURVED * float(known.gradient.norm()) / known.sigma)

@@ -184,7 +184,7 @@ class RegionDescent(Method[R]):
 
     def predicted(self, known: R, x: Tensor) -> float:
         """Return the loss at a point [n] according to a quadratic through the nearest evaluations."""
-        return _expected(self._modelled(known)[0], x)
+        return self._expected(self._modelled(known)[0], x)
 
     def promise(self, known: R) -> float:
         return known.promised if _is_sound(known) else math.inf
@@ -193,6 +193,11 @@ class RegionDescent(Method[R]):
         """Return the extent of the region; infinity where it may have shrunk because its model was wrong."""
         extent = known.sigma * known.root.norm(dim=0)
         return extent if _is_sound(known) else torch.full_like(extent, math.inf)
+
+    def _expected(self, known: R, x: Tensor) -> float:
+        """Return the loss at a point [n] according to the quadratic that was fitted last."""
+        step = x - known.lowest.point
+        return known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))
 
     def _begun(self, best: Best, **own: Any) -> R:
         """Return a round that begins at a point, with the fields of a subclass."""
@@ -258,7 +263,7 @@ class RegionDescent(Method[R]):
         if known.border is not None and float(known.border[:-1] @ step) > float(known.border[-1]):
             step = -step
         x = self.settings.inside((known.lowest.point + step)[None])
-        return replace(known, phase="geometry", expected=_expected(known, x[0])), x
+        return replace(known, phase="geometry", expected=self._expected(known, x[0])), x
 
     def _nearest(self, known: R, least: int) -> Tensor:
         """Return which evaluations are the nearest [P], the best one first; only the first `least` may be far away."""
@@ -270,12 +275,6 @@ class RegionDescent(Method[R]):
         nearest = order[: self._fitted]
         enough = torch.arange(len(nearest), device=nearest.device) < least
         return nearest[(distance[nearest] <= far) | enough]
-
-
-def _expected(known: RegionProgress, x: Tensor) -> float:
-    """Return the loss at a point [n] according to the quadratic that was fitted last."""
-    step = x - known.lowest.point
-    return known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))
 
 
 def _is_sound(known: RegionProgress) -> bool:

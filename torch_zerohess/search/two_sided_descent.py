@@ -1,0 +1,114 @@
+"""Descent on quadratics, and on the larger of two quadratics beside a kink.
+
+No quadratic predicts a loss on both sides of a kink, as of c + w max(0, d) or max(c, d). So after a rejected step the
+larger of two quadratics is fitted, too (`larger_of_two`). Where it has predicted the latest losses better, the steps
+lead to its minimum. The minimum on the kink is then found as fast as the minimum of a smooth loss.
+
+The metric of the region is learned from the Hessian of the quadratics mixed as their gradients balance: the Hessian
+along the kink.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.larger_of_two import least_of_larger, two_values
+from torch_zerohess.linalg.metric import learned, region_step
+from torch_zerohess.search.metric_descent import CURVED, RATE, MetricQuadratics
+from torch_zerohess.search.metric_progress import MetricProgress, TwoSides
+from torch_zerohess.search.state import Evaluated
+from torch_zerohess.surrogates.two_sides import larger_of_two
+
+_MOST = 10
+"""Parameters up to which two quadratics are fitted."""
+_FADING, _LARGEST = 0.8, 2.0
+"""Evidence is a sum over evaluations of log(error of one quadratic / error of two), each between minus and plus the
+second number. An evaluation counts the first number times as much as the next one."""
+_ENOUGH = 2.0
+"""Evidence from which steps follow two quadratics."""
+_ROUNDING = 1e-14
+"""Error of a prediction, relative to the loss, that is rounding."""
+_FEWEST = 2
+"""Evaluations, beyond the coefficients of one quadratic, that two are fitted to at least."""
+_FAR, _RELATIVELY = 8.0, 2.0
+"""Evaluations farther than this, and than this times the distance of the n + 3 nearest ones, are left out."""
+_SHARP = 3.0
+"""Change of the gradient across a kink, over that along it in the region, at least. Of a smooth loss it is less."""
+
+
+class TwoSidedQuadratics(MetricQuadratics):
+    """Descent on quadratics of a loss alone, and on the larger of two beside a kink."""
+
+    def next(
+        self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        return super().next(self._weighed(known, evaluated), evaluated, generator)
+
+    def _weighed(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
+        """Compare the loss at the point that was needed with what one quadratic and two have predicted."""
+        if known.sides is None or known.phase not in ("trial", "geometry") or not bool(evaluated.finite[0]):
+            return known
+        x, loss = evaluated.points[0], float(evaluated.losses[0])
+        rounding = _ROUNDING * abs(known.lowest.loss) + math.ulp(0.0)
+        errors = [abs(loss - expected(known, x)) + rounding for expected in (super()._expected, self._larger)]
+        gain = math.log(errors[0]) - math.log(errors[1])
+        return replace(known, evidence=_FADING * known.evidence + min(max(gain, -_LARGEST), _LARGEST))
+
+    def _modelled(self, known: MetricProgress) -> tuple[MetricProgress, int]:
+        known, count = super()._modelled(replace(known, sides=None))
+        wanted = known.rejected > 0 or known.evidence > 0.0
+        return (replace(known, sides=self._sides(known)) if wanted and self._n <= _MOST else known), count
+
+    def _sides(self, known: MetricProgress) -> TwoSides | None:
+        """Fit two quadratics to the nearest evaluations; None if these tell none, or no kink between them."""
+        n, u = self._n, known.scaled
+        distance = u.norm(dim=1)
+        order = distance.argsort()
+        order = order[~known.holes[order]][: 2 * (self._coefficients + n)]
+        if len(order) < self._coefficients + _FEWEST:
+            return None
+        order = order[distance[order] <= max(_FAR, _RELATIVELY * float(distance[order[n + 2]]))]
+        found = larger_of_two(u[order], known.values[order] - known.lowest.loss)
+        if found is None:
+            return None
+        axes = torch.block_diag(torch.ones_like(known.root[:1, :1]), torch.linalg.inv(known.sigma * known.root))
+        matrices = axes.mT @ found @ axes
+        sides = TwoSides(matrices, *self._least(known, matrices))
+        inwards = torch.linalg.inv(axes)
+        bend, jump = (inwards.mT @ sides.mixed @ inwards)[1:, 1:], inwards[1:, 1:].mT @ sides.jump
+        return sides if float(jump.norm()) >= _SHARP * float(bend.norm()) else None
+
+    def _least(self, known: MetricProgress, matrices: Tensor, factor: float = 1.0) -> tuple[Tensor, float]:
+        """Return the minimum [n] of the larger of two quadratics within the region, and the share of the second."""
+        x, settings = known.lowest.point, self.settings
+        region = factor * known.sigma * known.root, settings.lower - x, settings.upper - x, self._singular, known.border
+        return least_of_larger(matrices, lambda gradient, hessian: region_step(gradient, hessian, *region))
+
+    def _learned(self, known: MetricProgress, count: int) -> Tensor:
+        if (sides := _in_use(known)) is None:
+            return super()._learned(known, count)
+        floor = CURVED * float(sides.jump.norm()) / known.sigma
+        return learned(known.root, sides.mixed[1:, 1:], RATE * min(1.0, count / self._coefficients), floor)
+
+    def _step(self, known: MetricProgress) -> tuple[Tensor, float]:
+        if (sides := _in_use(known)) is None:
+            return super()._step(known)
+        return sides.step, -float(two_values(sides.matrices, sides.step[None]).amax())
+
+    def _minimum(self, known: MetricProgress, factor: float = 1.0) -> Tensor:
+        sides = _in_use(known)
+        return super()._minimum(known, factor) if sides is None else self._least(known, sides.matrices, factor)[0]
+
+    def _expected(self, known: MetricProgress, x: Tensor) -> float:
+        return super()._expected(known, x) if _in_use(known) is None else self._larger(known, x)
+
+    def _larger(self, known: MetricProgress, x: Tensor) -> float:
+        """Return the loss at a point [n] according to two quadratics."""
+        assert known.sides is not None
+        return known.lowest.loss + float(two_values(known.sides.matrices, (x - known.lowest.point)[None]).amax())
+
+
+def _in_use(known: MetricProgress) -> TwoSides | None:
+    return known.sides if known.evidence >= _ENOUGH else None

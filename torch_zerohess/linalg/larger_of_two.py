@@ -22,7 +22,8 @@ def least_of_larger(matrices: Tensor, minimum: Callable[[Tensor, Tensor], Tensor
     """Return the minimum s [n] of the larger of two quadratics, and the share w of the second one.
 
     Args:
-        matrices: M [2, n + 1, n + 1], symmetric. The quadratics are (1, s) M (1, s) / 2.
+        matrices: M [2, n + 1, n + 1], symmetric. The quadratics are (1, s) M (1, s) / 2. The second one should be the
+            steeper one: its share is then small, and more exact than a share near 1.
         minimum: returns the minimum [n] in the region of the quadratic with a gradient [n] and a Hessian [n, n].
     """
 
@@ -40,8 +41,10 @@ def least_of_larger(matrices: Tensor, minimum: Callable[[Tensor, Tensor], Tensor
     for _ in range(_STEPS):
         new = at(low[0] + (high[0] - low[0]) * below / (below - above))
         share, s, difference, size = new
-        if abs(difference) <= _EQUAL * size or not low[0] < share < high[0]:
+        if abs(difference) <= _EQUAL * size:
             return s, share
+        if not low[0] < share < high[0]:
+            break
         if difference > 0.0:
             above *= 0.5 if moved > 0.0 else 1.0  # the Illinois rule: an end that stays twice counts half
             low, below = new, difference

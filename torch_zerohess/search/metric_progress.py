@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from torch_zerohess.linalg.larger_of_two import two_values
 from torch_zerohess.search.axis_search import AxisLines
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.region_progress import RegionProgress
@@ -26,6 +27,10 @@ class TwoSides:
     def mixed(self) -> Tensor:
         """Matrix [n + 1, n + 1] of the quadratic with these shares."""
         return (1.0 - self.share) * self.matrices[0] + self.share * self.matrices[1]
+
+    def change(self, s: Tensor) -> float:
+        """Return the change of the loss by a step [n]."""
+        return float(two_values(self.matrices, s[None]).amax())
 
     @property
     def jump(self) -> Tensor:

@@ -97,7 +97,7 @@ class RegionDescent(Method[R]):
     def _step(self, known: R) -> tuple[Tensor, float]:
         """Return the step [n] to the minimum of the quadratic within the region, and the decrease that it promises."""
         s = self._minimum(known)
-        return s, -known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
+        return s, -self._change(known, s)
 
     def _minimum(self, known: R, factor: float = 1.0) -> Tensor:
         """Return the step [n] to the minimum of the quadratic within the region, or within one larger by a factor."""
@@ -194,10 +194,13 @@ class RegionDescent(Method[R]):
         extent = known.sigma * known.root.norm(dim=0)
         return extent if _is_sound(known) else torch.full_like(extent, math.inf)
 
+    def _change(self, known: R, s: Tensor) -> float:
+        """Return the change of the loss by a step [n] according to the quadratic that was fitted last."""
+        return known.size * float(known.gradient @ s + 0.5 * (s @ known.hessian @ s))
+
     def _expected(self, known: R, x: Tensor) -> float:
-        """Return the loss at a point [n] according to the quadratic that was fitted last."""
-        step = x - known.lowest.point
-        return known.lowest.loss + known.size * float(known.gradient @ step + 0.5 * (step @ known.hessian @ step))
+        """Return the loss at a point [n] according to this quadratic."""
+        return known.lowest.loss + self._change(known, x - known.lowest.point)
 
     def _begun(self, best: Best, **own: Any) -> R:
         """Return a round that begins at a point, with the fields of a subclass."""

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.larger_of_two import least_of_larger, two_values
+from torch_zerohess.linalg.larger_of_two import least_of_larger
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.metric_descent import CURVED, RATE, MetricQuadratics
 from torch_zerohess.search.metric_progress import MetricProgress, TwoSides
@@ -28,8 +28,8 @@ _FADING, _LARGEST = 0.8, 2.0
 second number. An evaluation counts the first number times as much as the next one."""
 _ENOUGH = 2.0
 """Evidence from which steps follow two quadratics."""
-_ROUNDING = 1e-14
-"""Error of a prediction, relative to the loss, that is rounding."""
+_ROUNDING, _SMALLEST = 1e-14, 1e-300
+"""Error of a prediction that is rounding, relative to the loss, and at a loss of 0."""
 _FEWEST = 2
 """Evaluations, beyond the coefficients of one quadratic, that two are fitted to at least."""
 _FAR, _RELATIVELY = 8.0, 2.0
@@ -50,9 +50,11 @@ class TwoSidedQuadratics(MetricQuadratics):
         """Compare the loss at the point that was needed with what one quadratic and two have predicted."""
         if known.sides is None or known.phase not in ("trial", "geometry") or not bool(evaluated.finite[0]):
             return known
-        x, loss = evaluated.points[0], float(evaluated.losses[0])
-        rounding = _ROUNDING * abs(known.lowest.loss) + math.ulp(0.0)
-        errors = [abs(loss - expected(known, x)) + rounding for expected in (super()._expected, self._larger)]
+        s, change = evaluated.points[0] - known.lowest.point, float(evaluated.losses[0]) - known.lowest.loss
+        rounding = _ROUNDING * abs(known.lowest.loss) + _SMALLEST
+        errors = [
+            abs(change - predicted) + rounding for predicted in (super()._change(known, s), known.sides.change(s))
+        ]
         gain = math.log(errors[0]) - math.log(errors[1])
         return replace(known, evidence=_FADING * known.evidence + min(max(gain, -_LARGEST), _LARGEST))
 
@@ -92,22 +94,13 @@ class TwoSidedQuadratics(MetricQuadratics):
         floor = CURVED * float(sides.jump.norm()) / known.sigma
         return learned(known.root, sides.mixed[1:, 1:], RATE * min(1.0, count / self._coefficients), floor)
 
-    def _step(self, known: MetricProgress) -> tuple[Tensor, float]:
-        if (sides := _in_use(known)) is None:
-            return super()._step(known)
-        return sides.step, -float(two_values(sides.matrices, sides.step[None]).amax())
-
     def _minimum(self, known: MetricProgress, factor: float = 1.0) -> Tensor:
-        sides = _in_use(known)
-        return super()._minimum(known, factor) if sides is None else self._least(known, sides.matrices, factor)[0]
+        if (sides := _in_use(known)) is None:
+            return super()._minimum(known, factor)
+        return sides.step if factor == 1.0 else self._least(known, sides.matrices, factor)[0]
 
-    def _expected(self, known: MetricProgress, x: Tensor) -> float:
-        return super()._expected(known, x) if _in_use(known) is None else self._larger(known, x)
-
-    def _larger(self, known: MetricProgress, x: Tensor) -> float:
-        """Return the loss at a point [n] according to two quadratics."""
-        assert known.sides is not None
-        return known.lowest.loss + float(two_values(known.sides.matrices, (x - known.lowest.point)[None]).amax())
+    def _change(self, known: MetricProgress, s: Tensor) -> float:
+        return super()._change(known, s) if (sides := _in_use(known)) is None else sides.change(s)
 
 
 def _in_use(known: MetricProgress) -> TwoSides | None:

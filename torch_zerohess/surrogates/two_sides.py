@@ -29,7 +29,8 @@ def larger_of_two(u: Tensor, values: Tensor) -> Tensor | None:
         values: [P].
 
     Returns:
-        Symmetric matrices M [2, n + 1, n + 1]. The quadratics are (1, u) M (1, u) / 2.
+        Symmetric matrices M [2, n + 1, n + 1]. The quadratics are (1, u) M (1, u) / 2. The second one is the steeper
+        one at u = 0.
     """
     n, terms = u.shape[1], quadratic_terms(u)
     weights = 1.0 / (_NEAR + u.square().sum(1))
@@ -65,9 +66,10 @@ def _guesses(u: Tensor, values: Tensor) -> Tensor:
 
 
 def _matrices(found: Tensor, n: int) -> Tensor:
-    """Return coefficients [2, q], in the order of `quadratic_terms`, as symmetric matrices [2, n + 1, n + 1]."""
+    """Return coefficients [2, q], in the order of `quadratic_terms`, as matrices [2, n + 1, n + 1], sorted by slope."""
     upper = found.new_zeros(2, n + 1, n + 1)
     row, column = torch.triu_indices(n + 1, n + 1, device=found.device)
     upper[:, row, column] = found
     upper[:, 0, 0] *= 2.0
-    return upper + upper.triu(1).mT
+    slopes = upper[:, 0, 1:].norm(dim=1)
+    return (upper + upper.triu(1).mT)[slopes.argsort()]

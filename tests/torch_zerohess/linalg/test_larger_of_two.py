@@ -55,6 +55,32 @@ def test_the_minimum_of_convex_quadratics(n: int) -> None:
     assert any(0.0 < share < 1.0 for share in shares)
 
 
+@pytest.mark.parametrize(("steep", "swapped"), [(1.0, False), (1e4, False), (100.0, True)])
+def test_where_they_are_equal_they_are_exactly_so(steep: float, swapped: bool) -> None:
+    """Also where one of them is much steeper than the other."""
+    found = 0
+    for seed in range(20):
+        matrices = random(seed, 5, convex=True)
+        matrices[1] *= steep
+        matrices = matrices.flip(0) if swapped else matrices
+        s, share = in_ball(matrices)
+        first, second = two_values(matrices, s[None])[:, 0].tolist()
+        if 0.0 < share < 1.0:
+            found += 1
+            assert first == pytest.approx(second, rel=1e-7)
+    assert found >= 5
+
+
+def test_the_larger_one_is_minimised_alone_where_it_is_larger_at_its_minimum() -> None:
+    matrices = random(0, 3, convex=True)
+    matrices[1] = matrices[0]
+    matrices[1, 0, 0] += 1.0
+    s, share = in_ball(matrices)
+    assert share == 1.0
+    assert torch.equal(s, ball_step(matrices[1, 1:, 0], matrices[1, 1:, 1:], 1.0))
+    assert in_ball(matrices.flip(0))[1] == 0.0
+
+
 def test_a_steep_side() -> None:
     """The share of the steep quadratic is a millionth, and the minimum as exact as without it."""
     slopes = torch.tensor([[0.0, 1.0, 0.0], [-3e5, -1e6, 0.0]]).double()
@@ -82,3 +108,11 @@ def test_values() -> None:
     for k, one in enumerate(matrices):
         expected = 0.5 * one[0, 0] + s @ one[1:, 0] + 0.5 * ((s @ one[1:, 1:]) * s).sum(1)
         assert torch.allclose(two_values(matrices, s)[k], expected)
+
+
+def test_concave_quadratics_have_a_minimum_between_the_sides_of_a_jump() -> None:
+    """At s = -1 and 1 one of them is 1, at 0 both are 0.5: s(w) jumps from one end to the other."""
+    matrices = torch.tensor([[[1.0, 0.5], [0.5, 0.0]], [[1.0, -0.5], [-0.5, 0.0]]]).double()
+    matrices[:, 1, 1] = -1e-3
+    s, _ = in_ball(matrices)
+    assert larger(matrices, s) == pytest.approx(0.5, abs=1e-3)

@@ -82,3 +82,11 @@ def test_too_few_values_tell_nothing() -> None:
 def test_a_quadratic_is_its_own_larger_one() -> None:
     u, others = (normal(random(k), 30, 2) for k in (0, 1))
     assert torch.allclose(fitted(u, u.square().sum(1), others), others.square().sum(1), atol=1e-6)
+
+
+def test_the_second_one_is_the_steeper_one() -> None:
+    u = normal(random(0), 30, 2)
+    for side in (u[:, 0], -u[:, 0]):
+        matrices = larger_of_two(u, u[:, 1] + 100 * side.clamp(min=0))
+        assert matrices is not None
+        assert matrices[:, 0, 1:].norm(dim=1).tolist() == pytest.approx([1.0, (1 + 1e4) ** 0.5], rel=1e-6)

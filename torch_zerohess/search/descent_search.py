@@ -46,8 +46,10 @@ class Descent(AskTell[Any]):
     Where a loss alone is not finite, a plane between evaluations with and without a value bounds the step, so that the
     search follows the border of the region that fails. Up to 100 steps in a row may fail there.
 
-    At a kink of a loss alone, slopes at up to 6 (n + 1) points around it tell whether it is a minimum: up to
-    6 (n + 1)(n + 8) evaluations, if no bound is near. If they do not tell, the search has not arrived.
+    Beside a kink of a loss alone, with up to 10 parameters, the model is the larger of two quadratics where it has
+    predicted the latest losses better than one quadratic. Slopes at up to 6 (n + 1) points around a kink tell whether
+    it is a minimum: up to 6 (n + 1)(n + 8) evaluations, if no bound is near. If they do not tell, the search has not
+    arrived.
 
     After a round two evaluations tell whether a loss alone is a sum of functions of one parameter each (in a box, for
     2 to 200 parameters). If such a sum has several minima, its lowest one is sought along all axes at once, and the
@@ -56,8 +58,9 @@ class Descent(AskTell[Any]):
     It has the settings of `AskTell`.
 
     Source: Powell (2004) for the quadratic of least change; Wang, Fischer and Ritschel (2025) for the smoothed second
-    order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation; Burke, Lewis and Overton (2005) for
-    slopes around a kink; Langerman, Seront and Bersini (1994) for the axes.
+    order; Cartis et al. (2019) and Wild (2017) for Gauss-Newton by interpolation; Magnani and Boyd (2009) for the two
+    sides of a kink; Burke, Lewis and Overton (2005) for slopes around it; Langerman, Seront and Bersini (1994) for the
+    axes.
 
     Example:
         >>> import torch

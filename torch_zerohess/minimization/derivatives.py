@@ -64,6 +64,7 @@ def _model(
 ) -> tuple[LocalModel, float | Tensor] | None:
     """Return the search's quadratic model around x and its sigma; or what all evaluations tell, if that is better.
 
+    It is also better where the errors of the model are infinite.
     In noise it is better if there are enough of them: its standard errors contain what is not quadratic.
     """
     found, unit = search.model_at_best(x), search.unit
@@ -74,4 +75,6 @@ def _model(
         return noisy_derivatives(x, points, losses, noise) or found
     around = quadratic_around(x, points, losses)
     most = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
-    return found if around is None or (found is not None and around[2] > most) else around[:2]
+    if around is None or (found is not None and around[2] > most and bool(found[0].full_errors()[1].isfinite().all())):
+        return found
+    return around[:2]

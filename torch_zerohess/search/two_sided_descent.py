@@ -2,7 +2,7 @@
 
 No quadratic predicts a loss on both sides of a kink, as of c + w max(0, d) or max(c, d). So after a rejected step the
 larger of two quadratics is fitted, too (`larger_of_two`). Where it has predicted the latest losses better, the steps
-lead to its minimum. The minimum on the kink is then found as fast as the minimum of a smooth loss.
+lead to its minimum.
 
 The metric of the region is learned from the Hessian of the quadratics mixed as their gradients balance: the Hessian
 along the kink.
@@ -24,8 +24,8 @@ from torch_zerohess.surrogates.two_sides import larger_of_two
 _MOST = 10
 """Parameters up to which two quadratics are fitted."""
 _FADING, _LARGEST = 0.8, 2.0
-"""Evidence is a sum over evaluations of log(error of one quadratic / error of two), each between minus and plus the
-second number. An evaluation counts the first number times as much as the next one."""
+"""The evidence is a sum over evaluations of log(error of one quadratic / error of two). Each term is at most the second
+number in magnitude. A term counts the first number times as much as the next one."""
 _ENOUGH = 2.0
 """Evidence from which steps follow two quadratics."""
 _ROUNDING, _SMALLEST = 1e-14, 1e-300
@@ -35,7 +35,8 @@ _FEWEST = 2
 _FAR, _RELATIVELY = 8.0, 2.0
 """Evaluations farther than this, and than this times the distance of the n + 3 nearest ones, are left out."""
 _SHARP = 3.0
-"""Change of the gradient across a kink, over that along it in the region, at least. Of a smooth loss it is less."""
+"""The gradient changes across a kink by at least so many times its change along the kink within the region. Two
+quadratics of a smooth loss differ by less."""
 
 
 class TwoSidedQuadratics(MetricQuadratics):
@@ -48,7 +49,9 @@ class TwoSidedQuadratics(MetricQuadratics):
 
     def _weighed(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the loss at the point that was needed with what one quadratic and two have predicted."""
-        if known.sides is None or known.phase not in ("trial", "geometry") or not bool(evaluated.finite[0]):
+        if known.sides is None or known.wide is not None or known.phase not in ("trial", "geometry"):
+            return known
+        if not bool(evaluated.finite[0]):
             return known
         s, change = evaluated.points[0] - known.lowest.point, float(evaluated.losses[0]) - known.lowest.loss
         rounding = _ROUNDING * abs(known.lowest.loss) + _SMALLEST
@@ -75,12 +78,11 @@ class TwoSidedQuadratics(MetricQuadratics):
         found = larger_of_two(u[order], known.values[order] - known.lowest.loss)
         if found is None:
             return None
-        axes = torch.block_diag(torch.ones_like(known.root[:1, :1]), torch.linalg.inv(known.sigma * known.root))
-        matrices = axes.mT @ found @ axes
+        to_u = torch.block_diag(torch.ones_like(known.root[:1, :1]), torch.linalg.inv(known.sigma * known.root))
+        matrices = to_u.mT @ found @ to_u
         sides = TwoSides(matrices, *self._least(known, matrices))
-        inwards = torch.linalg.inv(axes)
-        bend, jump = (inwards.mT @ sides.mixed @ inwards)[1:, 1:], inwards[1:, 1:].mT @ sides.jump
-        return sides if float(jump.norm()) >= _SHARP * float(bend.norm()) else None
+        in_u = replace(sides, matrices=found)
+        return sides if float(in_u.jump.norm()) >= _SHARP * float(in_u.mixed[1:, 1:].norm()) else None
 
     def _least(self, known: MetricProgress, matrices: Tensor, factor: float = 1.0) -> tuple[Tensor, float]:
         """Return the minimum [n] of the larger of two quadratics within the region, and the share of the second."""

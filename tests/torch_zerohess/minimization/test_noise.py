@@ -491,10 +491,10 @@ def test_x_is_evaluated_again_where_losses_are_counts():
         return (10.0 * (z - 0.3).abs().sum(1)).floor()
 
     for fn, most, count in ((steps, 80, 3), (lambda z: (z - 0.3).square().sum(1), 80, 1)):
-        fit = zh.minimize(fn, [-0.7, 0.9], sigma=0.7, seed=0, max_evaluations=most)
+        fit = zh.minimize(fn, [-0.7, 0.9], sigma=0.7, seed=2, max_evaluations=most)
         assert repeated(fit) == count
         assert (fit.noise, fit.value_error) == (0.0, 0.0)
-    assert repeated(zh.minimize(steps, [-0.7, 0.9], sigma=0.7, seed=0, max_evaluations=80, noise=0.0)) == 0
+    assert repeated(zh.minimize(steps, [-0.7, 0.9], sigma=0.7, seed=2, max_evaluations=80, noise=0.0)) == 0
 
 
 def test_counts_that_are_missing_at_times_have_a_noise():

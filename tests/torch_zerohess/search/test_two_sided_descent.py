@@ -11,6 +11,7 @@ from torch_zerohess.search.descent_search import Descent
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.search.two_sided_descent import TwoSidedQuadratics, _in_use
+from torch_zerohess.surrogates.pool import Pool
 
 
 def half_space(z: Tensor, weight: float) -> Tensor:
@@ -114,6 +115,8 @@ def test_evidence() -> None:
     assert after(one) == pytest.approx(0.8 - 2.0)
     assert after(two + (one - two) / (1 + 2.71828)) == pytest.approx(0.8 + 1.0, abs=1e-4)
     assert after(two, phase="slope") == after(float("nan")) == after(two, sides=None) == 1.0
+    wide = method._wide.go_on(Pool.empty(2, x.device), known.lowest, 1.0)
+    assert after(two, wide=wide) == 1.0
 
 
 def test_many_parameters_have_one_quadratic() -> None:

@@ -15,9 +15,9 @@ from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.minimization.callback import Callback
 from torch_zerohess.minimization.evaluating import evaluating
+from torch_zerohess.minimization.loop import run
 from torch_zerohess.minimization.minimum import Iterate, Minimum, Observation
 from torch_zerohess.minimization.outcome import outcome
-from torch_zerohess.minimization.run import run
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.separate import separated
 from torch_zerohess.minimization.stopping import Stopping

@@ -64,7 +64,7 @@ def _model(
 ) -> tuple[LocalModel, float | Tensor] | None:
     """Return the search's quadratic model around x and its sigma; or what all evaluations tell, if that is better.
 
-    It is also better where the errors of the model are infinite.
+    It is also better where the model of a loss alone has infinite errors.
     In noise it is better if there are enough of them: its standard errors contain what is not quadratic.
     """
     found, unit = search.model_at_best(x), search.unit
@@ -75,6 +75,11 @@ def _model(
         return noisy_derivatives(x, points, losses, noise) or found
     around = quadratic_around(x, points, losses)
     most = _RELIABLE if found is None or found[0].jacobian is None else _MORE_RELIABLE
-    if around is None or (found is not None and around[2] > most and bool(found[0].full_errors()[1].isfinite().all())):
+    if around is None or (found is not None and around[2] > most and _is_determined(found[0], search)):
         return found
     return around[:2]
+
+
+def _is_determined(model: LocalModel, search: TrustRegion) -> bool:
+    """Whether evaluations determine the curvatures of a model. Models of outputs do not tell their errors."""
+    return search.loss is not None or bool(model.full_errors()[1].isfinite().all())

@@ -20,7 +20,7 @@ from torch_zerohess.search.candidates import farthest, is_known, least_known, lo
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.loss_model import LossModel
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.pool_quadratic import quadratic_around
+from torch_zerohess.search.pool_quadratic import quadratic_of_pool
 from torch_zerohess.search.random_points import normal, orthonormal
 from torch_zerohess.search.state import LOST, Best, Evaluated, not_finite
 from torch_zerohess.surrogates.gaussian_process import HIGH_NOISES, NOISES, GaussianProcess
@@ -123,7 +123,7 @@ class ProcessMethod(Method[Q]):
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
         least = min(self.settings.n, self.capacity - 2) + 1
-        return quadratic_around(known.best, known.pool, self.settings.loss, known.shape, least)
+        return quadratic_of_pool(known.best, known.pool, self.settings.loss, known.shape, least)
 
     def begun(self) -> Q:
         """Return the progress before anything was evaluated."""

@@ -14,7 +14,7 @@ _NEAR, _WIDENING, _WIDEST = 1e-3, 1.5, 10.0
 """Weight from which an evaluation counts as near the best point; sigma is widened by the factor up to the last one."""
 
 
-def quadratic_around(
+def quadratic_of_pool(
     best: Best, pool: Pool, loss: Callable[[Tensor], Tensor] | None, shape: torch.Size, least: int
 ) -> tuple[LocalModel, float] | None:
     """Return a quadratic model around a point and its sigma, or None if too few evaluations are near.

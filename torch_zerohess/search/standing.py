@@ -1,6 +1,7 @@
 """Where a search stands: what its state says of the best point, of its progress, and of its end."""
 
 from abc import ABC
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Generic
 
@@ -25,6 +26,11 @@ class Standing(ABC, Generic[P]):
     def engine(self) -> str:
         """Which search it is: "gaussian_process", "descent", ..."""
         return self._method.engine
+
+    @property
+    def loss(self) -> Callable[[Tensor], Tensor] | None:
+        """The white box from an output to a number; None where the black box returns the loss."""
+        return self._method.settings.loss
 
     @property
     def x(self) -> Tensor:

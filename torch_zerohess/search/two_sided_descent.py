@@ -1,7 +1,7 @@
 """Descent on quadratics, and on the larger of two quadratics beside a kink.
 
 No quadratic predicts a loss on both sides of a kink, as of c + w max(0, d) or max(c, d). So after a rejected step the
-larger of two quadratics is fitted, too (`larger_of_two`). Where it has predicted the latest losses better, the steps
+larger of two quadratics is fitted, too (`fit_two_sides`). Where it has predicted the latest losses better, the steps
 lead to its minimum.
 
 The metric of the region is learned from the Hessian of the quadratics mixed as their gradients balance: the Hessian
@@ -19,7 +19,7 @@ from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.metric_descent import CURVED, RATE, MetricQuadratics
 from torch_zerohess.search.metric_progress import MetricProgress, TwoSides
 from torch_zerohess.search.state import Evaluated
-from torch_zerohess.surrogates.two_sides import larger_of_two
+from torch_zerohess.surrogates.two_sides import fit_two_sides
 
 _MOST = 10
 """Parameters up to which two quadratics are fitted."""
@@ -75,7 +75,7 @@ class TwoSidedQuadratics(MetricQuadratics):
         if len(order) < self._coefficients + _FEWEST:
             return None
         order = order[distance[order] <= max(_FAR, _RELATIVELY * float(distance[order[n + 2]]))]
-        found = larger_of_two(u[order], known.values[order] - known.lowest.loss)
+        found = fit_two_sides(u[order], known.values[order] - known.lowest.loss)
         if found is None:
             return None
         to_u = torch.block_diag(torch.ones_like(known.root[:1, :1]), torch.linalg.inv(known.sigma * known.root))

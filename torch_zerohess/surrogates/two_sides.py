@@ -21,7 +21,7 @@ _BENT, _SLOPED = 1e-5, 1e-9
 """Weights of the prior, for which all coefficients are 0: of the second derivatives, and of the others."""
 
 
-def larger_of_two(u: Tensor, values: Tensor) -> Tensor | None:
+def fit_two_sides(u: Tensor, values: Tensor) -> Tensor | None:
     """Return two quadratics, the larger of which fits the values, as matrices; None if there are too few values.
 
     Args:

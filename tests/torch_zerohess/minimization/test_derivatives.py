@@ -1,11 +1,13 @@
-"""Whether a quadratic is flat along some direction: by hand."""
+"""Which quadratic is that at the end of a search, and whether it is flat along some direction: by hand."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from torch_zerohess.minimization.derivatives import Derivatives, is_flat
+from torch_zerohess.minimization.derivatives import Derivatives, is_flat, quadratic_at
+from torch_zerohess.surrogates.quadratic import LocalModel
 from truths import vector
 
 
@@ -45,3 +47,15 @@ def test_nothing_is_flat_that_the_evaluations_do_not_determine():
     flat = found([[1.0, 1.0], [1.0, 1.0]], error=math.inf)
     assert not is_flat(flat, vector(1.0, 1.0))
     assert not is_flat(Derivatives(None, None, None, vector(1.0, 1.0)), vector(1.0, 1.0))
+
+
+@pytest.mark.parametrize("loss", [None, torch.sum])
+def test_a_model_that_evaluations_do_not_determine_gives_way_to_all_of_them(loss):
+    """A model of outputs does not know its errors. One of the loss alone with infinite errors is not determined."""
+    points = torch.randn(12, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    losses = points.square().sum(1) + 0.5 * (7 * points[:, 0]).sin()
+    unknown = vector(math.inf, math.inf)
+    own = LocalModel(0.0, vector(0.0, 0.0), 8.0 * torch.eye(2).double(), None, unknown, unknown)
+    search = SimpleNamespace(unit=vector(1.0, 1.0), loss=loss, model_at_best=lambda x: (own, 1.0))
+    hessian = quadratic_at(vector(0.0, 0.0), search, points, losses, 0.0).hessian
+    assert torch.equal(hessian, own.hessian) == (loss is not None)

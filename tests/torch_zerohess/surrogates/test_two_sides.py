@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.larger_of_two import two_values
-from torch_zerohess.surrogates.two_sides import larger_of_two
+from torch_zerohess.surrogates.two_sides import fit_two_sides
 
 
 def random(seed: int) -> torch.Generator:
@@ -17,7 +17,7 @@ def normal(generator: torch.Generator, *shape: int) -> Tensor:
 
 
 def fitted(u: Tensor, values: Tensor, at: Tensor) -> Tensor:
-    matrices = larger_of_two(u, values)
+    matrices = fit_two_sides(u, values)
     assert matrices is not None
     return two_values(matrices, at).amax(0)
 
@@ -69,14 +69,14 @@ def test_near_values_count_more_than_far_ones() -> None:
 def test_few_values_tell_planes() -> None:
     """With fewer values than a quadratic has coefficients the second derivatives are as small as can be."""
     u = normal(random(0), 14, 3)
-    matrices = larger_of_two(u, torch.maximum(u[:, 0], -2 * u[:, 0] + u[:, 1]))
+    matrices = fit_two_sides(u, torch.maximum(u[:, 0], -2 * u[:, 0] + u[:, 1]))
     assert matrices is not None
     assert float(matrices[:, 1:, 1:].abs().max()) < 1e-3
 
 
 def test_too_few_values_tell_nothing() -> None:
     u = normal(random(0), 5, 2)
-    assert larger_of_two(u, u[:, 0].abs()) is None
+    assert fit_two_sides(u, u[:, 0].abs()) is None
 
 
 def test_a_quadratic_is_its_own_larger_one() -> None:
@@ -87,6 +87,6 @@ def test_a_quadratic_is_its_own_larger_one() -> None:
 def test_the_second_one_is_the_steeper_one() -> None:
     u = normal(random(0), 30, 2)
     for side in (u[:, 0], -u[:, 0]):
-        matrices = larger_of_two(u, u[:, 1] + 100 * side.clamp(min=0))
+        matrices = fit_two_sides(u, u[:, 1] + 100 * side.clamp(min=0))
         assert matrices is not None
         assert matrices[:, 0, 1:].norm(dim=1).tolist() == pytest.approx([1.0, (1 + 1e4) ** 0.5], rel=1e-6)

@@ -1,4 +1,4 @@
-"""A search from where it is to its end."""
+"""The loop of a search: step by step to its end."""
 
 import contextlib
 

@@ -1,5 +1,7 @@
 """Descent on a loss with kinks."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -123,6 +125,17 @@ def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
         search.tell(half_space(search.ask(), 1e4))
     search.tell(half_space(search.ask(limit=2), 1e4))
     assert not search.solved
+
+
+def test_a_process_waits_until_slopes_are_measured() -> None:
+    """It has no patience left, and the slopes that are measured lower nothing."""
+    start = torch.zeros(3).double()
+    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=2, restarts=0)
+    while (local := search._state.progress.local) is None or local.slopes is None:
+        search.tell(half_space(search.ask(), 1e4))
+    search._state = replace(search._state, progress=replace(search._state.progress, waited=10**6))
+    search.tell(half_space(search.ask(), 1e4))
+    assert search._state.progress.finishing
 
 
 def test_a_smooth_function_is_not_searched_for_kinks() -> None:

@@ -12,7 +12,7 @@ from torch_zerohess.optim import (
     Descent,
     TrustRegion,
 )
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.state import Arrivals, Best, Evaluated, Progress
 from truths import vector
 
 
@@ -168,3 +168,18 @@ def test_a_state_of_another_search(n, changes, message):
     with pytest.raises(ValueError, match=message):
         search.load_state_dict(other.state_dict())
     assert torch.equal(search.ask(), asked)
+
+
+@pytest.mark.parametrize(
+    ("best", "rounds", "expected"),
+    [
+        (Best(vector(1.0, 1.0), 2.0), 1, True),
+        (Best(vector(1.0, 1.0), 2.0), 0, False),  # the round goes on
+        (Best(vector(1.0, 1.0 + 1e-5), 1.9), 1, True),
+        (Best(vector(3.0, 1.0), 1.9), 1, False),  # lower, and elsewhere
+        (Best(vector(1.0, 1.0), 2.1), 1, False),
+    ],
+)
+def test_a_search_is_at_an_arrival_where_its_best_point_is_one(best, rounds, expected):
+    arrivals = Arrivals(rounds=rounds, lowest=Best(vector(1.0, 1.0), 2.0))
+    assert Progress(best=best, center=best.point, arrivals=arrivals).is_at_arrival(1e-3) is expected

@@ -5,18 +5,16 @@ import math
 import torch
 from torch import Tensor
 
-_BISECTIONS = 60
-"""Bisections for the shift of the Hessian, at most."""
-_PRECISE = 1e-12
-"""Relative precision of the shift."""
+_NEWTON_STEPS = 60
+"""Steps to the shift of the Hessian, at most."""
+_PRECISE = 1e-13
+"""A step is longer than the radius by this share at most."""
 SINGULAR = 1e-14
 """Curvature, relative to the largest one, that may as well be zero."""
 _LEAST = 100.0
 """Least shift, over this curvature."""
 _SMALLEST = 1e-300
 """Least number that is divided by."""
-_FEW = 40
-"""Dimensions up to which a sum of Python numbers is faster than one of torch."""
 _LONGEST, _HALVINGS = 8, 24
 """Lengths tried along the gradient where bounds are hit: radius times 2^8 and less."""
 
@@ -33,7 +31,7 @@ def ball_step(gradient: Tensor, hessian: Tensor, radius: float, singular: float 
 def diagonal_step(a: Tensor, curvature: Tensor, radius: float, singular: float = SINGULAR) -> Tensor:
     """Return s [r] with |s| <= radius that minimises a.s + s.(curvature s)/2, in any order and of any sign.
 
-    By bisection for the shift mu of s = -a / (curvature + mu) (More and Sorensen 1983). In the hard case a has no
+    By Newton's method for the shift mu of s = -a / (curvature + mu) (More and Sorensen 1983). In the hard case a has no
     component along the most negative curvature; the step then goes on along it, to the boundary.
     """
     least, index = curvature.min(0)
@@ -56,22 +54,23 @@ def diagonal_step(a: Tensor, curvature: Tensor, radius: float, singular: float =
             missing = 1.0 - float(s.square().sum()) + float(s[index] ** 2)
             s[index] = math.copysign(math.sqrt(max(missing, 0.0)), float(s[index]))
         return radius * s
-    high = float(a.abs().max()) * math.sqrt(len(a))
-    few = len(a) <= _FEW
-    pairs = list(zip(a.tolist(), gap.tolist(), strict=True)) if few else []
-    for _ in range(_BISECTIONS):
-        middle = math.sqrt(low) * math.sqrt(high)
-        if few:
-            outside = sum((one / (bend + middle)) ** 2 for one, bend in pairs) > 1.0
-        else:
-            outside = float((a / (gap + middle)).norm()) > 1.0
-        if outside:
-            low = middle
-        else:
-            high = middle
-        if high - low <= _PRECISE * high:
+    return radius * -a / (gap + _shift(a.tolist(), gap.tolist(), low))
+
+
+def _shift(a: list[float], gap: list[float], low: float) -> float:
+    """Return mu with |a / (gap + mu)| = 1; mu is greater than `low`, gap is at least 0.
+
+    By Newton's method for 1/|a / (gap + mu)| = 1. The left side is concave in mu, so steps from below stay below.
+    """
+    shift = max(low, *(abs(one) - bend for one, bend in zip(a, gap, strict=True)))
+    for _ in range(_NEWTON_STEPS):
+        squares = [(one / (bend + shift)) ** 2 for one, bend in zip(a, gap, strict=True)]
+        length = math.sqrt(sum(squares))
+        if length - 1.0 <= _PRECISE:
             break
-    return radius * -a / (gap + high)
+        slope = sum(square / (bend + shift) for square, bend in zip(squares, gap, strict=True))
+        shift += (length - 1.0) * length * length / slope
+    return shift
 
 
 def box_step(gradient: Tensor, hessian: Tensor, radius: float, lower: Tensor, upper: Tensor) -> Tensor:

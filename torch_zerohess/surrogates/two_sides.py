@@ -34,18 +34,17 @@ def fit_two_sides(u: Tensor, values: Tensor) -> Tensor | None:
     """
     n, terms = u.shape[1], quadratic_terms(u)
     weights = 1.0 / (_NEAR + u.square().sum(1))
-    prior = torch.full_like(terms[0], _BENT)
-    prior[: n + 1] = _SLOPED
+    equations = torch.cat([terms, values[:, None]], 1)
+    prior = torch.full_like(equations[0], _BENT).diag()[:-1]
+    prior.diagonal()[: n + 1] = _SLOPED
     sides, least, best = _guesses(u, values), torch.inf, None
     for _ in range(_FITS):
         sides = torch.unique(sides[torch.minimum(sides.sum(1), (~sides).sum(1)) > n], dim=0)
         if not len(sides):
             break
-        both = weights * torch.stack([sides, ~sides], 1)  # [S, 2, P]
-        rows = torch.cat([both[..., None] * terms, prior.diag().expand(len(sides), 2, -1, -1)], 2)
-        q, r = torch.linalg.qr(rows)
-        wanted = q[:, :, : len(u)].mT @ (both * values)[..., None]
-        found = torch.linalg.solve_triangular(r, wanted, upper=True)[..., 0]  # [S, 2, q]
+        rows = (weights * torch.stack([sides, ~sides], 1))[..., None] * equations  # [S, 2, P, q + 1]
+        r = torch.linalg.qr(torch.cat([rows, prior.expand(len(sides), 2, -1, -1)], 2), mode="r")[1]
+        found = torch.linalg.solve_triangular(r[..., :-1, :-1], r[..., :-1, -1:], upper=True)[..., 0]  # [S, 2, q]
         fitted = found @ terms.mT
         errors = ((fitted.amax(1) - values) * weights).square().sum(1)
         k = int(errors.argmin())

@@ -123,9 +123,10 @@ def minimize(
             at a known minimum predicts its losses.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
             evaluations, and six more if the two differ. For that, a `batch` that takes all evaluations is made shorter;
-            the message says so where they are too few to measure it. Where losses are counts, which may be equal by
-            chance, x is evaluated twice again when the search arrives or is about to end. Give the noise if fn is noisy
-            elsewhere but not at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth
+            the message says so where they are too few to measure it. As there may be no noise at x0, x is evaluated
+            again when the search arrives, reaches `target`, or is about to end; twice where losses are counts, which
+            may be equal by chance. If values differ, the search begins again as one in noise. So give the noise where
+            fn has none at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth
             of `max_evaluations` (4 to 48) is kept for the end: the best candidates are evaluated again, and x is the
             one with the lowest mean. `value` is this mean and `value_error` its standard error. No call of fn has a
             point twice, because noise may be the same for all points of a call: repeated points are evaluated at once

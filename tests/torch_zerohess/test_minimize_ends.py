@@ -66,7 +66,8 @@ def test_results_are_compared_by_identity_and_have_a_hash():
 def test_target():
     fit = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, target=0.6)
     assert fit.value <= 0.6
-    assert all(one.value > 0.6 for one in fit.history[:-1])
+    assert all(one.value > 0.6 for one in fit.history[:-2])
+    assert torch.equal(fit.points[-2], fit.points[-1])  # a value of a noisy function may be luck
     assert fit.message == "the value is at most the target 0.6"
 
 
@@ -334,7 +335,7 @@ def test_the_hessian_in_a_curved_valley_is_that_of_the_nearest_evaluations_that_
         expected = torch.func.hessian(lambda x: banana(x[None])[0])(fit.x)
         off, errors = (fit.hessian - expected).diagonal().abs(), fit.standard_errors["hessian_diagonal"]
         assert bool((off < 5 * errors).all())
-        assert bool((errors < (0.1 if seed else 1.0) * expected.diagonal()).all())
+        assert bool((errors < 0.2 * expected.diagonal()).all())
 
 
 def test_a_region_that_shrank_by_mistake_is_no_evidence():

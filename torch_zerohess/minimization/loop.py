@@ -45,6 +45,8 @@ def _end(running: Running, stopping: Stopping, callback: Callback | None) -> End
     while True:
         running.look_again()
         end = stopping.reason(running)
+        if end is not None and end[0] == "target" and running.look_again(at_target=True):
+            continue
         if end is None and callback is not None and callback.asked:
             end = "callback", "the callback asked to end"
         if end is None:

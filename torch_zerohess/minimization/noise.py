@@ -51,12 +51,13 @@ def deviation(losses: Tensor) -> float:
     return float((finite / size).std()) * size
 
 
-def noise_of_counts(
+def noise_at(
     x: Tensor, points: Tensor, losses: Tensor, begun: int, evaluate: Callable[[Tensor], Tensor], most: int
 ) -> float | None:
-    """Evaluate x again where losses are counts; return the deviation of its losses, 0 if they are equal.
+    """Evaluate x again; return the deviation of its losses, 0 if they are equal, None if x has no loss.
 
-    None where they are no counts, or where x has not been evaluated.
+    Losses that are counts may be equal by chance: these are compared with two further ones, others with one. A
+    difference counts if it is more than rounding of the first loss, see `is_rounding`.
 
     Args:
         x: [n].
@@ -67,14 +68,20 @@ def noise_of_counts(
         most: how many further evaluations there may be.
     """
     before, known = losses[:begun][(points[:begun] == x).all(1)], losses[begun:]
-    if not are_counts(losses[:begun]) or not len(before):
+    if not len(before) or not bool(torch.isfinite(before[-1])):
         return None
-    again, most = known[:0], most + len(known)
-    for count in (min(_AGAIN, most), min(REPEATED, most)):
-        wanted = count - len(known)
+    few, most = _AGAIN if are_counts(losses[:begun]) else 1, most + len(known)
+    size = float(torch.stack([losses[torch.isfinite(losses)][0], before[-1]]).abs().max())
+    again = known[:0]
+    for count in (few, _AGAIN, REPEATED):
+        wanted = min(count, most) - len(known)
         known = torch.cat([known, evaluate(x.expand(wanted, -1))]) if wanted > 0 else known
         again = known[:count][torch.isfinite(known[:count])]
-        if not len(again) or not differs(again[:_AGAIN], before[-1]):
+        apart = (again - before[-1]).abs()
+        if not len(again) or float(apart[:few].max()) <= _ROUNDING * size:
+            return 0.0
+        alike = len(again) > 1 and float(again.max() - again.min()) <= _ROUNDING * size
+        if alike and float(apart.max()) <= _BATCHED * size:
             return 0.0
     return deviation(torch.cat([before, again]))
 

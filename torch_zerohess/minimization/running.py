@@ -16,7 +16,7 @@ from torch_zerohess.minimization.decision import Decision, decide
 from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.first_batch import evaluate_first_batch
 from torch_zerohess.minimization.minimum import Iterate
-from torch_zerohess.minimization.noise import REPEATED, noise_of_counts, opening, reserved
+from torch_zerohess.minimization.noise import REPEATED, noise_at, opening, reserved
 from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.minimization.wording import budget
 from torch_zerohess.search.trust_region import TrustRegion
@@ -175,20 +175,24 @@ class Running:
         search.tell(torch.cat([self.record.told[1][:1].to(values), values[1:]]) if lost else values)
         self._noted(points, values.to(search.told) if lost else search.told)
 
-    def look_again(self) -> None:
-        """Evaluate x twice again where the search has arrived or is about to end, and losses are counts.
+    def look_again(self, *, at_target: bool = False) -> bool:
+        """Evaluate x again, once, and return whether noise was found; twice where losses are counts.
 
-        Counts of a noisy simulator may be equal at x0 by chance. The search then begins again as one in noise.
+        That is done where the search has arrived or is about to end, or where the value has reached the target. There
+        may be no noise at x0, and counts of a noisy simulator may be equal there by chance. The search then begins
+        again as one in noise.
         """
-        ends = self.search.solved or self.left <= min(reserved(self._most) + REPEATED, self._most // 4)
-        if self._sure or self.noise or not (ends and self.left and self.begun) or self.record.requested is not None:
-            return
+        few = self.left <= min(reserved(self._most) + REPEATED, self._most // 4)
+        wanted = (at_target or self.search.solved or few) and self.left > 0 and self.begun
+        if self._sure or self.noise or not wanted or self.record.requested is not None:
+            return False
         self._looking = self.evaluations if self._looking is None else self._looking
-        found = noise_of_counts(self.search.x, *self.record.told, self._looking, self._evaluated, self.left)
+        found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)
         if found:
             self.noise, self.search = found, self._make(found)
         self._unmeasured, self._looking = self._unmeasured and found is None, None
         self._sure = True
+        return bool(found)
 
     def reaches(self, target: float) -> bool:
         """Whether the value is at most the target; in noise, the mean of a decision, or a loss that calls for one.

@@ -159,3 +159,4 @@ def test_rounding_that_depends_on_the_size_of_a_call_is_no_noise(relative, most,
     assert int((fit.points == 0.0).all(1).sum()) >= min(most - 3, 8)
     assert is_rounding(vector(1.0 + relative, 1.0, 1.0)[:, None]) == (relative < 1e-3)
     assert not is_rounding(vector(1.0, 1.0, 1.0 + relative)[:, None])
+    assert not is_rounding(vector(1.0, 1.0)[:, None])

@@ -159,7 +159,7 @@ class Running:
             measured = self.noise is None and self.left > len(search.ask()) + 1
             self._unmeasured = self._unmeasured or (self.noise is None and not measured)
             limit = opening(self._batch, len(search.ask()), self.left) if measured else self.left
-            points = search.ask(max(self._batch - int(measured), 1), limit=limit)
+            points = search.ask(min(max(self._batch - int(measured), 1), limit), limit=limit)
         else:
             measured, points = self.noise is None, points[: len(search.missing)]
         if measured:

@@ -51,3 +51,17 @@ def test_a_target_that_the_first_batch_reaches_is_seen(seed) -> None:
     fit = zh.minimize(noisy, [0.8, 0.8], sigma=0.5, target=0.4, batch=16, max_evaluations=18, seed=seed)
     assert (fit.status, fit.success) == ("target", True)
     assert fit.value <= 0.4
+
+
+def test_no_point_is_chosen_that_cannot_be_evaluated(monkeypatch) -> None:
+    """A batch of thousands is chosen one point after the other, by a Gaussian process of those before."""
+    wanted, ask = [], TrustRegion.ask
+
+    def noted(self, batch: int = 1, *, limit: int | None = None) -> Tensor:
+        wanted.append(batch)
+        return ask(self, batch, limit=limit)
+
+    monkeypatch.setattr(TrustRegion, "ask", noted)
+    settings = {"sigma": 0.5, "bounds": (-1, 1), "seed": 0}
+    assert zh.minimize(squares, [0.8, 0.8], batch=100, max_evaluations=12, **settings).evaluations == 12
+    assert max(wanted) <= 12

@@ -278,7 +278,7 @@ def test_minimize_gives_batches_to_the_function():
         seed=0,
         restarts=10,
     )
-    assert sizes == [4, 1] + [5] * 5 + [3]  # the start is repeated in a call of its own
+    assert sizes == [4, 1] + [5] * 4 + [1, 5, 2]  # the start and x are repeated in calls of their own
     assert fit.evaluations == 33
     assert len(fit.history) == sum(sizes)
 

@@ -6,7 +6,7 @@ is looked at (gradient sampling: Burke, Lewis and Overton 2005). If the shortest
 point is stationary. Otherwise its opposite is a direction of descent, and the search goes on from a lower point there.
 
 A penalty may be 10 000 times as steep on one side of a kink as the loss on the other side. The gentle slopes then tell
-whether the best point is a minimum, and long steps keep to their side.
+whether the best point is a minimum.
 """
 
 import math
@@ -31,6 +31,8 @@ _BENT = 30.0
 """The rise to the first corner is compared with the rise to an evaluation beside the best point, in the same direction.
 At a kink the first is at most 30 times as steep as the second, and at least a thirtieth. A smooth loss rises 100 times
 as steeply to the corner, and a loss that jumps a hundredth."""
+_ENOUGH = 8
+"""Evaluations beside the best point, and apart from it, from which their medians tell a kink."""
 _STRADDLED = 0.1
 """Error of a slope over its length, at most, unless the slope is gentle. Differences across a kink tell no slope."""
 _ROUNDING = 1e4 * torch.finfo(torch.float64).eps
@@ -42,11 +44,11 @@ _MOST = 6
 _UNKNOWN = "the slopes around a kink do not tell whether it is a minimum"
 _ZERO = 1e-3
 """Length of a vector in the hull that counts as zero, over the length of the shortest slope."""
-_NEAR, _FAR = (0.3, 1.0, 3.0), (10.0, 100.0, 1e3, 1e4)
-"""Steps that are tried, over the distance of the points whose slopes are measured: against the shortest vector of the
-hull; and turned away from the steep side of the kink, which may be curved."""
-_TURNED = 0.3
-"""The turn of the long steps costs at most this share of their decrease."""
+_LENGTHS = (0.3, 1.0, 3.0, 10.0, 100.0, 1e3, 1e4)
+"""Steps that are tried, against the shortest vector of the hull, over the distance of the points whose slopes are
+measured."""
+_ROOM = 3.0
+"""No slopes are measured if a bound is nearer than this, over the same distance."""
 _WIDER = 2.0
 """Sigma with which the search goes on, over the length of the step that has found a lower point."""
 
@@ -68,7 +70,7 @@ class KinkedQuadratics(TwoSidedQuadratics):
             return self.plan(after, generator)
         known = replace(known, evaluations=after.evaluations)
         simplex = evaluated.needed.those(slice(-n - 1, None))
-        complete = len(evaluated.needed) == n + 1 + (len(_NEAR + _FAR) if len(sampled) >= n else 0)
+        complete = len(evaluated.needed) == n + 1 + (len(_LENGTHS) if len(sampled) >= n else 0)
         if not bool(evaluated.finite.all()):  # it is a border
             return self._arrived(known, known.reason, generator)
         if not complete:
@@ -99,12 +101,21 @@ class KinkedQuadratics(TwoSidedQuadratics):
 
     def _is_kink(self, known: MetricProgress) -> bool:
         """Whether the loss rises as steeply next to the best point as farther away, and no bound is near."""
-        x, settings, tolerance = known.lowest.point, self.settings, self.settings.tolerance
+        x, settings = known.lowest.point, self.settings
         room = float(torch.minimum(x - settings.lower, settings.upper - x).min())
-        if known.lowest.loss > known.best.loss or room <= max(_NEAR) * _AROUND * tolerance:
+        if known.lowest.loss > known.best.loss or room <= _ROOM * _AROUND * settings.tolerance:
             return False
-        apart = next(filter(None, (_steepest(known, a * tolerance, b * tolerance)[1] for a, b in _APART)), 0.0)
-        return _steepest(known, 0.0, self._beside)[1] > _STEEP * apart > 0.0
+        beside, apart = self._beside_and_apart(known)
+        if not len(apart) or not len(beside):
+            return False
+        return bool(beside.max() > _STEEP * apart.max()) or bool(beside.median() > _STEEP * apart.median())
+
+    def _beside_and_apart(self, known: MetricProgress) -> tuple[Tensor, Tensor]:
+        """Return how steeply the loss rises to evaluations beside the best point, and to those apart from it."""
+        tolerance = self.settings.tolerance
+        ranges = ((a * tolerance, b * tolerance) for a, b in _APART)
+        apart = next(filter(len, (_steepness(known, *one) for one in ranges)), known.values[:0])
+        return _steepness(known, 0.0, self._beside), apart
 
     def _is_straddled(self, known: MetricProgress, simplex: Evaluated, slope: Tensor) -> bool:
         """Whether a slope [n] does not lead back to the best loss: its corners are on two sides of a kink."""
@@ -114,11 +125,19 @@ class KinkedQuadratics(TwoSidedQuadratics):
         return steep and abs(error) > _STRADDLED * float(slope.norm() * away.norm())
 
     def _is_straight(self, known: MetricProgress, simplex: Evaluated) -> bool:
-        """Whether the loss rises as steeply to the first corner as next to the best point, in the same direction."""
+        """Whether the loss rises as steeply to the first corner as next to the best point, in the same direction.
+
+        Or whether most of the evaluations beside it tell a rise as steep as most of those apart from it, if there are
+        enough, and none tells a jump. The corner is then on the steep side of a kink.
+        """
         rise = float(simplex.losses[0]) - known.lowest.loss
         steepness = rise / float((simplex.points[0] - known.lowest.point).norm())
-        beside = _steepest(known, 0.0, self._beside)[1]
-        return beside / _BENT < steepness < _BENT * beside
+        beside, apart = self._beside_and_apart(known)
+        steepest = float(beside.max())
+        enough = min(len(beside), len(apart)) >= _ENOUGH and steepest < _BENT * float(apart.max())
+        if enough and 1.0 / _BENT < float(beside.median() / apart.median()) < _BENT:
+            return True
+        return steepest / _BENT < steepness < _BENT * steepest
 
     def _measuring(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Ask for steps against the shortest vector of the hull, and for a further slope; end where it is zero."""
@@ -131,7 +150,8 @@ class KinkedQuadratics(TwoSidedQuadratics):
                 return self._arrived(known, known.reason, generator)
             if len(slopes) >= _MOST * (n + 1):
                 return self._ended(replace(known, slopes=None), None, _UNKNOWN, generator)
-            steps = x - distance * _steps(least, slopes)
+            lengths = torch.tensor(_LENGTHS, dtype=x.dtype, device=x.device)[:, None]
+            steps = x - distance * lengths * torch.nn.functional.normalize(least, dim=0)
         towards = normal(generator, x, n) / math.sqrt(n)
         if not len(slopes):
             towards = torch.nn.functional.normalize(_steepest(known, 0.0, self._beside)[0] - x, dim=0)
@@ -140,13 +160,11 @@ class KinkedQuadratics(TwoSidedQuadratics):
         return replace(known, phase="slope"), self.settings.inside(torch.cat([steps, corner[None], sides]))
 
 
-def _steps(least: Tensor, slopes: Tensor) -> Tensor:
-    """Return steps [k, n] along the shortest vector [n] of the hull of slopes [m, n], in units of the distance."""
-    lengths = slopes.norm(dim=1)
-    along, across = (torch.nn.functional.normalize(one, dim=0) for one in (least, slopes[int(lengths.argmax())]))
-    aside = torch.nn.functional.normalize(along + _TURNED * float(least.norm() / lengths.min()) * across, dim=0)
-    near, far = (torch.tensor(one, dtype=least.dtype, device=least.device)[:, None] for one in (_NEAR, _FAR))
-    return torch.cat([near * along, far * aside])
+def _steepness(known: MetricProgress, nearest: float, farthest: float) -> Tensor:
+    """Return how steeply the loss rises to the evaluations between two distances."""
+    distance, rise = (known.points - known.lowest.point).norm(dim=1), known.values - known.lowest.loss
+    told = (distance > nearest) & (distance <= farthest) & (rise > _ROUNDING * abs(known.lowest.loss))
+    return (rise / distance)[told]
 
 
 def _steepest(known: MetricProgress, nearest: float, farthest: float) -> tuple[Tensor, float]:

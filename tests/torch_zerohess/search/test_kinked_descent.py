@@ -76,6 +76,36 @@ def test_along_a_penalty_the_loss_falls(f, weight, bounds, start, least, excess)
     assert sorted(values)[2] < excess
 
 
+def ball(z: Tensor, weight: float) -> Tensor:
+    """The least value in 12 parameters is -sqrt(12), on the surface of the ball."""
+    return -z.sum(1) + weight * (z.square().sum(1) - 1).clamp(min=0)
+
+
+def plane(z: Tensor, weight: float) -> Tensor:
+    """The least value is that at the nearest point of a half space to (1, ..., 1): `_least_of_plane`."""
+    normal = torch.nn.functional.normalize(torch.linspace(1, 3, z.shape[1]).double(), dim=0)
+    return (z - 1).square().sum(1) + weight * (z @ normal - 1).clamp(min=0)
+
+
+def _least_of_plane(n: int) -> float:
+    normal = torch.nn.functional.normalize(torch.linspace(1, 3, n).double(), dim=0)
+    return float((normal.sum() - 1) ** 2)
+
+
+@pytest.mark.parametrize(("f", "seed"), [(plane, 0), (plane, 2), (ball, 0), (ball, 3)])
+def test_a_penalty_of_many_parameters_makes_no_false_claim(f, seed) -> None:
+    """Two quadratics have up to 10. Most evaluations beside the best point are on the gentle side of the kink."""
+    settings = {"sigma": 0.5, "seed": seed, "restarts": 0, "max_evaluations": 420}
+    fit = zh.minimize(lambda z: f(z, 1e4), torch.zeros(12).double(), **settings)
+    assert not fit.success or fit.value < (_least_of_plane(12) if f is plane else -(12**0.5)) + 0.01
+
+
+def test_long_steps_follow_a_kink() -> None:
+    settings = {"sigma": 0.5, "restarts": 0, "max_evaluations": 960}
+    fits = [zh.minimize(lambda z: plane(z, 100.0), torch.zeros(12).double(), seed=k, **settings) for k in range(3)]
+    assert all(fit.value < _least_of_plane(12) + 0.06 for fit in fits)
+
+
 def test_differences_across_a_kink_tell_no_slope() -> None:
     normal = torch.tensor([3.0, 2.0, 1.0]).double() / 14**0.5
 
@@ -94,6 +124,19 @@ def test_differences_across_a_kink_tell_no_slope() -> None:
         losses = penalised(points)
         slope = (losses[1:] - losses[0]) / 1e-6
         assert method._is_straddled(known, Evaluated(points, losses), slope) == straddled
+
+
+def test_zero_is_small_beside_the_shortest_slope() -> None:
+    """The shortest vector of the hull is (0, 1/2): the loss falls, however long one of the slopes is."""
+    f, _ = kinked(18, 2)
+    search = Descent(torch.full((2,), 0.9).double(), sigma=0.5, seed=18, restarts=0)
+    search.tell(f(search.ask()))
+    method, known = search._method, search._state.progress
+    assert isinstance(method, KinkedQuadratics)
+    for gentle, falls in ((0.5, True), (1e-4, False)):
+        slopes = torch.tensor([[1e4, gentle], [-1.0, gentle]]).double()
+        after, _ = method._measuring(replace(known, slopes=slopes, reason="arrived"), torch.Generator())
+        assert (after.phase == "slope") == falls
 
 
 def test_a_penalty_may_have_its_minimum_at_the_kink() -> None:

@@ -32,7 +32,7 @@ class Running:
     """A search with all that was evaluated, and the file that it is written to.
 
     Args:
-        make: the search for a standard deviation of repeated losses.
+        make: the search for a standard deviation of repeated losses, from x0 or from a point [n].
         call: outputs or losses of points [K, n]; the known ones if it is interrupted.
         noise: that standard deviation; measured at the start if None.
         batch: points that are evaluated at once.
@@ -46,7 +46,7 @@ class Running:
 
     def __init__(
         self,
-        make: Callable[[float], TrustRegion],
+        make: Callable[..., TrustRegion],
         call: Call,
         noise: float | None,
         batch: int,
@@ -172,7 +172,11 @@ class Running:
         values = self.record.values(points)
         # A search that begins again in noise may get no value at its start, where there was one before.
         lost = self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0]))
-        search.tell(torch.cat([self.record.told[1][:1].to(values), values[1:]]) if lost else values)
+        if lost:
+            known, losses = self.record.told
+            at_start = losses[(known == points[0]).all(1) & torch.isfinite(losses)]
+            values = torch.cat([at_start.mean()[None].to(values), values[1:]])
+        search.tell(values)
         self._noted(points, values.to(search.told) if lost else search.told)
 
     def look_again(self, *, at_target: bool = False) -> bool:
@@ -180,16 +184,17 @@ class Running:
 
         That is done where the search has arrived or is about to end, or where the value has reached the target. There
         may be no noise at x0, and counts of a noisy simulator may be equal there by chance. The search then begins
-        again as one in noise.
+        again at x as one in noise.
         """
-        few = self.left <= min(reserved(self._most) + REPEATED, self._most // 4)
-        wanted = (at_target or self.search.solved or few) and self.left > 0 and self.begun
-        if self._sure or self.noise or not wanted or self.record.requested is not None:
+        if self._sure or self.noise or not (self.left and self.begun) or self.record.requested is not None:
+            return False
+        few = min(reserved(self._most) + REPEATED, self._most // 4) + len(self.record.last[1]) - 1
+        if not (at_target or self.search.solved or self.left <= few or self._looking is not None):
             return False
         self._looking = self.evaluations if self._looking is None else self._looking
         found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)
         if found:
-            self.noise, self.search = found, self._make(found)
+            self.noise, self.search = found, self._make(found, self.best.x)
         self._unmeasured, self._looking = self._unmeasured and found is None, None
         self._sure = True
         return bool(found)

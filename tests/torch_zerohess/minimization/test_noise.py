@@ -529,6 +529,46 @@ def test_noise_that_is_absent_at_the_start_is_found():
         assert not reached.success
 
 
+@pytest.mark.parametrize("engine", ["auto", "local"])
+def test_a_search_in_noise_goes_on_from_x(engine, tmp_path) -> None:
+    """Pixels have noise in proportion to them, and a dark picture has none. The search is interrupted near its end."""
+    t = torch.linspace(0, 1, 20).double()
+
+    def picture(z):
+        return z[:, :1] * torch.exp(-20.0 * (t - z[:, 1:] - 0.4).square())
+
+    goal = picture(vector(0.7, 0.2)[None])[0]
+
+    def run(at: int, path=None):
+        generator, calls = torch.Generator().manual_seed(2), []
+
+        def fn(z):
+            if len(calls) == at:
+                calls.append(z)
+                raise KeyboardInterrupt
+            calls.append(z)
+            y = picture(z)
+            return y * (1.0 + 0.1 * torch.randn(y.shape, generator=generator, dtype=y.dtype))
+
+        settings = {"sigma": 0.2, "seed": 2, "max_evaluations": 150, "engine": engine}
+        settings |= {"loss": lambda y: (y - goal).square().mean(), "checkpoint": path}
+        fit = zh.minimize(fn, zeros(2), **settings)
+        return fit if fit.status != "interrupted" else zh.minimize(fn, zeros(2), **settings), calls
+
+    whole, calls = run(-1)
+    points = whole.points
+    repeated = [
+        k for k in range(1, len(points)) if bool(points[k].any()) and bool((points[k] == points[:k]).all(1).any())
+    ]
+    begun = next(k for k in range(repeated[0], len(points)) if not torch.equal(points[k], points[repeated[0]]))
+    assert whole.noise > 0.0
+    assert float((points[begun:] - points[repeated[0]]).norm(dim=1).min()) < 0.2
+    assert whole.value < 0.3 * whole.values[0]
+    for at in range(len(calls) - 12, len(calls), 3):
+        path = tmp_path / f"{at}.pt"
+        assert torch.equal(run(at, path)[0].points, points)
+
+
 @pytest.mark.parametrize(("jump", "calls"), [(0.0, [1]), (1e-7, [1]), (1e-4, [1, 1]), (1e-2, [1, 1, 6])])
 def test_sums_of_a_batch_are_no_noise(jump, calls):
     """Values of x alone differ by a jump from the value in a call of several points. The first loss is 1."""

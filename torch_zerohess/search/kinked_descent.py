@@ -114,14 +114,14 @@ class KinkedQuadratics(TwoSidedQuadratics):
         """Return how steeply the loss rises to evaluations beside the best point, and to those apart from it."""
         tolerance = self.settings.tolerance
         ranges = ((a * tolerance, b * tolerance) for a, b in _APART)
-        apart = next(filter(len, (_steepness(known, *one) for one in ranges)), known.values[:0])
-        return _steepness(known, 0.0, self._beside), apart
+        apart = next(filter(len, (_rises(known, *one)[1] for one in ranges)), known.values[:0])
+        return _rises(known, 0.0, self._beside)[1], apart
 
     def _is_straddled(self, known: MetricProgress, simplex: Evaluated, slope: Tensor) -> bool:
         """Whether a slope [n] does not lead back to the best loss: its corners are on two sides of a kink."""
         away = simplex.points[0] - known.lowest.point
         error = float(simplex.losses[0]) - known.lowest.loss - float(slope @ away)
-        steep = float(slope.norm()) > _STEEP * _steepest(known, 0.0, self._beside)[1]
+        steep = float(slope.norm()) > _STEEP * float(_rises(known, 0.0, self._beside)[1].max())
         return steep and abs(error) > _STRADDLED * float(slope.norm() * away.norm())
 
     def _is_straight(self, known: MetricProgress, simplex: Evaluated) -> bool:
@@ -154,23 +154,15 @@ class KinkedQuadratics(TwoSidedQuadratics):
             steps = x - distance * lengths * torch.nn.functional.normalize(least, dim=0)
         towards = normal(generator, x, n) / math.sqrt(n)
         if not len(slopes):
-            towards = torch.nn.functional.normalize(_steepest(known, 0.0, self._beside)[0] - x, dim=0)
+            points, steepness = _rises(known, 0.0, self._beside)
+            towards = torch.nn.functional.normalize(points[int(steepness.argmax())] - x, dim=0)
         corner = x + distance * towards
         sides = corner + _CLOSE * distance * torch.eye(n, dtype=x.dtype, device=x.device)
         return replace(known, phase="slope"), self.settings.inside(torch.cat([steps, corner[None], sides]))
 
 
-def _steepness(known: MetricProgress, nearest: float, farthest: float) -> Tensor:
-    """Return how steeply the loss rises to the evaluations between two distances."""
+def _rises(known: MetricProgress, nearest: float, farthest: float) -> tuple[Tensor, Tensor]:
+    """Return to which evaluations [k, n] between two distances the loss rises, and how steeply [k]."""
     distance, rise = (known.points - known.lowest.point).norm(dim=1), known.values - known.lowest.loss
     told = (distance > nearest) & (distance <= farthest) & (rise > _ROUNDING * abs(known.lowest.loss))
-    return (rise / distance)[told]
-
-
-def _steepest(known: MetricProgress, nearest: float, farthest: float) -> tuple[Tensor, float]:
-    """Return to which of the evaluations between two distances the loss rises most steeply, and how steeply; or 0."""
-    distance, rise = (known.points - known.lowest.point).norm(dim=1), known.values - known.lowest.loss
-    told = (distance > nearest) & (distance <= farthest) & (rise > _ROUNDING * abs(known.lowest.loss))
-    steepness = torch.where(told, rise / distance, 0.0)
-    k = int(steepness.argmax())
-    return known.points[k], float(steepness[k])
+    return known.points[told], (rise / distance)[told]

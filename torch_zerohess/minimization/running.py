@@ -189,7 +189,8 @@ class Running:
         if self._sure or self.noise or not (self.left and self.begun) or self.record.requested is not None:
             return False
         few = min(reserved(self._most) + REPEATED, self._most // 4) + len(self.record.last[1]) - 1
-        if not (at_target or self.search.solved or self.left <= few or self._looking is not None):
+        ends = self.left <= few and self.search.evaluations >= self._least
+        if not (at_target or self.search.solved or ends or self._looking is not None):
             return False
         self._looking = self.evaluations if self._looking is None else self._looking
         found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)

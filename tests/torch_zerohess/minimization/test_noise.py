@@ -510,6 +510,14 @@ def test_x_is_evaluated_again():
     assert repeated(zh.minimize(steps, [-0.7, 0.9], sigma=0.7, seed=2, max_evaluations=80, noise=0.0)) == 0
 
 
+def test_x_is_not_evaluated_again_before_there_is_a_step() -> None:
+    """With 4 evaluations there is no second one of the start; with 5 there is."""
+    for most in (4, 5):
+        points = zh.minimize(bowl, zeros(2), sigma=2.0, seed=0, max_evaluations=most).points
+        assert len(points) == most
+        assert len(points.unique(dim=0)) == 4
+
+
 def test_noise_that_is_absent_at_the_start_is_found():
     """A queue without customers has no noise. The mean of the loss is 0 at its minimum; the luckiest draw is below."""
     for seed in range(6):

@@ -125,8 +125,8 @@ def minimize(
             evaluations, and six more if the two differ. For that, a `batch` that takes all evaluations is made shorter;
             the message says so where they are too few to measure it. As there may be no noise at x0, x is evaluated
             again when the search arrives, reaches `target`, or is about to end; twice where losses are counts, which
-            may be equal by chance. If values differ, the search begins again at x as one in noise. Give the noise where
-            fn has none at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth
+            may be equal by chance. If values differ, the search begins again at x as one in noise. Give the noise if
+            fn has no noise at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth
             of `max_evaluations` (4 to 48) is kept for the end: the best candidates are evaluated again, and x is the
             one with the lowest mean. `value` is this mean and `value_error` its standard error. No call of fn has a
             point twice, because noise may be the same for all points of a call: repeated points are evaluated at once

@@ -180,11 +180,10 @@ class Running:
         self._noted(points, values.to(search.told) if lost else search.told)
 
     def look_again(self, *, at_target: bool = False) -> bool:
-        """Evaluate x again, once, and return whether noise was found; twice where losses are counts.
+        """Evaluate x again if the search has arrived or is about to end; return whether noise was found.
 
-        That is done where the search has arrived or is about to end, or where the value has reached the target. There
-        may be no noise at x0, and counts of a noisy simulator may be equal there by chance. The search then begins
-        again at x as one in noise.
+        There may be no noise at x0, and counts of a noisy simulator may be equal there by chance. A value that has
+        reached the target may be a lucky draw. Where noise is found, the search begins again at x as one in noise.
         """
         if self._sure or self.noise or not (self.left and self.begun) or self.record.requested is not None:
             return False

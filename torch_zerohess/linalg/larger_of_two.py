@@ -18,8 +18,8 @@ _BETWEEN = 11
 """Points between s(w) on both sides of a jump."""
 
 
-def least_of_larger(matrices: Tensor, minimum: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, float]:
-    """Return the minimum s [n] of the larger of two quadratics, and the share w of the second one.
+def least_of_larger(matrices: Tensor, minimum: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Return the minimum s [n] of the larger of two quadratics.
 
     Args:
         matrices: M [2, n + 1, n + 1], symmetric. The quadratics are (1, s) M (1, s) / 2. The second one should be the
@@ -36,13 +36,13 @@ def least_of_larger(matrices: Tensor, minimum: Callable[[Tensor, Tensor], Tensor
     low, high = at(0.0), at(1.0)
     for share, s, difference, _ in (low, high):
         if (difference <= 0.0) if share == 0.0 else (difference >= 0.0):
-            return s, share
+            return s
     below, above, moved = low[2], high[2], 0.0
     for _ in range(_STEPS):
         new = at(low[0] + (high[0] - low[0]) * below / (below - above))
         share, s, difference, size = new
         if abs(difference) <= _EQUAL * size:
-            return s, share
+            return s
         if not low[0] < share < high[0]:
             break
         if difference > 0.0:
@@ -54,10 +54,16 @@ def least_of_larger(matrices: Tensor, minimum: Callable[[Tensor, Tensor], Tensor
         moved = difference
     ways = torch.linspace(0.0, 1.0, _BETWEEN, dtype=matrices.dtype, device=matrices.device)[:, None]
     ends = (1.0 - ways) * low[1] + ways * high[1]
-    return ends[int(two_values(matrices, ends).amax(0).argmin())], high[0]
+    return ends[int(two_values(matrices, ends).amax(0).argmin())]
 
 
 def two_values(matrices: Tensor, s: Tensor) -> Tensor:
     """Return the values [2, K] of two quadratics, see `least_of_larger`, at s [K, n]."""
     one = torch.cat([torch.ones_like(s[:, :1]), s], 1)
     return 0.5 * ((one @ matrices) * one).sum(2)
+
+
+def share_of_shortest(first: Tensor, second: Tensor) -> float:
+    """Return the share w from 0 to 1 at which (1 - w) g_1 + w g_2 is shortest; g_1 and g_2 are gradients [n]."""
+    jump = second - first
+    return min(max(-float(first @ jump) / float(jump @ jump), 0.0), 1.0) if bool(jump.any()) else 0.0

@@ -14,14 +14,12 @@ from torch_zerohess.search.state import Best
 
 @dataclass(frozen=True, eq=False)
 class TwoSides:
-    """Two quadratics beside a kink, and the minimum of the larger one."""
+    """Two quadratics beside a kink."""
 
     matrices: Tensor
     """[2, n + 1, n + 1]; the quadratics of a step s from the best point are (1, s) M (1, s) / 2, above its loss."""
-    step: Tensor
-    """Step [n] to the minimum within the region."""
     share: float
-    """At this minimum the gradients balance with the shares 1 - w of the first one and w of the second one."""
+    """At s = 0 the gradients nearly balance with the shares 1 - w of the first one and w of the second one."""
 
     @property
     def mixed(self) -> Tensor:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.larger_of_two import least_of_larger
+from torch_zerohess.linalg.larger_of_two import least_of_larger, share_of_shortest
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.metric_descent import CURVED, RATE, MetricQuadratics
 from torch_zerohess.search.metric_progress import MetricProgress, TwoSides
@@ -78,17 +78,11 @@ class TwoSidedQuadratics(MetricQuadratics):
         found = fit_two_sides(u[order], known.values[order] - known.lowest.loss)
         if found is None:
             return None
+        in_u = TwoSides(found, share_of_shortest(found[0, 1:, 0], found[1, 1:, 0]))
+        if float(in_u.jump.norm()) < _SHARP * float(in_u.mixed[1:, 1:].norm()):
+            return None
         to_u = torch.block_diag(torch.ones_like(known.root[:1, :1]), torch.linalg.inv(known.sigma * known.root))
-        matrices = to_u.mT @ found @ to_u
-        sides = TwoSides(matrices, *self._least(known, matrices))
-        in_u = replace(sides, matrices=found)
-        return sides if float(in_u.jump.norm()) >= _SHARP * float(in_u.mixed[1:, 1:].norm()) else None
-
-    def _least(self, known: MetricProgress, matrices: Tensor, factor: float = 1.0) -> tuple[Tensor, float]:
-        """Return the minimum [n] of the larger of two quadratics within the region, and the share of the second."""
-        x, settings = known.lowest.point, self.settings
-        region = factor * known.sigma * known.root, settings.lower - x, settings.upper - x, self._singular, known.border
-        return least_of_larger(matrices, lambda gradient, hessian: region_step(gradient, hessian, *region))
+        return replace(in_u, matrices=to_u.mT @ found @ to_u)
 
     def _learned(self, known: MetricProgress, count: int) -> Tensor:
         if (sides := _in_use(known)) is None:
@@ -99,7 +93,9 @@ class TwoSidedQuadratics(MetricQuadratics):
     def _minimum(self, known: MetricProgress, factor: float = 1.0) -> Tensor:
         if (sides := _in_use(known)) is None:
             return super()._minimum(known, factor)
-        return sides.step if factor == 1.0 else self._least(known, sides.matrices, factor)[0]
+        x, settings = known.lowest.point, self.settings
+        region = factor * known.sigma * known.root, settings.lower - x, settings.upper - x, self._singular, known.border
+        return least_of_larger(sides.matrices, lambda gradient, hessian: region_step(gradient, hessian, *region))
 
     def _change(self, known: MetricProgress, s: Tensor) -> float:
         return super()._change(known, s) if (sides := _in_use(known)) is None else sides.change(s)

@@ -6,7 +6,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from torch_zerohess.linalg.larger_of_two import least_of_larger, two_values
+from torch_zerohess.linalg.larger_of_two import least_of_larger, share_of_shortest, two_values
 from torch_zerohess.linalg.subproblem import ball_step
 
 
@@ -21,8 +21,12 @@ def random(seed: int, n: int, *, convex: bool) -> Tensor:
     return m
 
 
-def in_ball(matrices: Tensor) -> tuple[Tensor, float]:
+def in_ball(matrices: Tensor) -> Tensor:
     return least_of_larger(matrices, lambda gradient, hessian: ball_step(gradient, hessian, 1.0))
+
+
+def is_minimum_of_one(matrices: Tensor, s: Tensor) -> bool:
+    return any(torch.equal(s, ball_step(one[1:, 0], one[1:, 1:], 1.0)) for one in matrices)
 
 
 def larger(matrices: Tensor, s: Tensor) -> float:
@@ -45,14 +49,14 @@ def by_scipy(matrices: Tensor) -> float:
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_the_minimum_of_convex_quadratics(n: int) -> None:
-    shares = []
+    alone = []
     for seed in range(20):
         matrices = random(seed, n, convex=True)
-        s, share = in_ball(matrices)
+        s = in_ball(matrices)
         assert float(s.norm()) <= 1 + 1e-9
         assert larger(matrices, s) == pytest.approx(by_scipy(matrices), abs=1e-7)
-        shares.append(share)
-    assert any(0.0 < share < 1.0 for share in shares)
+        alone.append(is_minimum_of_one(matrices, s))
+    assert not all(alone)
 
 
 @pytest.mark.parametrize(("steep", "swapped"), [(1.0, False), (1e4, False), (100.0, True)])
@@ -63,9 +67,9 @@ def test_where_they_are_equal_they_are_exactly_so(steep: float, swapped: bool) -
         matrices = random(seed, 5, convex=True)
         matrices[1] *= steep
         matrices = matrices.flip(0) if swapped else matrices
-        s, share = in_ball(matrices)
+        s = in_ball(matrices)
         first, second = two_values(matrices, s[None])[:, 0].tolist()
-        if 0.0 < share < 1.0:
+        if not is_minimum_of_one(matrices, s):
             found += 1
             assert first == pytest.approx(second, rel=1e-7)
     assert found >= 5
@@ -75,10 +79,9 @@ def test_the_larger_one_is_minimised_alone_where_it_is_larger_at_its_minimum() -
     matrices = random(0, 3, convex=True)
     matrices[1] = matrices[0]
     matrices[1, 0, 0] += 1.0
-    s, share = in_ball(matrices)
-    assert share == 1.0
-    assert torch.equal(s, ball_step(matrices[1, 1:, 0], matrices[1, 1:, 1:], 1.0))
-    assert in_ball(matrices.flip(0))[1] == 0.0
+    expected = ball_step(matrices[1, 1:, 0], matrices[1, 1:, 1:], 1.0)
+    assert torch.equal(in_ball(matrices), expected)
+    assert torch.equal(in_ball(matrices.flip(0)), expected)
 
 
 def test_a_steep_side() -> None:
@@ -87,9 +90,8 @@ def test_a_steep_side() -> None:
     matrices = torch.zeros(2, 3, 3).double()
     matrices[:, 0], matrices[:, 1:, 0] = slopes, slopes[:, 1:]
     matrices[:, 1:, 1:] = torch.eye(2).double()
-    s, share = in_ball(matrices)
-    assert s.tolist() == pytest.approx([-0.15, 0.0], abs=1e-5)
-    assert share == pytest.approx(0.85e-6, rel=1e-3)
+    assert in_ball(matrices).tolist() == pytest.approx([-0.15, 0.0], abs=1e-5)
+    assert share_of_shortest(*slopes[:, 1:]) == pytest.approx(1e-6, rel=1e-3)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -97,10 +99,22 @@ def test_concave_quadratics(n: int) -> None:
     """The end is no worse than the minimum of either, and than what lies between the sides of a jump."""
     for seed in range(40):
         matrices = random(seed, n, convex=False)
-        found = larger(matrices, in_ball(matrices)[0])
+        found = larger(matrices, in_ball(matrices))
         assert found <= larger(matrices, torch.zeros(n).double()) + 1e-9
         ends = [ball_step(one[1:, 0], one[1:, 1:], 1.0) for one in matrices]
         assert found <= min(larger(matrices, end) for end in ends) + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("second", "share"),
+    [([-1.0, 0.0], 0.5), ([-3.0, 0.0], 0.25), ([0.0, 1.0], 0.5), ([2.0, 0.0], 0.0), ([0.5, 0.0], 1.0)],
+)
+def test_the_share_of_the_shortest_gradient(second: list[float], share: float) -> None:
+    assert share_of_shortest(torch.tensor([1.0, 0.0]), torch.tensor(second)) == pytest.approx(share)
+
+
+def test_equal_gradients_have_no_share() -> None:
+    assert share_of_shortest(torch.ones(2), torch.ones(2)) == 0.0
 
 
 def test_values() -> None:
@@ -114,5 +128,4 @@ def test_concave_quadratics_have_a_minimum_between_the_sides_of_a_jump() -> None
     """At s = -1 and 1 one of them is 1, at 0 both are 0.5: s(w) jumps from one end to the other."""
     matrices = torch.tensor([[[1.0, 0.5], [0.5, 0.0]], [[1.0, -0.5], [-0.5, 0.0]]]).double()
     matrices[:, 1, 1] = -1e-3
-    s, _ = in_ball(matrices)
-    assert larger(matrices, s) == pytest.approx(0.5, abs=1e-3)
+    assert larger(matrices, in_ball(matrices)) == pytest.approx(0.5, abs=1e-3)

@@ -92,6 +92,14 @@ def test_every_tensor_is_made_on_a_device_that_is_named(tree: str, path: Path) -
     assert unnamed == DEFAULT_DEVICE.get(name(tree, path), [])
 
 
+@pytest.mark.parametrize(("tree", "path"), [one for one in CASES if one.values[0] == "torch_zerohess"])
+def test_random_numbers_are_of_a_type_that_is_named(tree: str, path: Path) -> None:
+    """A generator draws other numbers in another type, and the default type of torch may be another one."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("torch.rand", "torch.randn"):
+            assert "dtype" in {one.arg for one in node.keywords}, ast.unparse(node)
+
+
 @pytest.mark.parametrize("tree", LAYERS)
 def test_every_module_has_a_layer(tree: str) -> None:
     layers = {name(tree, path).split(".")[0] for path in MODULES[tree]} - {""}

@@ -1,5 +1,6 @@
 """What surroundings may do to a layer, and what a layer may not do to them."""
 
+import contextlib
 import subprocess
 import sys
 
@@ -168,18 +169,41 @@ def test_settings_that_cannot_work_say_so():
         zh.estimate(f, torch.zeros(1024), S.replace(proposal="uniform"))
 
 
+@contextlib.contextmanager
+def default_dtype(dtype):
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize("engine", ["descent", "gaussian_process", "local"])
+def test_a_search_does_not_depend_on_the_default_dtype(engine):
+    def rosenbrock(z):
+        return torch.stack([10.0 * (z[:, 1] - z[:, 0] ** 2), 1.0 - z[:, 0]], 1)
+
+    def points(dtype):
+        """Also of further rounds, whose starts are random."""
+        settings = {"sigma": 0.5, "bounds": (-3, 3), "seed": 1, "max_evaluations": 60, "engine": engine}
+        if engine == "local":
+            settings["loss"] = lambda y: y.square().sum()
+        with default_dtype(dtype):
+            fn = rosenbrock if engine == "local" else lambda z: rosenbrock(z).square().sum(1)
+            return zh.minimize(fn, torch.tensor([-1.2, 1.0], dtype=torch.float64), **settings).points
+
+    assert torch.equal(points(torch.float32), points(torch.float64))
+
+
 @pytest.mark.parametrize("default", [torch.float32, torch.float64])
 def test_numbers_of_python_follow_x_and_not_the_default_dtype(default):
     """The sparse fit mixes them with tensors of x's dtype."""
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(default)
-    try:
+    with default_dtype(default):
         for dtype in (torch.float32, torch.float64):
             scale = torch.arange(1, 31, dtype=dtype).sqrt()
             found = zh.sparse_jacobian(lambda z, s=scale: z * s, torch.zeros(30, dtype=dtype), S.replace(samples=40))
             torch.testing.assert_close(found.dense().to(dtype), scale.diag(), rtol=1e-2, atol=1e-2)
-    finally:
-        torch.set_default_dtype(before)
 
 
 def test_adapters_are_there_without_an_import_of_their_own():

@@ -36,7 +36,9 @@ def output_blocks(operator: CurvatureOperator) -> list[Tensor]:
 def _check(operator: CurvatureOperator, blocks: list[Tensor]) -> None:
     """Compare with a product of A with a vector of random numbers, another for every element."""
     generator = torch.Generator().manual_seed(0)
-    vectors = [torch.rand(y.shape, generator=generator, device="cpu").to(y) for y in operator.through]
+    vectors = [
+        torch.rand(y.shape, generator=generator, dtype=torch.float32, device="cpu").to(y) for y in operator.through
+    ]
     products = operator.output_curvature(vectors)
     error = size = 0.0
     for product, block, vector in zip(products, blocks, vectors, strict=True):

@@ -94,7 +94,9 @@ class _Segments:
         values = Prediction(self.control, self.control.memory.surrogate, self.aux)(z).double()
         values = values.reshape(*z.shape[:2], -1)
         if values.shape[2] > 1:  # one number that kinks where any of them does
-            weights = torch.randn(values.shape[2], generator=torch.Generator().manual_seed(0), device="cpu")
+            weights = torch.randn(
+                values.shape[2], generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu"
+            )
             values = values * weights.to(values)
         losses = values.sum(2)
         slopes, bends = self._slope(losses, z, graph=derivatives > 1), None

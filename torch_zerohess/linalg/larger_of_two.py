@@ -66,4 +66,8 @@ def two_values(matrices: Tensor, s: Tensor) -> Tensor:
 def share_of_shortest(first: Tensor, second: Tensor) -> float:
     """Return the share w from 0 to 1 at which (1 - w) g_1 + w g_2 is shortest; g_1 and g_2 are gradients [n]."""
     jump = second - first
-    return min(max(-float(first @ jump) / float(jump @ jump), 0.0), 1.0) if bool(jump.any()) else 0.0
+    size = float(jump.abs().max())
+    if size == 0.0:
+        return 0.0
+    unit = jump / size  # its square is no 0
+    return min(max(-float(first @ unit) / float(unit @ unit) / size, 0.0), 1.0)

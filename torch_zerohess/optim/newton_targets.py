@@ -135,7 +135,9 @@ class NewtonTargets:
         n = gradient.shape[1]
         units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
         columns = torch.stack([product(unit.expand_as(gradient)) for unit in units], 2)
-        v = torch.rand(gradient.shape, generator=torch.Generator().manual_seed(0), device="cpu").to(gradient)
+        v = torch.rand(
+            gradient.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu"
+        ).to(gradient)
         _check_elements(lambda c: product(c[:, None] * v), torch.einsum("bij,bj->bi", columns, v))
         h = _magnitudes(columns.double())
         shift = self._shift(h.diagonal(dim1=1, dim2=2).abs().mean(1))
@@ -148,7 +150,7 @@ class NewtonTargets:
 
     def _iterate(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
         n = gradient.shape[1]
-        coins = torch.rand(n, generator=torch.Generator().manual_seed(0), device="cpu")
+        coins = torch.rand(n, generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu")
         signs = torch.where(coins < 0.5, -1.0, 1.0).to(gradient)
         image = product(signs.expand_as(gradient))
         size = (image @ signs)[:, None].abs() / n

@@ -77,7 +77,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         """Ask for samples along the next directions, as many as are wanted and left of the basis."""
         n, unused = self.settings.n, known.unused
         if not len(unused):
-            basis = orthonormal(torch.randn(n, n, generator=generator, device="cpu"))
+            basis = orthonormal(torch.randn(n, n, generator=generator, dtype=torch.float32, device="cpu"))
             unused = basis.to(known.center.device)
         steps = known.sigma * math.sqrt(n) * unused[: known.wanted].double()
         lower, upper = self.settings.lower, self.settings.upper

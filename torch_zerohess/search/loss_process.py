@@ -20,7 +20,7 @@ from torch_zerohess.search.gaussian_process_method import APART, ROUND
 from torch_zerohess.search.kinked_descent import KinkedQuadratics
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_progress import MetricProgress
-from torch_zerohess.search.random_points import uniform
+from torch_zerohess.search.random_points import fractions, uniform
 from torch_zerohess.search.state import Evaluated
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients
 
@@ -159,7 +159,7 @@ class LossProcess(FinishedProcess[LossProgress]):
     def _hop(self, known: LossProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let quadratics begin beside the best point."""
         shortest, longest = _HOPS
-        hop = shortest * (longest / shortest) ** float(torch.rand((), generator=generator, device="cpu"))
+        hop = shortest * (longest / shortest) ** float(fractions(generator))
         (center,) = self.settings.drawn(known.best.point, hop, 1, generator)
         return self.local.begin(center, _HOP_WIDTH * hop, generator)
 

@@ -1,4 +1,4 @@
-"""Random points of a search, in double precision, from a generator on the CPU whatever the device of the search."""
+"""Random points of a search, from a generator on the CPU whatever the device of the search."""
 
 import torch
 from torch import Tensor
@@ -10,6 +10,11 @@ _AWAY = 2.0
 def normal(generator: torch.Generator, like: Tensor, *shape: int) -> Tensor:
     """Standard normal numbers on the device of `like`."""
     return torch.randn(*shape, generator=generator, dtype=torch.float64, device="cpu").to(like.device)
+
+
+def fractions(generator: torch.Generator, *shape: int) -> Tensor:
+    """Uniform random numbers from 0 to 1, on the CPU."""
+    return torch.rand(shape, generator=generator, dtype=torch.float32, device="cpu")
 
 
 def uniform(generator: torch.Generator, lower: Tensor, upper: Tensor, count: int) -> Tensor:

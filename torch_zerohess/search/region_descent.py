@@ -16,7 +16,7 @@ from torch_zerohess.linalg.metric import region_step
 from torch_zerohess.linalg.subproblem import SINGULAR
 from torch_zerohess.search.border import border_between
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.random_points import normal
+from torch_zerohess.search.random_points import fractions, normal
 from torch_zerohess.search.region_progress import R, RegionProgress
 from torch_zerohess.search.state import Best, Evaluated, not_finite
 from torch_zerohess.surrogates.determined import with_true_errors
@@ -223,7 +223,7 @@ class RegionDescent(Method[R]):
     def _started(self, known: R, generator: torch.Generator) -> tuple[R, Tensor]:
         """Ask for the start and a point along every axis, on the side where there is room."""
         center, upper = known.center, self.settings.upper
-        side = torch.where(torch.rand(self._n, generator=generator, device="cpu").to(center.device) < 0.5, -1.0, 1.0)
+        side = torch.where(fractions(generator, self._n).to(center.device) < 0.5, -1.0, 1.0)
         side = torch.where(center + known.sigma > upper, -1.0, side)
         side = torch.where(center - known.sigma < self.settings.lower, 1.0, side).to(center)
         return known, torch.cat([center[None], self.settings.inside(center + known.sigma * torch.diag(side))])
@@ -262,7 +262,7 @@ class RegionDescent(Method[R]):
     def _geometry(self, known: R, direction: Tensor, generator: torch.Generator) -> tuple[R, Tensor]:
         """Ask for a point of the region in a direction u [n] or its opposite."""
         step = known.sigma * (known.root @ direction)
-        step = -step if float(torch.rand((), generator=generator, device="cpu")) < 0.5 else step
+        step = -step if float(fractions(generator)) < 0.5 else step
         if known.border is not None and float(known.border[:-1] @ step) > float(known.border[-1]):
             step = -step
         x = self.settings.inside((known.lowest.point + step)[None])

@@ -59,8 +59,8 @@ def _guesses(u: Tensor, values: Tensor) -> Tensor:
     """Return which points are on the first side [S, P], by guesses."""
     P, n = u.shape
     rank = values.argsort().argsort()
-    high = rank >= torch.linspace(n + 1, P - n - 1, _GUESSES, device=u.device)[:, None]
-    along = u[torch.linspace(1, P - 1, _GUESSES, device=u.device).long()] @ u.mT
+    high = rank >= torch.linspace(n + 1, P - n - 1, _GUESSES, dtype=u.dtype, device=u.device)[:, None]
+    along = u[torch.linspace(1, P - 1, _GUESSES, dtype=u.dtype, device=u.device).long()] @ u.mT
     return torch.cat([high, along > along.median(1, keepdim=True)[0]])
 
 

@@ -113,6 +113,12 @@ def test_the_share_of_the_shortest_gradient(second: list[float], share: float) -
     assert share_of_shortest(torch.tensor([1.0, 0.0]), torch.tensor(second)) == pytest.approx(share)
 
 
+@pytest.mark.parametrize("size", [1e-300, 1.0, 1e300])
+def test_the_size_of_gradients_does_not_matter(size: float) -> None:
+    assert share_of_shortest(size * torch.tensor([1.0, 0.0]).double(), torch.zeros(2).double()) == 1.0
+    assert share_of_shortest(size * torch.ones(2).double(), -size * torch.ones(2).double()) == pytest.approx(0.5)
+
+
 def test_equal_gradients_have_no_share() -> None:
     assert share_of_shortest(torch.ones(2), torch.ones(2)) == 0.0
 

@@ -182,7 +182,11 @@ class BlackBox(nn.Module):
             around = None if zero else estimated(center).detach()
             return lambda x: self.call.outer.value(estimated(x), constants, self.call.value, around)
         self.memory.check_parameters(center.shape[1])
-        with transforms.outside(), transforms.random_numbers_allowed():
+        if transforms.recorded([center, *aux]):
+            raise RuntimeError(
+                "a BlackBox with a memory cannot be traced by make_fx: its surrogate would not be renewed"
+            )
+        with transforms.outside(), transforms.random_numbers_allowed(), transforms.unrecorded():
             self.control = Control.of(self.memory, self.call.outer, learning=self.training)
             seed = self.smoothing.drawn_seed(self.control.taken)
         try:
@@ -217,7 +221,8 @@ class BlackBox(nn.Module):
         x = opaque.noise_checked(self._handle, x, aux)
         keep = torch.compiler.is_compiling() or stored(self.smoothing, B * transforms.mapped_size([x, *aux]), n)
         K = self.smoothing.evaluations(n, center=False)
-        tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, torch.is_grad_enabled(), x, aux)
+        with contextlib.nullcontext() if transforms.recorded([x, *aux]) else transforms.unrecorded():
+            tensors = torch.ops.torch_zerohess.evaluate(self._handle, K, keep, torch.is_grad_enabled(), x, aux)
         return Expansion.rebuild(tensors, x, self.smoothing if keep else self.smoothing.resolved(n), keep)
 
     def _center(self, x: Tensor, aux: list[Tensor]) -> Tensor:

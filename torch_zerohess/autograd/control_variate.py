@@ -62,7 +62,7 @@ def around(
     """
     B, memory, outer = len(center), control.memory, control.outer
     fresh = B if memory.fresh is None else min(memory.fresh, B)
-    with transforms.outside(), transforms.random_numbers_allowed():
+    with transforms.outside(), transforms.random_numbers_allowed(), transforms.unrecorded():
         generator = torch.Generator().manual_seed(seed)
         part = torch.randperm(B, generator=generator, device="cpu")[:fresh].sort().values.to(center.device)
 

@@ -88,12 +88,13 @@ def empty(owner: Owner, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
 
 def nodes(handle: int, seed: int, count: int, x: Tensor, aux: list[Tensor]) -> Tensor:
     """Return `surrogate_mean.nodes` for x [B, n]; each point that vmap maps over gets its own."""
-    if not transforms.transform_active():
-        with transforms.random_numbers_allowed():
-            return nodes_of(seed, count, x.shape[1], len(x)).to(x.device)
-    x = noise_checked(handle, x, aux)
-    result: Tensor = torch.ops.torch_zerohess.nodes(handle, seed, count, x, aux)
-    return result
+    with transforms.unrecorded():
+        if not transforms.transform_active():
+            with transforms.random_numbers_allowed():
+                return nodes_of(seed, count, x.shape[1], len(x)).to(x.device)
+        x = noise_checked(handle, x, aux)
+        result: Tensor = torch.ops.torch_zerohess.nodes(handle, seed, count, x, aux)
+        return result
 
 
 _owners: "weakref.WeakValueDictionary[int, Owner]" = weakref.WeakValueDictionary()

@@ -16,6 +16,8 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | how often is forward mode nested | `torch._C._functorch.get_interpreter_stack`, `TransformType` | `torch.func` does \
 not tell |
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
+| does `make_fx` record operations, and on which inputs a tensor depends | `torch._C._get_dispatch_mode`,
+`torch.fx.experimental.proxy_tensor` | `torch.func.linearize` records operations on constants, too |
 | may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
 | let torch see what a custom operator does | `torch._C._ForceDispatchKeyGuard`, `_dispatch_tls_local_include_set`,
@@ -78,6 +80,45 @@ def watched(x: Tensor) -> bool:
         or torch._C._len_torch_dispatch_stack() > 0
         or type(x) not in (Tensor, torch.nn.Parameter)
     )
+
+
+def recorded(tensors: Sequence[Tensor]) -> bool:
+    """Whether a compiler or `make_fx` records operations, and a tensor depends on an input of what it records.
+
+    `torch.func.linearize` records operations at a fixed x. There only the tangents are inputs.
+    """
+    if torch.compiler.is_compiling():
+        return True
+    mode = torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY)
+    if mode is None:
+        return False
+    from torch.fx.experimental.proxy_tensor import get_proxy_slot  # loaded by who records
+
+    seen: set[object] = set()
+    left = []
+    for one in tensors:
+        while torch._C._functorch.is_functorch_wrapped_tensor(one):
+            one = torch._C._functorch.get_unwrapped(one)
+        slot = get_proxy_slot(one, mode.tracer, None)
+        if slot is not None:
+            left.append(slot.proxy.node)
+    while left:
+        node = left.pop()
+        if node.op == "placeholder":
+            return True
+        new = [one for one in node.all_input_nodes if one not in seen]
+        seen.update(new)
+        left += new
+    return False
+
+
+def unrecorded() -> AbstractContextManager[object]:
+    """Compute numbers that are constants of what `make_fx` records."""
+    if torch.compiler.is_compiling() or torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY) is None:
+        return contextlib.nullcontext()
+    from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing  # loaded by who records
+
+    return disable_proxy_modes_tracing()
 
 
 def derivative_wanted(x: Tensor) -> bool:

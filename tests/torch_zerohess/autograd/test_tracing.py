@@ -8,8 +8,9 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils.checkpoint import checkpoint
 
-from torch_zerohess import BlackBox, Smoothing, estimate
+from torch_zerohess import BlackBox, Memory, Smoothing, estimate
 from torch_zerohess.estimation import perturbations
+from torch_zerohess.heads import SquaredError
 from torch_zerohess.sampling import extension, proposals
 from truths import spread, truths
 
@@ -226,3 +227,54 @@ def test_older_compilers_get_the_layer_between_two_graphs(monkeypatch) -> None:
     assert len(graphs) > 1
     with pytest.raises(Exception, match=r"the layer needs torch 2\.15"):
         torch.compile(layer, backend="eager", fullgraph=True)(X)
+
+
+@pytest.mark.parametrize("redrawn", [False, True])
+@pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")
+@pytest.mark.parametrize("seed", [12, None])
+def test_a_linearized_layer_is_one_linear_function(
+    seed: int | None, redrawn: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It belongs to the evaluations that were made for it, whatever becomes of the layer."""
+    calls: list[int] = []
+    if redrawn:
+        monkeypatch.setattr(perturbations, "STORED", 0)
+    layer = BlackBox(lambda z: calls.append(len(z)) or F(z), S.replace(seed=seed))
+    direction = spread(N, 0.3, -0.8)
+    for f in (layer, torch.func.grad(layer), lambda x: torch.func.vmap(layer)(torch.stack([x, 2.0 * x])).cos()):
+        _, linear = torch.func.linearize(f, X)
+        product = linear(direction)
+        if seed is not None:
+            torch.testing.assert_close(product, torch.func.jvp(f, (X,), (direction,))[1])
+        before = len(calls)
+        layer.smoothing = layer.smoothing.replace(sigma=2.0)
+        torch.testing.assert_close(linear(2.0 * direction), 2.0 * product)
+        layer.smoothing = layer.smoothing.replace(sigma=S.sigma)
+        assert len(calls) == before
+
+
+@pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")
+@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize("fresh", [None, 2])
+def test_a_linearized_layer_with_a_memory_is_one_linear_function(fresh: int | None, training: bool) -> None:
+    layer = BlackBox(lambda z: z.sin(), S.replace(samples=50), head=SquaredError(), memory=Memory(fresh=fresh))
+    references, direction = torch.ones_like(BATCH), BATCH.flip(0)
+    for _ in range(3):
+        layer(BATCH.clone().requires_grad_(), references)
+    layer.train(training)
+    _, linear = torch.func.linearize(lambda x: layer(x, references), BATCH)
+    product = linear(direction)
+    torch.testing.assert_close(linear(2.0 * direction), 2.0 * product)
+    if fresh is None:
+        slope = 2.0 / N * ((BATCH.sin() - 1.0) * BATCH.cos() * direction).sum(1)
+        torch.testing.assert_close(product, slope, rtol=0.3, atol=0.1)
+    layer.eval()
+    fixed = lambda x: layer(x, references)  # noqa: E731
+    expected = torch.func.jvp(fixed, (BATCH,), (direction,))[1]
+    torch.testing.assert_close(torch.func.linearize(fixed, BATCH)[1](direction), expected)
+
+
+def test_a_layer_with_a_memory_is_not_traced() -> None:
+    layer = BlackBox(F, S, memory=Memory())
+    with pytest.raises(RuntimeError, match="cannot be traced by make_fx"):
+        make_fx(torch.func.grad(layer))(X)

@@ -68,6 +68,13 @@ def edges_before(node: Node | None) -> set[tuple[Node, int]]:
     return seen
 
 
+def uses_of(leaf: Tensor, outputs: Tensor) -> int:
+    """Return how many edges of the graph of outputs lead to a leaf."""
+    end = edge_of(leaf)
+    nodes = {outputs.grad_fn, *(node for node, _ in edges_before(outputs.grad_fn))}
+    return sum(edge == end for node in nodes if node is not None for edge in node.next_functions)
+
+
 def check_twice(outputs: Sequence[Tensor], ends: Sequence[Tensor]) -> None:
     """Raise RuntimeError if a backward of `torch.compile` is on the way from outputs to one of the ends.
 

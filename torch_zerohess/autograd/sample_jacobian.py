@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.overrides import TorchFunctionMode
 
+from torch_zerohess.autograd.graph import uses_of
 from torch_zerohess.evaluation_mode import BATCH_NORMS, mixes_in_evaluation
 from torch_zerohess.linalg.flat import flattened
 from torch_zerohess.linalg.jacobians import Blocks, Jacobian, OuterProducts, Rows
@@ -160,10 +161,15 @@ class SampleJacobian:
         return given
 
     def _outer(self, chosen: Mapping[Places, Tensor]) -> set[Places]:
-        """Return the weights [p, q] whose only use, for one sample, is one product with a vector."""
-        with torch.enable_grad(), _Uses(chosen.values()) as uses:
-            self._called(chosen, self.inputs[:1])
-        return {at for at, one in chosen.items() if uses.count[id(one)] == 1 and id(one) in uses.products}
+        """Return the weights [p, q] whose only use, for one sample, is one product with a vector.
+
+        TorchScript hides its uses of a weight from `_Uses`, but not from the graph.
+        """
+        leaves = {at: one.clone().requires_grad_() for at, one in chosen.items()}
+        with torch.enable_grad(), _Uses(leaves.values()) as uses:
+            outputs = self._called(leaves, self.inputs[:1])
+        once = {at: one for at, one in leaves.items() if uses.count[id(one)] == 1 and id(one) in uses.products}
+        return {at for at, one in once.items() if uses_of(one, _tensor(outputs)) <= 1}
 
 
 def _generators(inputs: Tensor) -> list[Tensor]:

@@ -122,6 +122,11 @@ NETWORKS = {
 }
 
 
+@torch.jit.script
+def scripted(x: Tensor, weight: Tensor) -> Tensor:
+    return x.tanh() @ weight
+
+
 def parametrized() -> nn.Module:
     net = nn.Sequential(linear(), nn.Tanh(), linear(2, 3))
     register_parametrization(net[0], "weight", nn.Tanh())
@@ -165,6 +170,12 @@ def test_rows_and_products_are_those_of_backward_passes(make) -> None:
     torch.testing.assert_close(products.gram(), expected @ expected.mT)
     torch.testing.assert_close(products.rmatvec(w), expected.mT @ w)
     torch.testing.assert_close(products.matvec(v), expected @ v)
+
+
+def test_uses_of_a_weight_in_torchscript_are_counted() -> None:
+    net = Net(lambda net, x: scripted(net.a(x), net.a.weight), a=linear(4)).double()
+    parameters = list(net.parameters())
+    torch.testing.assert_close(SampleJacobian(net, SAMPLES)(parameters), backward(net, parameters))
 
 
 def test_it_is_of_the_parameters_that_are_given_in_their_order() -> None:

@@ -93,6 +93,10 @@ NETWORKS = {
         Net(lambda net, x: net.a(x).tanh() + net.a.weight.square().sum(), a=linear()),
         set(),
     ),
+    "a product that nothing needs": lambda: (
+        Net(lambda net, x: (net.a(x), x * net.a.weight.square().sum() + net.a.bias.sum())[1], a=linear()),
+        set(),
+    ),
     "a weight in a list": lambda: (
         Net(
             lambda net, x: net.a(x).tanh() + torch.stack([net.a.weight, net.b.weight]).sum() + net.b(x),

@@ -2,9 +2,11 @@
 
 import contextlib
 import io
+import math
 import os
 import subprocess
 import threading
+import time
 from collections import deque
 from collections.abc import Sequence
 from typing import IO, Any
@@ -13,6 +15,9 @@ from torch_zerohess.evaluators.lifetime import end_group, end_tree, ends_by_its_
 
 GRACE = 1.0
 """Seconds that a program has to end, and that pipes have to close after it."""
+
+_WAIT = 1.0
+"""Seconds after which Ctrl-C is looked for, at most."""
 
 _KEPT = 50
 """Lines of the standard error that are shown in an error."""
@@ -53,11 +58,10 @@ class Server:
                 self.process.stdin.flush()
                 answer.append(_read_npy(self.process.stdout) if npy else self.process.stdout.readline())
 
-        thread = threading.Thread(target=exchange, daemon=True)
-        self._exchange = thread
-        thread.start()
+        self._exchange = thread = threading.Thread(target=exchange, daemon=True)
         try:
-            thread.join(limit)
+            thread.start()
+            _join(thread, limit)
         except BaseException:  # Ctrl-C, which a group of its own does not get
             end_program(self.process)
             raise
@@ -86,13 +90,14 @@ class Server:
             self.process.wait(GRACE)
         end_program(self.process)
         self.process.wait()
+        self._close(self.process.stdin, self._exchange)  # if a request was on its way before
         self._close(self.process.stdout, self._exchange)
         self._close(self.process.stderr, self._listener)
 
     def _close(self, pipe: IO[bytes] | None, user: threading.Thread | None) -> None:
         """Close a pipe, unless a thread still uses it: that would wait for a program that left the group."""
         assert pipe is not None
-        if user is not None:
+        if user is not None and user.ident is not None:  # Ctrl-C may have come before it began
             user.join(GRACE)
         if user is None or not user.is_alive():
             with contextlib.suppress(OSError):
@@ -102,6 +107,13 @@ class Server:
         assert self.process.stderr is not None
         with contextlib.suppress(OSError, ValueError):
             self.errors.extend(self.process.stderr)
+
+
+def _join(thread: threading.Thread, limit: float | None) -> None:
+    """Wait for a thread. A Ctrl-C that comes just before a wait is noticed after it, so that each wait is short."""
+    end = math.inf if limit is None else time.monotonic() + limit
+    while thread.is_alive() and (left := end - time.monotonic()) > 0.0:
+        thread.join(min(left, _WAIT))
 
 
 def end_program(process: "subprocess.Popen[bytes]") -> None:

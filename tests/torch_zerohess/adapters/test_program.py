@@ -11,11 +11,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 import torch_zerohess as zh
+from torch_zerohess.adapters import server as servers
 from torch_zerohess.adapters.process import Program
 from torch_zerohess.evaluators import Executor, ProcessPool
 from torch_zerohess.evaluators.finished import finished_values
@@ -209,6 +211,35 @@ def test_ctrl_c_ends_the_program_and_what_it_started(tmp_path, server):
     ):
         program(Z)
     assert has_ended(noted(note))
+
+
+def test_a_server_that_is_closed_at_work_leaves_no_pipe_open(tmp_path):
+    """Ctrl-C may come at any time, also before the wait for an answer begins."""
+    note = tmp_path / "note"
+    program = Program(STARTS, server=True, environment={"NOTE": str(note)}, on_failure="nan")
+    caller = threading.Thread(target=program, args=(Z,))
+    caller.start()
+    child = noted(note)
+    process = program._server.process
+    program.close()
+    caller.join()
+    assert process.stdin.closed
+    assert process.stdout.closed
+    assert process.stderr.closed
+    assert has_ended(child)
+
+
+def test_every_wait_is_short(monkeypatch):
+    """Python loses a Ctrl-C that comes just before it waits for a lock, until the wait is over."""
+    waits = []
+    clock = iter(range(100))
+    monkeypatch.setattr(servers.time, "monotonic", lambda: next(clock))
+    thread = SimpleNamespace(is_alive=lambda: len(waits) < 3, join=waits.append)
+    servers._join(thread, None)
+    assert waits == [1.0] * 3
+    waits.clear()
+    servers._join(thread, 1.5)
+    assert waits == [0.5]
 
 
 def test_a_program_that_left_the_group_is_not_waited_for(tmp_path):
@@ -440,6 +471,7 @@ def test_python_ends_where_a_server_still_runs(tmp_path):
 
 FORKS = """
 import os, signal, sys, threading, time, torch
+from torch_zerohess.adapters import server as servers
 from torch_zerohess.adapters.process import Program
 serve = "import os, sys, time\\nfor line in sys.stdin: time.sleep(0.2); print([os.getpid()], flush=True)"
 program, z = Program([sys.executable, "-S", "-c", serve], server=True), torch.ones(1, 2)

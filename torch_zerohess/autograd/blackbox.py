@@ -182,10 +182,7 @@ class BlackBox(nn.Module):
             around = None if zero else estimated(center).detach()
             return lambda x: self.call.outer.value(estimated(x), constants, self.call.value, around)
         self.memory.check_parameters(center.shape[1])
-        if transforms.recorded([center, *aux]):
-            raise RuntimeError(
-                "a BlackBox with a memory cannot be traced by make_fx: its surrogate would not be renewed"
-            )
+        tracing.check_not_recorded([center, *aux])
         with transforms.outside(), transforms.random_numbers_allowed(), transforms.unrecorded():
             self.control = Control.of(self.memory, self.call.outer, learning=self.training)
             seed = self.smoothing.drawn_seed(self.control.taken)

@@ -1,10 +1,11 @@
 """What a layer refuses when torch traces, compiles or exports it, and what stays outside of compiled code."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
 from torch_zerohess.autograd import transforms
 
@@ -25,6 +26,12 @@ def check_traceable() -> None:
 
         if in_graph.exporting():
             raise RuntimeError("a BlackBox cannot be exported: it is code of this process, and no file holds it")
+
+
+def check_not_recorded(tensors: Sequence[Tensor]) -> None:
+    """Raise RuntimeError if `make_fx` records a layer with a memory at these points and aux."""
+    if transforms.recorded(tensors):
+        raise RuntimeError("a BlackBox with a memory cannot be traced by make_fx: its surrogate would not be renewed")
 
 
 def check_derivatives() -> None:

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.hull import shortest
+from torch_zerohess.search.inflection_descent import InflectionQuadratics
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Evaluated
-from torch_zerohess.search.two_sided_descent import TwoSidedQuadratics
 
 _BESIDE, _APART = 1e-4, ((1e-2, 1.0), (1.0, math.inf))
 """Distances over the tolerance up to which an evaluation is beside the best point, and between which it is apart; the
@@ -53,7 +53,7 @@ _WIDER = 2.0
 """Sigma with which the search goes on, over the length of the step that has found a lower point."""
 
 
-class KinkedQuadratics(TwoSidedQuadratics):
+class KinkedQuadratics(InflectionQuadratics):
     """Descent on quadratics that looks at kinks before it ends at them."""
 
     def next(

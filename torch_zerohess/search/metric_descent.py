@@ -148,15 +148,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Keep the quadratic of a round that has arrived, unless its minimum is elsewhere or may be one of many.
 
         It is elsewhere where the round has ended at the border of a region that fails.
-
-        The last quadratic of the round is made of differences near rounding. A fit to more evaluations is better.
         """
-        around = quadratic_around(known.lowest.point, known.points[~known.holes], known.values[~known.holes])
-        if around is None or around[2] > _SURE:
-            slope, bend = known.size * known.gradient, known.size * known.hessian
-        else:
-            model, sigma, _ = around
-            slope, bend = model.full_gradient() / sigma, model.full_hessian() / sigma**2
+        slope, bend = self._quadratic_at_end(known)
         curvatures = torch.linalg.eigvalsh(bend)
         if float(curvatures[0]) < _UNIQUE * float(curvatures[-1]):
             return replace(known, bottom=None)
@@ -165,6 +158,18 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         if not are_same(x + step, x, self.settings.tolerance):
             return replace(known, bottom=None)
         return replace(known, bottom=known.lowest, slope=slope, bend=bend)
+
+    def _quadratic_at_end(self, known: MetricProgress) -> tuple[Tensor, Tensor]:
+        """Return gradient [n] and Hessian [n, n] at the best point of a round that has arrived.
+
+        The last quadratic of the round is made of differences near rounding. A fit to more evaluations is better, if
+        they tell a quadratic.
+        """
+        around = quadratic_around(known.lowest.point, known.points[~known.holes], known.values[~known.holes])
+        if around is None or around[2] > _SURE:
+            return known.size * known.gradient, known.size * known.hessian
+        model, sigma, _ = around
+        return model.full_gradient() / sigma, model.full_hessian() / sigma**2
 
     def _ended(
         self, known: MetricProgress, end: Best | None, reason: str, generator: torch.Generator, *, last: bool = False

@@ -40,9 +40,9 @@ class RegionProgress(Progress):
     """The best point of the round."""
     first: Tensor
     """Where the search began [n]."""
-    phase: Literal["start", "axes", "trial", "geometry", "slope", "lines"] = "start"
+    phase: Literal["start", "axes", "trial", "geometry", "slope", "aside", "lines"] = "start"
     """What is asked for: the start and n points, n further ones, the end of a step, a point for the model, a slope at
-    a kink, or points along the axes."""
+    a kink, two points beside a flat end, or points along the axes."""
     promised: float = 0.0
     """Decrease that the model promises at the end of the step."""
     length: float = 0.0

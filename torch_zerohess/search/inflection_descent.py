@@ -1,0 +1,65 @@
+"""Descent on quadratics that does not take an inflection for a minimum.
+
+At an inflection, as of x^3, slope and curvature are zero, and the steps of quadratics end there. So where the curvature
+along some direction is next to nothing, the loss is evaluated at two points along it, one on each side. If one of them
+is lower, the search goes on from there. At a minimum like that of x^4 both are higher.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.search.metric_progress import MetricProgress
+from torch_zerohess.search.state import Evaluated
+from torch_zerohess.search.two_sided_descent import TwoSidedQuadratics
+
+_FLAT = 1e-4
+"""Least curvature, over the largest one that evaluations apart from the best point tell, where there is no doubt."""
+_APART = 0.03
+"""Distance of these evaluations, over the first sigma, at least."""
+_ASIDE = 0.1
+"""Distance of the two points from the best point, over the first sigma."""
+_WIDER = 2.0
+"""Sigma with which the search goes on, over this distance."""
+_ROUNDING = 1e2 * torch.finfo(torch.float64).eps
+"""Decrease of the loss, relative to it, that may be rounding."""
+
+
+class InflectionQuadratics(TwoSidedQuadratics):
+    """Descent on quadratics that looks to both sides of its end where the loss is flat there."""
+
+    def next(
+        self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        if known.phase != "aside":
+            return super().next(known, evaluated, generator)
+        before = known.lowest.loss
+        known = known.remembered(evaluated, self._capacity)
+        if known.lowest.loss >= before - _ROUNDING * abs(before):
+            return super()._arrived(known, known.reason, generator)
+        root = torch.eye(self._n, dtype=known.root.dtype, device=known.root.device)
+        known = replace(known, phase="geometry", root=root, sigma=_WIDER * _ASIDE, rejected=0, tied=0)
+        return self.plan(known, generator)
+
+    def more(self, known: MetricProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        return points[:0] if known.phase == "aside" else super().more(known, points, count, generator)
+
+    def _arrived(
+        self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
+    ) -> tuple[MetricProgress, Tensor]:
+        if known.is_lost or last or (direction := self._flat(known)) is None:
+            return super()._arrived(known, reason, generator, last=last)
+        step = _ASIDE * direction
+        points = self.settings.inside(known.lowest.point + torch.stack([step, -step]))
+        return replace(known, phase="aside", reason=reason), points
+
+    def _flat(self, known: MetricProgress) -> Tensor | None:
+        """Return the direction [n] of the least curvature at the best point if that is next to nothing."""
+        squares = (known.points - known.lowest.point).square().sum(1)
+        apart = (squares >= _APART**2) & ~known.holes
+        if known.lowest.loss > known.best.loss or not bool(apart.any()):
+            return None
+        largest = float((2.0 * (known.values[apart] - known.lowest.loss) / squares[apart]).max())
+        curvatures, directions = torch.linalg.eigh(self._quadratic_at_end(known)[1])
+        return directions[:, 0] if abs(float(curvatures[0])) < _FLAT * largest else None

@@ -51,6 +51,9 @@ class Descent(AskTell[Any]):
     it is a minimum: up to 6 (n + 1)(n + 8) evaluations, if no bound is near. If they do not tell, the search has not
     arrived.
 
+    Where a loss alone is flat along some direction at the end of a round, as at the inflection of x^3, two points along
+    it are evaluated, a tenth of sigma to both sides. The search goes on from there if one of them is lower.
+
     After a round two evaluations tell whether a loss alone is a sum of functions of one parameter each (in a box, for
     2 to 200 parameters). If such a sum has several minima, its lowest one is sought along all axes at once, and the
     next round begins there: some 40 n evaluations, and 7 if it is convex.

@@ -33,8 +33,9 @@ Q = TypeVar("Q", bound="JacobianProgress")
 class JacobianProgress(Progress):
     """The output at the center, and the kind of points asked for next. A subclass adds the Jacobian."""
 
-    phase: Literal["sample", "trial"] = "sample"
-    """What is asked for: samples, after the start itself at first, or steps."""
+    phase: Literal["sample", "trial", "aside"] = "sample"
+    """What is asked for: samples, after the start itself at first, or steps; or points where others move, see
+    `LocalMethod`."""
     radius: float
     """Root mean square over the parameters."""
     output: Tensor

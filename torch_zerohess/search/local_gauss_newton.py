@@ -38,7 +38,9 @@ class LocalGaussNewton(AskTell[LocalProgress]):
     Only parameters that some output was found to depend on are moved. The others stay where they are, and `untouched`
     names them. Of the parameters found in a batch, at most 0.5 % have no effect, by expectation. A parameter with a
     weak effect counts as untouched until there is enough evidence. Samples perturb all parameters. So no sample is the
-    best point while some parameters stay.
+    best point while some parameters stay. Where the search arrives, it moves only the parameters that stay, once to
+    each side. If outputs change there, no parameter stays any more. If the loss falls, too, the search goes on from
+    there.
 
     Args:
         x0: start [n], float32 or float64, within the bounds.

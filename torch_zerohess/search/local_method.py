@@ -135,13 +135,32 @@ class LocalMethod(GaussNewton[LocalProgress]):
             known = replace(known, radius=max(1.0, known.radius))
         return replace(known, phase="trial")
 
+    def next(
+        self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[LocalProgress, Tensor]:
+        if known.phase != "aside":
+            return super().next(known, evaluated, generator)
+        before = known.counted(evaluated).recorded(evaluated)
+        known = before.told_aside(evaluated.those(evaluated.finite), _SLOW)
+        if known.center is not before.center:
+            known = replace(known, radius=self.radius, sigma=self.distance(self.radius), phase="sample", slow=0)
+        elif not known.done:
+            known = self.arrived(known)
+        return self.asked(known, generator)
+
     def asked(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
         """Ask for what the phase says; for no steps where the loss of linear outputs promises nothing."""
-        if known.phase == "trial":
+        if known.phase == "trial" and not known.done:
             promised = self._solved(known, self.radii(known)).promised
             if promised is not None and promised <= _NOTHING * abs(known.loss):
                 known = self._at_kink(known)
-        return (known, known.center[None][:0]) if known.done else super().asked(known, generator)
+        if known.done:
+            return known, known.center[None][:0]
+        if known.phase != "aside":
+            return super().asked(known, generator)
+        assert known.evidence is not None
+        step = ~known.evidence.found * normal(generator, known.center, self.settings.n)
+        return known, self.settings.inside(known.center + torch.stack([step, -step]))
 
     def steps(self, known: LocalProgress, radii: Tensor) -> Tensor:
         """Solve the model, see `local_steps`."""
@@ -170,7 +189,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
     def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Take the best step; double the samples after a small gain, and halve them after a large one; or hop."""
         after = super().taken(known, evaluated)
-        if after.home is not known.home or after.rounds > known.rounds:  # it has ended a round or hopped
+        if after.home is not known.home or after.rounds > known.rounds or after.phase == "aside":  # it has arrived
             return after
         before, gain = known.loss, known.loss - after.loss
         count = known.samples * (2 if gain < _SLOW * abs(before) else 1) // (2 if gain > _FAST * abs(before) else 1)
@@ -194,6 +213,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
             return self._returned(known)
         if not (known.predicts and self._is_minimum(known)):
             return super().arrived(known)
+        if known.some_stay and not (known.moved or self.settings.noise):
+            return replace(known, phase="aside")
         end = Best(known.center, known.loss, known.sigma)
         known = super().arrived(known.arriving(end).agreeing(end, self.settings.tolerance))
         return known if known.done else self._hopping(replace(known, finished=True))

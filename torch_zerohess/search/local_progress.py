@@ -19,6 +19,9 @@ _PAIRS = 16
 _ROUNDING = 1e-12
 """A hop leads to something better if it lowers the loss by more than this share of it, and of what the hop added."""
 
+_EQUAL = 1e-5
+"""Change of outputs, over the largest number of an output, that may be rounding."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalProgress(JacobianProgress):
@@ -41,6 +44,8 @@ class LocalProgress(JacobianProgress):
     """Whether the search has arrived at the center."""
     patient: bool = False
     """Whether slow steps go on, because a hop from here has found nothing better."""
+    moved: bool = False
+    """Whether the parameters that stay were moved, to see whether outputs change."""
     home: "LocalProgress | None" = None
     """The search before the hop that has led here."""
     hopped: float = math.inf
@@ -119,6 +124,21 @@ class LocalProgress(JacobianProgress):
             return after
         at = self.home if self.home is not None and self.failed else self
         return replace(after, best=Best(at.center, at.loss, at.sigma))
+
+    def told_aside(self, evaluated: Evaluated, gain: float) -> "LocalProgress":
+        """Take what points tell at which only the parameters that stay have moved.
+
+        Slopes may be zero although outputs change, as at the maximum of a parabola. Then no parameter stays any more,
+        and the center is the lowest point if the loss falls by more than this share of it.
+        """
+        outputs, losses = evaluated.outputs, evaluated.losses
+        known, least = replace(self, moved=True), _EQUAL * float(self.output.abs().max())
+        if outputs is None or self.evidence is None or not bool(((outputs - self.output).abs() > least).any()):
+            return known
+        known, k = replace(known, evidence=self.evidence.of_all()), int(losses.argmin())
+        if float(losses[k]) >= self.loss - gain * abs(self.loss):
+            return known
+        return replace(known, center=evaluated.points[k].clone(), output=outputs[k].clone(), loss=float(losses[k]))
 
     def recorded(self, evaluated: Evaluated) -> "LocalProgress":
         """Return the progress with the lowest loss as the best one. Samples do not count where parameters stay."""

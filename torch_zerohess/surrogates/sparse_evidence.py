@@ -65,6 +65,10 @@ class Evidence:
         found = self.found | _found(torch.erfc(z * math.sqrt(0.5)))
         return Evidence(found, sums, batches)
 
+    def of_all(self) -> "Evidence":
+        """Return evidence by which every parameter is found."""
+        return replace(self, found=torch.ones_like(self.found))
+
 
 def _found(chance: Tensor) -> Tensor:
     """Return which parameters are found, by the probabilities [n] of their tests if no output depends on them."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from searches import SIDE, N, run, square
+from searches import SIDE, N, run, square, zeros
 from searches import texels as image
 
 import torch_zerohess as zh
@@ -292,6 +292,53 @@ def test_parameters_that_no_pixel_depends_on_stay_and_are_named(f, engine, seed)
     first = ", ".join(str(60 + k) for k in (~moved[60:]).nonzero()[:5, 0].tolist())
     said = f"; {int((~moved).sum())} of 100 parameters ({first}, ...) were not found to change any output, and stay"
     assert fit.message.endswith(said)
+
+
+def parabolas(x):
+    """No slope tells that outputs depend on a parameter at 0. There the loss is at a maximum."""
+    return x.square() - 1.0
+
+
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_parameters_that_change_outputs_without_a_slope_are_moved(seed):
+    fit = zh.minimize(parabolas, zeros(100), sigma=0.1, loss=square(0.0), seed=seed)
+    assert fit.success
+    assert fit.value < 1e-6
+    assert fit.x.abs().tolist() == pytest.approx([1.0] * 100, abs=1e-2)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.5])
+@pytest.mark.parametrize("start", [(0.01, 0.5), (0.0, 0.5)])
+def test_a_start_at_a_maximum_is_not_solved(start, sigma):
+    for seed in range(4):
+        settings = {"sigma": sigma, "loss": square(0.0), "seed": seed, "restarts": 0, "max_evaluations": 300}
+        fit = zh.minimize(parabolas, vector(*start), engine="local", **settings)
+        assert not fit.success or fit.value < 1e-4
+
+
+def test_parameters_without_effect_take_two_evaluations():
+    start, settings = zeros(100), {"sigma": 1.0, "seed": 0, "restarts": 0, "max_evaluations": 300}
+    fit = zh.minimize(lambda x: x[:, :60] - 1.0, start, loss=square(0.0), engine="local", **settings)
+    aside = (fit.points[:, 60:] != 0.0).any(1) & (fit.points[:, :60] == fit.x[:60]).all(1)
+    assert int(aside.sum()) == 2
+    assert torch.equal(fit.x[60:], start[60:])
+    assert "40 of 100 parameters" in fit.message
+
+
+def test_a_look_at_parameters_that_stay_survives_in_a_state():
+    def search():
+        return LocalGaussNewton(vector(0.01, 0.5), sigma=0.5, loss=square(0.0), restarts=0, seed=2)
+
+    one, looked = search(), 0
+    while not one.done:
+        one.tell(parabolas(one.ask()))
+        looked += one._state.progress.phase == "aside"
+        other = search()
+        other.load_state_dict(one.state_dict())
+        assert one.done or torch.equal(one.ask(), other.ask())
+        one = other
+    assert looked == 1
+    assert one.value < 1e-6
 
 
 def test_parameters_that_no_pixel_depends_on_stay_in_noise():

@@ -22,8 +22,8 @@ _ASIDE = 0.1
 """Distance of the two points from the best point, over the first sigma."""
 _WIDER = 2.0
 """Sigma with which the search goes on, over this distance."""
-_ROUNDING = 1e2 * torch.finfo(torch.float64).eps
-"""Decrease of the loss, relative to it, that may be rounding."""
+_GAIN = 1e-6
+"""Least decrease of the loss that counts there, over what the largest curvature adds."""
 
 
 class InflectionQuadratics(TwoSidedQuadratics):
@@ -34,9 +34,9 @@ class InflectionQuadratics(TwoSidedQuadratics):
     ) -> tuple[MetricProgress, Tensor]:
         if known.phase != "aside":
             return super().next(known, evaluated, generator)
-        before = known.lowest.loss
+        before, largest = known.lowest.loss, self._largest(known)
         known = known.remembered(evaluated, self._capacity)
-        if known.lowest.loss >= before - _ROUNDING * abs(before):
+        if known.lowest.loss >= before - _GAIN * largest * _ASIDE**2:
             return super()._arrived(known, known.reason, generator)
         root = torch.eye(self._n, dtype=known.root.dtype, device=known.root.device)
         known = replace(known, phase="geometry", root=root, sigma=_WIDER * _ASIDE, rejected=0, tied=0)
@@ -56,10 +56,14 @@ class InflectionQuadratics(TwoSidedQuadratics):
 
     def _flat(self, known: MetricProgress) -> Tensor | None:
         """Return the direction [n] of the least curvature at the best point if that is next to nothing."""
+        if known.lowest.loss > known.best.loss:
+            return None
+        curvatures, directions = torch.linalg.eigh(self._quadratic_at_end(known)[1])
+        return directions[:, 0] if abs(float(curvatures[0])) < _FLAT * self._largest(known) else None
+
+    def _largest(self, known: MetricProgress) -> float:
+        """Return the largest curvature between the best point and an evaluation apart from it; 0 if there is none."""
         squares = (known.points - known.lowest.point).square().sum(1)
         apart = (squares >= _APART**2) & ~known.holes
-        if known.lowest.loss > known.best.loss or not bool(apart.any()):
-            return None
-        largest = float((2.0 * (known.values[apart] - known.lowest.loss) / squares[apart]).max())
-        curvatures, directions = torch.linalg.eigh(self._quadratic_at_end(known)[1])
-        return directions[:, 0] if abs(float(curvatures[0])) < _FLAT * largest else None
+        curvatures = 2.0 * (known.values[apart] - known.lowest.loss) / squares[apart]
+        return float(curvatures.max()) if len(curvatures) else 0.0

@@ -286,5 +286,6 @@ def test_a_round_that_ends_on_a_floor_agrees_with_none(others, agreed):
     points, values = vector(5.0, 6.0, 7.0, 8.0, 9.0)[:, None], vector(0.0, *others)
     arrivals = Arrivals(place=elsewhere, agreed=1)
     known = replace(search._state.progress, best=elsewhere, arrivals=arrivals, lowest=end, points=points)
+    known = replace(known, holes=torch.zeros(len(points), dtype=torch.bool))
     after, _ = search._method._arrived(replace(known, values=values), "it ends", torch.Generator())
     assert after.agreed == agreed

@@ -443,7 +443,7 @@ def test_a_state_can_be_saved():
 
 def test_batches_of_one_and_values_that_are_not_finite():
     search, f = search_for(), noisy()
-    for one in range(60):
+    for one in range(40):
         values = f(search.ask(limit=1 if one % 7 == 6 else None))
         values[0] = math.nan if one % 5 == 1 else values[0]
         search.tell(values)

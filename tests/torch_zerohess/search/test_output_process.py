@@ -154,7 +154,7 @@ def turns(found, fn, evaluations):
 def test_where_the_output_jumps_the_process_goes_on_after_rejected_steps():
     """After two of them in a row, or after five where a step of this turn was good."""
     every = set()
-    for seed, scale in itertools.product(range(1, 5), (16.0, 1000.0)):
+    for seed, scale in itertools.product(range(1, 3), (16.0, 1000.0)):
         ends, begins = turns(search(restarts=100, seed=seed), lambda x, s=scale: torch.round(s * swing(x)) / s, 150)
         every |= {(one["kept"], one["rejected"]) for one in ends}
         assert len({one[1:] for one in begins}) == len(begins)  # it does not begin twice at one point with one region

@@ -172,7 +172,8 @@ class LossProcess(FinishedProcess[LossProgress]):
         known = self.told(known, now, evaluated)
         best = known.best
         plateau = now.wide is not None  # the process leaves it sooner
-        patient = now.slopes is not None or known.waited < _PATIENCE * (self.settings.n + 1)
+        looks = now.slopes is not None or now.phase == "aside"  # around where they may have arrived
+        patient = looks or known.waited < _PATIENCE * (self.settings.n + 1)
         if not now.done and not plateau and patient:
             return known, points
         converged = now.done and now.arrivals.lowest is not None

@@ -1,11 +1,13 @@
 """Descent at inflections, where slope and curvature are zero, and at flat minima."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from torch_zerohess import minimize
-from torch_zerohess.optim import Descent
+from torch_zerohess.optim import Descent, TrustRegion
 
 
 def inflection(x: Tensor) -> Tensor:
@@ -81,3 +83,19 @@ def test_a_batch_has_no_points_besides_those_of_a_look() -> None:
     while search._state.progress.phase != "aside":
         search.tell(inflection(search.ask()))
     assert len(search.ask(8)) == 2
+
+
+def test_a_process_waits_for_a_look_to_both_sides() -> None:
+    """It has no patience left where quadratics are about to look."""
+
+    def flat(x: Tensor) -> Tensor:
+        return x.pow(4).sum(1) + 1.0
+
+    search = TrustRegion(start(2), sigma=1.0, bounds=(-2.0, 5.0), engine="gaussian_process", seed=0, restarts=0)
+    while (local := search._state.progress.local) is None or local.phase != "aside":
+        before = search.state_dict()
+        search.tell(flat(search.ask()))
+    search.load_state_dict(before)
+    search._state = replace(search._state, progress=replace(search._state.progress, waited=10**6))
+    search.tell(flat(search.ask()))
+    assert search._state.progress.finishing

@@ -92,7 +92,7 @@ def recorded(tensors: Sequence[Tensor]) -> bool:
     mode = torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY)
     if mode is None:
         return False
-    from torch.fx.experimental.proxy_tensor import get_proxy_slot  # loaded by who records
+    from torch.fx.experimental.proxy_tensor import get_proxy_slot  # make_fx has loaded it
 
     seen: set[object] = set()
     left = []
@@ -116,7 +116,7 @@ def unrecorded() -> AbstractContextManager[object]:
     """Compute numbers that are constants of what `make_fx` records."""
     if torch.compiler.is_compiling() or torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY) is None:
         return contextlib.nullcontext()
-    from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing  # loaded by who records
+    from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing  # make_fx has loaded it
 
     return disable_proxy_modes_tracing()
 

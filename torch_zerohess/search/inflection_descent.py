@@ -15,15 +15,15 @@ from torch_zerohess.search.state import Evaluated
 from torch_zerohess.search.two_sided_descent import TwoSidedQuadratics
 
 _FLAT = 1e-4
-"""Least curvature, over the largest one that evaluations apart from the best point tell, where there is no doubt."""
+"""Share of the largest curvature below which a curvature is next to nothing."""
 _APART = 0.03
-"""Distance of these evaluations, over the first sigma, at least."""
+"""Least distance from the best point, over the first sigma, of evaluations that tell the largest curvature."""
 _ASIDE = 0.1
 """Distance of the two points from the best point, over the first sigma."""
 _WIDER = 2.0
 """Sigma with which the search goes on, over this distance."""
 _GAIN = 1e-6
-"""Least decrease of the loss that counts there, over what the largest curvature adds."""
+"""Least decrease of the loss that counts, over what the largest curvature adds at this distance."""
 
 
 class InflectionQuadratics(TwoSidedQuadratics):

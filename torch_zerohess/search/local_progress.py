@@ -45,7 +45,7 @@ class LocalProgress(JacobianProgress):
     patient: bool = False
     """Whether slow steps go on, because a hop from here has found nothing better."""
     moved: bool = False
-    """Whether the parameters that stay were moved, to see whether outputs change."""
+    """Whether the parameters that stay have been moved once, to see whether outputs change."""
     home: "LocalProgress | None" = None
     """The search before the hop that has led here."""
     hopped: float = math.inf

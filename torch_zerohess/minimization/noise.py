@@ -10,6 +10,8 @@ REPEATED = 8
 """Values at one point that tell the standard deviation of noise."""
 _AGAIN = 2
 """Further evaluations of x where losses are counts: one would be equal to the first too often."""
+_TWO = 6
+"""Further evaluations of x where losses have two values, as successes and failures have: many are equal by chance."""
 _ROUNDING = 1e-6
 """Difference of two values, relative to them, that is rounding: renders of one seed differ by 3e-8."""
 _BATCHED = 1e-3
@@ -56,8 +58,9 @@ def noise_at(
 ) -> float | None:
     """Evaluate x again; return the deviation of its losses, 0 if they are equal, None if x has no loss.
 
-    Losses that are counts may be equal by chance: these are compared with two further ones, others with one. A
-    difference counts if it is more than rounding of the first loss, see `is_rounding`.
+    Losses that are counts may be equal by chance: these are compared with two further ones, others with one. If there
+    are only two different losses, they are compared with six. A difference counts if it is more than rounding of the
+    first loss, see `is_rounding`.
 
     Args:
         x: [n].
@@ -71,9 +74,10 @@ def noise_at(
     if not len(before) or not bool(torch.isfinite(before[-1])):
         return None
     few, most = _AGAIN if are_counts(losses[:begun]) else 1, most + len(known)
+    few = _TWO if few > 1 and len(losses[torch.isfinite(losses)].unique()) <= 2 else few
     size = float(torch.stack([losses[torch.isfinite(losses)][0], before[-1]]).abs().max())
     again = known[:0]
-    for count in (few, _AGAIN, REPEATED):
+    for count in (few, max(few, _AGAIN), REPEATED):
         wanted = min(count, most) - len(known)
         known = torch.cat([known, evaluate(x.expand(wanted, -1))]) if wanted > 0 else known
         again = known[:count][torch.isfinite(known[:count])]

@@ -180,7 +180,7 @@ class Running:
         self._noted(points, values.to(search.told) if lost else search.told)
 
     def look_again(self, *, at_target: bool = False) -> bool:
-        """Evaluate x again if the search has arrived or is about to end; return whether noise was found.
+        """Evaluate x again if the search has ended or is about to end; return whether noise was found.
 
         There may be no noise at x0, and counts of a noisy simulator may be equal there by chance. A value that has
         reached the target may be a lucky draw. Where noise is found, the search begins again at x as one in noise.
@@ -189,7 +189,7 @@ class Running:
             return False
         few = min(reserved(self._most) + REPEATED, self._most // 4) + len(self.record.last[1]) - 1
         ends = self.left <= few and self.search.evaluations >= self._least
-        if not (at_target or self.search.solved or ends or self._looking is not None):
+        if not (at_target or self.search.solved or self.search.done or ends or self._looking is not None):
             return False
         self._looking = self.evaluations if self._looking is None else self._looking
         found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)

@@ -49,6 +49,22 @@ def test_counts_that_are_equal_at_the_start_are_found_to_be_noisy(per, most):
         assert not fit.success
 
 
+@pytest.mark.parametrize(("bounds", "restarts"), [(None, 10), (None, 0), ((-3.0, 3.0), 0)])
+def test_successes_and_failures_are_noisy(bounds, restarts):
+    """Losses of 0 and 1, of which many are equal by chance. The best expected loss is 0.325, the lowest one 0."""
+    for seed in (0, 1, 13, 14):
+        generator = torch.Generator().manual_seed(seed)
+
+        def fn(z, generator=generator):
+            return torch.bernoulli((0.325 + 0.05 * (z - 1.0).square().sum(1)).clamp(0.0, 1.0), generator=generator)
+
+        settings = {"bounds": bounds, "restarts": restarts, "seed": seed, "max_evaluations": 120}
+        fit = zh.minimize(fn, vector(-1.0, 0.0), sigma=1.0, **settings)
+        assert fit.noise > 0.3
+        assert fit.value_error > 0.0
+        assert not fit.success
+
+
 def test_x_is_evaluated_again():
     """Once, and twice where losses are counts; the values themselves are the same."""
 

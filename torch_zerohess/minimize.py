@@ -124,13 +124,13 @@ def minimize(
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
             evaluations, and six more if the two differ. For that, a `batch` that takes all evaluations is made shorter;
             the message says so where they are too few to measure it. As there may be no noise at x0, x is evaluated
-            again when the search arrives, reaches `target`, or is about to end; twice where losses are counts, which
-            may be equal by chance. If values differ, the search begins again at x as one in noise. Give the noise if
-            fn has no noise at x0, as on a plateau. The noise is taken to be the same everywhere. In noise, an eighth
-            of `max_evaluations` (4 to 48) is kept for the end: the best candidates are evaluated again, and x is the
-            one with the lowest mean. `value` is this mean and `value_error` its standard error. No call of fn has a
-            point twice, because noise may be the same for all points of a call: repeated points are evaluated at once
-            only in several processes.
+            again when the search ends or is about to end, or reaches `target`; twice where losses are counts, which may
+            be equal by chance; six times where there are only two different losses. If values differ, the search begins
+            again at x as one in noise. Give the noise if fn has no noise at x0, as on a plateau. The noise is taken to
+            be the same everywhere. In noise, an eighth of `max_evaluations` (4 to 48) is kept for the end: the best
+            candidates are evaluated again, and x is the one with the lowest mean. `value` is this mean and
+            `value_error` its standard error. No call of fn has a point twice, because noise may be the same for all
+            points of a call: repeated points are evaluated at once only in several processes.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
             in it. The search does not read the memory: the result is the same as without one. The next `estimate`

@@ -11,7 +11,8 @@ REPEATED = 8
 _AGAIN = 2
 """Further evaluations of x where losses are counts: one would be equal to the first too often."""
 _TWO = 6
-"""Further evaluations of x where losses have two values, as successes and failures have: many are equal by chance."""
+"""Further evaluations of x where there are only two different losses, as of success and failure. Many of them are equal
+by chance."""
 _ROUNDING = 1e-6
 """Difference of two values, relative to them, that is rounding: renders of one seed differ by 3e-8."""
 _BATCHED = 1e-3
@@ -74,7 +75,8 @@ def noise_at(
     if not len(before) or not bool(torch.isfinite(before[-1])):
         return None
     few, most = _AGAIN if are_counts(losses[:begun]) else 1, most + len(known)
-    few = _TWO if few > 1 and len(losses[torch.isfinite(losses)].unique()) <= 2 else few
+    if few > 1 and len(losses[:begun][torch.isfinite(losses[:begun])].unique()) <= 2:
+        few = _TWO
     size = float(torch.stack([losses[torch.isfinite(losses)][0], before[-1]]).abs().max())
     again = known[:0]
     for count in (few, max(few, _AGAIN), REPEATED):

@@ -65,6 +65,20 @@ def test_successes_and_failures_are_noisy(bounds, restarts):
         assert not fit.success
 
 
+@pytest.mark.parametrize("losses", [(1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 2.0)])
+def test_a_look_at_two_losses_has_six_values_also_if_it_was_interrupted(losses):
+    """The third of the values that differ is one of the look."""
+    made = []
+
+    def evaluate(z):
+        made.append(len(z))
+        return torch.ones(len(z), dtype=z.dtype)
+
+    points = vector(0.0, 0.5, 1.0, 1.0)[: len(losses), None]
+    assert noise_at(points[2], points, vector(*losses), 3, evaluate, 20) > 0.0
+    assert made == [9 - len(losses), 2]
+
+
 def test_x_is_evaluated_again():
     """Once, and twice where losses are counts; the values themselves are the same."""
 

@@ -29,6 +29,11 @@ def test_an_inflection_is_passed(n: int, seed: int) -> None:
     assert found.x.tolist() == pytest.approx([-3.0] * n, abs=1e-3)
 
 
+def test_where_many_evaluations_do_not_tell_the_curvature_the_last_quadratic_does() -> None:
+    found = minimize(inflection, start(6), sigma=1.0, seed=0, restarts=0, max_evaluations=600)
+    assert found.value == pytest.approx(1.0 - 6.75)
+
+
 def test_further_rounds_do_not_confirm_an_inflection() -> None:
     for seed in range(3):
         found = minimize(inflection, start(1), sigma=1.0, seed=seed, max_evaluations=400)

@@ -1,6 +1,6 @@
 """Gauss-Newton for outputs whose elements depend on few parameters each: thousands of parameters, few evaluations.
 
-See `search.local_method` for how it goes on, and `search.noisy_local` in noise.
+See `search.local_method` for how it goes on, and `search.noisy_local` and `search.averaging` in noise.
 """
 
 from collections.abc import Callable

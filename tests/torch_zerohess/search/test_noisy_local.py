@@ -88,7 +88,7 @@ def begun(search, f=image):
 def averaging(search, f=image):
     """The progress of a search that begins to average after the first batch, without noise."""
     known, method = begun(search, f), search._method
-    return method._begun(replace(method._averaging(known), sigma=0.5))
+    return method.averaging.begun(replace(method._begin(known), sigma=0.5))
 
 
 def told(points, shape):
@@ -175,7 +175,7 @@ def test_it_begins_with_the_largest_sigma_without_curvature():
     assert float((straight.center - TRUTH).square().mean()) < 1e-3
     search = search_for()
     known = replace(begun(search, lambda x: image(x + 0.3 * x.square())), variance=1e-4, pairs=1, sigma=0.5)
-    assert search._method._begun(search._method._averaging(known)).sigma == 0.5
+    assert search._method.averaging.begun(search._method._begin(known)).sigma == 0.5
     assert bent.averaging
 
 
@@ -199,7 +199,7 @@ def test_samples_come_nearer_where_there_is_curvature_and_otherwise_go_apart(exp
     known = begun(search)
     jacobian = replace(known.jacobian, explained=explained)
     known = replace(known, jacobian=jacobian, sigma=0.1, variance=1.0, pairs=1)
-    assert search._method._distance(known, rest) == pytest.approx(0.1 * factor)
+    assert search._method.averaging.distance(known, rest) == pytest.approx(0.1 * factor)
 
 
 @pytest.mark.parametrize(("explained", "least"), [(0.9, 5e-4), (0.4, 0.03)])
@@ -209,7 +209,7 @@ def test_samples_come_nearer_than_the_least_sigma_only_where_the_jacobian_predic
     jacobian = replace(known.jacobian, explained=explained)
     for sigma in (1.01 * least, 0.9 * least):
         known = replace(known, jacobian=jacobian, sigma=sigma, variance=1e-9, pairs=1)
-        assert search._method._distance(known, 1.0) == pytest.approx(min(sigma, least))
+        assert search._method.averaging.distance(known, 1.0) == pytest.approx(min(sigma, least))
 
 
 def test_a_batch_is_the_center_twice_and_samples_whose_number_grows():
@@ -283,7 +283,7 @@ def test_far_evaluations_are_left_out():
     points = torch.cat([known.points, known.center + 3.0 * normal(20, N)])
     outputs = known.outputs + SD * normal(*known.outputs.shape)  # without noise rounding may look like curvature
     far = replace(known, points=points, outputs=torch.cat([outputs, normal(20, N)]))
-    assert search._method._regressed(far, 0)[2] == 33.0
+    assert search._method.averaging.regressed(far, 0)[2] == 33.0
 
 
 def test_a_step_that_raises_the_loss_is_undone():
@@ -359,10 +359,10 @@ def test_outputs_at_the_center_count_where_curvature_has_moved_the_constant():
     known = replace(averaging(search), variance=1.0, pairs=1)
     apart = torch.ones_like(known.output)
     for off, weight in ((10.0, 0.995), (0.8, 0.0)):
-        output, variance = search._method._combined(known, 1000, (known.output + off * apart).expand(2, -1))
+        output, variance = search._method.averaging.combined(known, 1000, (known.output + off * apart).expand(2, -1))
         torch.testing.assert_close(output, known.output + weight * off * apart, atol=1e-3, rtol=0.0)
         assert variance == pytest.approx(weight * 0.5 or 1e-3, rel=1e-2)
-    assert search._method._combined(known, 1000, known.outputs[:0])[1] == 1e-3
+    assert search._method.averaging.combined(known, 1000, known.outputs[:0])[1] == 1e-3
 
 
 def test_the_error_of_a_loss_by_noise():
@@ -371,8 +371,8 @@ def test_the_error_of_a_loss_by_noise():
     known = averaging(search)
     slope = 2.0 * (known.output - TARGET.flatten()) / N
     known = replace(known, loss=float((known.output - TARGET.flatten()).square().mean()))
-    assert search._method._error(known, 0.04) == pytest.approx(0.2 * float(slope.norm()))
-    assert search._method._raised(known, 0.04) == pytest.approx(0.04)
+    assert search._method.averaging.error(known, 0.04) == pytest.approx(0.2 * float(slope.norm()))
+    assert search._method.averaging.raised(known, 0.04) == pytest.approx(0.04)
 
 
 def test_the_promise_is_what_the_last_step_is_to_achieve():
@@ -390,9 +390,9 @@ def test_the_radius_follows_what_a_step_achieves(achieved, factor):
     search = search_for()
     known = averaging(search)
     known = replace(known, radius=0.5, before=replace(known.before, loss=1.0), loss=1.0 - 0.8 * achieved)
-    assert search._method._radius(known, 0.2, 1e-3) == pytest.approx(0.5 * factor)
-    assert search._method._radius(known, 0.2, 0.9) == 0.5  # noise may have achieved that
-    assert search._method._radius(replace(known, radius=1.9), 0.2, 1e-3) <= 2.0
+    assert search._method.averaging.radius(known, 0.2, 1e-3) == pytest.approx(0.5 * factor)
+    assert search._method.averaging.radius(known, 0.2, 0.9) == 0.5  # noise may have achieved that
+    assert search._method.averaging.radius(replace(known, radius=1.9), 0.2, 1e-3) <= 2.0
 
 
 def test_steps_are_short_along_directions_that_noise_hides():

@@ -2,7 +2,9 @@
 
 import math
 
+import numpy as np
 import torch
+from scipy.optimize import linprog
 
 from truths import vector
 
@@ -139,3 +141,33 @@ def cosine_bowl(z):
     """A wide bowl with its minimum beside 0 and local minima in every turn of cosines along the diagonals."""
     z = torch.stack([z[:, 0] + z[:, 1], z[:, 0] - z[:, 1]], 1) / 2**0.5
     return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)
+
+
+KINKS = {"largest": lambda d: d.abs().max(), "mean": lambda d: d.abs().mean()}
+
+
+class Linear:
+    """Linear outputs [K, 3 n] of n parameters, whose loss may be least on sides of the box [-side, side]^n.
+
+    The loss is the largest magnitude of differences from a target, or their mean. Its minimum is by linear programming.
+    """
+
+    def __init__(self, n, seed, kind, side=1.0):
+        generator = torch.Generator().manual_seed(seed)
+        self.a = torch.randn(3 * n, n, generator=generator).double()
+        away = self.a @ (2 * torch.randn(n, generator=generator).double())
+        self.target = away + 0.5 * torch.randn(3 * n, generator=generator).double()
+        a, target, eye = self.a.numpy(), self.target.numpy(), np.eye(3 * n)
+        beyond = np.ones((3 * n, 1)) if kind == "largest" else eye
+        cost = np.r_[np.zeros(n), np.full(beyond.shape[1], 1.0 / beyond.shape[1])]
+        rows = np.block([[a, -beyond], [-a, -beyond]])
+        box = [(-side, side)] * n + [(0, None)] * beyond.shape[1]
+        self.least = linprog(cost, A_ub=rows, b_ub=np.r_[target, -target], bounds=box).fun
+        self.loss = lambda y: KINKS[kind](y - self.target)
+
+    def __call__(self, x):
+        return x @ self.a.mT
+
+    def excess(self, value):
+        """Loss above the least one, over that of the start at zero."""
+        return (value - self.least) / (float(self.loss(torch.zeros_like(self.target))) - self.least)

@@ -69,3 +69,20 @@ def kinked_minimum(
         left = one - torch.outer(step, change) / curvature
         inverse = left @ inverse @ left.mT + torch.outer(step, step) / curvature
     return x
+
+
+def mirrored(x: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the point of a box [n] that x leads to by reflections at its sides, and the signs [n] of the derivative.
+
+    A function of the point it leads to has the kinks of a penalty at the sides, and no point outside is ever used.
+
+    Args:
+        x: [n].
+        lower: finite [n], below `upper`.
+        upper: finite [n].
+    """
+    width = upper - lower
+    along = (x - lower).remainder(2.0 * width)
+    back = along > width
+    at = lower + torch.where(back, 2.0 * width - along, along)
+    return torch.where(x == x.clamp(lower, upper), x, at), torch.where(back, -1.0, 1.0).to(x)

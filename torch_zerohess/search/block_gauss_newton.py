@@ -23,17 +23,22 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
+from torch_zerohess.linalg.krylov import are_free
 from torch_zerohess.linalg.levenberg_marquardt import damped_steps
-from torch_zerohess.search.gauss_newton import GaussNewton, JacobianProgress
+from torch_zerohess.linalg.smoothed_newton import LinearOutputs
+from torch_zerohess.search.gauss_newton import LENGTHS, GaussNewton, JacobianProgress
+from torch_zerohess.search.local_steps import LocalSteps, checked_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_step import alternating
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated
-from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_and_slope
 from torch_zerohess.surrogates.surrogate import scaled
 
+_LITTLE = 1e-5
+"""Decrease that the loss of linear outputs promises, over the loss, with which a search has arrived."""
 _RIDGE = 1e-6
 """Added to D D^T, in units of its mean diagonal: bounds can make the steps of a block dependent."""
 
@@ -99,7 +104,27 @@ class BlockMethod(GaussNewton[BlockProgress]):
         return replace(known, jacobian=jacobian, unused=known.unused[count:], wanted=wanted, phase=phase)
 
     def steps(self, known: BlockProgress, radii: Tensor) -> Tensor:
-        return damped_steps(*self._derivatives(known), radii)
+        """Solve the model for the parameters that no bound holds, see `damped_steps` and `checked_steps`."""
+        return self._solved(known, radii).steps
+
+    def _solved(self, known: BlockProgress, radii: Tensor) -> LocalSteps:
+        x, jacobian, (gradient, hessian) = known.center, known.jacobian, self._derivatives(known)
+        lower, upper = self.settings.lower - x, self.settings.upper - x
+        free = are_free(torch.zeros_like(x), gradient, lower, upper) > 0.0
+        steps = x.new_zeros(len(radii), len(x))
+        if bool(free.any()):
+            steps[:, free] = damped_steps(gradient[free], hessian[free][:, free], radii)
+
+        def valued(y: Tensor) -> tuple[float, Tensor]:
+            value, slope = value_and_slope(self.settings.white_box, y.view(known.shape))
+            return value, slope.flatten()
+
+        outputs = LinearOutputs(
+            valued, known.output, lambda s: (s.float() @ jacobian).double(), lambda w: (jacobian @ w.float()).double()
+        )
+        widths = jacobian.double().norm(dim=0) * (float(radii[-1]) / math.sqrt(self.settings.n))
+        bent = ((steps @ hessian) * steps).sum(1)
+        return checked_steps(outputs, steps, gradient, bent, widths, radii, lower, upper)
 
     def taken(self, known: BlockProgress, evaluated: Evaluated) -> BlockProgress:
         return super().taken(replace(known, wanted=max(1, round(self.block * self.settings.n))), evaluated)
@@ -111,7 +136,11 @@ class BlockMethod(GaussNewton[BlockProgress]):
         return replace(known, jacobian=broyden_update(known.jacobian, step[None], change[None]))
 
     def arrived(self, known: BlockProgress) -> BlockProgress:
-        known = known.arriving(Best(known.center, known.loss, known.sigma))
+        """Begin again or end; it has arrived only where outputs change, and their linear model promises nothing."""
+        longest = known.center.new_tensor([LENGTHS[-1] * self.radius * math.sqrt(self.settings.n)])
+        promised = self._solved(known, longest).promised
+        if bool(known.jacobian.any()) and (promised is None or promised <= _LITTLE * abs(known.loss)):
+            known = known.arriving(Best(known.center, known.loss, known.sigma))
         return super().arrived(replace(known, wanted=self.settings.n))
 
     def distance(self, radius: float) -> float:

@@ -68,13 +68,37 @@ def local_steps(
     outputs = LinearOutputs(
         valued, output.flatten(), lambda s: rows.times(s[None])[0], lambda w: columns.times(w[None])[0]
     )
-    before = outputs.value(torch.zeros_like(gradient))
-    down, bent = steps @ gradient, torch.stack([s @ product(s) for s in steps])
+    bent = torch.stack([v @ product(v) for v in steps])
+    widths = jacobian.values.to(radii).square().sum(1).sqrt() * (float(radii[-1]) / math.sqrt(jacobian.n))
+    return checked_steps(outputs, steps, gradient, bent, widths, radii, lower, upper)
+
+
+def checked_steps(
+    outputs: LinearOutputs,
+    steps: Tensor,
+    gradient: Tensor,
+    bent: Tensor,
+    widths: Tensor,
+    radii: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+) -> LocalSteps:
+    """Return the steps [k, n] of a quadratic where it holds, and else steps to the minimum of linear outputs.
+
+    Args:
+        outputs: with their loss.
+        steps: within the radii [k], which are in rising order.
+        gradient: of the quadratic [n].
+        bent: s.Hs of each step [k].
+        widths: how far outputs change within the longest radius [m], about.
+        radii: [k].
+        lower: bounds of steps [n], at most 0.
+        upper: at least 0.
+    """
+    before, down, longest = outputs.value(torch.zeros_like(gradient)), steps @ gradient, float(radii[-1])
     if all(_holds(outputs, before, s, float(one)) for s, one in zip(steps, -(down + 0.5 * bent), strict=True)):
         straight = float(bent[-1]) <= -_ROUNDED * float(down[-1])
         return LocalSteps(steps, -float(down[-1]) if straight else None)
-    longest = float(radii[-1])
-    widths = jacobian.values.to(radii).square().sum(1).sqrt() * (longest / math.sqrt(jacobian.n))
     start = min(steps.clamp(lower, upper), key=outputs.value)
     end, promised = smoothed_minimum(outputs, widths, longest, lower, upper, start)
     return LocalSteps(radii[:, None] / longest * end, promised)

@@ -23,10 +23,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.nonsmooth import kinked_minimum
+from torch_zerohess.linalg.nonsmooth import kinked_minimum, mirrored
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
 from torch_zerohess.search.method import Settings
+from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.region_descent import BAD, LONG, NEAR, RegionDescent
 from torch_zerohess.search.region_progress import RegionProgress
 from torch_zerohess.search.state import Best, Evaluated
@@ -45,6 +46,9 @@ _ITERATIONS = 100
 """Of the minimisation without the quadratic."""
 _LEAST_GAIN = 1e-3
 """Share of its decrease that ten iterations bring at least: the outputs are not known to be linear any better."""
+_AGAIN, _ASIDE = ((1000, 1e-6), (1000, 1e-6)), 0.01
+"""Iterations and least gains of further tries where it finds next to nothing and the slope is known, and the distance
+of their starts from x, over the radius."""
 _NOTHING = 1e-8
 """Promised decrease, over the loss, that is next to nothing."""
 _LEVEL = 1e-3
@@ -102,6 +106,8 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     def __init__(self, settings: Settings, capacity: int, patience: int | None = None) -> None:
         super().__init__(settings, min(coefficients(settings.n), capacity), capacity)
         self._patience = _PATIENCE if patience is None else patience
+        self.at_kink = False
+        """Whether the quadratic was wrong for the last step, as at a kink of the loss."""
         self._linear: tuple[Tensor, Tensor] | None = None  # output [m] and Jacobian [n, m] of the last quadratic
 
     def taking_over(self, known: DescentProgress | ProcessProgress, lowest: Best, sigma: float) -> OutputProgress:
@@ -159,6 +165,11 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
             return None
         return torch.nn.functional.one_hot(unseen.nonzero()[0, 0], self._n).to(x)
 
+    def _is_known(self, known: OutputProgress) -> bool:
+        """Whether evaluations near the best point tell its slope in every direction."""
+        near = int((known.scaled.norm(dim=1) <= NEAR).sum())
+        return known.confirmed or (near > self._n and self._unseen(known) is None)
+
     def _modelled(self, known: OutputProgress) -> tuple[OutputProgress, int]:
         nearest = self._nearest(known, self._n + 1)
         center, others = known.outputs[nearest[0]], nearest[1:]
@@ -183,22 +194,35 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         curvature = known.size * known.curvature if known.curved else torch.zeros_like(known.curvature)
         before, _ = self._of_linear(known, curvature, torch.zeros_like(s))
         after, _ = self._of_linear(known, curvature, s)
-        if abs(before - after - promised) <= _EXPANDED * promised + _ROUNDED * abs(before):
+        self.at_kink = abs(before - after - promised) > _EXPANDED * promised + _ROUNDED * abs(before)
+        if not self.at_kink:
             return s, promised
         x, settings, radius = known.lowest.point, self.settings, known.sigma
-        lower, upper = settings.lower - x, settings.upper - x
+        lower, upper = ((one - x).clamp(-2.0 * radius, 2.0 * radius) for one in (settings.lower, settings.upper))
         steep = _STEEP * known.size * max(float(known.gradient.norm()), math.ulp(0.0))
 
         def penalised(s: Tensor) -> tuple[float, Tensor]:
-            value, slope = self._of_linear(known, curvature, s)
-            length, beyond = float(s.norm()), s - s.clamp(lower, upper)
-            value += steep * (max(length - radius, 0.0) + float(beyond.abs().sum()))
-            slope = slope + steep * beyond.sign()
-            return value, slope + steep * s / length if length > radius else slope
+            inside, signs = mirrored(s, lower, upper)
+            value, slope = self._of_linear(known, curvature, inside)
+            length = float(inside.norm())
+            if length > radius:
+                value, slope = value + steep * (length - radius), slope + steep * inside / length
+            return value, signs * slope
 
-        start = s if after < before else torch.zeros_like(s)
-        t = kinked_minimum(penalised, start, _ITERATIONS, radius, _LEAST_GAIN).clamp(lower, upper)
-        t = t * min(1.0, radius / max(float(t.norm()), math.ulp(0.0)))
+        def lowest(start: Tensor, iterations: int, least_gain: float) -> Tensor:
+            t, _ = mirrored(kinked_minimum(penalised, start, iterations, radius, least_gain), lower, upper)
+            return t * min(1.0, radius / max(float(t.norm()), math.ulp(0.0)))
+
+        zero, generator = torch.zeros_like(s), torch.Generator().manual_seed(0)
+        t = lowest(s if after < before else zero, _ITERATIONS, _LEAST_GAIN)
+        # Where kinks meet, a slope may point to no decrease although there is one.
+        again = _AGAIN if self._is_known(known) else ((_ITERATIONS, _LEAST_GAIN),)
+        for iterations, least_gain in again:
+            if before - self._of_linear(known, curvature, t)[0] > _NOTHING * abs(before):
+                break
+            beside = _ASIDE * radius * torch.nn.functional.normalize(normal(generator, s, self._n), dim=0)
+            end = lowest(beside, iterations, least_gain)
+            t = min(t, end, key=lambda one: self._of_linear(known, curvature, one)[0])
         return t, before - self._of_linear(known, curvature, t)[0]
 
     def _of_linear(self, known: OutputProgress, curvature: Tensor, s: Tensor) -> tuple[float, Tensor]:

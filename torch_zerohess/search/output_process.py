@@ -30,6 +30,8 @@ _WORTH = 0.1
 _WORTH_EARLY = 0.3
 """`_WORTH` right after the first samples. Where outputs have nothing in common, as images of objects that do not
 overlap, an affine output promises to fade the object out: up to a quarter."""
+_ARRIVED = 1e-8
+"""`_WORTH` at a kink of the loss where the process has arrived: it does not know the kink."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""
 
@@ -160,7 +162,8 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)
             begun = self.local.taking_over(known, best, sigma)
         newton, points = self.local.plan(begun, generator)
-        if len(points) and newton.promised > least:
+        at_kink = bool(known.due) and self.local.at_kink and newton.promised > _ARRIVED * abs(best.loss)
+        if len(points) and (newton.promised > least or at_kink):
             return replace(known, local=newton, finishing=True, waited=0), points
         return known, points[:0]
 

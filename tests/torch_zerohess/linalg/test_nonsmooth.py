@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torch_zerohess.linalg import nonsmooth
-from torch_zerohess.linalg.nonsmooth import kinked_minimum
+from torch_zerohess.linalg.nonsmooth import kinked_minimum, mirrored
 from truths import vector
 
 PLACES = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -70,3 +70,23 @@ def test_it_ends_where_ten_iterations_bring_next_to_nothing() -> None:
     left = float(f(minimum(f, least_gain=1e-3))) - least
     assert without > 1.5 * calls
     assert whole <= left < 2e-3 * (float(f(torch.full_like(PLACES[0], 2.0))) - least)
+
+
+def test_mirrored_points_are_in_the_box_and_signs_are_derivatives() -> None:
+    lower, upper = vector(-1.0, 0.0, -3.0), vector(2.0, 0.5, 3.0)
+    x = 20.0 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    at, signs = mirrored(x, lower, upper)
+    after, _ = mirrored(x + 1e-7, lower, upper)
+    assert bool(((at >= lower) & (at <= upper)).all())
+    torch.testing.assert_close((after - at) / 1e-7, signs, rtol=0.0, atol=1e-6)
+    assert torch.equal(mirrored(0.1 * upper, lower, upper)[0], 0.1 * upper)
+
+
+def test_a_minimum_on_the_side_of_a_box_is_found_by_reflection() -> None:
+    lower, upper = -torch.ones(4, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+
+    def folded(x):
+        return (mirrored(x, lower, upper)[0] - 3.0 * PLACES).abs().sum()
+
+    found, _ = mirrored(minimum(folded), lower, upper)
+    torch.testing.assert_close(found, (3.0 * PLACES.median(0).values).clamp(-1.0, 1.0), rtol=0.0, atol=1e-6)

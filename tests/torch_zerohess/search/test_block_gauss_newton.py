@@ -5,7 +5,8 @@ from itertools import pairwise
 
 import pytest
 import torch
-from searches import run
+from scipy.optimize import lsq_linear
+from searches import Linear, run, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.search.block_gauss_newton import broyden_update
@@ -175,6 +176,36 @@ def test_it_stays_within_the_bounds_and_solves_there():
 
     run(search, f, 400)
     torch.testing.assert_close(search.x, wanted.clamp(-0.75, 0.75), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_least_squares_on_the_sides_of_a_box_are_solved(seed):
+    """Steps along parameters that a bound holds would be no descent after they are cut off."""
+    fn = Linear(20, seed, "mean")
+    search = zh.optim.BlockGaussNewton(
+        zeros(20), sigma=1.0, bounds=(-1, 1), loss=square(fn.target), seed=seed, restarts=0
+    )
+    run(search, fn, 300)
+    x = torch.from_numpy(lsq_linear(fn.a.numpy(), fn.target.numpy(), (-1, 1), tol=1e-14).x)
+    assert search.solved
+    torch.testing.assert_close(search.x, x, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mean_of_magnitudes_is_minimised_as_a_whole(seed):
+    """Its quadratic is a plane: steps along it end at the first kinks, a tenth of the loss above the minimum."""
+    fn = Linear(10, seed, "mean", side=100.0)
+    search = run(zh.optim.BlockGaussNewton(zeros(10), sigma=1.0, loss=fn.loss, seed=seed, restarts=0), fn, 300)
+    assert search.solved
+    assert fn.excess(search.value) < 1e-3
+
+
+def test_on_steps_it_has_not_arrived():
+    """Samples within a step change no output, so that nothing is known of the loss."""
+    search = zh.optim.BlockGaussNewton(zeros(10), sigma=1.0, loss=square(3.0), seed=0, restarts=0)
+    while not search.done:
+        search.tell(search.ask().round())
+    assert not search.solved
 
 
 def test_a_start_in_a_corner_is_sampled_away_from_it():

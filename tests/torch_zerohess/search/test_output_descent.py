@@ -3,7 +3,7 @@
 import pytest
 import torch
 from every_search import same, saved
-from searches import bent, plateau, rays, rays_loss, run, zeros
+from searches import KINKS, Linear, bent, plateau, rays, rays_loss, run, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent
@@ -93,6 +93,16 @@ def test_at_a_kink_the_step_is_the_best_one_in_the_region(seed, monkeypatch):
     assert ratio() > 0.99
     monkeypatch.setattr(output_gauss_newton, "_STEEP", 0.0)
     assert ratio() < 0.95
+
+
+@pytest.mark.parametrize("kind", KINKS)
+@pytest.mark.parametrize("seed", [0, 5])
+def test_at_kinks_on_the_sides_of_a_box_it_arrives_at_the_minimum(kind, seed):
+    """Kinks and sides meet at the minimum: there a slope may point to no decrease although there is one."""
+    fn = Linear(8, seed, kind)
+    search = run(Descent(zeros(8), sigma=1.0, bounds=(-1, 1), loss=fn.loss, seed=seed, restarts=0), fn, 300)
+    assert search.solved
+    assert fn.excess(search.value) < 1e-6
 
 
 def test_rounded_outputs_do_not_keep_it_from_arriving(monkeypatch):

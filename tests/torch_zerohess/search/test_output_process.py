@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 import torch
-from searches import misfit, waves
+from searches import KINKS, Linear, misfit, run, waves, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.optim import GaussianProcessSearch
@@ -29,6 +29,16 @@ def search(fn=swing, solution=SOLUTION, shift=0.0, **settings):
 
 def finishing(found):
     return found.state_dict()["progress"]["finishing"]
+
+
+@pytest.mark.parametrize("kind", KINKS)
+def test_at_kinks_gauss_newton_goes_on_from_where_the_process_arrives(kind):
+    """By itself the process ends 1e-3 of the loss at the start above the minimum."""
+    fn = Linear(4, 4, kind)
+    found = GaussianProcessSearch(zeros(4), sigma=1.0, bounds=(-1, 1), loss=fn.loss, seed=4, restarts=0)
+    run(found, fn, 200)
+    assert found.solved
+    assert fn.excess(found.value) < 1e-6
 
 
 @pytest.mark.parametrize("seed", range(1, 4))

@@ -9,7 +9,7 @@ from torch.optim import lr_scheduler
 
 import torch_zerohess as zh
 from torch_zerohess.autograd.curvature import CurvatureOperator
-from torch_zerohess.optim.second_order import Model
+from torch_zerohess.optim.second_order import Model, checked_lr
 from truths import spread, vector
 
 
@@ -161,6 +161,21 @@ def test_a_warm_up_may_end_at_a_little_more_than_one() -> None:
         optimizer.step(lambda: 0.5 * x.square().sum())
         warm_up.step()
     assert optimizer.param_groups[0]["lr"] == 1.0000000000000002
+
+
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
+def test_a_schedule_may_end_at_a_little_less_than_zero(kind: type) -> None:
+    x = vector(3.0, -2.0).requires_grad_()
+    optimizer = kind([x], radius=0.1)
+    schedule = lr_scheduler.LinearLR(optimizer, start_factor=1 / 3, end_factor=0.0, total_iters=4)
+    for _ in range(4):
+        optimizer.step(lambda: 0.5 * x.square().sum())
+        schedule.step()
+    assert -1e-16 < optimizer.param_groups[0]["lr"] < 0.0  # rounding: otherwise this test would show nothing
+    before = x.detach().clone()
+    optimizer.step(lambda: 0.5 * x.square().sum())
+    assert torch.equal(x.detach(), before)
+    assert checked_lr(optimizer.param_groups[0]) == 0.0
 
 
 @pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])

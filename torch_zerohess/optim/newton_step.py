@@ -40,6 +40,9 @@ class NewtonStep(SecondOrder):
     the radius stays. The length compared with the radius is the length of the step times `lr`, so the radius does not
     grow while `lr` is below 1.
 
+    Layers in training mode see every call of the closure with `adapt`. BatchNorm updates its running statistics at the
+    start of the step and again at its end, also where the step is taken back.
+
     The first radius is a setting of the group, `first_radius`, and so part of the state. A state of an earlier version
     lacks it. An optimizer that loads such a state keeps its own first radius.
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_tensors
-from torch_zerohess.autograd.graph import COMPILED, black_box_inputs, check_twice, edge_of, edges_before
+from torch_zerohess.autograd.graph import COMPILED, black_box_inputs, check_once, check_through, check_twice
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.flat import flattened, split_like, widest_type
 
@@ -32,14 +32,15 @@ class CurvatureOperator:
         inputs: the parameters, one tensor or several, N numbers in all. Products are in the widest of their types.
         mode: "exact" or "gauss_newton", see the module. With "gauss_newton" only the curvature through the inputs of
             the black boxes counts: a term of the loss that reaches the parameters in another way adds none.
-        through: for "gauss_newton", the tensors y at which the white box ends; the inputs of all `BlackBox` layers
-            between `inputs` and `outputs` if None.
+        through: for "gauss_newton", the tensors y at which the white box ends, each on the path to the loss, and none
+            computed from another; the inputs of all `BlackBox` layers between `inputs` and `outputs` if None.
 
     Raises:
         TypeError: `outputs`, or one of `inputs` or `through`, is no tensor.
         RuntimeError: `torch.compile` made the backward that is to be differentiated.
-        ValueError: `outputs` has no graph or more than one element; nothing to go through was found, one black box
-            stands behind another, or the loss is not computed from `through`.
+        ValueError: `outputs` has no graph or more than one element; nothing to go through was found, or one black box
+            stands behind another; the loss is not computed from every tensor of `through`, or one of these from another
+            one; a tensor is given twice.
 
     Example:
         >>> w = torch.tensor([1.0, 2.0], requires_grad=True)
@@ -69,6 +70,7 @@ class CurvatureOperator:
         self._outputs, self._inputs = outputs, _listed("inputs", inputs)
         if not self._inputs or not all(one.requires_grad for one in self._inputs):
             raise ValueError("inputs must be tensors that require grad")
+        check_once(inputs=self._inputs)
         self.mode = mode
         N = sum(one.numel() for one in self._inputs)
         self.shape = (N, N)
@@ -79,8 +81,11 @@ class CurvatureOperator:
             self._slopes = _or_zeros(found, self._inputs)
             self.gradient = flattened([one.detach() for one in self._slopes])
         else:
-            self._through = black_box_inputs(outputs) if through is None else _listed("through", through)
-            self._check_path(outputs)
+            if through is None:
+                self._through = black_box_inputs(outputs)
+            else:
+                self._through = _listed("through", through)
+                check_through(outputs, self._through)
             self._slopes = _grad([outputs], self._through, None, create_graph=True)
             found = _derivatives([outputs], self._inputs, None)
             self.gradient = flattened(_or_zeros(found, self._inputs))
@@ -90,15 +95,6 @@ class CurvatureOperator:
     """Gradient of the loss, [N]."""
     depends: bool
     """Whether the loss is computed from any of the parameters."""
-
-    def _check_path(self, outputs: Tensor) -> None:
-        """Raise ValueError if the loss does not go through any of the tensors at which the white box ends."""
-        ends = {edge_of(one) for one in self._through if one.requires_grad}
-        if not ends & {edge_of(outputs), *edges_before(outputs.grad_fn)}:
-            raise ValueError(
-                f"outputs must be computed from through, but no tensor of {[list(one.shape) for one in self._through]} "
-                "is on the path to the loss: give the tensors themselves, not copies and not a second forward pass"
-            )
 
     def __matmul__(self, v: Tensor) -> Tensor:
         """Return H v for v [N], or H V for V [N, m]."""

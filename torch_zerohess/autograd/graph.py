@@ -1,4 +1,4 @@
-"""The graph behind a loss: the black boxes in it, and backwards that `torch.compile` made."""
+"""The graph behind a loss: the black boxes in it, where its white box ends, and backwards of `torch.compile`."""
 
 from collections.abc import Sequence
 
@@ -27,21 +27,57 @@ def black_box_inputs(outputs: Tensor) -> list[Tensor]:
             "mode 'gauss_newton' found no BlackBox layer between inputs and outputs: name the tensors at which the "
             "white box ends in `through` (a compiled layer is neither found nor differentiated twice)"
         )
-    for one in found.values():
-        if _entries(one.grad_fn):
-            raise ValueError(
-                "mode 'gauss_newton' needs black boxes side by side, but one stands behind another: use mode 'exact'"
-            )
-        if edges_before(one.grad_fn) & found.keys():
-            raise ValueError(
-                "mode 'gauss_newton' found a black box whose input is computed from the input of another: name in "
-                "`through` the tensors that both come from"
-            )
+    nodes = [one.grad_fn for one in found.values()]
+    if _entries(*nodes):
+        raise ValueError(
+            "mode 'gauss_newton' needs black boxes side by side, but one stands behind another: use mode 'exact'"
+        )
+    if edges_before(*nodes) & found.keys():
+        raise ValueError(
+            "mode 'gauss_newton' found a black box whose input is computed from the input of another: name in "
+            "`through` the tensors that both come from"
+        )
     return list(found.values())
 
 
-def _entries(node: Node | None) -> list[Tensor]:
-    seen, stack, found = {node}, [node], []
+def check_through(outputs: Tensor, through: Sequence[Tensor]) -> None:
+    """Raise ValueError if the white box of a loss cannot end at these tensors.
+
+    The curvature through a tensor off the path to the loss would be missing. The curvature through a tensor that is
+    given twice, or computed from another, would count twice.
+    """
+    if not through:
+        raise ValueError("through must have at least one tensor, got none: leave it out to end at all BlackBox layers")
+    path = {edge_of(outputs), *edges_before(outputs.grad_fn)}
+    for index, one in enumerate(through):
+        if not one.requires_grad or edge_of(one) not in path:
+            raise ValueError(
+                f"outputs must be computed from every tensor of through, but through[{index}], {list(one.shape)}, is "
+                "not on the path to the loss: give the tensors themselves, not copies and not a second forward pass, "
+                "and leave out tensors that the loss does not use or that do not require grad"
+            )
+    check_once(through=through)
+    before = edges_before(*(one.grad_fn for one in through)) if len(through) > 1 else set()
+    for index, one in enumerate(through):
+        if edge_of(one) in before:
+            raise ValueError(
+                "through must have tensors side by side, but one of them is computed from "
+                f"through[{index}], {list(one.shape)}: leave one of the two out"
+            )
+
+
+def check_once(**arguments: Sequence[Tensor]) -> None:
+    """Raise ValueError for an argument that has a tensor twice; all tensors require grad."""
+    for name, tensors in arguments.items():
+        first: dict[tuple[Node, int], int] = {}
+        for index, one in enumerate(tensors):
+            if (before := first.setdefault(edge_of(one), index)) < index:
+                raise ValueError(f"{name} must have every tensor once, but {name}[{index}] is {name}[{before}] again")
+
+
+def _entries(*nodes: Node | None) -> list[Tensor]:
+    """Return the inputs of all black boxes before some nodes, or at them."""
+    seen, stack, found = {*nodes}, [*nodes], []
     while stack:
         current = stack.pop()
         if current is None:
@@ -55,10 +91,10 @@ def _entries(node: Node | None) -> list[Tensor]:
     return found
 
 
-def edges_before(node: Node | None) -> set[tuple[Node, int]]:
-    """Return all gradient edges that can be reached from a node, (node, number of its output) each."""
+def edges_before(*nodes: Node | None) -> set[tuple[Node, int]]:
+    """Return all gradient edges that can be reached from any of the nodes, (node, number of its output) each."""
     seen: set[tuple[Node, int]] = set()
-    stack = [node]
+    stack = [*nodes]
     while stack:
         current = stack.pop()
         for following, number in current.next_functions if current is not None else ():

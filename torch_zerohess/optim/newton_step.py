@@ -3,6 +3,7 @@
 import math
 import traceback
 from abc import abstractmethod
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -39,12 +40,28 @@ class NewtonStep(SecondOrder):
     the radius stays. The length compared with the radius is the length of the step times `lr`, so the radius does not
     grow while `lr` is below 1.
 
+    Layers in training mode see every call of the closure with `adapt`. BatchNorm updates its running statistics at the
+    start of the step and again at its end, also where the step is taken back.
+
+    The first radius is a setting of the group, `first_radius`, and so part of the state. A state of an earlier version
+    lacks it. An optimizer that loads such a state keeps its own first radius.
+
     Without `adapt` every step is taken, as suits a loss whose values have noise: over small batches, or of a layer with
     `value="smoothed"`. A test of such values near a minimum shrinks the radius for good.
     """
 
     exit: str | None = None
     """Why the search for the last step ended; not part of the state."""
+
+    def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any], *, distributed: bool = False) -> None:
+        super().__init__(params, defaults | {"first_radius": defaults["radius"]}, distributed=distributed)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take a loaded state, of an earlier version with the first radius of this optimizer."""
+        if hasattr(self, "defaults"):  # a copy of an optimizer has everything in the state
+            for group in state["param_groups"]:
+                group.setdefault("first_radius", self.defaults["first_radius"])
+        super().__setstate__(state)
 
     @abstractmethod
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:
@@ -100,7 +117,7 @@ class NewtonStep(SecondOrder):
         if slope > 0.0:
             return self._bounded(0.5 * radius)
         if slope < 0.0:
-            most = min(self.defaults["radius"], group["max_radius"])
+            most = min(group["first_radius"], group["max_radius"])
             return min(_next_radius(1.0, float(level.norm()), radius), max(radius, most))
         return radius
 
@@ -116,7 +133,8 @@ class NewtonStep(SecondOrder):
 
     def _bounded(self, radius: float) -> float:
         """Return a radius that is not below 1e-8 of the first one, unless it was before."""
-        return max(radius, min(self.param_groups[0]["radius"], _LEAST * self.defaults["radius"]))
+        group = self.param_groups[0]
+        return max(radius, min(group["radius"], _LEAST * group["first_radius"]))
 
     def _try(self, s: Tensor, closure: Closure, loss: Tensor) -> float:
         """Move by s [N] and return by how much the loss fell; if it rose or is not finite, take the move back."""

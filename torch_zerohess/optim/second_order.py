@@ -149,16 +149,18 @@ class Model:
 
 
 _ROUNDING = 1e-9
-"""By how much a learning rate may exceed 1."""
+"""How far a learning rate may be out of its range."""
 
 
 def checked_lr(group: dict[str, Any]) -> float:
     """Return the learning rate of a group, which a scheduler may have set; ValueError if it is not in [0, 1].
 
-    Schedulers that end at 1 may end a little above it, by rounding. That counts as 1.
+    Schedulers that end at 0 or 1 may end a little beyond it, by rounding. That counts as 0 or 1.
     """
     lr = group["lr"]
-    return 1.0 if isinstance(lr, float) and 1.0 < lr < 1.0 + _ROUNDING else checked_number("lr", lr, 0.0, most=1.0)
+    if isinstance(lr, float) and -_ROUNDING < lr < 1.0 + _ROUNDING:
+        return float(min(max(lr, 0.0), 1.0))
+    return checked_number("lr", lr, 0.0, most=1.0)
 
 
 class SecondOrder(Optimizer):

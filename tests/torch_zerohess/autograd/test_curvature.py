@@ -156,6 +156,7 @@ def test_errors_name_what_is_wrong():
         (lambda: zh.CurvatureOperator(layer(chained), x, mode="gauss_newton"), "side by side"),
         (lambda: zh.CurvatureOperator(x.sum(), x) @ torch.ones(3), r"\[3\]"),
         (lambda: zh.CurvatureOperator(x.sum(), x, through=x), "through"),
+        (lambda: zh.CurvatureOperator(x.sum(), x, mode="gauss_newton", through=[]), "through must have at least one"),
         (lambda: zh.hvp(x.sum(), x, torch.ones(3)), "shapes of inputs"),
     ]
     for make, message in cases:
@@ -195,9 +196,51 @@ def test_a_loss_that_is_not_computed_from_through_is_refused(through):
     net, x = torch.nn.Linear(3, 2), torch.ones(4, 3)
     y = net(x)
     other = {"a second pass": net(x), "a copy": y.clone(), "a new leaf": y.detach().requires_grad_()}[through]
-    with pytest.raises(ValueError, match=r"no tensor of \[\[4, 2\]\] is on the path to the loss"):
-        zh.CurvatureOperator(y.square().sum(), list(net.parameters()), mode="gauss_newton", through=other)
-    zh.CurvatureOperator(y.square().sum(), list(net.parameters()), mode="gauss_newton", through=[other, y])
+    for index, ends in enumerate((other, [y, other])):
+        with pytest.raises(ValueError, match=rf"but through\[{index}\], \[4, 2\], is not on the path to the loss"):
+            zh.CurvatureOperator(y.square().sum(), list(net.parameters()), mode="gauss_newton", through=ends)
+
+
+def test_a_tensor_is_given_once():
+    """Else its curvature would count more than once."""
+    W = torch.ones(2, 3, requires_grad=True)
+    y = torch.ones(4, 3) @ W.T
+    for through in ([y, y], (y, W.sum(), y)):
+        loss, last = y.square().sum() + W.sum() * y.sum(), len(through) - 1
+        with pytest.raises(ValueError, match=rf"but through\[{last}\] is through\[0\] again"):
+            zh.CurvatureOperator(loss + through[1].sum(), W, mode="gauss_newton", through=through)
+    for call in (lambda: zh.CurvatureOperator(W.sum(), [W, W]), lambda: zh.hvp(W.sum(), [W, W], [W, W])):
+        with pytest.raises(
+            ValueError, match=r"inputs must have every tensor once, but inputs\[1\] is inputs\[0\] again"
+        ):
+            call()
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_where_the_white_box_ends_no_tensor_is_computed_from_another(index):
+    net = torch.nn.Linear(3, 2)
+    y = net(torch.ones(4, 3))
+    z = y.tanh()
+    loss, through = y.square().sum() + z.square().sum(), [y, z] if index == 0 else [z, y]
+    with pytest.raises(ValueError, match=rf"one of them is computed from through\[{index}\], \[4, 2\]"):
+        zh.CurvatureOperator(loss, list(net.parameters()), mode="gauss_newton", through=through)
+
+
+def test_the_white_box_may_end_at_several_results_of_one_operation():
+    net = torch.nn.Linear(3, 2)
+    y = net(torch.randn(4, 3, generator=torch.Generator().manual_seed(0)))
+    left, right = y.unbind(1)
+    loss = (left * right).square().sum()
+    found = zh.CurvatureOperator(loss, list(net.parameters()), mode="gauss_newton", through=[left, right])
+    one = zh.CurvatureOperator(loss, list(net.parameters()), mode="gauss_newton", through=y)
+    torch.testing.assert_close(found.to_dense(), one.to_dense())
+
+
+def test_an_end_of_the_white_box_that_does_not_require_grad_is_refused():
+    w, c = torch.ones(3, requires_grad=True), torch.ones(3)
+    y = 2 * w
+    with pytest.raises(ValueError, match=r"but through\[1\], \[3\], is not on the path .* that do not require grad"):
+        zh.CurvatureOperator((y * c).square().sum(), w, mode="gauss_newton", through=[y, c])
 
 
 def test_what_is_no_tensor_is_refused():

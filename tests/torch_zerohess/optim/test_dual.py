@@ -136,8 +136,8 @@ def test_a_jacobian_per_sample_is_of_evaluation_mode(layer: torch.nn.Module) -> 
 
 
 COUPLED = {
-    "all elements": lambda a, b: a.sum() ** 2,
-    "two elements": lambda a, b: a.square().sum() + 3.0 * (a[0] * a[2]).sum(),
+    "all elements": lambda a, b: a.sum() ** 2 + b.square().sum(),
+    "two elements": lambda a, b: a.square().sum() + b.square().sum() + 3.0 * (a[0] * a[2]).sum(),
     "elements of the second tensor": lambda a, b: a.square().sum() + b.sum(0).square().sum(),
     "elements of two tensors": lambda a, b: a.square().sum() + b.square().sum() + (a[1] * b[1]).sum(),
 }

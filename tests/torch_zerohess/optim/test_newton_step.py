@@ -199,6 +199,30 @@ def test_a_resumed_search_knows_the_last_step_to_the_same_loss() -> None:
     assert float(x.detach()) == 0.0
 
 
+@BOTH
+def test_a_resumed_search_has_the_first_radius(optimizer, tmp_path) -> None:
+    """On a plateau the radius doubles up to the first one, which is that of the state and not of the new optimizer."""
+
+    def radii(steps, x):
+        for _ in range(4):
+            steps.step(lambda: sampled(vector(5.0).sum(), x.sum()))
+            yield steps.param_groups[0]["radius"]
+
+    x = vector(0.0).requires_grad_()
+    steps = optimizer([x], radius=4.0)
+    steps.param_groups[0]["radius"] = 0.5
+    torch.save(steps.state_dict(), tmp_path / "state.pt")
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    resumed = optimizer([x], radius=1.0)
+    resumed.load_state_dict(state)
+    assert [*radii(resumed, x)] == [0.5, 1.0, 2.0, 4.0]
+    del state["param_groups"][0]["first_radius"]  # of an earlier version
+    resumed = optimizer([x], radius=1.0)
+    resumed.load_state_dict(state)
+    assert [*radii(resumed, x)] == [0.5, 1.0, 1.0, 1.0]
+    assert "first_radius" not in state["param_groups"][0]
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @BOTH
 def test_the_radius_has_an_end_where_every_step_raises_the_loss(optimizer, dtype) -> None:

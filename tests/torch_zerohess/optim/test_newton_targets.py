@@ -269,3 +269,91 @@ def test_the_scale_of_the_losses_does_not_matter(n: int, scale: float) -> None:
 def test_a_step_of_any_length_is_shortened_to_the_radius(n: int) -> None:
     found = NewtonTargets(output_radius=2.0)(lambda y: (y - 1e25).square().sum(1), torch.zeros(2, n))
     torch.testing.assert_close(found.norm(dim=1), torch.full((2,), 2.0))
+
+
+def of_scales(*scales):
+    """Quadratics of these scales [B, n] of the outputs, with minima at 1."""
+    c = torch.stack(scales)
+    return lambda y: (c * (y - 1.0)).square().sum(1)
+
+
+def test_a_preconditioner_is_made_again_as_soon_as_the_curvature_has_changed() -> None:
+    """Sixty-four outputs, whose scales turn round again and again: each call finds the minimum."""
+    scales, y = torch.logspace(0, 1.5, 64), torch.zeros(8, 64)
+    targets = NewtonTargets(relative_damping=1e-6)
+    for c in (scales, scales.flip(0), scales.flip(0), scales.roll(32), scales):
+        torch.testing.assert_close(targets(of_scales(*[c] * 8), y), torch.ones_like(y), rtol=1e-3, atol=0.0)
+
+
+class Counted(torch.autograd.Function):
+    """The identity, which counts backward passes: one per gradient and one per product."""
+
+    passes = 0
+
+    @staticmethod
+    def forward(ctx, y):
+        return y.clone()
+
+    @staticmethod
+    def backward(ctx, g):
+        Counted.passes += 1
+        return g
+
+
+def test_a_preconditioner_that_does_not_help_is_made_once_in_a_hundred_calls() -> None:
+    """Two elements of opposite scales: one matrix suits neither of them in two iterations."""
+    losses, y = of_scales(scales := torch.logspace(0, 1.5, 20), scales.flip(0)), torch.zeros(2, 20)
+    targets, passes = NewtonTargets(relative_damping=1e-6, iterations=2), []
+    for _ in range(203):
+        Counted.passes = 0
+        targets(lambda y: losses(Counted.apply(y)), y)
+        passes.append(Counted.passes)
+    ordinary = min(passes)
+    assert [k for k, one in enumerate(passes) if one > ordinary] == [0, 101, 202]
+    assert passes[0] == ordinary + 10  # columns of two elements at a time
+    assert passes[101] == ordinary + 10 + 2  # and the iterations before and after it
+
+
+@pytest.mark.parametrize("iterations", [1, 16])
+def test_targets_resume_to_the_bit(iterations: int, tmp_path) -> None:
+    """Whether preconditioners help or not, which they do not in one iteration."""
+    scales, y = torch.logspace(0, 1.5, 40), torch.linspace(-1.0, 1.0, 80).view(2, 40)
+    losses = of_scales(scales, 1.1 * scales.roll(1))
+    settings = {"relative_damping": 1e-6, "iterations": iterations}
+    targets = NewtonTargets(**settings)
+    targets(of_scales(scales, scales), y)
+    if iterations == 1:
+        targets(of_scales(scales.roll(9), scales), y)  # it helps no more: 100 calls have no other
+    torch.save(targets.state_dict(), tmp_path / "targets.pt")
+    resumed = NewtonTargets(**settings)
+    resumed.load_state_dict(torch.load(tmp_path / "targets.pt", weights_only=True))
+    expected = targets(losses, y)
+    assert torch.equal(resumed(losses, y), expected)
+    assert not torch.equal(NewtonTargets(**settings)(losses, y), expected)
+    for one in (targets, resumed):
+        one(losses, y)
+    assert torch.equal(targets(of_scales(scales, scales), y), resumed(of_scales(scales, scales), y))
+
+
+def test_the_state_of_targets_is_its_own_and_is_checked() -> None:
+    losses, y = of_scales(scales := torch.logspace(0, 1.5, 20), scales), torch.zeros(2, 20)
+    targets, other = NewtonTargets(), NewtonTargets()
+    state = targets.state_dict()
+    other.load_state_dict(state)  # before the first call
+    targets(losses, y)
+    expected, state = targets(losses, y), targets.state_dict()
+    other.load_state_dict(state)
+    state["factor"].zero_()
+    assert torch.equal(other(losses, y), expected)
+    good = other.state_dict()
+    for wrong, error, message in (
+        ([], TypeError, "state must be a state_dict of NewtonTargets, got list"),
+        ({"wait": 0}, KeyError, "state must be a state_dict of NewtonTargets, this one lacks factor"),
+        (good | {"factor": 3.0}, TypeError, "factor must be a tensor, got float"),
+        (good | {"factor": torch.ones(2, 3)}, ValueError, r"factor must be a matrix \[n, n\], got \[2, 3\]"),
+        (good | {"wait": -1}, ValueError, "wait must be at least 0, got -1"),
+        (good | {"factor": None, "wait": 0.5}, TypeError, "wait must be an integer, got 0.5"),
+    ):
+        with pytest.raises(error, match=message):
+            other.load_state_dict(wrong)
+        assert torch.equal(other(losses, y), expected)

@@ -9,7 +9,7 @@ from torch.optim import lr_scheduler
 
 import torch_zerohess as zh
 from torch_zerohess.autograd.curvature import CurvatureOperator
-from torch_zerohess.optim.second_order import Model
+from torch_zerohess.optim.second_order import Model, checked_lr
 from truths import spread, vector
 
 
@@ -164,6 +164,21 @@ def test_a_warm_up_may_end_at_a_little_more_than_one() -> None:
 
 
 @pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
+def test_a_schedule_may_end_at_a_little_less_than_zero(kind: type) -> None:
+    x = vector(3.0, -2.0).requires_grad_()
+    optimizer = kind([x], radius=0.1)
+    schedule = lr_scheduler.LinearLR(optimizer, start_factor=1 / 3, end_factor=0.0, total_iters=4)
+    for _ in range(4):
+        optimizer.step(lambda: 0.5 * x.square().sum())
+        schedule.step()
+    assert -1e-16 < optimizer.param_groups[0]["lr"] < 0.0  # rounding: otherwise this test would show nothing
+    before = x.detach().clone()
+    optimizer.step(lambda: 0.5 * x.square().sum())
+    assert torch.equal(x.detach(), before)
+    assert checked_lr(optimizer.param_groups[0]) == 0.0
+
+
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton, zh.optim.NonlinearCG])
 @pytest.mark.parametrize("lr", [-0.1, 1.5, float("nan")])
 def test_lr_is_a_factor_from_0_to_1(kind: type, lr: float) -> None:
     with pytest.raises(ValueError, match=r"lr must be (at least 0 and at most 1|a number), got"):
@@ -299,3 +314,39 @@ def test_embeddings_with_sparse_gradients_take_the_same_steps(kind: type, settin
         ends.append([float(optimizer.step(closure)) for _ in range(4)])
     assert ends[0][-1] < ends[0][0]
     assert ends[1] == pytest.approx(ends[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_several_losses_may_each_use_some_of_the_ends_of_the_white_box(noise: float) -> None:
+    """Losses 3 (2 x_0)^2 and 5 (x_1 - 2)^2: a step of Newton reaches the minimum of their mean."""
+    x = torch.nn.Parameter(vector(1.0, 1.0))
+    optimizer = zh.optim.NewtonCG([x], radius=10.0, curvature="gauss_newton", adapt=False, noise=noise)
+
+    def closure() -> tuple[torch.Tensor, list[torch.Tensor]]:
+        a, b = 2 * x[0], x[1] - 2
+        return torch.stack([3 * a**2, 5 * b**2]), [a, b]
+
+    found = optimizer._model(closure, separate=noise > 0)
+    units = torch.eye(2, dtype=torch.float64)
+    expected = torch.diag(vector(24.0, 0.0)), torch.diag(vector(0.0, 10.0))
+    torch.testing.assert_close(
+        torch.stack([found.products(unit) for unit in units], 1),
+        torch.stack(expected) if noise else (0.5 * sum(expected))[None],
+    )
+    if not noise:
+        optimizer.step(closure)
+        torch.testing.assert_close(x.detach(), vector(0.0, 2.0))
+
+
+@pytest.mark.parametrize("kind", [zh.optim.NewtonCG, zh.optim.Newton])
+def test_ends_that_a_closure_gives_twice_are_refused(kind: type) -> None:
+    x = torch.nn.Parameter(vector(1.0, 1.0))
+
+    def closure() -> tuple[torch.Tensor, list[torch.Tensor]]:
+        y = 2 * x
+        return y.square().sum(), [y, y]
+
+    with pytest.raises(
+        ValueError, match=r"through must have every tensor once, but through\[1\] is through\[0\] again"
+    ):
+        kind([x], curvature="gauss_newton").step(closure)

@@ -164,10 +164,10 @@ def minimize(
     start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
     rounds = max(max_evaluations, 0) if restarts is None else restarts
     given = {**settings, "loss": loss, "engine": engine, "restarts": rounds}
-    given |= {"seed": random_seed() if seed is None else seed}
+    own_seed = random_seed() if seed is None else seed
 
-    def make(noise: float, at: Tensor | None = None) -> TrustRegion:
-        return TrustRegion(start if at is None else at, sigma=sigma, bounds=bounds, noise=noise, **given)
+    def make(noise: float, at: Tensor | None = None, *, seed: int = own_seed) -> TrustRegion:
+        return TrustRegion(start if at is None else at, sigma=sigma, bounds=bounds, noise=noise, seed=seed, **given)
 
     smallest = len(make(noise or 0.0).ask()) + 1
     if max_evaluations < smallest:

@@ -32,7 +32,7 @@ class Running:
     """A search with all that was evaluated, and the file that it is written to.
 
     Args:
-        make: the search for a standard deviation of repeated losses, from x0 or from a point [n].
+        make: the search for a standard deviation of repeated losses, from x0 or from a point [n], with a seed.
         call: outputs or losses of points [K, n]; the known ones if it is interrupted.
         noise: that standard deviation; measured at the start if None.
         batch: points that are evaluated at once.
@@ -164,7 +164,7 @@ class Running:
             measured, points = self.noise is None, points[: len(search.missing)]
         if measured:
             most = self._most - self._least
-            found = evaluate_first_batch(points, self.record, search, self._make, self._batch, most)
+            found = evaluate_first_batch(points, self.record, search, self._again, self._batch, most)
             self.noise, self.search, points, losses = found
             self._noted(points, losses)
             return
@@ -173,9 +173,7 @@ class Running:
         # A search that begins again in noise may get no value at its start, where there was one before.
         lost = self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0]))
         if lost:
-            known, losses = self.record.told
-            at_start = losses[(known == points[0]).all(1) & torch.isfinite(losses)]
-            values = torch.cat([at_start.mean()[None].to(values), values[1:]])
+            values = torch.cat([self.record.mean_at(points[0])[None].to(values), values[1:]])
         search.tell(values)
         self._noted(points, values.to(search.told) if lost else search.told)
 
@@ -194,7 +192,7 @@ class Running:
         self._looking = self.evaluations if self._looking is None else self._looking
         found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)
         if found:
-            self.noise, self.search = found, self._make(found, self.best.x)
+            self.noise, self.search = found, self._again(found, self.best.x)
         self._unmeasured, self._looking = self._unmeasured and found is None, None
         self._sure = True
         return bool(found)
@@ -256,10 +254,14 @@ class Running:
         self._unmeasured = saved.get("unmeasured", False) and given is None
         if given is not None and given != self.noise:  # a new search, which keeps the evaluations
             self.record.note_known()
-            self.noise, self.search, self._decided, self._deciding = given, self._make(given), None, None
+            self.noise, self.search, self._decided, self._deciding = given, self._again(given), None, None
         elif self.search.done:
             check_limits(self._limits, saved.get("limits", self._limits), self.search.message)
         self._sure = saved["sure"] or given is not None
+
+    def _again(self, noise: float, at: Tensor | None = None) -> TrustRegion:
+        """Return a search that begins again, at x0 or at a point [n]; the seed is that of the file, if there is one."""
+        return self._make(noise, at, seed=self.search.seed)
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""

@@ -26,6 +26,9 @@ from torch_zerohess.search.white_box import checked_loss
 from torch_zerohess.smoothing import random_seed
 from torch_zerohess.version import VERSION
 
+_LATER = ("seed",)
+"""What a state may lack: earlier versions did not write it."""
+
 
 class AskTell(Standing[P]):
     """A search whose evaluations the caller owns: `ask` for points, evaluate them, `tell` their values.
@@ -67,11 +70,12 @@ class AskTell(Standing[P]):
         if not 0 <= checked_number("noise", noise) < math.inf:
             raise ValueError(f"noise must be finite and at least 0, got {noise}")
         checked_number("tolerance", tolerance, above=0.0, below=1.0)
-        seed = random_seed() if seed is None else checked_seed(seed)
+        self.seed = random_seed() if seed is None else checked_seed(seed)
+        """Of the samples; after `load_state_dict` it is the one of the saved search."""
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
         self._method = self._make(Settings(start, lower, upper, white_box, restarts, tolerance, float(noise), pool))
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(self.seed)
         self._state = self._after(*self._method.first(generator), generator)
         self._out: Tensor | None = self._state.asked[:0]
         """Points out for evaluation [K, n], None if `load_state_dict` does not know."""
@@ -164,14 +168,14 @@ class AskTell(Standing[P]):
         alone = len(self._given) in (0, len(self._state.asked))  # nothing is out, or what the search itself asked for
         out = {"early": dict(self._early), "out": None if alone else self._given, "version": VERSION}
         bounds = {"lower": self._space.lower, "upper": self._space.upper}
-        return {"search": self._kind, "unit": self.unit, **bounds, **out, **plain(self._state)}
+        return {"search": self._kind, "unit": self.unit, **bounds, **out, "seed": self.seed, **plain(self._state)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a `state_dict`; the settings and the loss stay those given here.
 
         ValueError for a state of another search, other parameters, sigma or bounds. KeyError if something is missing.
         """
-        check_state(state, self.state_dict(), "a search")
+        check_state(state, {name: None for name in self.state_dict() if name not in _LATER}, "a search")
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         self._space.check_state(state)
@@ -180,6 +184,7 @@ class AskTell(Standing[P]):
         early = {k: value.to(device) for k, value in state["early"].items()}
         out = None if state["out"] is None else state["out"].to(device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
+        self.seed = state.get("seed", self.seed)
         self._out, self._early, self._drawn = out, early, None
 
     @property

@@ -108,11 +108,12 @@ def minimize(
         time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but a
             prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
-            from it, with its samples, whatever the seed: the function must be the same, and so must x0, sigma, bounds
-            and engine. `noise` where the file has none, or 0 where it has noise, begins a new search from x0, which
-            keeps the evaluations; None goes on with the noise of the file. All other settings hold from then on.
-            ValueError if it is no such file, if what must be the same differs, or for other `restarts` or `tolerance`
-            where the search has come to an end by those in the file. A file that cannot be written later on, or that
+            from it, with its samples and their seed, whatever the seed here. The function must be the same, and so
+            must loss, x0, sigma, bounds and engine. `noise` where the file has none, or 0 where it has noise, begins a
+            new search from x0, which keeps the evaluations; None goes on with the noise of the file. All other settings
+            hold from then on. ValueError if it is no such file, or if what must be the same differs; only fn is not
+            compared, nor a loss that is random. ValueError, too, for other `restarts` or `tolerance` where the search
+            has come to an end by those in the file. A file that cannot be written later on, or that
             another process writes, too, is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. 0 ends it there: give it for a function
             that has only one minimum. At a kink of a loss alone, as of a penalty, the search first looks for a

@@ -134,8 +134,7 @@ class Running:
     @property
     def decision(self) -> Decision | None:
         """The decision, unless the search has gone on since."""
-        decided = self._decided
-        return decided if decided is not None and decided.evaluations == self.evaluations else None
+        return self._decided if self._decided and self._decided.evaluations == self.evaluations else None
 
     @property
     def needed_for_noise(self) -> int:
@@ -146,8 +145,7 @@ class Running:
     def iterate(self) -> Iterate:
         """The best point and the values of the latest batch."""
         x, value, _ = self.best
-        points, losses = self.record.last
-        return Iterate(self.evaluations, value, x, points.clone(), losses.clone())
+        return Iterate(self.evaluations, value, x, *(one.clone() for one in self.record.last))
 
     def step(self) -> None:
         """Evaluate what the search asks for next; in the first batch the start twice, if noise is to be measured.
@@ -234,10 +232,10 @@ class Running:
         if self._file is None or not (self.begun or self.record.known):  # there is nothing to go on with
             return
         self._written = time.monotonic()
-        decided = None if self._decided is None else vars(self._decided)
-        own: dict[str, Any] = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
-        own |= {"looking": self._looking, "unmeasured": self._unmeasured, "limits": self._limits, "version": VERSION}
-        self._file.write({**own, "search": self.search.state_dict(), **self.record.state_dict()})
+        own: dict[str, Any] = {"noise": self.noise, "sure": self._sure, "deciding": self._deciding}
+        own |= {"decided": self._decided and vars(self._decided), "looking": self._looking, "limits": self._limits}
+        own |= {"unmeasured": self._unmeasured, "version": VERSION, "search": self.search.state_dict()}
+        self._file.write({**own, **self.record.state_dict()})
 
     def _resume(self, saved: dict[str, Any]) -> None:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
@@ -261,7 +259,9 @@ class Running:
 
     def _again(self, noise: float, at: Tensor | None = None) -> TrustRegion:
         """Return a search that begins again, at x0 or at a point [n]; the seed is that of the file, if there is one."""
-        return self._make(noise, at, seed=self.search.seed)
+        search = self._make(noise, at, seed=self.search.seed)
+        search.reference = self.search.reference
+        return search
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""

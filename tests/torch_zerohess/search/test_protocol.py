@@ -517,6 +517,9 @@ def test_wrong_states_seeds_and_numbers_are_named():
     search.ask()
     with pytest.raises(TypeError, match=r"which must be an integer, got 0\.7"):
         search.tell([1.0], which=[0.7])
+    for which in (0, torch.tensor(0)):
+        with pytest.raises(TypeError, match=r"which must be a list of numbers of points, as \[0\], got (0|tensor)"):
+            search.tell([1.0], which=which)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -112,9 +112,10 @@ def minimize(
             must loss, x0, sigma, bounds and engine. `noise` where the file has none, or 0 where it has noise, begins a
             new search from x0, which keeps the evaluations; None goes on with the noise of the file. All other settings
             hold from then on. ValueError if it is no such file, or if what must be the same differs; only fn is not
-            compared, nor a loss that is random. ValueError, too, for other `restarts` or `tolerance` where the search
-            has come to an end by those in the file. A file that cannot be written later on, or that
-            another process writes, too, is a `UserWarning`, once.
+            compared, nor a loss that is random. With 5 to 19 parameters in a box and a loss, `restarts` of 0 make
+            "auto" choose another engine. ValueError, too, for other `restarts` or `tolerance` where the search has come
+            to an end by those in the file. A file that cannot be written later on, or that another process writes, too,
+            is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. 0 ends it there: give it for a function
             that has only one minimum. At a kink of a loss alone, as of a penalty, the search first looks for a
             direction in which the loss falls. It may miss one, and with `ftol` or beside a bound it does not look: give

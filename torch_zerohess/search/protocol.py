@@ -180,7 +180,8 @@ class AskTell(Standing[P]):
 
         ValueError for a state of another search, other parameters, sigma, bounds or loss. KeyError if something is
         missing. The loss is another one if the first or the lowest output of the saved search has another loss now. A
-        loss that is random is not compared: one whose values of these outputs differ from call to call.
+        loss that is random is not compared: one whose values of these outputs differ from call to call. What the loss
+        raises passes, and the search is then as before.
         """
         check_state(state, {name: None for name in self.state_dict() if name not in _LATER}, "a search")
         if state["search"] != self._kind:

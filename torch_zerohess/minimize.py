@@ -108,12 +108,14 @@ def minimize(
         time_limit: seconds after which no further batch is evaluated. In noise `value` is then no mean, but a
             prediction from all evaluations.
         checkpoint: file that the search is written to, every second and at the end. If it exists the search goes on
-            from it, with its samples, whatever the seed: the function must be the same, and so must x0, sigma, bounds
-            and engine. `noise` where the file has none, or 0 where it has noise, begins a new search from x0, which
-            keeps the evaluations; None goes on with the noise of the file. All other settings hold from then on.
-            ValueError if it is no such file, if what must be the same differs, or for other `restarts` or `tolerance`
-            where the search has come to an end by those in the file. A file that cannot be written later on, or that
-            another process writes, too, is a `UserWarning`, once.
+            from it, with its samples and their seed, whatever the seed here. The function must be the same, and so
+            must loss, x0, sigma, bounds and engine. `noise` where the file has none, or 0 where it has noise, begins a
+            new search from x0, which keeps the evaluations; None goes on with the noise of the file. All other settings
+            hold from then on. ValueError if it is no such file, or if what must be the same differs; only fn is not
+            compared, nor a loss that is random. With 5 to 19 parameters in a box and a loss, `restarts` of 0 make
+            "auto" choose another engine. ValueError, too, for other `restarts` or `tolerance` where the search has come
+            to an end by those in the file. A file that cannot be written later on, or that another process writes, too,
+            is a `UserWarning`, once.
         restarts: how often to go on after the search has arrived at a minimum. 0 ends it there: give it for a function
             that has only one minimum. At a kink of a loss alone, as of a penalty, the search first looks for a
             direction in which the loss falls. It may miss one, and with `ftol` or beside a bound it does not look: give
@@ -164,10 +166,10 @@ def minimize(
     start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
     rounds = max(max_evaluations, 0) if restarts is None else restarts
     given = {**settings, "loss": loss, "engine": engine, "restarts": rounds}
-    given |= {"seed": random_seed() if seed is None else seed}
+    own_seed = random_seed() if seed is None else seed
 
-    def make(noise: float, at: Tensor | None = None) -> TrustRegion:
-        return TrustRegion(start if at is None else at, sigma=sigma, bounds=bounds, noise=noise, **given)
+    def make(noise: float, at: Tensor | None = None, *, seed: int = own_seed) -> TrustRegion:
+        return TrustRegion(start if at is None else at, sigma=sigma, bounds=bounds, noise=noise, seed=seed, **given)
 
     smallest = len(make(noise or 0.0).ask()) + 1
     if max_evaluations < smallest:

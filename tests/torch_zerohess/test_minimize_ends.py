@@ -87,6 +87,10 @@ def test_callback():
     assert fit.message == "the callback asked to end"
     none = zh.minimize(tilted, zeros(2), sigma=2.0, seed=0, max_evaluations=15, callback=lambda one: "go on")
     assert none.evaluations == 15
+    for answer, shape in ((torch.tensor([True, False]), r"\[2\]"), (np.ones((1, 2), dtype=bool), r"\[1, 2\]")):
+        message = rf"callback must return True to end .* one truth value, got values of shape {shape}: use \.any\(\)"
+        with pytest.raises(TypeError, match=message):
+            zh.minimize(tilted, zeros(2), sigma=2.0, callback=lambda one: answer)  # noqa: B023
 
 
 @pytest.mark.parametrize("where", ["fn", "callback"])
@@ -416,6 +420,20 @@ def test_an_exception_says_whose_it_is():
     with pytest.raises(ZeroDivisionError) as caught:
         zh.minimize(lambda z: z, zeros(2), loss=raising(torch.sum, 9), **settings)
     assert caught.value.minimum.message == "fn or loss raised ZeroDivisionError()"
+
+
+@pytest.mark.parametrize("value", [math.inf, math.nan, 1e306])
+def test_what_is_wrong_with_a_value_is_said_once_and_not_as_an_error_of_fn(value):
+    with pytest.raises(ValueError, match="at the start x0") as caught:
+        zh.minimize(lambda x: value, zeros(2), sigma=1.0, vectorized=False)
+    message = str(caught.value)
+    if not math.isfinite(value):
+        message += "; values or outputs that are not finite, and were left out: 4"
+    assert caught.value.minimum.message == message
+    values = iter([1.0, 2.0, 3.0, 1.0, [1.0, 2.0]])
+    with pytest.raises(ValueError, match="fn must return one number per point") as caught:
+        zh.minimize(lambda x: next(values), zeros(2), sigma=1.0, vectorized=False)
+    assert caught.value.minimum.message == str(caught.value)
 
 
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])

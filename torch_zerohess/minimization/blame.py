@@ -1,16 +1,43 @@
-"""Whose error an exception of a minimisation is."""
+"""Whose error an exception of a minimisation is, in words."""
 
 import torch
 
 _NUMERICAL = torch.linalg.LinAlgError  # type: ignore[attr-defined]
 _OWN = tuple(f"torch_zerohess.{folder}." for folder in ("search", "surrogates", "linalg"))
 """Beginnings of the names of modules with models of a search."""
+_CHECKS = tuple(
+    f"torch_zerohess.{module}"
+    for module in (
+        "evaluators.values",
+        "minimization.callback",
+        "minimization.evaluating",
+        "minimization.separate",
+        "search.local_progress",
+        "search.told",
+    )
+)
+"""Modules that check what functions of a caller return."""
 
 
-def blamed(error: BaseException, caller: str) -> str:
-    """Return "the search" for a numerical failure of its own models, else `caller`, the name of a caller's function."""
+def failure(error: BaseException, caller: str) -> str:
+    """Return who raised an error: "the search" for a numerical failure of its own models, or a function of the caller.
+
+    What a check raises of a value that such a function returned speaks for itself.
+
+    Args:
+        error: with its traceback.
+        caller: name of the function.
+    """
+    module = _raising(error)
+    if module in _CHECKS and isinstance(error, TypeError | ValueError):
+        return str(error)
+    own = isinstance(error, _NUMERICAL) and module.startswith(_OWN)
+    return f"{'the search' if own else caller} raised {error!r}"
+
+
+def _raising(error: BaseException) -> str:
+    """Return the name of the module that raised an error."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
-    return "the search" if isinstance(error, _NUMERICAL) and module.startswith(_OWN) else caller
+    return "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))

@@ -1,5 +1,6 @@
 """The callback of a caller, and whether it has asked for the end."""
 
+import math
 from collections.abc import Callable
 
 from torch_zerohess.minimization.minimum import Iterate
@@ -22,5 +23,16 @@ class Callback:
 
 
 def _is_true(answer: object) -> bool:
-    """Whether a callback returned True. Other truthy values, such as the count of bytes it wrote, do not end."""
-    return str(getattr(answer, "dtype", type(answer).__name__)) in ("bool", "torch.bool") and bool(answer)
+    """Whether a callback returned True. Other truthy values, such as the count of bytes it wrote, do not end.
+
+    TypeError for several truth values.
+    """
+    if str(getattr(answer, "dtype", type(answer).__name__)) not in ("bool", "torch.bool"):
+        return False
+    shape = [*getattr(answer, "shape", ())]
+    if math.prod(shape) != 1:
+        raise TypeError(
+            f"callback must return True to end the search, one truth value, got values of shape {shape}: use .any() or "
+            ".all()"
+        )
+    return bool(answer)

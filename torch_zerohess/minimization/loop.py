@@ -2,7 +2,7 @@
 
 import contextlib
 
-from torch_zerohess.minimization.blame import blamed
+from torch_zerohess.minimization.blame import failure
 from torch_zerohess.minimization.callback import Callback
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.outcome import outcome
@@ -35,7 +35,7 @@ def run(running: Running, stopping: Stopping, callback: Callback | None, black_b
         if running.evaluations:
             caller = "callback" if callback is not None and callback.running else black_box
             with contextlib.suppress(Exception):  # nothing takes the place of the caller's own error
-                error.minimum = outcome(running, "failed", f"{blamed(error, caller)} raised {error!r}")  # type: ignore[union-attr]
+                error.minimum = outcome(running, "failed", failure(error, caller))  # type: ignore[union-attr]
                 running.say()
         raise
 

@@ -14,7 +14,8 @@ def outcome(running: Running, status: Status, message: str) -> Minimum:
     search = running.search
     (x, value, error), (points, losses) = running.best, running.record.told
     around = quadratic_at(x, search, points, losses, running.noise or 0.0)
-    equal = running.evaluations if running.record.flat and len(search.unit) < running.evaluations else 0
+    begun = search.evaluations > 0  # a start whose value it cannot take says nothing of sigma
+    equal = running.evaluations if begun and running.record.flat and len(search.unit) < running.evaluations else 0
     success = status in ("target", "solved") or status_of(running, arrived=search.solved) == "solved"
     return Minimum(
         x=x,

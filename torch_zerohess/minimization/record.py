@@ -102,6 +102,11 @@ class Record:
             return points, losses
         return points, torch.where((points == x)[:, untouched].all(1), losses, torch.nan)
 
+    def mean_at(self, x: Tensor) -> Tensor:
+        """Return the mean of the finite losses at a point [n]."""
+        points, losses = self.told
+        return losses[(points == x).all(1) & torch.isfinite(losses)].mean()
+
     @property
     def flat(self) -> bool:
         """Whether all values are equal."""

@@ -32,7 +32,7 @@ class Running:
     """A search with all that was evaluated, and the file that it is written to.
 
     Args:
-        make: the search for a standard deviation of repeated losses, from x0 or from a point [n].
+        make: the search for a standard deviation of repeated losses, from x0 or from a point [n], with a seed.
         call: outputs or losses of points [K, n]; the known ones if it is interrupted.
         noise: that standard deviation; measured at the start if None.
         batch: points that are evaluated at once.
@@ -134,8 +134,7 @@ class Running:
     @property
     def decision(self) -> Decision | None:
         """The decision, unless the search has gone on since."""
-        decided = self._decided
-        return decided if decided is not None and decided.evaluations == self.evaluations else None
+        return self._decided if self._decided and self._decided.evaluations == self.evaluations else None
 
     @property
     def needed_for_noise(self) -> int:
@@ -146,8 +145,7 @@ class Running:
     def iterate(self) -> Iterate:
         """The best point and the values of the latest batch."""
         x, value, _ = self.best
-        points, losses = self.record.last
-        return Iterate(self.evaluations, value, x, points.clone(), losses.clone())
+        return Iterate(self.evaluations, value, x, *(one.clone() for one in self.record.last))
 
     def step(self) -> None:
         """Evaluate what the search asks for next; in the first batch the start twice, if noise is to be measured.
@@ -164,7 +162,7 @@ class Running:
             measured, points = self.noise is None, points[: len(search.missing)]
         if measured:
             most = self._most - self._least
-            found = evaluate_first_batch(points, self.record, search, self._make, self._batch, most)
+            found = evaluate_first_batch(points, self.record, search, self._again, self._batch, most)
             self.noise, self.search, points, losses = found
             self._noted(points, losses)
             return
@@ -173,9 +171,7 @@ class Running:
         # A search that begins again in noise may get no value at its start, where there was one before.
         lost = self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0]))
         if lost:
-            known, losses = self.record.told
-            at_start = losses[(known == points[0]).all(1) & torch.isfinite(losses)]
-            values = torch.cat([at_start.mean()[None].to(values), values[1:]])
+            values = torch.cat([self.record.mean_at(points[0])[None].to(values), values[1:]])
         search.tell(values)
         self._noted(points, values.to(search.told) if lost else search.told)
 
@@ -194,7 +190,7 @@ class Running:
         self._looking = self.evaluations if self._looking is None else self._looking
         found = noise_at(self.best.x, *self.record.told, self._looking, self._evaluated, self.left)
         if found:
-            self.noise, self.search = found, self._make(found, self.best.x)
+            self.noise, self.search = found, self._again(found, self.best.x)
         self._unmeasured, self._looking = self._unmeasured and found is None, None
         self._sure = True
         return bool(found)
@@ -236,10 +232,10 @@ class Running:
         if self._file is None or not (self.begun or self.record.known):  # there is nothing to go on with
             return
         self._written = time.monotonic()
-        decided = None if self._decided is None else vars(self._decided)
-        own: dict[str, Any] = {"noise": self.noise, "sure": self._sure, "decided": decided, "deciding": self._deciding}
-        own |= {"looking": self._looking, "unmeasured": self._unmeasured, "limits": self._limits, "version": VERSION}
-        self._file.write({**own, "search": self.search.state_dict(), **self.record.state_dict()})
+        own: dict[str, Any] = {"noise": self.noise, "sure": self._sure, "deciding": self._deciding}
+        own |= {"decided": self._decided and vars(self._decided), "looking": self._looking, "limits": self._limits}
+        own |= {"unmeasured": self._unmeasured, "version": VERSION, "search": self.search.state_dict()}
+        self._file.write({**own, **self.record.state_dict()})
 
     def _resume(self, saved: dict[str, Any]) -> None:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
@@ -256,10 +252,16 @@ class Running:
         self._unmeasured = saved.get("unmeasured", False) and given is None
         if given is not None and given != self.noise:  # a new search, which keeps the evaluations
             self.record.note_known()
-            self.noise, self.search, self._decided, self._deciding = given, self._make(given), None, None
+            self.noise, self.search, self._decided, self._deciding = given, self._again(given), None, None
         elif self.search.done:
             check_limits(self._limits, saved.get("limits", self._limits), self.search.message)
         self._sure = saved["sure"] or given is not None
+
+    def _again(self, noise: float, at: Tensor | None = None) -> TrustRegion:
+        """Return a search that begins again, at x0 or at a point [n]; the seed is that of the file, if there is one."""
+        search = self._make(noise, at, seed=self.search.seed)
+        search.reference = self.search.reference
+        return search
 
     def _believed(self, count: int) -> Belief:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""

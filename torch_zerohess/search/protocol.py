@@ -18,13 +18,17 @@ from torch import Tensor
 
 from torch_zerohess.arguments import check_state, checked_integer, checked_number, checked_seed
 from torch_zerohess.search.method import Method, Settings
+from torch_zerohess.search.reference import Reference, reference
 from torch_zerohess.search.space import Bounds, Space, checked_start
 from torch_zerohess.search.standing import Standing
-from torch_zerohess.search.state import Evaluated, P, State, plain, restored_progress
+from torch_zerohess.search.state import Evaluated, P, State, plain, restored, restored_progress
 from torch_zerohess.search.told import as_evaluated, check_start, converted, joined
 from torch_zerohess.search.white_box import checked_loss
 from torch_zerohess.smoothing import random_seed
 from torch_zerohess.version import VERSION
+
+_LATER = "seed", "reference"
+"""What a state may lack: earlier versions did not write it."""
 
 
 class AskTell(Standing[P]):
@@ -67,11 +71,12 @@ class AskTell(Standing[P]):
         if not 0 <= checked_number("noise", noise) < math.inf:
             raise ValueError(f"noise must be finite and at least 0, got {noise}")
         checked_number("tolerance", tolerance, above=0.0, below=1.0)
-        seed = random_seed() if seed is None else checked_seed(seed)
+        self.seed = random_seed() if seed is None else checked_seed(seed)
+        """Of the samples; after `load_state_dict` it is the one of the saved search."""
         self._space = space = Space.checked(x0, sigma, bounds)
         start, lower, upper = (space.coordinates(one) for one in (space.start, space.lower, space.upper))
         self._method = self._make(Settings(start, lower, upper, white_box, restarts, tolerance, float(noise), pool))
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(self.seed)
         self._state = self._after(*self._method.first(generator), generator)
         self._out: Tensor | None = self._state.asked[:0]
         """Points out for evaluation [K, n], None if `load_state_dict` does not know."""
@@ -80,7 +85,9 @@ class AskTell(Standing[P]):
         self._drawn: tuple[int, Tensor] | None = None
         """The batch that `ask` drew points for last, and these points, so that no model is fitted twice."""
         self.told = torch.empty(0, dtype=torch.float64, device=x0.device)
-        """Losses [K] of the points told last."""
+        """Losses [K] of the points told last; none after `load_state_dict`."""
+        self.reference: Reference | None = None
+        """Outputs by which `load_state_dict` knows the loss."""
 
     @abstractmethod
     def _make(self, settings: Settings) -> Method[P]:
@@ -150,6 +157,7 @@ class AskTell(Standing[P]):
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.after(self._state.progress, evaluated, generator), generator)
         self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.usable
+        self.reference = reference(self.reference, evaluated)
 
     def losses(self, values: Any) -> Tensor:
         """Return the losses [K] of what the black box has returned for K points, read and checked as by `tell`."""
@@ -164,22 +172,30 @@ class AskTell(Standing[P]):
         alone = len(self._given) in (0, len(self._state.asked))  # nothing is out, or what the search itself asked for
         out = {"early": dict(self._early), "out": None if alone else self._given, "version": VERSION}
         bounds = {"lower": self._space.lower, "upper": self._space.upper}
-        return {"search": self._kind, "unit": self.unit, **bounds, **out, **plain(self._state)}
+        own = {"search": self._kind, "unit": self.unit, **bounds, "seed": self.seed, "reference": plain(self.reference)}
+        return {**own, **out, **plain(self._state)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a `state_dict`; the settings and the loss stay those given here.
+        """Go on from a `state_dict`; the settings stay those given here.
 
-        ValueError for a state of another search, other parameters, sigma or bounds. KeyError if something is missing.
+        ValueError for a state of another search, other parameters, sigma, bounds or loss. KeyError if something is
+        missing. The loss is another one if the first or the lowest output of the saved search has another loss now. A
+        loss that is random is not compared: one whose values of these outputs differ from call to call. What the loss
+        raises passes, and the search is then as before.
         """
-        check_state(state, self.state_dict(), "a search")
+        check_state(state, {name: None for name in self.state_dict() if name not in _LATER}, "a search")
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         self._space.check_state(state)
         device = self.unit.device
         progress = restored_progress(self._method.progress, state, device)
+        known = None if state.get("reference") is None else restored(Reference, state["reference"], device)
+        if known is not None and self.loss is not None:
+            known.check(self.loss)
         early = {k: value.to(device) for k, value in state["early"].items()}
         out = None if state["out"] is None else state["out"].to(device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
+        self.seed, self.reference, self.told = state.get("seed", self.seed), known, self.told[:0]
         self._out, self._early, self._drawn = out, early, None
 
     @property

@@ -83,8 +83,11 @@ def _check_loss(loss: Any, shape: list[int]) -> None:
 def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count: int) -> dict[int, Tensor]:
     """Return the values of points by number, those known early and further ones [k, *out] of the points `which` [k].
 
-    Raises ValueError for a number that is not one of `count` points or is known, or for values of another shape.
+    Raises ValueError for a number that is not one of `count` points or is known, or for values of another shape;
+    TypeError for what is no list of numbers.
     """
+    if not hasattr(which, "__iter__") or getattr(which, "ndim", 1) == 0:
+        raise TypeError(f"which must be a list of numbers of points, as [0], got {which!r}")
     numbers = [checked_integer("which", one) for one in which]
     for k, one in enumerate(numbers):
         if not 0 <= one < count or one in early or one in numbers[:k]:

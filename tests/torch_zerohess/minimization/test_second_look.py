@@ -162,6 +162,44 @@ def test_a_search_in_noise_goes_on_from_x(engine, tmp_path) -> None:
         assert torch.equal(run(at, path)[0].points, points)
 
 
+@pytest.mark.parametrize("seed", [None, 1234])
+@pytest.mark.parametrize(("quiet", "stop"), [(0.5, 7), (-1.0, 4)])
+def test_a_search_that_begins_again_in_noise_has_the_seed_of_the_file(quiet, stop, seed, tmp_path) -> None:
+    """There is no noise where the first parameter is low: none at the start, or noise that is measured there.
+
+    It is interrupted before the noise is found, or in the first batch.
+    """
+
+    def run(at: int, path=None):
+        calls = []
+
+        def fn(x):
+            if len(calls) == at and calls[-1] is not None:
+                calls.append(None)
+                raise KeyboardInterrupt
+            calls.append(x)
+            count = sum(one is not None for one in calls)
+            random = torch.randn((), generator=torch.Generator().manual_seed(count), dtype=x.dtype)
+            return (x - 3).square().sum() + (0.1 * random if x[0] >= quiet else 0.0)
+
+        settings = {"sigma": 1.0, "vectorized": False, "max_evaluations": 80, "checkpoint": path}
+        fit = zh.minimize(fn, zeros(2), seed=3, **settings)
+        return fit if at < 0 else zh.minimize(fn, zeros(2), seed=seed, **settings)
+
+    whole = run(-1)
+    assert whole.noise > 0.0
+    assert torch.equal(run(stop, tmp_path / "search.pt").points, whole.points)
+
+
+def test_noise_that_is_given_on_resumption_has_the_seed_of_the_file(tmp_path) -> None:
+    found = []
+    for seed in (0, 1):
+        settings = {"sigma": 2.0, "checkpoint": tmp_path / f"{seed}.pt"}
+        zh.minimize(bowl, zeros(2), seed=0, max_evaluations=10, **settings)
+        found.append(zh.minimize(bowl, zeros(2), seed=seed, max_evaluations=40, noise=0.1, **settings).points)
+    assert torch.equal(*found)
+
+
 @pytest.mark.parametrize(("jump", "calls"), [(0.0, [1]), (1e-7, [1]), (1e-4, [1, 1]), (1e-2, [1, 1, 6])])
 def test_sums_of_a_batch_are_no_noise(jump, calls):
     """Values of x alone differ by a jump from the value in a call of several points. The first loss is 1."""

@@ -123,7 +123,8 @@ def test_points_that_are_out_stay_out_until_all_are_told(name):
 
 
 @every_search
-def test_loading_takes_no_loss_and_fails_as_a_whole(name):
+def test_loading_fails_as_a_whole(name):
+    """Also where the loss raises."""
     search = make(name)
     values = SEARCHES[name][2](search.ask(8))
     search.tell(values)
@@ -135,11 +136,17 @@ def test_loading_takes_no_loss_and_fails_as_a_whole(name):
 
     resumed = make(name, loss=loss if SEARCHES[name][3] else None)
     fresh = resumed.ask()
-    for key in state.keys() - {"version"}:
+    for key in state.keys() - {"version", "seed", "reference"}:
         with pytest.raises(KeyError):
             resumed.load_state_dict({one: value for one, value in state.items() if one != key})
         assert torch.equal(resumed.ask(), fresh)
         assert resumed.evaluations == 0
+    if SEARCHES[name][3]:
+        with pytest.raises(ZeroDivisionError):
+            resumed.load_state_dict(state)
+        assert torch.equal(resumed.ask(), fresh)
+        assert resumed.evaluations == 0
+        resumed = make(name)
     resumed.load_state_dict(state)
     assert resumed.value == search.value
 

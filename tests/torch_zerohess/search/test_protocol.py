@@ -496,6 +496,18 @@ def test_a_state_of_another_version_is_named_and_changes_nothing(written, change
     search.load_state_dict(state)
 
 
+def test_a_state_without_what_earlier_versions_did_not_write():
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    state = search.state_dict()
+    assert state["seed"] == 0
+    other = Descent(zeros(2), sigma=1.0, seed=1)
+    other.load_state_dict({name: one for name, one in state.items() if name != "seed"})
+    assert other.seed == 1
+    other.load_state_dict(state)
+    assert other.seed == 0
+    assert torch.equal(other.ask(), search.ask())
+
+
 def test_wrong_states_seeds_and_numbers_are_named():
     search = Descent(zeros(2), sigma=1.0, seed=0)
     with pytest.raises(KeyError, match="state must be a state_dict of a search, this one lacks search, unit"):
@@ -505,6 +517,9 @@ def test_wrong_states_seeds_and_numbers_are_named():
     search.ask()
     with pytest.raises(TypeError, match=r"which must be an integer, got 0\.7"):
         search.tell([1.0], which=[0.7])
+    for which in (0, torch.tensor(0)):
+        with pytest.raises(TypeError, match=r"which must be a list of numbers of points, as \[0\], got (0|tensor)"):
+            search.tell([1.0], which=which)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -101,6 +101,15 @@ def test_a_state_is_not_changed_by_the_search_it_came_from():
         assert torch.equal(points_of(copy, f, 80), first)
 
 
+def test_losses_told_before_a_state_is_loaded_are_not_those_told_last():
+    search = Descent(zeros(2), sigma=1.0, seed=0)
+    state = search.state_dict()
+    search.tell(bowl(search.ask()))
+    assert len(search.told) == 3
+    search.load_state_dict(state)
+    assert search.told.tolist() == []
+
+
 def test_the_settings_stay_those_of_the_search_that_loads():
     search = run(Descent(zeros(2), sigma=1.0, noise=1e-3, pool=60, seed=0), bowl, 40)
     copy = Descent(zeros(2), sigma=1.0, noise=1e-3, pool=5, seed=0)

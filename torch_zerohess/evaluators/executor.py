@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import hashlib
+import itertools
 import pickle
 import threading
 import traceback
@@ -26,6 +27,8 @@ _HELD = 4
 """Black boxes that a process keeps."""
 _held: dict[str, Callable[..., Any]] = {}
 _lock = threading.Lock()
+_numbers = itertools.count()
+"""Of tasks: dask takes tasks with equal arguments for one."""
 
 Answer = tuple[bool, bytes]
 """True and the values of a chunk, or False and the error of the black box."""
@@ -120,7 +123,8 @@ class Executor(Closing):
             while batch.waiting:
                 chunk = batch.take()
                 data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
-                tasks.append((chunk, self.executor.submit(evaluated, name, fn, data, identity())))
+                task = self.executor.submit(evaluated, name, fn, data, identity(), next(_numbers))
+                tasks.append((chunk, task))
         except BaseException:
             for _, task in tasks:
                 task.cancel()
@@ -174,11 +178,12 @@ def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[
         task.add_done_callback(one_less)
 
 
-def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str) -> Answer:
+def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, number: int) -> Answer:
     """Return the values of a chunk, or its error, in a worker.
 
     The first fn with a name stays: what comes later is a copy of it. An error is returned in a form that the caller can
-    read for certain: one that cannot be unpickled would break an executor of processes for good.
+    read for certain: one that cannot be unpickled would break an executor of processes for good. The number makes each
+    task of a caller another one.
     """
     become_worker(caller)
     with _lock:

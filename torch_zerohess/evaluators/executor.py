@@ -30,8 +30,8 @@ _lock = threading.Lock()
 _numbers = itertools.count()
 """Of tasks: dask takes tasks with equal arguments for one."""
 
-Answer = tuple[bool, bytes]
-"""True and the values of a chunk, or False and the error of the black box."""
+Answer = tuple[bool, Any]
+"""True and the values of a chunk, or False and the error of the black box, as bytes if it comes from a process."""
 Tasks = list[tuple[Chunk, "concurrent.futures.Future[Answer]"]]
 
 
@@ -149,7 +149,7 @@ def _joined(batch: Batch, tasks: Tasks) -> Tensor:
     for chunk, task in tasks:  # in order, so that the first error is of the first point
         good, data = task.result()
         if not good:
-            raise loaded_error(data)
+            raise loaded_error(data) if isinstance(data, bytes) else data
         batch.came(chunk, transfer.unpacked(data)[0])
     return batch.result()
 
@@ -196,8 +196,8 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, numbe
             in_this_process(draw_apart, fn)
         return True, values_of(fn, data)
     except BaseException as error:  # SystemExit too
-        if caller == identity():  # a thread: the error itself can be raised
-            raise
+        if caller == identity():  # a thread: the error itself can be raised, but here it would end a thread of dask
+            return False, error
         return False, dumped_error(error, traceback.format_exc(), _dumps())
 
 

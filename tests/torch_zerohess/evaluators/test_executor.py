@@ -75,6 +75,10 @@ def test_dask():
             assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
             with pytest.raises(ArithmeticError, match="no value above one half"):
                 evaluator(black_boxes.failing, Z)
+            with pytest.raises(black_boxes.Odd):
+                evaluator(black_boxes.odd, Z)
+            with pytest.raises(SystemExit, match="done"):
+                evaluator.submit(black_boxes.leaving, Z).result(60)
             noise = torch.cat([evaluator(black_boxes.noisy, torch.zeros(4, 1)) for _ in range(2)])
             assert len(noise.unique()) == 8  # equal arguments are no reason to take an earlier value
 

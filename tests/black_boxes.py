@@ -282,6 +282,13 @@ def noisy_elsewhere(z):
     return z[:, 0] + torch.randn(len(z), dtype=z.dtype, generator=PLACE.generator)
 
 
+def noisy_late(z):
+    import late_noise
+
+    time.sleep(0.02)
+    return z[:, 0] + torch.from_numpy(late_noise.GENERATOR.standard_normal(len(z)))
+
+
 def noisy_with_numpy(z):
     time.sleep(0.02)
     return z[:, 0] + torch.from_numpy(np.random.standard_normal(len(z)))

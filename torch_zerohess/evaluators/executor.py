@@ -1,6 +1,7 @@
 """Evaluation by an executor of somebody else: the standard pools, loky, dask, mpi4py."""
 
 import concurrent.futures
+import functools
 import hashlib
 import itertools
 import pickle
@@ -20,7 +21,7 @@ from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
-from torch_zerohess.evaluators.random_numbers import draw_apart
+from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
 from torch_zerohess.evaluators.values import checked_values
 
 _HELD = 4
@@ -191,10 +192,12 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, numbe
         fn = _held.setdefault(name, fn)
         while len(_held) > _HELD:
             _held.pop(next(iter(_held)))
+    evaluate = functools.partial(values_of, fn, data)
     try:
         if is_new:
-            in_this_process(draw_apart, fn)
-        return True, values_of(fn, data)
+            generators = in_this_process(draw_apart, fn)
+            return True, drawn_apart(fn, generators, evaluate)
+        return True, evaluate()
     except BaseException as error:  # SystemExit too
         if caller == identity():  # a thread: the error itself can be raised, but here it would end a thread of dask
             return False, error

@@ -1,5 +1,6 @@
 """Evaluation on a cluster: actors of Ray that hold the black box."""
 
+import functools
 import os
 import sys
 import traceback
@@ -17,7 +18,7 @@ from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.executor import values_of
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker
-from torch_zerohess.evaluators.random_numbers import draw_apart
+from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
 
 _LOOK = 0.05
 """Seconds after which a wait looks for calls that were submitted meanwhile."""
@@ -210,8 +211,9 @@ class Actor:
             if held[0] != self._held:
                 self._fn = None
                 fn = ray.get(held[0])
-                draw_apart(fn)
+                generators = draw_apart(fn)
                 self._fn, self._held = fn, held[0]
+                return True, drawn_apart(fn, generators, functools.partial(values_of, fn, data))
             return True, values_of(self._fn, data)
         except BaseException as error:  # SystemExit too: Ray would end the actor
             if hasattr(error, "ray_terminate_msg"):  # Ray itself ends the actor

@@ -1,6 +1,7 @@
 """What runs in a worker process: it gets a black box once, then points, until its pipe is closed."""
 
 import contextlib
+import functools
 import multiprocessing
 import pickle
 import traceback
@@ -16,7 +17,7 @@ from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
 from torch_zerohess.evaluators.process_identity import become_worker, in_this_process
-from torch_zerohess.evaluators.random_numbers import draw_apart
+from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
 from torch_zerohess.evaluators.values import checked_values
 
 READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
@@ -73,6 +74,8 @@ def main(connection: "Connection[Any, Any]") -> None:
     torch.set_num_threads(1)
     messages = Messages(connection)
     fn: Any = None
+    generators: list[Any] | None = None
+    """Those of a black box that has not been called."""
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the pool was closed
         messages.send(READY)
         while True:
@@ -86,14 +89,21 @@ def main(connection: "Connection[Any, Any]") -> None:
                 if kind == FUNCTION:
                     fn = None  # what it holds is given back before the next one is made
                     fn = pickle.loads(parts[0].data)
-                    in_this_process(draw_apart, fn)
+                    generators = in_this_process(draw_apart, fn)
                 else:
-                    tensors = [one.tensor() for one in parts]
-                    values = checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
+                    evaluate = functools.partial(values_of, fn, parts)
+                    values = evaluate() if generators is None else drawn_apart(fn, generators, evaluate)
+                    generators = None
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's
                 messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:
                 _answer(messages, values)
+
+
+def values_of(fn: Any, parts: Sequence[transfer.Part]) -> Tensor:
+    """Return the values of points and auxiliary inputs that are bytes."""
+    tensors = [one.tensor() for one in parts]
+    return checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
 
 
 def _answer(messages: Messages, values: Tensor | None) -> None:

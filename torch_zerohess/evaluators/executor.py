@@ -19,14 +19,13 @@ from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
+from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
 from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
 from torch_zerohess.evaluators.values import checked_values
 
-_HELD = 4
-"""Black boxes that a process keeps."""
-_held: dict[str, Callable[..., Any]] = {}
+_kept: dict[str, Callable[..., Any]] = {}
 _lock = threading.Lock()
 _numbers = itertools.count()
 """Of tasks: dask takes tasks with equal arguments for one."""
@@ -42,6 +41,7 @@ class Executor(Closing):
     The executor says how the black box gets to its workers, and so what it must be: picklable for the standard
     `ProcessPoolExecutor` (use one with `mp_context` "spawn"), almost anything for loky, dask and threads. It is sent
     with every task; pass `Factory(make, *args)` for one that is large or slow to make, which each process makes once.
+    A process keeps four black boxes, of all Executors together, those that were used last.
 
     Processes use the black box as it was when the call began. Where `pickle` tells that it has changed since the last
     call they take the new one. Do not change one that only loky or dask can pickle.
@@ -70,10 +70,8 @@ class Executor(Closing):
         if not callable(getattr(executor, "submit", None)):
             raise TypeError(f"executor must have a method submit, as concurrent.futures.Executor has, got {executor!r}")
         self.executor = executor
-        self._fn: Callable[..., Any] | None = None
-        self._pickled = b""
-        """A digest of the state of that black box."""
-        self._name = ""
+        self._names: dict[str, tuple[Callable[..., Any], bytes]] = {}
+        """Black boxes, and a digest of the state of each, by the names that processes know them by."""
         self._closed = False
 
     def __repr__(self) -> str:
@@ -116,9 +114,12 @@ class Executor(Closing):
         threads = isinstance(self.executor, concurrent.futures.ThreadPoolExecutor)  # they use the black box itself
         state = b"" if threads else _state(fn)
         with _lock:
-            if not same(self._fn, fn) or state != self._pickled:
-                self._fn, self._pickled, self._name = fn, state, uuid.uuid4().hex
-            name = self._name
+            name = next((one for one, known in self._names.items() if same(known[0], fn) and known[1] == state), "")
+            if not name:
+                make_room(self._names)
+                name = uuid.uuid4().hex
+                self._names[name] = fn, state
+            used(self._names, name)
         batch, tasks = Batch(points, 0), Tasks()
         try:
             while batch.waiting:
@@ -135,7 +136,7 @@ class Executor(Closing):
     def close(self) -> None:
         """Take no further points; the executor stays as it is."""
         self._closed = True
-        self._fn = None
+        self._names.clear()
 
 
 def _state(fn: Callable[..., Any]) -> bytes:
@@ -188,10 +189,10 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, numbe
     """
     become_worker(caller)
     with _lock:
-        is_new = name not in _held
-        fn = _held.setdefault(name, fn)
-        while len(_held) > _HELD:
-            _held.pop(next(iter(_held)))
+        if is_new := name not in _kept:
+            make_room(_kept)
+            _kept[name] = fn
+        fn = used(_kept, name)
     evaluate = functools.partial(values_of, fn, data)
     try:
         if is_new:

@@ -33,8 +33,8 @@ class Messages:
     | kind | from | header | tensors |
     |---|---|---|---|
     | READY | worker | None | |
-    | FUNCTION | caller, then worker | None | the pickled black box; none |
-    | EVALUATE | caller | None | points, aux |
+    | FUNCTION | caller, then worker | number of a black box, numbers of those that go; None | it, pickled; none |
+    | EVALUATE | caller | number of a black box | points, aux |
     | VALUES | worker | None | values |
     | ROOM | worker, then caller | bytes | |
     | ERROR | worker | whether fn could not be made, and the error | |
@@ -65,6 +65,26 @@ class Messages:
             self.memory = None
 
 
+class Kept:
+    """A black box of this process."""
+
+    def __init__(self, fn: Any) -> None:
+        self.fn = fn
+        self.generators: list[Any] | None = in_this_process(draw_apart, fn)
+        """None once it has been called."""
+
+    def values(self, parts: Sequence[transfer.Part]) -> Tensor:
+        """Return the values of points and auxiliary inputs."""
+        evaluate = functools.partial(self._values, parts)
+        values = evaluate() if self.generators is None else drawn_apart(self.fn, self.generators, evaluate)
+        self.generators = None
+        return values
+
+    def _values(self, parts: Sequence[transfer.Part]) -> Tensor:
+        tensors = [one.tensor() for one in parts]
+        return checked_values(in_this_process(self.fn, *tensors), tensors[0], not isinstance(self.fn, Each))
+
+
 def main(connection: "Connection[Any, Any]") -> None:
     """Serve until the pipe is closed."""
     end_with_parent()
@@ -73,9 +93,8 @@ def main(connection: "Connection[Any, Any]") -> None:
     _leave_no_core()
     torch.set_num_threads(1)
     messages = Messages(connection)
-    fn: Any = None
-    generators: list[Any] | None = None
-    """Those of a black box that has not been called."""
+    kept: dict[int, Kept] = {}
+    """By number; the caller says which ones stay."""
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the pool was closed
         messages.send(READY)
         while True:
@@ -87,23 +106,16 @@ def main(connection: "Connection[Any, Any]") -> None:
             torch.set_grad_enabled(kind == FUNCTION)  # it is made with gradients, and called without
             try:
                 if kind == FUNCTION:
-                    fn = None  # what it holds is given back before the next one is made
-                    fn = pickle.loads(parts[0].data)
-                    generators = in_this_process(draw_apart, fn)
+                    number, gone = header
+                    for one in gone:  # what they hold is given back before the next one is made
+                        del kept[one]
+                    kept[number] = Kept(pickle.loads(parts[0].data))
                 else:
-                    evaluate = functools.partial(values_of, fn, parts)
-                    values = evaluate() if generators is None else drawn_apart(fn, generators, evaluate)
-                    generators = None
+                    values = kept[header].values(parts)
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's
                 messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:
                 _answer(messages, values)
-
-
-def values_of(fn: Any, parts: Sequence[transfer.Part]) -> Tensor:
-    """Return the values of points and auxiliary inputs that are bytes."""
-    tensors = [one.tensor() for one in parts]
-    return checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
 
 
 def _answer(messages: Messages, values: Tensor | None) -> None:

@@ -65,6 +65,17 @@ def test_pools_of_processes(make, tmp_path):
             evaluator(black_boxes.never, Z)
 
 
+def test_a_process_keeps_several_black_boxes(tmp_path):
+    boxes = [Factory(black_boxes.Counted, tmp_path / "made") for _ in range(5)]
+    with standard() as pool:
+        evaluator = Executor(pool)
+        for k in (0, 1, 2, 0, 3, 4, 0, 2, 0):  # the fifth takes the place of the second
+            assert torch.equal(evaluator(boxes[k], Z), black_boxes.waves(Z))
+        assert len((tmp_path / "made").read_text().split()) == 5
+        evaluator(boxes[1], Z)
+    assert len((tmp_path / "made").read_text().split()) == 6
+
+
 def test_dask():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # dask's own

@@ -38,6 +38,7 @@ def test_actors_hold_the_black_box(actors, tmp_path):
     fn = Factory(black_boxes.Counted, tmp_path / "made")
     for _ in range(3):
         assert torch.equal(actors(fn, Z), black_boxes.waves(Z))
+        assert torch.equal(actors(black_boxes.waves, Z), black_boxes.waves(Z))
     made = (tmp_path / "made").read_text().split()
     assert len(set(made)) == len(made) <= 2  # one that ended in the test before may still be starting
 

@@ -227,6 +227,11 @@ def made_late(path):
     return waves
 
 
+def in_default_type(z):
+    """Thirds [K], in the default type of torch."""
+    return torch.full((len(z),), 1 / 3, dtype=torch.get_default_dtype())
+
+
 class Scaled:
     """Points times a factor that the caller may change."""
 

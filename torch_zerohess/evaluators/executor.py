@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
+from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
@@ -125,7 +126,8 @@ class Executor(Closing):
             while batch.waiting:
                 chunk = batch.take()
                 data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
-                task = self.executor.submit(evaluated, name, fn, data, identity(), next(_numbers))
+                more = identity(), next(_numbers), default_dtype()
+                task = self.executor.submit(evaluated, name, fn, data, *more)
                 tasks.append((chunk, task))
         except BaseException:
             for _, task in tasks:
@@ -180,7 +182,7 @@ def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[
         task.add_done_callback(one_less)
 
 
-def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, number: int) -> Answer:
+def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, number: int, dtype: str) -> Answer:
     """Return the values of a chunk, or its error, in a worker.
 
     The first fn with a name stays: what comes later is a copy of it. An error is returned in a form that the caller can
@@ -188,6 +190,8 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, numbe
     task of a caller another one.
     """
     become_worker(caller)
+    if caller != identity():
+        take_default_dtype(dtype)
     with _lock:
         if is_new := name not in _kept:
             make_room(_kept)

@@ -64,7 +64,7 @@ class ProcessPool(Ahead):
     Values have the same bits as with `Inline` for every number of workers, if the black box is deterministic and
     its value of a point does not depend on which points share its call. (Matrix products, and some functions of torch
     such as `sigmoid`, may round differently in the last bit when a call has fewer points. The number of workers makes
-    no difference to them either.) fn gets tensors on the CPU.
+    no difference to them either.) fn gets tensors on the CPU. The default type of torch is the caller's.
 
     The pool ends when it is closed, with the interpreter, and on Linux at once when the interpreter is killed.
 

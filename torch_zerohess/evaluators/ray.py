@@ -15,6 +15,7 @@ from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch, Chunk
+from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
 from torch_zerohess.evaluators.executor import values_of
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
@@ -114,7 +115,7 @@ class Ray(Ahead):
             self._idle.remove(actor)
             chunk = job.batch.take()
             data = transfer.packed([one[chunk.start : chunk.stop] for one in job.tensors])
-            self._busy[actor.evaluate.remote([job.function.sent], data)] = actor, chunk, job
+            self._busy[actor.evaluate.remote([job.function.sent], data, default_dtype())] = actor, chunk, job
         done, _ = self._ray.wait([*self._busy, *self._starting], num_returns=1, timeout=_LOOK)
         for one in done:
             if one in self._busy:
@@ -202,7 +203,7 @@ class Actor:
     def ready(self) -> None:
         """Do nothing, once the actor has started."""
 
-    def evaluate(self, held: list[Any], data: bytes) -> tuple[bool, bytes]:
+    def evaluate(self, held: list[Any], data: bytes, dtype: str) -> tuple[bool, bytes]:
         """Return True and the values of a chunk, or False and the error of the black box.
 
         A reference inside a list is not fetched with every call.
@@ -210,6 +211,7 @@ class Actor:
         import ray
 
         try:
+            take_default_dtype(dtype)
             if held[0] in self._kept:
                 return True, values_of(used(self._kept, held[0]), data)
             make_room(self._kept)

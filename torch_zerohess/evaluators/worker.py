@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
+from torch_zerohess.evaluators.default_dtype import take_default_dtype
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
@@ -33,8 +34,8 @@ class Messages:
     | kind | from | header | tensors |
     |---|---|---|---|
     | READY | worker | None | |
-    | FUNCTION | caller, then worker | number of a black box, numbers of those that go; None | it, pickled; none |
-    | EVALUATE | caller | number of a black box | points, aux |
+    | FUNCTION | caller, then worker | default type, number, numbers of those that go; None | a black box; none |
+    | EVALUATE | caller | default type, number of a black box | points, aux |
     | VALUES | worker | None | values |
     | ROOM | worker, then caller | bytes | |
     | ERROR | worker | whether fn could not be made, and the error | |
@@ -105,13 +106,14 @@ def main(connection: "Connection[Any, Any]") -> None:
             values = None
             torch.set_grad_enabled(kind == FUNCTION)  # it is made with gradients, and called without
             try:
+                dtype, number, *gone = header
+                take_default_dtype(dtype)
                 if kind == FUNCTION:
-                    number, gone = header
                     for one in gone:  # what they hold is given back before the next one is made
                         del kept[one]
                     kept[number] = Kept(pickle.loads(parts[0].data))
                 else:
-                    values = kept[header].values(parts)
+                    values = kept[number].values(parts)
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's
                 messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:

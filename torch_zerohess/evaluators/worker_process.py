@@ -12,6 +12,7 @@ from typing import Any
 from torch_zerohess.evaluators import transfer, worker
 from torch_zerohess.evaluators.ahead import Job
 from torch_zerohess.evaluators.batch import Chunk
+from torch_zerohess.evaluators.default_dtype import default_dtype
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.lifetime import end_group, ending, one_thread
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
@@ -63,14 +64,14 @@ class Process:
         gone = make_room(self.kept, most)
         self.kept[number] = None
         parts = [transfer.Part("torch.uint8", (len(payload),), payload)]
-        self.messages.send(FUNCTION, (number, gone), parts, shared=self._room(parts))
+        self.messages.send(FUNCTION, (default_dtype(), number, *gone), parts, shared=self._room(parts))
 
     def give(self, job: Job, chunk: Chunk, timeout: float | None) -> None:
         """Send the points of a chunk."""
         self.ready, self.job, self.chunk = False, job, chunk
         parts = [one.rows(chunk.start, chunk.stop) for one in job.parts]
         used(self.kept, job.function.number)
-        self.messages.send(EVALUATE, job.function.number, parts, shared=self._room(parts))
+        self.messages.send(EVALUATE, (default_dtype(), job.function.number), parts, shared=self._room(parts))
         self.deadline = None if timeout is None else time.monotonic() + timeout * len(chunk)
 
     def forget(self) -> int | None:

@@ -65,6 +65,17 @@ def test_pools_of_processes(make, tmp_path):
             evaluator(black_boxes.never, Z)
 
 
+def test_workers_have_the_default_type_of_the_caller():
+    before = torch.get_default_dtype()
+    try:
+        with standard() as pool:
+            for dtype in (torch.float64, torch.float32):
+                torch.set_default_dtype(dtype)
+                assert Executor(pool)(black_boxes.in_default_type, Z).dtype == dtype
+    finally:
+        torch.set_default_dtype(before)
+
+
 def test_a_process_keeps_several_black_boxes(tmp_path):
     boxes = [Factory(black_boxes.Counted, tmp_path / "made") for _ in range(5)]
     with standard() as pool:

@@ -147,6 +147,16 @@ def test_a_worker_keeps_the_black_boxes_that_were_used_last(tmp_path, limit, cou
     assert made == (count if limited else 5) + (limit is not None)
 
 
+def test_workers_have_the_default_type_of_the_caller(pool):
+    before = torch.get_default_dtype()
+    try:
+        for dtype in (torch.float64, torch.float32):
+            torch.set_default_dtype(dtype)
+            assert pool(black_boxes.in_default_type, points(3)).dtype == dtype
+    finally:
+        torch.set_default_dtype(before)
+
+
 def test_a_black_box_is_made_with_gradients_and_called_without(pool):
     for _ in range(2):
         assert pool(Factory(black_boxes.sloped), points(5)).tolist() == [0.0] * 5

@@ -55,6 +55,16 @@ def test_calls_that_do_not_wait_share_the_actors(actors, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
+def test_actors_have_the_default_type_of_the_caller(actors):
+    before = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert actors(black_boxes.in_default_type, Z).dtype == torch.float64
+    finally:
+        torch.set_default_dtype(before)
+
+
+@pytest.mark.filterwarnings("ignore")
 def test_a_fork_in_an_actor_does_not_answer(actors):
     assert torch.equal(actors(black_boxes.forking, Z), Z.sum(1))
 

@@ -44,8 +44,9 @@ class Executor(Closing):
     with every task; pass `Factory(make, *args)` for one that is large or slow to make, which each process makes once.
     A process keeps four black boxes, of all Executors together, those that were used last.
 
-    Processes use the black box as it was when the call began. Where `pickle` tells that it has changed since the last
-    call they take the new one. Do not change one that only loky or dask can pickle.
+    Processes use the black box as it was when the call began: where its pickled form has changed since an earlier call
+    they take the new one, and make a Factory again. For loky and dask that includes the global variables that a function of a script names.
+    The standard `ProcessPoolExecutor` sends a function by its name: its global variables are those of the worker.
 
     Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception
     of the first point is raised, also SystemExit; one that cannot be sent is a RuntimeError that names it. An executor
@@ -113,7 +114,8 @@ class Executor(Closing):
     def _tasks(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> tuple[Batch, Tasks]:
         """Submit the chunks of points."""
         threads = isinstance(self.executor, concurrent.futures.ThreadPoolExecutor)  # they use the black box itself
-        state = b"" if threads else _state(fn)
+        standard = isinstance(self.executor, concurrent.futures.ProcessPoolExecutor)
+        state = b"" if threads else _state(fn, pickle.dumps if standard else _dumps())
         with _lock:
             name = next((one for one, known in self._names.items() if same(known[0], fn) and known[1] == state), "")
             if not name:
@@ -141,10 +143,10 @@ class Executor(Closing):
         self._names.clear()
 
 
-def _state(fn: Callable[..., Any]) -> bytes:
+def _state(fn: Callable[..., Any], dumps: Callable[[Any], bytes]) -> bytes:
     """Return a digest of what the workers get for a black box; the same for all that are not picklable."""
     try:
-        return hashlib.sha256(pickle.dumps(fn)).digest()
+        return hashlib.sha256(dumps(fn)).digest()
     except Exception:  # what pickle raises is up to the object
         return b""
 
@@ -210,7 +212,7 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, numbe
 
 
 def _dumps() -> Callable[[Any], bytes]:
-    """Return what writes errors: cloudpickle, which loky and dask bring, also writes classes of a script."""
+    """Return cloudpickle, which loky and dask bring, and which also writes classes and functions of a script."""
     try:
         import cloudpickle
     except ModuleNotFoundError:

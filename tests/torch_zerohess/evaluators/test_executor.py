@@ -164,6 +164,15 @@ def test_what_is_no_executor_is_refused():
         Executor(3)
 
 
+def test_a_function_of_a_script_has_the_global_variables_of_each_call():
+    names = {"__name__": "__main__", "factor": 1.0}
+    exec("def scaled(z): return factor * z.sum(1)", names)
+    with loky() as pool:
+        evaluator = Executor(pool)
+        for names["factor"] in (1.0, 10.0):
+            assert torch.equal(evaluator(names["scaled"], Z), names["factor"] * Z.sum(1))
+
+
 def test_a_black_box_that_has_changed_is_sent_again():
     with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         evaluator, fn = Executor(pool), black_boxes.Scaled()

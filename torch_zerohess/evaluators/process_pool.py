@@ -59,7 +59,8 @@ class ProcessPool(Ahead):
     `evaluators.batch`. Points that failed too often have the value NaN: `on_nonfinite` of `BlackBox` and `estimate`
     says what becomes of them, "raise" names the point and how the worker ended. A black box whose first 10 evaluations
     (`retries` + 1 if that is more) end so is given up: `LostEvaluationError`. An exception of the black box is raised
-    here, with the worker's traceback as its cause, and not tried again.
+    here, with the worker's traceback as its cause, and not tried again. One that cannot be made again from its pickled
+    form is a RuntimeError with its type and text.
 
     Values have the same bits as with `Inline` for every number of workers, if the black box is deterministic and
     its value of a point does not depend on which points share its call. (Matrix products, and some functions of torch

@@ -45,7 +45,8 @@ class Executor(Closing):
     A process keeps four black boxes, of all Executors together, those that were used last.
 
     Processes use the black box as it was when the call began: where its pickled form has changed since an earlier call
-    they take the new one, and make a Factory again. For loky and dask that includes the global variables that a function of a script names.
+    they take the new one, and make a Factory again. For loky and dask that includes the global variables that a
+    function of a script names.
     The standard `ProcessPoolExecutor` sends a function by its name: its global variables are those of the worker.
 
     Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception

@@ -1,5 +1,6 @@
 """Does the value of a point depend on the other points of its call? Then it is no function of the point."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -23,7 +24,7 @@ class MixedPoints:
         """
         if self.checked or bool((x == x[:1]).all()) or not bool(values.isfinite().all()):
             return
-        sizes = values.double().flatten(1).norm(dim=1)
+        sizes = values.double().reshape(len(values), math.prod(values.shape[1:])).norm(dim=1)
         k = int(sizes.argmax())
         try:
             one, again = alone(k).double(), alone(k).double()

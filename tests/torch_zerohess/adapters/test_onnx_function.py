@@ -167,10 +167,10 @@ def test_an_output_that_joins_the_points_of_a_batch_is_refused():
         OnnxFunction(mean)(Z)
 
 
-def of_node(*nodes, kind=TensorProto.FLOAT) -> onnx.ModelProto:
-    """A model [K, 2] -> [K, 2] of nodes from x to y."""
+def of_node(*nodes, kind=TensorProto.FLOAT, out=(2,)) -> onnx.ModelProto:
+    """A model [K, 2] -> [K, *out] of nodes from x to y."""
     value = helper.make_tensor_value_info
-    ends = [value("x", TensorProto.FLOAT, ["K", 2])], [value("y", kind, ["K", 2])]
+    ends = [value("x", TensorProto.FLOAT, ["K", 2])], [value("y", kind, ["K", *out])]
     opset = [helper.make_opsetid("", 17)]
     return helper.make_model(helper.make_graph(nodes, "graph", *ends), opset_imports=opset, ir_version=10)
 
@@ -189,6 +189,16 @@ def test_a_model_that_mixes_the_points_of_a_batch_is_refused(nodes):
     for _ in range(2):
         with pytest.raises(ValueError, match="output 'y' must depend on its own point alone"):
             f(Z)
+
+
+@pytest.mark.parametrize("out", [(), (1,), (0,)])
+def test_values_of_any_shape_are_looked_at(out):
+    axes = helper.make_node("Constant", [], ["a"], value_ints=[1])
+    total = helper.make_node("ReduceSum", ["x", "a"], ["y"], keepdims=len(out))
+    ends = [helper.make_node("Constant", [], [name], value_ints=[0]) for name in ("b", "c")]
+    nothing = helper.make_node("Slice", ["x", "b", "c", "a"], ["y"])
+    f = OnnxFunction(of_node(axes, *([*ends, nothing] if out == (0,) else [total]), out=out))
+    torch.testing.assert_close(f(Z), Z.float()[:, :0] if out == (0,) else Z.float().sum(1).reshape(5, *out))
 
 
 def test_a_model_of_random_numbers_is_not_said_to_mix_points():

@@ -60,8 +60,8 @@ def drawn_apart(fn: Callable[..., Any], known: list[Any], evaluate: Callable[[],
     result = evaluate()
     if not is_worker():
         return result
-    new = [one for one in (*_global_ones(), *_held_by(_built(fn))) if not any(one is other for other in known)]
-    for generator in new:
+    new = [one for one in _held_by(_built(fn)) if not any(one is other for other in known)]
+    for generator in new:  # not the one of NumPy: torch itself imports NumPy late, and then its seed is a random one
         _reseed(generator)
     return evaluate() if new else result
 

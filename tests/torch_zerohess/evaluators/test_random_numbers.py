@@ -166,6 +166,16 @@ def test_generators_of_modules_that_a_function_imports_are_found(monkeypatch, li
     assert random_numbers._held_by(names["late"]) == [module.rng]
 
 
+def test_the_first_call_is_made_again_only_for_a_generator_of_the_black_box(monkeypatch):
+    """Torch imports NumPy late, which has a generator with a random seed."""
+    monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
+    calls, generator = [], KINDS["torch"]()
+    for fn, known, count in ((print, [], 1), (Slotted(generator), [generator], 1), (Slotted(generator), [], 2)):
+        calls.clear()
+        random_numbers.drawn_apart(fn, known, lambda: calls.append(1))
+        assert len(calls) == count
+
+
 def test_generators_here_stay_as_they_are():
     generator = KINDS["torch"]()
     before = state(generator), torch.get_rng_state(), random.getstate(), repr(np.random.get_state())

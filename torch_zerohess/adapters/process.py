@@ -218,7 +218,9 @@ class Program(Closing):
                     raise
             try:
                 answer = self._server.ask(request, self.format == "npy", self._limit(points))
-                return self._values(answer, b"".join(self._server.errors))
+                values = self._values(answer, b"".join(self._server.errors))
+                self._server.refuse_more("after the answer")
+                return values
             except BaseException:  # also Ctrl-C: an answer may be on its way
                 self.close()
                 raise

@@ -39,9 +39,9 @@ class Server:
         return self.process.poll() is None
 
     def ask(self, request: bytes, npy: bool, limit: float | None) -> bytes:
-        """Return the answer to a request. ValueError if the program wrote something since the last one, or with it."""
+        """Return the answer to a request. ValueError if the program wrote something since the last one."""
         command: Any = self.process.args
-        self._refuse_more("before the next request")
+        self.refuse_more("before the next request")
         answer: list[bytes] = []
 
         def exchange() -> None:
@@ -70,10 +70,9 @@ class Server:
             end_program(self.process)
             self._listener.join(GRACE)
             raise RuntimeError(ended(command, self.process.wait(), b"".join(self.errors)))
-        self._refuse_more("after the answer")
         return answer[0]
 
-    def _refuse_more(self, when: str) -> None:
+    def refuse_more(self, when: str) -> None:
         """Raise ValueError if the program wrote something that nobody asked for."""
         command: Any = self.process.args
         if more := _pending(self.process.stdout):

@@ -227,6 +227,11 @@ def made_late(path):
     return waves
 
 
+def in_default_type(z):
+    """Thirds [K], in the default type of torch."""
+    return torch.full((len(z),), 1 / 3, dtype=torch.get_default_dtype())
+
+
 class Scaled:
     """Points times a factor that the caller may change."""
 
@@ -280,6 +285,13 @@ def noisy_of_one(point):
 def noisy_elsewhere(z):
     time.sleep(0.02)
     return z[:, 0] + torch.randn(len(z), dtype=z.dtype, generator=PLACE.generator)
+
+
+def noisy_late(z):
+    import late_noise
+
+    time.sleep(0.02)
+    return z[:, 0] + torch.from_numpy(late_noise.GENERATOR.standard_normal(len(z)))
 
 
 def noisy_with_numpy(z):

@@ -83,8 +83,8 @@ class MitsubaScene:
             of `BlackBox`.
         variant: "auto" (`llvm_ad_rgb` where it is known to be safe, else `scalar_rgb`) or the name of one.
         threads: render threads of this process; None for all cores. With 1, renders of one point with fixed noise have
-            the same bits. With more, a just-in-time variant adds up samples in an order that changes from render to
-            render, and the last bits of pixels change with it.
+            the same bits. With more, samples add up in an order that changes from render to render, and the last bits
+            of pixels change with it.
 
     Raises:
         ValueError: an argument out of its range, bounds outside what the scene accepts, a film for a scene with a crop
@@ -134,11 +134,11 @@ class MitsubaScene:
             for name in parameter.names:
                 if name not in known:
                     raise ValueError(_unknown(name, known))
-        names = [name for parameter in parameters for name in parameter.names]
+        self.parameters = tuple(parameter.bind(self.mi, self.values) for parameter in parameters)
+        names = [name for one in self.parameters for name in one.names]  # a mesh that moves changes its normals, too
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"parameters must not change the same value twice, got {', '.join(twice)} more than once")
-        self.parameters = tuple(parameter.bind(self.mi, self.values) for parameter in parameters)
         self.n = sum(one.n for one in self.parameters)
         self.labels = [label for one in self.parameters for label in one.labels]
         """Of the columns of x [n]."""

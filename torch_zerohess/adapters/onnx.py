@@ -10,7 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_tensors, checked_integer
+from torch_zerohess.adapters.mixed_points import MixedPoints
+from torch_zerohess.adapters.onnx_session import fed, got, started
+from torch_zerohess.arguments import check_tensors
 
 _TYPES = {
     "tensor(float)": torch.float32,
@@ -30,9 +32,10 @@ class OnnxFunction:
 
     x holds the elements of the inputs that are parameters, one input after the other, each flattened. An input whose
     first dimension is free is a batch: if all parameters and auxiliary inputs are, the model runs once for all points.
-    Otherwise (first dimension 1, or an input without a batch) it runs once per point. x may be float32 or float64
-    whatever the model takes; it is converted. Tensors go to and from onnxruntime without a copy where their type and
-    layout allow it.
+    Otherwise (first dimension 1, or an input without a batch) it runs once per point. The first call with two points
+    that differ also runs one of them alone. It is an error if its value is another one then, by more than 5 %. x may be
+    float32 or float64 whatever the model takes; it is converted. Tensors go to and from onnxruntime without a copy
+    where their type and layout allow it.
 
     An `OnnxFunction` can be pickled, for `evaluators.ProcessPool`, if its model is a path, bytes or a ModelProto.
     A copy or deep copy, as of a model with such a layer, shares the session.
@@ -52,7 +55,9 @@ class OnnxFunction:
         ModuleNotFoundError: onnxruntime or NumPy is not installed.
         FileNotFoundError: there is no such model file.
         ValueError: a name is unknown, an input is given twice or not at all, a parameter is of an integer type or has
-            free dimensions beside the first, or a constant has a value that an input of integers cannot hold.
+            free dimensions beside the first, a constant has a value that an input of integers cannot hold, or the
+            output is no tensor of numbers.
+        TypeError: parameters or aux is a single name.
     """
 
     takes_batches = True
@@ -72,8 +77,11 @@ class OnnxFunction:
             model = model.SerializeToString()
         if isinstance(model, (str, os.PathLike)) and not Path(model).is_file():
             raise FileNotFoundError(f"model: there is no file {os.fspath(model)!r}")
+        for argument, names in (("parameters", parameters), ("aux", aux)):
+            if isinstance(names, str):
+                raise TypeError(f"{argument} must be a list of names, got {names!r}: write [{names!r}]")
         self._arguments = (model, parameters, constants, aux, output, threads, providers)
-        self.session = _session(model, threads, providers)
+        self.session = started(model, threads, providers)
         """The session of onnxruntime."""
         self._inputs = {one.name: one for one in self.session.get_inputs()}
         fixed = dict(constants or {})
@@ -89,6 +97,7 @@ class OnnxFunction:
         self.n = sum(math.prod(shape) for shape in self.shapes.values())
         """Number of parameters."""
         self._batched = all(_free(self._inputs[name].shape[:1]) for name in (*self.parameters, *self.aux))
+        self._mixing = MixedPoints()
         self._constants = {
             name: self._converted("constants", name, torch.as_tensor(_compact(one), device="cpu")).clone()
             for name, one in fixed.items()
@@ -117,7 +126,8 @@ class OnnxFunction:
         """Evaluate at points [K, n] with auxiliary inputs [K, ...].
 
         Raises ValueError if x has another number of columns, if points that differ are all equal in the type of the
-        model, if there are not as many auxiliary inputs as names, or if an input of integers cannot hold one of them.
+        model, if the value of a point depends on the other points, if there are not as many auxiliary inputs as names,
+        or if an input of integers cannot hold one of them.
         """
         check_tensors(x=x, aux=aux)
         if x.ndim != 2 or x.shape[1] != self.n:
@@ -134,6 +144,7 @@ class OnnxFunction:
                     f"{list(values.shape)}: it joins the points of the batch. Export the model for a batch of 1, or an "
                     "output before it is joined"
                 )
+            self._mixing.check(self.output, x, values, lambda k: self._run(x[k : k + 1], [a[k : k + 1] for a in aux]))
             return values.to(x.device)
         rows = [self._one(x[k : k + 1], tuple(one[k : k + 1] for one in aux)) for k in range(len(x))]
         return torch.stack(rows).to(x.device) if rows else x.new_empty(0)
@@ -146,6 +157,11 @@ class OnnxFunction:
             return
         first = self._given(x[:1])
         if all(all(map(torch.equal, self._given(x[k : k + 1]), first)) for k in range(1, len(x))):
+            if any(bool(one.isinf().any()) for one in first) and bool(x.isfinite().all()):
+                raise ValueError(
+                    f"x must be in the range of {', '.join(sorted(map(str, kinds)))}, which the model takes, got "
+                    f"{float(x.abs().max()):g}; use other units"
+                )
             raise ValueError(
                 f"sigma is below the rounding of the model: the {len(x)} points differ in {x.dtype}, and all are equal "
                 f"in {', '.join(sorted(map(str, kinds)))}, which the model takes; use a larger sigma or other units"
@@ -160,7 +176,7 @@ class OnnxFunction:
         values = self._run(x, aux)
         return values[0] if values.ndim and len(values) == 1 else values
 
-    def _run(self, x: Tensor, aux: tuple[Tensor, ...]) -> Tensor:
+    def _run(self, x: Tensor, aux: Sequence[Tensor]) -> Tensor:
         K, feeds = len(x), {}
         for name, part in zip(self.parameters, self._given(x), strict=True):
             feeds[name] = part.reshape(self._full(name, self.shapes[name], K))
@@ -175,8 +191,8 @@ class OnnxFunction:
                 one = one.expand(K, *one.shape[1:]) if len(one) == 1 and self._is_of_points(name) else one
             feeds[name] = one
         arrays = {name: one.detach().to("cpu", self._type(name)).contiguous().numpy() for name, one in feeds.items()}
-        (value,) = self.session.run_with_ort_values([self.output], {name: _value(one) for name, one in arrays.items()})
-        return _tensor(value)
+        (value,) = self.session.run_with_ort_values([self.output], {name: fed(one) for name, one in arrays.items()})
+        return got(value)
 
     def _is_of_points(self, name: str) -> bool:
         """Whether the free first dimension of a constant is that of the parameters, or may be."""
@@ -232,12 +248,16 @@ class OnnxFunction:
                 )
 
     def _output(self, name: str | None) -> str:
-        names = [one.name for one in self.session.get_outputs()]
+        kinds = {one.name: one.type for one in self.session.get_outputs()}
+        names = list(kinds)
         if name is None and len(names) > 1:
             raise ValueError(f"output must be one of {names}, because the model has several, got None")
         if name is not None and name not in names:
             raise ValueError(f"output must be one of {names}, got {name!r}")
-        return name or names[0]
+        name = name or names[0]
+        if "string" in kinds[name] or kinds[name].startswith(("seq(", "map(")):
+            raise ValueError(f"output {name!r} must be a tensor of numbers, got {kinds[name]}")
+        return name
 
 
 def _compact(numbers: Any) -> Any:
@@ -250,40 +270,6 @@ def _again(*arguments: Any) -> OnnxFunction:
     return OnnxFunction(
         model, parameters, constants=constants, aux=aux, output=output, threads=threads, providers=providers
     )
-
-
-def _session(model: Any, threads: int | None, providers: str | Sequence[Any]) -> Any:
-    if hasattr(model, "run_with_ort_values"):
-        return model
-    if not isinstance(model, (str, bytes, os.PathLike)):
-        raise TypeError(
-            f"model must be a path, the bytes of a model or an InferenceSession, got {type(model).__name__}"
-            + (": export it by torch.onnx.export first" if isinstance(model, torch.nn.Module) else "")
-        )
-    try:
-        import onnxruntime
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "onnxruntime is not installed; pip install onnxruntime", name="onnxruntime"
-        ) from error
-    options = onnxruntime.SessionOptions()
-    if threads is not None:
-        options.intra_op_num_threads = options.inter_op_num_threads = checked_integer("threads", threads, 1)
-    source = os.fspath(model) if isinstance(model, os.PathLike) else model
-    names = [providers] if isinstance(providers, str) else list(providers)
-    return onnxruntime.InferenceSession(source, options, providers=names)
-
-
-def _value(array: Any) -> Any:
-    import onnxruntime
-
-    return onnxruntime.OrtValue.ortvalue_from_numpy(array)
-
-
-def _tensor(value: Any) -> Tensor:
-    """Return an output without a copy where that is possible; it keeps the memory of the output alive."""
-    inner = getattr(value, "_ortvalue", value)
-    return torch.utils.dlpack.from_dlpack(inner) if hasattr(inner, "__dlpack__") else torch.from_numpy(value.numpy())
 
 
 def _free(dims: Sequence[Any]) -> bool:

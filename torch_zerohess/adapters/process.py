@@ -36,15 +36,16 @@ class Program(Closing):
 
     - "json": a request is the line `{"x": [[...], ...]}`, with `"aux": [...]` where there is aux. The answer is one
       line, the list of K values. Numbers are written so that float64 is read back exactly.
-    - "npy": a request is the array x, then each aux, as `numpy.save` writes them, in the types of the tensors. The
+    - "npy": a request is the array x, then each aux, as `numpy.save` writes them, in the types of the tensors;
+      bfloat16, which NumPy does not have, as float32. The
       answer is one array of numbers, as `numpy.save(sys.stdout.buffer, values)` writes it. `numpy.load` cannot read
       from a pipe. A Python program reads one array by
       `numpy.lib.format.read_array(types.SimpleNamespace(read=sys.stdin.buffer.read))`.
     - a function of bytes: turns the output of the program into the value. Requests are written as for "json".
 
     A server writes one answer per request and flushes it, and writes messages to the standard error alone. More answers
-    are an error of the next call, if they are there when it begins. A server ends when its standard input
-    does. A server that ended or took too long is started again by the next call.
+    are an error of the call if they come with the first one, and of the next call if they are there when it begins. A
+    server ends when its standard input does. A server that ended or took too long is started again by the next call.
 
     A run fails if it ends with a code other than 0, takes too long, or writes no number, or fewer or more of them than
     before. With on_failure="nan" all points of the run have NaN as their values, in the shape of earlier outputs.
@@ -161,7 +162,7 @@ class Program(Closing):
             found: dict[int, Tensor | None] = {}
             try:
                 for k, one in enumerate(x.detach()):  # a command may write its point to a file: one after the other
-                    command = found_program(self.command(one), self.folder, self.environment)
+                    command = found_program(self.command(one.clone()), self.folder, self.environment)
                     found[k] = self._unless_failed(functools.partial(self._run, command, b"", 1), one)
             except BaseException as error:  # Ctrl-C, too
                 keep_finished(error, x, {k: one for k, one in found.items() if one is not None})
@@ -217,7 +218,9 @@ class Program(Closing):
                     raise
             try:
                 answer = self._server.ask(request, self.format == "npy", self._limit(points))
-                return self._values(answer, b"".join(self._server.errors))
+                values = self._values(answer, b"".join(self._server.errors))
+                self._server.refuse_more("after the answer")
+                return values
             except BaseException:  # also Ctrl-C: an answer may be on its way
                 self.close()
                 raise
@@ -259,7 +262,7 @@ class Program(Closing):
 
             file = io.BytesIO()
             for one in tensors:
-                np.save(file, one.numpy())
+                np.save(file, (one.float() if one.dtype is torch.bfloat16 else one).numpy())
             return file.getvalue()
         content: dict[str, Any] = {"x": tensors[0].tolist()}
         if aux:

@@ -41,13 +41,7 @@ class Server:
     def ask(self, request: bytes, npy: bool, limit: float | None) -> bytes:
         """Return the answer to a request. ValueError if the program wrote something since the last one."""
         command: Any = self.process.args
-        assert self.process.stdout is not None
-        if more := _pending(self.process.stdout):
-            raise ValueError(
-                f"the program {command[0]!r} wrote more than one answer to a request, or other text beside it: "
-                f"{more[:200].decode(errors='replace')!r} was there before the next request; let it write one answer "
-                f"and flush, and print messages to its standard error{shown(b''.join(self.errors))}"
-            )
+        self.refuse_more("before the next request")
         answer: list[bytes] = []
 
         def exchange() -> None:
@@ -77,6 +71,16 @@ class Server:
             self._listener.join(GRACE)
             raise RuntimeError(ended(command, self.process.wait(), b"".join(self.errors)))
         return answer[0]
+
+    def refuse_more(self, when: str) -> None:
+        """Raise ValueError if the program wrote something that nobody asked for."""
+        command: Any = self.process.args
+        if more := _pending(self.process.stdout):
+            raise ValueError(
+                f"the program {command[0]!r} wrote more than one answer to a request, or other text beside it: "
+                f"{more[:200].decode(errors='replace')!r} was there {when}; let it write one answer and flush, and "
+                f"print messages to its standard error{shown(b''.join(self.errors))}"
+            )
 
     def end(self) -> None:
         """Close the input of the program, and kill it if it does not end. The programs that it started end with it.
@@ -144,10 +148,11 @@ def _read_npy(file: IO[bytes]) -> bytes:
     import numpy as np
 
     version = file.read(2)
-    size = file.read(2 if version[0] == 1 else 4)
+    first = version[:1] == b"\x01"
+    size = file.read(2 if first else 4)  # nothing where the program ended: ValueError below
     header = file.read(int.from_bytes(size, "little"))
     layout = io.BytesIO(size + header)
-    read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(layout)
     return start + version + size + header + file.read(int(np.prod(shape)) * dtype.itemsize)
 

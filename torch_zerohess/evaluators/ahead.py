@@ -23,6 +23,7 @@ from torch_zerohess.evaluators.batch import MOST, Batch
 from torch_zerohess.evaluators.factory import same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
+from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.transfer import Part
 
 
@@ -103,7 +104,8 @@ class Ahead(Closing, ABC):
         return MOST
 
     def __init__(self) -> None:
-        self._function: Function | None = None
+        self._functions: dict[int, Function] = {}
+        """Black boxes by number, the one that was used last at the end."""
         self._closed = False
         self._alone()
 
@@ -200,9 +202,13 @@ class Ahead(Closing, ABC):
     def _job(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> Job:
         with self._taking:
             self._check_open()
-            if self._function is None or not same(self._function.fn, fn):
-                self._function = Function(fn, self._sent(fn))
-            function = self._function
+            number = next((number for number, one in self._functions.items() if same(one.fn, fn)), None)
+            if number is None:
+                function = Function(fn, self._sent(fn))
+                make_room(self._functions)
+                self._functions[function.number] = function
+            else:
+                function = used(self._functions, number)
         tensors = tuple(one.detach().cpu() for one in (points, *aux))
         return Job(function, tensors, points.device, self._batch(tensors[0]))
 

@@ -1,7 +1,9 @@
 """Evaluation by an executor of somebody else: the standard pools, loky, dask, mpi4py."""
 
 import concurrent.futures
+import functools
 import hashlib
+import itertools
 import pickle
 import threading
 import traceback
@@ -14,21 +16,23 @@ from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
+from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
 from torch_zerohess.evaluators.factory import Each, same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
+from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
-from torch_zerohess.evaluators.random_numbers import draw_apart
+from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
 from torch_zerohess.evaluators.values import checked_values
 
-_HELD = 4
-"""Black boxes that a process keeps."""
-_held: dict[str, Callable[..., Any]] = {}
+_kept: dict[str, Callable[..., Any]] = {}
 _lock = threading.Lock()
+_numbers = itertools.count()
+"""Of tasks: dask takes tasks with equal arguments for one."""
 
-Answer = tuple[bool, bytes]
-"""True and the values of a chunk, or False and the error of the black box."""
+Answer = tuple[bool, Any]
+"""True and the values of a chunk, or False and the error of the black box, as bytes if it comes from a process."""
 Tasks = list[tuple[Chunk, "concurrent.futures.Future[Answer]"]]
 
 
@@ -38,9 +42,12 @@ class Executor(Closing):
     The executor says how the black box gets to its workers, and so what it must be: picklable for the standard
     `ProcessPoolExecutor` (use one with `mp_context` "spawn"), almost anything for loky, dask and threads. It is sent
     with every task; pass `Factory(make, *args)` for one that is large or slow to make, which each process makes once.
+    A process keeps four black boxes, of all Executors together, those that were used last.
 
-    Processes use the black box as it was when the call began. Where `pickle` tells that it has changed since the last
-    call they take the new one. Do not change one that only loky or dask can pickle.
+    Processes use the black box as it was when the call began: where its pickled form has changed since an earlier call
+    they take the new one, and make a Factory again. For loky and dask that includes the global variables that a
+    function of a script names.
+    The standard `ProcessPoolExecutor` sends a function by its name: its global variables are those of the worker.
 
     Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception
     of the first point is raised, also SystemExit; one that cannot be sent is a RuntimeError that names it. An executor
@@ -66,10 +73,8 @@ class Executor(Closing):
         if not callable(getattr(executor, "submit", None)):
             raise TypeError(f"executor must have a method submit, as concurrent.futures.Executor has, got {executor!r}")
         self.executor = executor
-        self._fn: Callable[..., Any] | None = None
-        self._pickled = b""
-        """A digest of the state of that black box."""
-        self._name = ""
+        self._names: dict[str, tuple[Callable[..., Any], bytes]] = {}
+        """Black boxes, and a digest of the state of each, by the names that processes know them by."""
         self._closed = False
 
     def __repr__(self) -> str:
@@ -110,17 +115,23 @@ class Executor(Closing):
     def _tasks(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> tuple[Batch, Tasks]:
         """Submit the chunks of points."""
         threads = isinstance(self.executor, concurrent.futures.ThreadPoolExecutor)  # they use the black box itself
-        state = b"" if threads else _state(fn)
+        standard = isinstance(self.executor, concurrent.futures.ProcessPoolExecutor)
+        state = b"" if threads else _state(fn, pickle.dumps if standard else _dumps())
         with _lock:
-            if not same(self._fn, fn) or state != self._pickled:
-                self._fn, self._pickled, self._name = fn, state, uuid.uuid4().hex
-            name = self._name
+            name = next((one for one, known in self._names.items() if same(known[0], fn) and known[1] == state), "")
+            if not name:
+                make_room(self._names)
+                name = uuid.uuid4().hex
+                self._names[name] = fn, state
+            used(self._names, name)
         batch, tasks = Batch(points, 0), Tasks()
         try:
             while batch.waiting:
                 chunk = batch.take()
                 data = transfer.packed([one[chunk.start : chunk.stop] for one in (points, *aux)])
-                tasks.append((chunk, self.executor.submit(evaluated, name, fn, data, identity())))
+                more = identity(), next(_numbers), default_dtype()
+                task = self.executor.submit(evaluated, name, fn, data, *more)
+                tasks.append((chunk, task))
         except BaseException:
             for _, task in tasks:
                 task.cancel()
@@ -130,13 +141,13 @@ class Executor(Closing):
     def close(self) -> None:
         """Take no further points; the executor stays as it is."""
         self._closed = True
-        self._fn = None
+        self._names.clear()
 
 
-def _state(fn: Callable[..., Any]) -> bytes:
+def _state(fn: Callable[..., Any], dumps: Callable[[Any], bytes]) -> bytes:
     """Return a digest of what the workers get for a black box; the same for all that are not picklable."""
     try:
-        return hashlib.sha256(pickle.dumps(fn)).digest()
+        return hashlib.sha256(dumps(fn)).digest()
     except Exception:  # what pickle raises is up to the object
         return b""
 
@@ -145,7 +156,7 @@ def _joined(batch: Batch, tasks: Tasks) -> Tensor:
     for chunk, task in tasks:  # in order, so that the first error is of the first point
         good, data = task.result()
         if not good:
-            raise loaded_error(data)
+            raise loaded_error(data) if isinstance(data, bytes) else data
         batch.came(chunk, transfer.unpacked(data)[0])
     return batch.result()
 
@@ -174,30 +185,35 @@ def _wait_all(tasks: "Sequence[concurrent.futures.Future[Any]]", then: Callable[
         task.add_done_callback(one_less)
 
 
-def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str) -> Answer:
+def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, number: int, dtype: str) -> Answer:
     """Return the values of a chunk, or its error, in a worker.
 
     The first fn with a name stays: what comes later is a copy of it. An error is returned in a form that the caller can
-    read for certain: one that cannot be unpickled would break an executor of processes for good.
+    read for certain: one that cannot be unpickled would break an executor of processes for good. The number makes each
+    task of a caller another one.
     """
     become_worker(caller)
+    if caller != identity():
+        take_default_dtype(dtype)
     with _lock:
-        is_new = name not in _held
-        fn = _held.setdefault(name, fn)
-        while len(_held) > _HELD:
-            _held.pop(next(iter(_held)))
+        if is_new := name not in _kept:
+            make_room(_kept)
+            _kept[name] = fn
+        fn = used(_kept, name)
+    evaluate = functools.partial(values_of, fn, data)
     try:
         if is_new:
-            in_this_process(draw_apart, fn)
-        return True, values_of(fn, data)
+            generators = in_this_process(draw_apart, fn)
+            return True, drawn_apart(fn, generators, evaluate)
+        return True, evaluate()
     except BaseException as error:  # SystemExit too
-        if caller == identity():  # a thread: the error itself can be raised
-            raise
+        if caller == identity():  # a thread: the error itself can be raised, but here it would end a thread of dask
+            return False, error
         return False, dumped_error(error, traceback.format_exc(), _dumps())
 
 
 def _dumps() -> Callable[[Any], bytes]:
-    """Return what writes errors: cloudpickle, which loky and dask bring, also writes classes of a script."""
+    """Return cloudpickle, which loky and dask bring, and which also writes classes and functions of a script."""
     try:
         import cloudpickle
     except ModuleNotFoundError:

@@ -17,7 +17,8 @@ class Factory:
     """A black box that is made in the process that calls it: `make(*args, **kwargs)` returns it.
 
     Every process that evaluates a `Factory` calls `make` once, and keeps what it returns. So a scene, a session or a
-    program need not be picklable. `make` and its arguments must be.
+    program need not be picklable. `make` and its arguments must be. A worker keeps four black boxes, those that were
+    used last, and calls `make` again for one that it has not kept.
 
     Args:
         make: a function or class at the top of a module.

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.kept import MOST
 from torch_zerohess.evaluators.payload import dumped, loaded_error
 from torch_zerohess.evaluators.worker import ERROR, VALUES
 from torch_zerohess.evaluators.worker_errors import unmade, unstarted
@@ -44,9 +45,11 @@ class ProcessPool(Ahead):
     """Calls the black box in worker processes, a few points at a time.
 
     Workers are new Python processes (spawn) with one thread each, so that a black box with its own threads does not
-    take more cores than there are. They start with the first call, and stay. The black box is sent to a worker once;
-    what it holds stays there. Pass `Factory(make, *args)` for one that cannot be pickled, or that takes long to make.
-    What the caller changes in a black box afterwards does not reach the workers.
+    take more cores than there are. They start with the first call, and stay. The black box is sent to a worker
+    once; what it holds stays there. A worker keeps four black boxes, those that were used last, and this process
+    their pickled forms. With a `memory_limit` a worker keeps one. Pass `Factory(make, *args)` for one that cannot
+    be pickled, or that takes long to make. What the caller changes in a black box afterwards does not reach the
+    workers.
     A black box may have processes of its own, such as those of a DataLoader. They end with the worker on Linux and
     macOS.
 
@@ -56,12 +59,13 @@ class ProcessPool(Ahead):
     `evaluators.batch`. Points that failed too often have the value NaN: `on_nonfinite` of `BlackBox` and `estimate`
     says what becomes of them, "raise" names the point and how the worker ended. A black box whose first 10 evaluations
     (`retries` + 1 if that is more) end so is given up: `LostEvaluationError`. An exception of the black box is raised
-    here, with the worker's traceback as its cause, and not tried again.
+    here, with the worker's traceback as its cause, and not tried again. One that cannot be made again from its pickled
+    form is a RuntimeError with its type and text.
 
     Values have the same bits as with `Inline` for every number of workers, if the black box is deterministic and
     its value of a point does not depend on which points share its call. (Matrix products, and some functions of torch
     such as `sigmoid`, may round differently in the last bit when a call has fewer points. The number of workers makes
-    no difference to them either.) fn gets tensors on the CPU.
+    no difference to them either.) fn gets tensors on the CPU. The default type of torch is the caller's.
 
     The pool ends when it is closed, with the interpreter, and on Linux at once when the interpreter is killed.
 
@@ -101,6 +105,7 @@ class ProcessPool(Ahead):
             raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
         self.timeout = None if timeout is None else checked_number("timeout", timeout, above=0.0)
         self.retries, self.recycle, self.memory_limit = retries, recycle, memory_limit
+        self._most = MOST if memory_limit is None else 1  # a limit is for one
         super().__init__()
         self._forget()
         _pools.add(self)
@@ -188,8 +193,8 @@ class ProcessPool(Ahead):
             if job is None:
                 continue
             try:
-                if one.number != job.function.number:
-                    one.give_function(job.function.number, job.function.sent)
+                if job.function.number not in one.kept:
+                    one.give_function(job.function.number, job.function.sent, self._most)
                 elif job.begin():
                     one.give(job, job.batch.take(), self.timeout)
             except (BrokenPipeError, ConnectionResetError):
@@ -230,7 +235,7 @@ class ProcessPool(Ahead):
             making, data = header
             error = loaded_error(data)
             if making:  # calls with other black boxes go on
-                number, one.number = one.number, None
+                number = one.forget()
                 for each in [each for each in jobs if each.function.number == number]:
                     each.error = unmade(error)
                 return

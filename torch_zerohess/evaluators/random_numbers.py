@@ -13,12 +13,14 @@ import random
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from torch_zerohess.evaluators.factory import Each, Factory
 from torch_zerohess.evaluators.process_identity import digest, is_worker
+
+T = TypeVar("T")
 
 _DEPTH = 8
 _MOST = 10_000
@@ -31,22 +33,44 @@ _numbers = itertools.count()
 """Of seeds: an executor may send a black box again, as it was at first."""
 
 
-def draw_apart(fn: Callable[..., Any]) -> None:
+def draw_apart(fn: Callable[..., Any]) -> list[Any]:
     """Give the generators that a black box uses seeds of this process, if it is a worker. A `Factory` is built first.
 
-    These are the generators of torch, NumPy and Python in what fn holds and in the global variables that its code
-    names, and the three global ones. Others, as inside of a C++ library, are the black box's own affair.
+    These are the generators of torch, NumPy and Python in what fn holds and in the global variables and modules that
+    its code names, and the three global ones. Others, as inside of a C++ library, are the black box's own affair.
+    Return these generators.
     """
-    if isinstance(fn, Each):
-        draw_apart(fn.fn)
-        return
-    if isinstance(fn, Factory):
-        fn = fn.build()
+    fn = _built(fn)
     if not is_worker():
-        return
+        return []
     torch.manual_seed(_next_seed() >> 1)  # on every device
-    for generator in (*_global_ones(), *_held_by(fn)):
+    found = [*_global_ones(), *_held_by(fn)]
+    for generator in found:
         _reseed(generator)
+    return found
+
+
+def drawn_apart(fn: Callable[..., Any], known: list[Any], evaluate: Callable[[], T]) -> T:
+    """Return evaluate(), the first call of a black box here: the second where the first one brought generators.
+
+    A module that fn imports when it is called may have a generator. Its first numbers are the same in all workers.
+
+    known: what `draw_apart` returned.
+    """
+    result = evaluate()
+    if not is_worker():
+        return result
+    new = [one for one in _held_by(_built(fn)) if not any(one is other for other in known)]
+    for generator in new:  # not the one of NumPy: torch itself imports NumPy late, and then its seed is a random one
+        _reseed(generator)
+    return evaluate() if new else result
+
+
+def _built(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the black box of many points or of one that a `Factory` makes, or that is given."""
+    while isinstance(fn, Each):
+        fn = fn.fn
+    return fn.build() if isinstance(fn, Factory) else fn
 
 
 def _global_ones() -> Iterator[Any]:
@@ -90,6 +114,8 @@ def _parts(thing: Any) -> Iterator[Any]:
         yield from inspect.getclosurevars(thing).nonlocals.values()  # ValueError before all of them are assigned
     elif isinstance(thing, types.MethodType):
         yield from (thing.__self__, thing.__func__)
+    elif isinstance(thing, property):
+        yield thing.fget
     elif not isinstance(thing, type | types.ModuleType):
         yield getattr(thing, "__dict__", None)
         yield from (getattr(thing, name, None) for one in type(thing).__mro__ for name in _slots(one))
@@ -109,13 +135,30 @@ def _slots(kind: type) -> tuple[str, ...]:
 
 
 def _of_code(code: types.CodeType, names: Mapping[str, Any]) -> Iterator[Any]:
-    """Return the global variables that code names, also of modules: `sim.rng` of the module sim."""
-    for name in code.co_names:
-        thing = names.get(name)
+    """Return the global variables that code names, also of modules: `pkg.sim.rng` of the module pkg.sim.
+
+    A name that is no global variable may be a module that the code imports.
+    """
+    package = str(names.get("__package__") or "")
+    homes = itertools.accumulate(package.split("."), "{}.{}".format) if package else ()  # of `from .sim import rng`
+    prefixes = ["", *(f"{one}." for one in homes)]
+    inside = [one for one in code.co_names if one not in names]
+    imported = (sys.modules.get(f"{prefix}{one}".rstrip(".")) for prefix in prefixes for one in inside)
+    modules, seen = list[types.ModuleType](), set[int]()
+    for thing in (*(names.get(one) for one in code.co_names), *imported):
         if isinstance(thing, types.ModuleType):
-            yield from (vars(thing).get(one) for one in code.co_names)
+            modules.append(thing)
         else:
             yield thing
+    for module in modules:  # it grows
+        if id(module) in seen or module.__name__.partition(".")[0] in _LIBRARIES:
+            continue
+        seen.add(id(module))
+        for thing in (vars(module).get(one) for one in code.co_names):
+            if isinstance(thing, types.ModuleType):
+                modules.append(thing)
+            else:
+                yield thing
     yield from (part for one in code.co_consts if isinstance(one, types.CodeType) for part in _of_code(one, names))
 
 

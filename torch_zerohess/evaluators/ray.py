@@ -1,5 +1,6 @@
 """Evaluation on a cluster: actors of Ray that hold the black box."""
 
+import functools
 import os
 import sys
 import traceback
@@ -14,10 +15,12 @@ from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.ahead import Ahead, Job
 from torch_zerohess.evaluators.batch import Batch, Chunk
+from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
 from torch_zerohess.evaluators.executor import values_of
+from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker
-from torch_zerohess.evaluators.random_numbers import draw_apart
+from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
 
 _LOOK = 0.05
 """Seconds after which a wait looks for calls that were submitted meanwhile."""
@@ -26,9 +29,10 @@ _LOOK = 0.05
 class Ray(Ahead):
     """Calls the black box in actors of Ray, on one machine or many, one chunk per actor and call.
 
-    An actor holds the black box from call to call. An actor that ends, with its process or its machine, is replaced by
-    a new one, which makes the black box again. Its points are tried again, by the new one or by another. What becomes
-    of points that failed too often: see `ProcessPool`. An exception of the black box is raised here, also SystemExit.
+    An actor keeps the black box from call to call, up to four of them, those that were used last. An actor that
+    ends, with its process or its machine, is replaced by a new one, which makes the black box again. Its points are
+    tried again, by the new one or by another. What becomes of points that failed too often: see `ProcessPool`. An
+    exception of the black box is raised here, also SystemExit.
 
     An actor that cannot start, as on a machine without this package, is tried again as often as points are, and then
     given up with a warning. A call without any actor left raises RuntimeError; the next call tries all of them again.
@@ -85,7 +89,7 @@ class Ray(Ahead):
     def _end(self) -> None:
         for actor in self.actors if self._ray.is_initialized() else ():
             self._ray.kill(actor)
-        self.actors, self._idle, self._busy, self._starting, self._function = [], [], {}, {}, None
+        self.actors, self._idle, self._busy, self._starting, self._functions = [], [], {}, {}, {}
         if self._own:
             self._own = False
             self._ray.shutdown()
@@ -111,7 +115,7 @@ class Ray(Ahead):
             self._idle.remove(actor)
             chunk = job.batch.take()
             data = transfer.packed([one[chunk.start : chunk.stop] for one in job.tensors])
-            self._busy[actor.evaluate.remote([job.function.sent], data)] = actor, chunk, job
+            self._busy[actor.evaluate.remote([job.function.sent], data, default_dtype())] = actor, chunk, job
         done, _ = self._ray.wait([*self._busy, *self._starting], num_returns=1, timeout=_LOOK)
         for one in done:
             if one in self._busy:
@@ -188,18 +192,18 @@ class Ray(Ahead):
 
 
 class Actor:
-    """What runs on the cluster: it fetches a black box once, and holds it."""
+    """What runs on the cluster: it fetches a black box once, and keeps it."""
 
     def __init__(self) -> None:
         torch.set_num_threads(1)
         become_worker()
-        self._held: Any = None
-        self._fn: Any = None
+        self._kept: dict[Any, Any] = {}
+        """Black boxes by their references."""
 
     def ready(self) -> None:
         """Do nothing, once the actor has started."""
 
-    def evaluate(self, held: list[Any], data: bytes) -> tuple[bool, bytes]:
+    def evaluate(self, held: list[Any], data: bytes, dtype: str) -> tuple[bool, bytes]:
         """Return True and the values of a chunk, or False and the error of the black box.
 
         A reference inside a list is not fetched with every call.
@@ -207,12 +211,14 @@ class Actor:
         import ray
 
         try:
-            if held[0] != self._held:
-                self._fn = None
-                fn = ray.get(held[0])
-                draw_apart(fn)
-                self._fn, self._held = fn, held[0]
-            return True, values_of(self._fn, data)
+            take_default_dtype(dtype)
+            if held[0] in self._kept:
+                return True, values_of(used(self._kept, held[0]), data)
+            make_room(self._kept)
+            fn = ray.get(held[0])
+            generators = draw_apart(fn)
+            self._kept[held[0]] = fn
+            return True, drawn_apart(fn, generators, functools.partial(values_of, fn, data))
         except BaseException as error:  # SystemExit too: Ray would end the actor
             if hasattr(error, "ray_terminate_msg"):  # Ray itself ends the actor
                 raise

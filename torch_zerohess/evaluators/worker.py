@@ -1,6 +1,7 @@
 """What runs in a worker process: it gets a black box once, then points, until its pipe is closed."""
 
 import contextlib
+import functools
 import multiprocessing
 import pickle
 import traceback
@@ -12,11 +13,12 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators import transfer
+from torch_zerohess.evaluators.default_dtype import take_default_dtype
 from torch_zerohess.evaluators.factory import Each
 from torch_zerohess.evaluators.lifetime import end_with_parent
 from torch_zerohess.evaluators.payload import dumped_error
 from torch_zerohess.evaluators.process_identity import become_worker, in_this_process
-from torch_zerohess.evaluators.random_numbers import draw_apart
+from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart
 from torch_zerohess.evaluators.values import checked_values
 
 READY, FUNCTION, EVALUATE, VALUES, ROOM, ERROR = range(6)
@@ -32,8 +34,8 @@ class Messages:
     | kind | from | header | tensors |
     |---|---|---|---|
     | READY | worker | None | |
-    | FUNCTION | caller, then worker | None | the pickled black box; none |
-    | EVALUATE | caller | None | points, aux |
+    | FUNCTION | caller, then worker | default type, number, numbers of those that go; None | a black box; none |
+    | EVALUATE | caller | default type, number of a black box | points, aux |
     | VALUES | worker | None | values |
     | ROOM | worker, then caller | bytes | |
     | ERROR | worker | whether fn could not be made, and the error | |
@@ -64,6 +66,26 @@ class Messages:
             self.memory = None
 
 
+class Kept:
+    """A black box of this process."""
+
+    def __init__(self, fn: Any) -> None:
+        self.fn = fn
+        self.generators: list[Any] | None = in_this_process(draw_apart, fn)
+        """None once it has been called."""
+
+    def values(self, parts: Sequence[transfer.Part]) -> Tensor:
+        """Return the values of points and auxiliary inputs."""
+        evaluate = functools.partial(self._values, parts)
+        values = evaluate() if self.generators is None else drawn_apart(self.fn, self.generators, evaluate)
+        self.generators = None
+        return values
+
+    def _values(self, parts: Sequence[transfer.Part]) -> Tensor:
+        tensors = [one.tensor() for one in parts]
+        return checked_values(in_this_process(self.fn, *tensors), tensors[0], not isinstance(self.fn, Each))
+
+
 def main(connection: "Connection[Any, Any]") -> None:
     """Serve until the pipe is closed."""
     end_with_parent()
@@ -72,7 +94,8 @@ def main(connection: "Connection[Any, Any]") -> None:
     _leave_no_core()
     torch.set_num_threads(1)
     messages = Messages(connection)
-    fn: Any = None
+    kept: dict[int, Kept] = {}
+    """By number; the caller says which ones stay."""
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the pool was closed
         messages.send(READY)
         while True:
@@ -83,13 +106,14 @@ def main(connection: "Connection[Any, Any]") -> None:
             values = None
             torch.set_grad_enabled(kind == FUNCTION)  # it is made with gradients, and called without
             try:
+                dtype, number, *gone = header
+                take_default_dtype(dtype)
                 if kind == FUNCTION:
-                    fn = None  # what it holds is given back before the next one is made
-                    fn = pickle.loads(parts[0].data)
-                    in_this_process(draw_apart, fn)
+                    for one in gone:  # what they hold is given back before the next one is made
+                        del kept[one]
+                    kept[number] = Kept(pickle.loads(parts[0].data))
                 else:
-                    tensors = [one.tensor() for one in parts]
-                    values = checked_values(in_this_process(fn, *tensors), tensors[0], not isinstance(fn, Each))
+                    values = kept[number].values(parts)
             except BaseException as error:  # SystemExit too: it is the black box's, not this process's
                 messages.send(ERROR, (kind == FUNCTION, dumped_error(error, traceback.format_exc())))
             else:

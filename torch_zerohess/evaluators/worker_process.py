@@ -12,6 +12,8 @@ from typing import Any
 from torch_zerohess.evaluators import transfer, worker
 from torch_zerohess.evaluators.ahead import Job
 from torch_zerohess.evaluators.batch import Chunk
+from torch_zerohess.evaluators.default_dtype import default_dtype
+from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.lifetime import end_group, ending, one_thread
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
 
@@ -37,7 +39,9 @@ class Process:
         self.ready = False
         """Whether it waits for a black box or points."""
         self.number: int | None = None
-        """Number of the black box that it has."""
+        """Number of the black box that it got last."""
+        self.kept: dict[int, None] = {}
+        """Numbers of the black boxes that it has, the one that was used last at the end."""
         self.chunk: Chunk | None = None
         """What it evaluates."""
         self.job: Job | None = None
@@ -54,18 +58,28 @@ class Process:
         """What becomes ready with a message, or when the process ends."""
         return [self.connection, self.process.sentinel]
 
-    def give_function(self, number: int, payload: bytes) -> None:
-        """Send a black box."""
+    def give_function(self, number: int, payload: bytes, most: int) -> None:
+        """Send a black box, in place of others if there would be more than `most`."""
         self.ready, self.number = False, number
+        gone = make_room(self.kept, most)
+        self.kept[number] = None
         parts = [transfer.Part("torch.uint8", (len(payload),), payload)]
-        self.messages.send(FUNCTION, None, parts, shared=self._room(parts))
+        self.messages.send(FUNCTION, (default_dtype(), number, *gone), parts, shared=self._room(parts))
 
     def give(self, job: Job, chunk: Chunk, timeout: float | None) -> None:
         """Send the points of a chunk."""
         self.ready, self.job, self.chunk = False, job, chunk
         parts = [one.rows(chunk.start, chunk.stop) for one in job.parts]
-        self.messages.send(EVALUATE, None, parts, shared=self._room(parts))
+        used(self.kept, job.function.number)
+        self.messages.send(EVALUATE, (default_dtype(), job.function.number), parts, shared=self._room(parts))
         self.deadline = None if timeout is None else time.monotonic() + timeout * len(chunk)
+
+    def forget(self) -> int | None:
+        """Return the number of the black box that it got last, and could not make."""
+        number, self.number = self.number, None
+        if number is not None:
+            del self.kept[number]
+        return number
 
     def receive(self) -> tuple[int, Any, list[transfer.Part]]:
         """Return the next message; EOFError or OSError if the process has ended."""

@@ -132,6 +132,14 @@ def test_normals_that_are_given_stay(variant, parameters) -> None:
         np.testing.assert_allclose(triangle_normals(scene), [[0, 0, 1]] * 3, atol=1e-6)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_normals_that_follow_a_transform_are_not_given(order) -> None:
+    """The transform would write over them."""
+    both = [Value(NORMALS), Transform(POSITIONS, move=((1, 0, 0),))]
+    with pytest.raises(ValueError, match=f"must not change the same value twice, got {NORMALS} more than once"):
+        scalar(shaded, both[::order])
+
+
 def test_a_mesh_without_normals_moves(variant, tmp_path: Path) -> None:
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
 

@@ -66,6 +66,7 @@ def test_a_constant_is_repeated_only_along_the_dimension_of_the_points(lead):
     rows = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
     for given in (torch.full((2,), 0.5), torch.full((1, 2), 0.5), torch.full((2, 2), 0.5).numpy()[::-1]):
         f = OnnxFunction(rows, ["x"], constants={"c": given})
+        f._mixing.checked = True  # it depends on the number of points, by intent
         repeated = len(Z) if lead != "T" and len(given.reshape(-1, 2)) == 1 else len(given.reshape(-1, 2))
         torch.testing.assert_close(f(Z), repeated * Z.float())
 
@@ -164,6 +165,84 @@ def test_an_output_that_joins_the_points_of_a_batch_is_refused():
     mean = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
     with pytest.raises(ValueError, match=r"output 'y' must have one value per point, .* got \[\]: it joins"):
         OnnxFunction(mean)(Z)
+
+
+def of_node(*nodes, kind=TensorProto.FLOAT, out=(2,)) -> onnx.ModelProto:
+    """A model [K, 2] -> [K, *out] of nodes from x to y."""
+    value = helper.make_tensor_value_info
+    ends = [value("x", TensorProto.FLOAT, ["K", 2])], [value("y", kind, ["K", *out])]
+    opset = [helper.make_opsetid("", 17)]
+    return helper.make_model(helper.make_graph(nodes, "graph", *ends), opset_imports=opset, ir_version=10)
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [helper.make_node("Softmax", ["x"], ["y"], axis=0)],
+        [helper.make_node("ReduceMean", ["x"], ["m"], axes=[0]), helper.make_node("Sub", ["x", "m"], ["y"])],
+    ],
+)
+def test_a_model_that_mixes_the_points_of_a_batch_is_refused(nodes):
+    f = OnnxFunction(of_node(*nodes))
+    f(Z[:1])  # a single point tells nothing, and neither do equal ones
+    f(Z[:1].expand(3, 2))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="output 'y' must depend on its own point alone"):
+            f(Z)
+
+
+@pytest.mark.parametrize("out", [(), (1,), (0,)])
+def test_values_of_any_shape_are_looked_at(out):
+    axes = helper.make_node("Constant", [], ["a"], value_ints=[1])
+    total = helper.make_node("ReduceSum", ["x", "a"], ["y"], keepdims=len(out))
+    ends = [helper.make_node("Constant", [], [name], value_ints=[0]) for name in ("b", "c")]
+    nothing = helper.make_node("Slice", ["x", "b", "c", "a"], ["y"])
+    f = OnnxFunction(of_node(axes, *([*ends, nothing] if out == (0,) else [total]), out=out))
+    torch.testing.assert_close(f(Z), Z.float()[:, :0] if out == (0,) else Z.float().sum(1).reshape(5, *out))
+
+
+def test_a_model_of_random_numbers_is_not_said_to_mix_points():
+    noise = helper.make_node("RandomNormalLike", ["x"], ["y"], seed=1.0)
+    assert OnnxFunction(of_node(noise))(Z).shape == (5, 2)
+
+
+def test_a_model_that_needs_several_points_is_called_with_them():
+    """Two points are one row inside."""
+    nodes = [
+        helper.make_node("Constant", [], ["s"], value_ints=[-1, 4]),
+        helper.make_node("Reshape", ["x", "s"], ["row"]),
+        helper.make_node("Constant", [], ["t"], value_ints=[-1, 2]),
+        helper.make_node("Reshape", ["row", "t"], ["y"]),
+    ]
+    assert torch.equal(OnnxFunction(of_node(*nodes))(Z[:4]), Z[:4].float())
+
+
+def test_values_of_a_point_alone_are_asked_for_once(monkeypatch):
+    f, calls, run = OnnxFunction(model(), constants={"c": C[:1]}, output="y"), [], OnnxFunction._run
+    monkeypatch.setattr(OnnxFunction, "_run", lambda self, x, aux: calls.append(len(x)) or run(self, x, aux))
+    f(Z), f(Z)
+    assert calls == [5, 1, 1, 5]
+
+
+def test_an_output_without_numbers_is_refused():
+    cast = helper.make_node("Cast", ["x"], ["y"], to=TensorProto.STRING)
+    with pytest.raises(ValueError, match=r"output 'y' must be a tensor of numbers, got tensor\(string\)"):
+        OnnxFunction(of_node(cast, kind=TensorProto.STRING))
+
+
+def test_a_single_name_is_refused():
+    for argument in ("parameters", "aux"):
+        with pytest.raises(TypeError, match=rf"{argument} must be a list of names, got 'x': write \['x'\]"):
+            OnnxFunction(model(), **{argument: "x"}, output="y")
+
+
+def test_points_beyond_the_range_of_the_model_are_refused():
+    with pytest.raises(
+        ValueError, match=r"x must be in the range of torch\.float32, which the model takes, got 1e\+300"
+    ):
+        OnnxFunction(model(), constants={"c": C[:1]}, output="y")(
+            torch.tensor([[1e299, 1e300], [1e300, 1e299]], dtype=torch.float64)
+        )
 
 
 @pytest.mark.parametrize("batch", ["K", 1])

@@ -93,6 +93,28 @@ def test_arrays(server):
             assert torch.equal(program(Z), torch.stack([Z, 2 * Z], 1).float())
 
 
+def test_a_server_that_ends_within_an_array_has_no_answer():
+    code = "import sys; sys.stdin.buffer.read(9); sys.stdout.buffer.write(b'\\x93NUMPY')"
+    with python(code, server=True, format="npy") as program, pytest.raises(RuntimeError, match="without an answer"):
+        program(Z)
+
+
+def test_arrays_of_a_type_that_numpy_does_not_have():
+    code = (
+        "import sys, types, numpy as np\n"
+        "x = np.lib.format.read_array(types.SimpleNamespace(read=sys.stdin.buffer.read))\n"
+        "np.save(sys.stdout.buffer, x)\n"
+    )
+    values = Program([sys.executable, "-c", code], format="npy")(Z.bfloat16())
+    assert torch.equal(values, Z.bfloat16().float())
+
+
+def test_a_command_may_write_to_its_point():
+    z = Z.clone()
+    assert Program(lambda point: ["echo", str(float(point.zero_().sum()))])(z).tolist() == [0.0, 0.0]
+    assert torch.equal(z, Z)
+
+
 @pytest.mark.parametrize("more", ["b'done'", "one.getvalue()"], ids=["text", "array"])
 def test_one_array_and_nothing_after_it(more):
     code = "import io, sys, numpy as np\none = io.BytesIO(); np.save(one, np.ones(2))\n"
@@ -120,10 +142,19 @@ def test_a_program_that_ends_or_hangs_says_why(server):
 TWICE = ANSWER.replace("print(json", "print(2 * (json").replace("), flush", ") + chr(10)), end='', flush")
 
 
-@pytest.mark.parametrize("answers", [TWICE, ANSWER + "    time.sleep(0.1)\n    " + ANSWER])
-def test_an_answer_too_many_is_not_taken_for_the_next(answers):
-    """The second line is read with the first, or waits in the pipe."""
-    code = SERVE + answers
+@pytest.mark.parametrize("line", ["3", "[3, 3]"])
+def test_a_line_too_many_that_comes_with_the_answer_is_an_error_of_the_call(line):
+    """Before the answer it would be taken for it."""
+    for code in (TWICE, ANSWER.replace("print(", f"print({line!r} + chr(10) + ")):
+        message = r"wrote more than one answer to a request(.|\n)*after the answer"
+        with python(SERVE + code, server=True) as program, pytest.raises(ValueError, match=message):
+            program(Z)
+        with python(SERVE + code, server=True, on_failure="nan") as program:
+            assert program(Z).isnan().all()
+
+
+def test_an_answer_too_many_is_not_taken_for_the_next():
+    code = SERVE + ANSWER + "    time.sleep(0.1)\n    " + ANSWER
     with python(code, server=True) as program:
         assert torch.equal(program(Z), Z.sum(1))
         time.sleep(1.0)  # the answer too many arrives

@@ -119,8 +119,8 @@ def test_values_that_cannot_go_to_their_device_are_an_error_of_their_call():
 
 def test_a_call_can_be_cancelled_until_its_first_point_is_given_to_a_worker():
     one, other, given = job(), job(), []
-    worker = SimpleNamespace(ready=True, number=None, give=lambda *what: given.append(what[0]))
-    worker.give_function = lambda number, _: setattr(worker, "number", number)
+    worker = SimpleNamespace(ready=True, kept={}, give=lambda *what: given.append(what[0]))
+    worker.give_function = lambda number, *_: worker.kept.update({number: None})
     with ProcessPool(1) as pool:
         pool._staffed = [worker]
         for expected in ([], [one]):

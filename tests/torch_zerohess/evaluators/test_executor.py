@@ -65,6 +65,28 @@ def test_pools_of_processes(make, tmp_path):
             evaluator(black_boxes.never, Z)
 
 
+def test_workers_have_the_default_type_of_the_caller():
+    before = torch.get_default_dtype()
+    try:
+        with standard() as pool:
+            for dtype in (torch.float64, torch.float32):
+                torch.set_default_dtype(dtype)
+                assert Executor(pool)(black_boxes.in_default_type, Z).dtype == dtype
+    finally:
+        torch.set_default_dtype(before)
+
+
+def test_a_process_keeps_several_black_boxes(tmp_path):
+    boxes = [Factory(black_boxes.Counted, tmp_path / "made") for _ in range(5)]
+    with standard() as pool:
+        evaluator = Executor(pool)
+        for k in (0, 1, 2, 0, 3, 4, 0, 2, 0):  # the fifth takes the place of the second
+            assert torch.equal(evaluator(boxes[k], Z), black_boxes.waves(Z))
+        assert len((tmp_path / "made").read_text().split()) == 5
+        evaluator(boxes[1], Z)
+    assert len((tmp_path / "made").read_text().split()) == 6
+
+
 def test_dask():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # dask's own
@@ -75,6 +97,12 @@ def test_dask():
             assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
             with pytest.raises(ArithmeticError, match="no value above one half"):
                 evaluator(black_boxes.failing, Z)
+            with pytest.raises(black_boxes.Odd):
+                evaluator(black_boxes.odd, Z)
+            with pytest.raises(SystemExit, match="done"):
+                evaluator.submit(black_boxes.leaving, Z).result(60)
+            noise = torch.cat([evaluator(black_boxes.noisy, torch.zeros(4, 1)) for _ in range(2)])
+            assert len(noise.unique()) == 8  # equal arguments are no reason to take an earlier value
 
 
 def test_threads_serve_a_layer_and_any_function(threads):
@@ -134,6 +162,15 @@ def test_threads_that_share_it_get_the_values_of_their_own_black_box():
 def test_what_is_no_executor_is_refused():
     with pytest.raises(TypeError, match="executor must have a method submit"):
         Executor(3)
+
+
+def test_a_function_of_a_script_has_the_global_variables_of_each_call():
+    names = {"__name__": "__main__", "factor": 1.0}
+    exec("def scaled(z): return factor * z.sum(1)", names)
+    with loky() as pool:
+        evaluator = Executor(pool)
+        for names["factor"] in (1.0, 10.0):
+            assert torch.equal(evaluator(names["scaled"], Z), names["factor"] * Z.sum(1))
 
 
 def test_a_black_box_that_has_changed_is_sent_again():

@@ -132,6 +132,31 @@ def test_a_factory_is_called_once_in_every_worker(pool, tmp_path):
     assert (tmp_path / "made").read_text().split() == [*made, str(os.getpid())]
 
 
+@pytest.mark.parametrize(("limit", "count"), [(None, 5), (10**12, 9)])
+def test_a_worker_keeps_the_black_boxes_that_were_used_last(tmp_path, limit, count):
+    boxes = [Factory(black_boxes.Counted, tmp_path / "made") for _ in range(5)]
+    z = points(3)
+    limited = {} if limit is None else {"memory_limit": limit}
+    with ProcessPool(1, **(limited if sys.platform == "linux" else {})) as pool:
+        for k in (0, 1, 2, 0, 3, 4, 0, 2, 0):  # the fifth takes the place of the second
+            assert torch.equal(pool(boxes[k], z), black_boxes.waves(z))
+        with pytest.raises(OSError, match="the scene is not there"):
+            pool(Factory(black_boxes.broken), z)
+        assert torch.equal(pool(boxes[0], z), black_boxes.waves(z))
+    made = len((tmp_path / "made").read_text().split())
+    assert made == (count if limited else 5) + (limit is not None)
+
+
+def test_workers_have_the_default_type_of_the_caller(pool):
+    before = torch.get_default_dtype()
+    try:
+        for dtype in (torch.float64, torch.float32):
+            torch.set_default_dtype(dtype)
+            assert pool(black_boxes.in_default_type, points(3)).dtype == dtype
+    finally:
+        torch.set_default_dtype(before)
+
+
 def test_a_black_box_is_made_with_gradients_and_called_without(pool):
     for _ in range(2):
         assert pool(Factory(black_boxes.sloped), points(5)).tolist() == [0.0] * 5

@@ -28,6 +28,7 @@ BOXES = {
     "a factory": Factory(black_boxes.Noisy),
     "a global variable": black_boxes.noisy,
     "a global variable of a module": black_boxes.noisy_elsewhere,
+    "a module that is imported late": black_boxes.noisy_late,
     "the generator of NumPy": Factory(black_boxes.seeded),
     "one point": Each(black_boxes.noisy_of_one),
 }
@@ -77,8 +78,10 @@ def boxes_with(generator):
     """Black boxes that reach a generator in every way there is."""
     module = types.ModuleType("simulator")
     module.rng = generator
-    names = {"held": generator, "module": module}
+    names = {"held": generator, "module": module, "package": types.ModuleType("package")}
+    names["package"].sub = module
     code = "def named(z): return held\ndef through(z): return module.rng\ndef inner(z): return [held for _ in z]"
+    code += "\ndef below(z): return package.sub.rng"
     exec(code, names)
 
     def enclosing(z):
@@ -103,9 +106,28 @@ def boxes_with(generator):
         def further(self, z):
             return generator
 
+    class ByProperty:
+        @property
+        def now(self):
+            return generator
+
+        def __call__(self, z):
+            return self.now
+
     slotted = Slotted([{"deep": generator}])
     return [
-        *(names["named"], names["through"], names["inner"], enclosing, default, by_name, slotted, slotted.__call__),
+        *(
+            names["named"],
+            names["through"],
+            names["inner"],
+            names["below"],
+            ByProperty(),
+            enclosing,
+            default,
+            by_name,
+            slotted,
+            slotted.__call__,
+        ),
         *(functools.partial(default, rng=generator), Each(enclosing), lambda z: enclosing(z)),
         *(OfClass(), ByMethod(), ByMethod().further, lambda z: OfClass.rng),
     ]
@@ -124,6 +146,34 @@ def test_every_way_to_a_generator_is_found(monkeypatch, kind):
         draw_apart(lambda z: z)  # has none
         assert state(generator) == later
     torch.set_rng_state(before)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("import simulators.one; return simulators.one.rng", "import simulators.one as sim; return sim.rng"),
+        *("from simulators import one; return one.rng", "from simulators.one import rng; return rng"),
+        *("from . import one; return one.rng", "from .one import rng; return rng"),
+    ],
+)
+def test_generators_of_modules_that_a_function_imports_are_found(monkeypatch, line):
+    package, module = types.ModuleType("simulators"), types.ModuleType("simulators.one")
+    package.one, module.rng = module, KINDS["numpy"]()
+    monkeypatch.setitem(sys.modules, "simulators", package)
+    monkeypatch.setitem(sys.modules, "simulators.one", module)
+    names = {"__package__": "simulators"}
+    exec(f"def late(z): {line}", names)
+    assert random_numbers._held_by(names["late"]) == [module.rng]
+
+
+def test_the_first_call_is_made_again_only_for_a_generator_of_the_black_box(monkeypatch):
+    """Torch imports NumPy late, which has a generator with a random seed."""
+    monkeypatch.setattr(random_numbers, "is_worker", lambda: True)
+    calls, generator = [], KINDS["torch"]()
+    for fn, known, count in ((print, [], 1), (Slotted(generator), [generator], 1), (Slotted(generator), [], 2)):
+        calls.clear()
+        random_numbers.drawn_apart(fn, known, lambda: calls.append(1))
+        assert len(calls) == count
 
 
 def test_generators_here_stay_as_they_are():

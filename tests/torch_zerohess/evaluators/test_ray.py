@@ -38,6 +38,7 @@ def test_actors_hold_the_black_box(actors, tmp_path):
     fn = Factory(black_boxes.Counted, tmp_path / "made")
     for _ in range(3):
         assert torch.equal(actors(fn, Z), black_boxes.waves(Z))
+        assert torch.equal(actors(black_boxes.waves, Z), black_boxes.waves(Z))
     made = (tmp_path / "made").read_text().split()
     assert len(set(made)) == len(made) <= 2  # one that ended in the test before may still be starting
 
@@ -51,6 +52,16 @@ def test_calls_that_do_not_wait_share_the_actors(actors, tmp_path):
     assert isinstance(futures[2].exception(), ArithmeticError)
     for k in range(2):
         assert torch.equal(futures[k].result(), black_boxes.waves(torch.full((1, 1), float(k))))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_actors_have_the_default_type_of_the_caller(actors):
+    before = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert actors(black_boxes.in_default_type, Z).dtype == torch.float64
+    finally:
+        torch.set_default_dtype(before)
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -7,8 +7,9 @@ once before the next basis is drawn.
     J <- J + D^T (D D^T)^-1 (f(x + D) - f(x) - D J)            D [k, n], the steps in a block
 
 Steps of several lengths then minimise the model g J^T s + s J H J^T s / 2, where g and H are gradient and Hessian of
-the loss after the output; see `gauss_newton`. Sigma is a share of the radius. The same formula with D = s corrects J
-along the step that was taken (Broyden 1965).
+the loss after the output; see `gauss_newton`. Parameters that a bound holds stay. At a kink of the loss the quadratic
+is wrong, and the loss of the linear outputs itself is minimised; see `checked_steps`. Sigma is a share of the radius.
+The same formula with D = s corrects J along the step that was taken (Broyden 1965).
 
 `Descent` fits a linear model to all evaluations near x, which suits few parameters. That model has as many unknowns per
 element of the output as there are parameters: with a thousand parameters it steps in the span of a few samples only.
@@ -174,7 +175,8 @@ class BlockGaussNewton(AskTell[BlockProgress]):
         x0: start [n], float32 or float64, within the bounds.
         sigma: length over which the output changes, in units of the parameters; one value, or one per parameter [n].
         loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch. It should be
-            convex, as a mean of squares is: directions in which it bends downwards count as straight.
+            convex, as a mean of squares is: directions in which it bends downwards count as straight. A mean of
+            magnitudes is minimised to about 1e-4 of its first value, and in the same number of evaluations.
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         radius: first length of a step, root mean square over the parameters, in units of sigma.
         share: distance of the samples, in units of the radius.

@@ -3,7 +3,9 @@
 The Jacobian at the best point is the Jacobian of quadratics through the nearest evaluations, one per output
 (`LeastNorm`). With the gradient and the Hessian of the loss it gives a quadratic of the loss, which is minimised within
 the region. The Hessian has the curvature of the outputs where that predicted the last step better. At a kink of the
-loss the quadratic is wrong. There the loss of the linear outputs itself is minimised (`kinked_minimum`).
+loss the quadratic is wrong. There the loss of the linear outputs itself is minimised (`kinked_minimum`). Points beyond
+a bound stand for their mirror images: the bound is a kink, too. Where kinks meet, a slope may point to no decrease
+although there is one, so the minimisation is repeated from points close by before the search arrives.
 
 Where steps achieve what the model promises, this converges fast. Where they do not, the method fails, and says so.
 Short steps that promise next to nothing and achieve nothing are an arrival: an adaptive solver of differential

@@ -28,7 +28,7 @@ def test_quadratics(n, evaluations, seed):
 
 @pytest.mark.parametrize(
     ("n", "evaluations", "reached", "seed"),
-    [*[(1, 12, 1e-6, seed) for seed in range(3)], *[(2, 200, 1e-3, seed) for seed in range(3)], (10, 1500, 0.5, 0)],
+    [*[(1, 12, 1e-6, seed) for seed in range(3)], *[(2, 200, 1e-3, seed) for seed in range(3)], (6, 600, 0.1, 0)],
 )
 def test_rosenbrock(n, evaluations, reached, seed):
     start = torch.full((n,), -1.2, dtype=torch.float64)
@@ -110,7 +110,7 @@ def test_the_minimum_on_a_bound():
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3, 1e6, -1e6])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_an_offset_of_the_loss(offset, seed):
     """With restarts, as by default: a curved valley is followed to its end under any offset."""
     start = vector(-1.2, -1.2)
@@ -221,7 +221,7 @@ def test_finite_only_at_the_start():
     assert search.value == 4.0
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(5))
 def test_half_of_the_values_missing(seed):
     generator = torch.Generator().manual_seed(seed)
     search = Descent(zeros(2), sigma=2.0, seed=seed)
@@ -242,11 +242,10 @@ def test_rounds_that_start_where_nothing_is_finite():
         assert search.value < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_hopeless_round_is_not_the_last_one(seed):
-    search = Descent(zeros(2), sigma=1.0, seed=seed, restarts=3)
+def test_a_hopeless_round_is_not_the_last_one():
+    search = Descent(zeros(2), sigma=1.0, seed=0, restarts=2)
     run(search, lambda z: torch.where(z[:, 0] > 1.2, math.nan, bowl(z)), 10_000)
-    assert search.rounds == 4
+    assert search.rounds == 3
 
 
 def test_a_round_whose_start_is_not_finite_goes_on_to_what_is():

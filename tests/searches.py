@@ -143,7 +143,11 @@ def cosine_bowl(z):
     return (0.01 * (z - 1.3).square() - torch.cos(3.0 * z)).sum(1)
 
 
-KINKS = {"largest": lambda d: d.abs().max(), "mean": lambda d: d.abs().mean()}
+KINKS = {
+    "largest": lambda d: d.abs().max(),
+    "mean": lambda d: d.abs().mean(),
+    "curved": lambda d: d.abs().max() + 1e-9 * d.square().mean(),  # next to the largest one
+}
 
 
 class Linear:
@@ -158,7 +162,7 @@ class Linear:
         away = self.a @ (2 * torch.randn(n, generator=generator).double())
         self.target = away + 0.5 * torch.randn(3 * n, generator=generator).double()
         a, target, eye = self.a.numpy(), self.target.numpy(), np.eye(3 * n)
-        beyond = np.ones((3 * n, 1)) if kind == "largest" else eye
+        beyond = eye if kind == "mean" else np.ones((3 * n, 1))
         cost = np.r_[np.zeros(n), np.full(beyond.shape[1], 1.0 / beyond.shape[1])]
         rows = np.block([[a, -beyond], [-a, -beyond]])
         box = [(-side, side)] * n + [(0, None)] * beyond.shape[1]

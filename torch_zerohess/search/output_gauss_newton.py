@@ -108,8 +108,6 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     def __init__(self, settings: Settings, capacity: int, patience: int | None = None) -> None:
         super().__init__(settings, min(coefficients(settings.n), capacity), capacity)
         self._patience = _PATIENCE if patience is None else patience
-        self.at_kink = False
-        """Whether the quadratic was wrong for the last step, as at a kink of the loss."""
         self._linear: tuple[Tensor, Tensor] | None = None  # output [m] and Jacobian [n, m] of the last quadratic
 
     def taking_over(self, known: DescentProgress | ProcessProgress, lowest: Best, sigma: float) -> OutputProgress:
@@ -196,8 +194,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         curvature = known.size * known.curvature if known.curved else torch.zeros_like(known.curvature)
         before, _ = self._of_linear(known, curvature, torch.zeros_like(s))
         after, _ = self._of_linear(known, curvature, s)
-        self.at_kink = abs(before - after - promised) > _EXPANDED * promised + _ROUNDED * abs(before)
-        if not self.at_kink:
+        if abs(before - after - promised) <= _EXPANDED * promised + _ROUNDED * abs(before):
             return s, promised
         x, settings, radius = known.lowest.point, self.settings, known.sigma
         lower, upper = ((one - x).clamp(-2.0 * radius, 2.0 * radius) for one in (settings.lower, settings.upper))

@@ -30,8 +30,9 @@ _WORTH = 0.1
 _WORTH_EARLY = 0.3
 """`_WORTH` right after the first samples. Where outputs have nothing in common, as images of objects that do not
 overlap, an affine output promises to fade the object out: up to a quarter."""
-_ARRIVED = 1e-8
-"""`_WORTH` at a kink of the loss where the process has arrived: it does not know the kink."""
+_ARRIVED, _STRAIGHT = 1e-8, 0.01
+"""`_WORTH` where the process has arrived, but the loss falls nearly straight along the step: its curvature takes less
+than this part of the promise."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""
 
@@ -162,8 +163,11 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
             sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)
             begun = self.local.taking_over(known, best, sigma)
         newton, points = self.local.plan(begun, generator)
-        at_kink = bool(known.due) and self.local.at_kink and newton.promised > _ARRIVED * abs(best.loss)
-        if len(points) and (newton.promised > least or at_kink):
+        if known.due and len(points):
+            step = points[0] - newton.lowest.point
+            if 0.5 * newton.size * float(step @ newton.hessian @ step) < _STRAIGHT * newton.promised:
+                least = min(least, _ARRIVED * abs(best.loss))
+        if len(points) and newton.promised > least:
             return replace(known, local=newton, finishing=True, waited=0), points
         return known, points[:0]
 

@@ -28,6 +28,7 @@ from torch_zerohess.linalg.krylov import are_free
 from torch_zerohess.linalg.levenberg_marquardt import damped_steps
 from torch_zerohess.linalg.smoothed_newton import LinearOutputs
 from torch_zerohess.search.gauss_newton import LENGTHS, GaussNewton, JacobianProgress
+from torch_zerohess.search.local_progress import check_range
 from torch_zerohess.search.local_steps import LocalSteps, checked_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_step import alternating
@@ -96,6 +97,8 @@ class BlockMethod(GaussNewton[BlockProgress]):
         """Correct the Jacobian along the samples; steps follow when no more are wanted."""
         count, sound = len(evaluated), evaluated.those(evaluated.finite)
         assert sound.outputs is not None
+        if not len(known.jacobian) and len(sound):
+            check_range("BlockGaussNewton", (sound.outputs - known.output) / known.sigma)
         jacobian = (
             known.jacobian if len(known.jacobian) else known.jacobian.new_zeros(self.settings.n, len(known.output))
         )

@@ -97,12 +97,8 @@ class LocalProgress(JacobianProgress):
                 "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
                 "number: use engine='descent'"
             )
-        changes = (outputs - self.output) / self.sigma
-        if self.jacobian is None and not in_range(changes):
-            raise ValueError(
-                "the engine 'local' computes in float32, got outputs whose largest change over sigma is "
-                f"{float(changes.abs().max()):g}: return them in other units, so that it is near 1"
-            )
+        if self.jacobian is None:
+            check_range("the engine 'local'", (outputs - self.output) / self.sigma)
 
     def relative(self, points: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return directions from the center and changes of the output along them, in units of sigma, float32."""
@@ -151,6 +147,15 @@ class LocalProgress(JacobianProgress):
         """Whether a hop has led to a loss that is lower by more than rounding."""
         added = self.hopped - before if self.hopped < math.inf else 0.0
         return loss < before - _ROUNDING * max(abs(before), added)
+
+
+def check_range(search: str, changes: Tensor) -> None:
+    """Raise ValueError for changes of outputs over sigma that float32 cannot hold; `search` says who computes in it."""
+    if not in_range(changes):
+        raise ValueError(
+            f"{search} computes in float32, got outputs whose largest change over sigma is "
+            f"{float(changes.abs().max()):g}: return them in other units, so that it is near 1"
+        )
 
 
 def in_range(changes: Tensor) -> bool:

@@ -300,6 +300,14 @@ def test_outputs_of_any_size(scale):
     torch.testing.assert_close(search.x, truth, atol=0.05, rtol=0)
 
 
+@pytest.mark.parametrize("scale", [1e-50, 1e50])
+def test_outputs_that_its_type_cannot_hold_are_an_error(scale):
+    """They would be zero or infinite, and so would the Jacobian."""
+    search = zh.optim.BlockGaussNewton(zeros(4), sigma=1.0, loss=lambda y: (y / scale).square().mean(), seed=0)
+    with pytest.raises(ValueError, match="BlockGaussNewton computes in float32, got outputs whose largest change"):
+        search.tell(scale * search.ask())
+
+
 @pytest.mark.parametrize("scale", [2.0**-80, 2.0**100])
 @pytest.mark.parametrize("power", [2, 4])
 def test_a_second_derivative_of_any_size(scale, power):

@@ -26,10 +26,9 @@ class Transform:
     """Pose of a shape, an instance, an emitter or a sensor, relative to that in the scene.
 
     The pose is T(sum_i x_i unit_i move_i) P R(turn_1, x_j unit_j) ... P^-1 (pose in the scene), with P the translation
-    to the pivot. A mesh has no `to_world`: name its `vertex_positions`, and its normals follow: a `Value` cannot
-    change them as well. Moving an instance of a
-    shape group is faster, since a mesh writes all vertices. Wherever several numbers are asked for, a list, an array of
-    NumPy or a tensor will do.
+    to the pivot. A mesh has no `to_world`: name its `vertex_positions`. Its normals follow, so a `Value` cannot change
+    them as well. Moving an instance of a shape group is faster, since a mesh writes all vertices. Wherever several
+    numbers are asked for, a list, an array of NumPy or a tensor will do.
 
     Args:
         name: of a `to_world` or of `vertex_positions`, or several that move together.

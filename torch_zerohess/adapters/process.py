@@ -36,11 +36,10 @@ class Program(Closing):
 
     - "json": a request is the line `{"x": [[...], ...]}`, with `"aux": [...]` where there is aux. The answer is one
       line, the list of K values. Numbers are written so that float64 is read back exactly.
-    - "npy": a request is the array x, then each aux, as `numpy.save` writes them, in the types of the tensors;
-      bfloat16, which NumPy does not have, as float32. The
-      answer is one array of numbers, as `numpy.save(sys.stdout.buffer, values)` writes it. `numpy.load` cannot read
-      from a pipe. A Python program reads one array by
-      `numpy.lib.format.read_array(types.SimpleNamespace(read=sys.stdin.buffer.read))`.
+    - "npy": a request is the array x, then each aux, as `numpy.save` writes them, in the types of the tensors. NumPy
+      has no bfloat16: such a tensor is written as float32. The answer is one array of numbers, as
+      `numpy.save(sys.stdout.buffer, values)` writes it. `numpy.load` cannot read from a pipe. A Python program reads
+      one array by `numpy.lib.format.read_array(types.SimpleNamespace(read=sys.stdin.buffer.read))`.
     - a function of bytes: turns the output of the program into the value. Requests are written as for "json".
 
     A server writes one answer per request and flushes it, and writes messages to the standard error alone. More answers

@@ -42,12 +42,12 @@ class Executor(Closing):
     The executor says how the black box gets to its workers, and so what it must be: picklable for the standard
     `ProcessPoolExecutor` (use one with `mp_context` "spawn"), almost anything for loky, dask and threads. It is sent
     with every task; pass `Factory(make, *args)` for one that is large or slow to make, which each process makes once.
-    A process keeps four black boxes, of all Executors together, those that were used last.
+    A process keeps the four black boxes that were used last, of all Executors together.
 
-    Processes use the black box as it was when the call began: where its pickled form has changed since an earlier call
-    they take the new one, and make a Factory again. For loky and dask that includes the global variables that a
-    function of a script names.
-    The standard `ProcessPoolExecutor` sends a function by its name: its global variables are those of the worker.
+    Processes use the black box as it was when the call began. If its pickled form has changed since an earlier call,
+    they take the new one, and make a Factory again. For loky and dask the pickled form of a function of a script has
+    the global variables that the function names. The standard `ProcessPoolExecutor` sends a function by its name: its
+    global variables are those of the worker.
 
     Values have the same bits as with `Inline`, see `ProcessPool`. Of several exceptions of the black box, the exception
     of the first point is raised, also SystemExit; one that cannot be sent is a RuntimeError that names it. An executor
@@ -189,8 +189,8 @@ def evaluated(name: str, fn: Callable[..., Any], data: bytes, caller: str, numbe
     """Return the values of a chunk, or its error, in a worker.
 
     The first fn with a name stays: what comes later is a copy of it. An error is returned in a form that the caller can
-    read for certain: one that cannot be unpickled would break an executor of processes for good. The number makes each
-    task of a caller another one.
+    read for certain: one that cannot be unpickled would break an executor of processes for good. No two tasks of a
+    caller have the same number.
     """
     become_worker(caller)
     if caller != identity():

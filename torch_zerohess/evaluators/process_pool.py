@@ -45,11 +45,10 @@ class ProcessPool(Ahead):
     """Calls the black box in worker processes, a few points at a time.
 
     Workers are new Python processes (spawn) with one thread each, so that a black box with its own threads does not
-    take more cores than there are. They start with the first call, and stay. The black box is sent to a worker
-    once; what it holds stays there. A worker keeps four black boxes, those that were used last, and this process
-    their pickled forms. With a `memory_limit` a worker keeps one. Pass `Factory(make, *args)` for one that cannot
-    be pickled, or that takes long to make. What the caller changes in a black box afterwards does not reach the
-    workers.
+    take more cores than there are. They start with the first call, and stay. The black box is sent to a worker once;
+    what it holds stays there. A worker keeps the four black boxes that were used last, and this process keeps their
+    pickled forms. With a `memory_limit` a worker keeps one. Pass `Factory(make, *args)` for a black box that cannot be
+    pickled, or that takes long to make. What the caller changes in a black box afterwards does not reach the workers.
     A black box may have processes of its own, such as those of a DataLoader. They end with the worker on Linux and
     macOS.
 

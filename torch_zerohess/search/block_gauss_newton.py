@@ -26,21 +26,18 @@ from torch import Tensor
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.krylov import are_free
 from torch_zerohess.linalg.levenberg_marquardt import damped_steps
-from torch_zerohess.linalg.smoothed_newton import LinearOutputs
 from torch_zerohess.search.gauss_newton import LENGTHS, GaussNewton, JacobianProgress
 from torch_zerohess.search.local_progress import check_range
-from torch_zerohess.search.local_steps import LocalSteps, checked_steps
+from torch_zerohess.search.local_steps import LITTLE, LocalSteps, checked_steps, linear_outputs
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_step import alternating
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated
-from torch_zerohess.surrogates.loss_curvature import loss_curvature, value_and_slope
+from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.surrogate import scaled
 
-_LITTLE = 1e-5
-"""Decrease that the loss of linear outputs promises, over the loss, with which a search has arrived."""
 _RIDGE = 1e-6
 """Added to D D^T, in units of its mean diagonal: bounds can make the steps of a block dependent."""
 
@@ -119,12 +116,11 @@ class BlockMethod(GaussNewton[BlockProgress]):
         if bool(free.any()):
             steps[:, free] = damped_steps(gradient[free], hessian[free][:, free], radii)
 
-        def valued(y: Tensor) -> tuple[float, Tensor]:
-            value, slope = value_and_slope(self.settings.white_box, y.view(known.shape))
-            return value, slope.flatten()
-
-        outputs = LinearOutputs(
-            valued, known.output, lambda s: (s.float() @ jacobian).double(), lambda w: (jacobian @ w.float()).double()
+        outputs = linear_outputs(
+            self.settings.white_box,
+            known.output.view(known.shape),
+            lambda s: (s.float() @ jacobian).double(),
+            lambda w: (jacobian @ w.float()).double(),
         )
         widths = jacobian.double().norm(dim=0) * (float(radii[-1]) / math.sqrt(self.settings.n))
         bent = ((steps @ hessian) * steps).sum(1)
@@ -143,7 +139,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         """Begin again or end; it has arrived only where outputs change, and their linear model promises nothing."""
         longest = known.center.new_tensor([LENGTHS[-1] * self.radius * math.sqrt(self.settings.n)])
         promised = self._solved(known, longest).promised
-        if bool(known.jacobian.any()) and (promised is None or promised <= _LITTLE * abs(known.loss)):
+        if bool(known.jacobian.any()) and (promised is None or promised <= LITTLE * abs(known.loss)):
             known = known.arriving(Best(known.center, known.loss, known.sigma))
         return super().arrived(replace(known, wanted=self.settings.n))
 
@@ -178,8 +174,8 @@ class BlockGaussNewton(AskTell[BlockProgress]):
         x0: start [n], float32 or float64, within the bounds.
         sigma: length over which the output changes, in units of the parameters; one value, or one per parameter [n].
         loss: from one output [*out], float64 on the device of x0, to a scalar, differentiable by torch. It should be
-            convex, as a mean of squares is: directions in which it bends downwards count as straight. A mean of
-            magnitudes is minimised to about 1e-4 of its first value, and in the same number of evaluations.
+            convex, as a mean of squares is: directions in which it bends downwards count as straight. It may have
+            kinks, as a mean of magnitudes has, whose minimum is found to 1e-3 of its first value.
         bounds: lower and upper, numbers or [n]; no point outside of them is ever asked for.
         radius: first length of a step, root mean square over the parameters, in units of sigma.
         share: distance of the samples, in units of the radius.

@@ -27,7 +27,7 @@ from torch import Tensor
 from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
 from torch_zerohess.search.local_progress import LocalProgress, in_range
 from torch_zerohess.search.local_settings import LocalSettings
-from torch_zerohess.search.local_steps import LocalSteps, derivatives, local_steps
+from torch_zerohess.search.local_steps import LITTLE, LocalSteps, derivatives, local_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated
@@ -52,9 +52,8 @@ _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
 _FOUND = 0.3
 """Share of the entries that must be of parameters that were found, before steps follow, or else more samples."""
-_NOTHING, _LITTLE = 1e-8, 1e-5
-"""Decrease that the loss of linear outputs promises, over the loss: so small that no step is tried, and so small that
-a search whose steps are below the tolerance has arrived."""
+_NOTHING = 1e-8
+"""Decrease that the loss of linear outputs promises, over the loss: so small that no step is tried."""
 _INSIDE = 0.5
 """Length of the step to the minimum of that loss, over the longest one, up to which the region contains the minimum."""
 _FULL = 1000
@@ -223,7 +222,7 @@ class LocalMethod(GaussNewton[LocalProgress]):
         """Whether the loss of linear outputs promises next to nothing in the region, or has its minimum inside."""
         longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
         found = self._solved(known, known.center.new_tensor([longest]))
-        if found.promised is None or found.promised <= _LITTLE * abs(known.loss):
+        if found.promised is None or found.promised <= LITTLE * abs(known.loss):
             return True
         return float(found.steps.norm()) <= _INSIDE * longest
 

@@ -23,6 +23,9 @@ _ITERATIONS = 100
 _EXPANDED, _ROUNDED = 0.5, 1e-12
 """Error of the quadratic's promise, over the promise and over the loss, with which its steps are taken."""
 
+LITTLE = 1e-5
+"""Decrease that the loss of linear outputs promises, over the loss, with which a search has arrived."""
+
 Loss = Callable[[Tensor], Tensor]
 
 
@@ -60,17 +63,23 @@ def local_steps(
     free = are_free(torch.zeros_like(gradient), gradient, lower, upper)
     steps = krylov_steps(lambda v: free * product(v), free * gradient, radii, iterations=_ITERATIONS)
 
+    rows, columns = jacobian.entries
+    outputs = linear_outputs(loss, output, lambda s: rows.times(s[None])[0], lambda w: columns.times(w[None])[0])
+    bent = torch.stack([v @ product(v) for v in steps])
+    widths = jacobian.values.to(radii).square().sum(1).sqrt() * (float(radii[-1]) / math.sqrt(jacobian.n))
+    return checked_steps(outputs, steps, gradient, bent, widths, radii, lower, upper)
+
+
+def linear_outputs(
+    loss: Loss, output: Tensor, matvec: Callable[[Tensor], Tensor], rmatvec: Callable[[Tensor], Tensor]
+) -> LinearOutputs:
+    """Return outputs that are linear in the parameters, with the loss of an output [*out]; see `LinearOutputs`."""
+
     def valued(y: Tensor) -> tuple[float, Tensor]:
         value, slope = value_and_slope(loss, y.view(output.shape))
         return value, slope.flatten()
 
-    rows, columns = jacobian.entries
-    outputs = LinearOutputs(
-        valued, output.flatten(), lambda s: rows.times(s[None])[0], lambda w: columns.times(w[None])[0]
-    )
-    bent = torch.stack([v @ product(v) for v in steps])
-    widths = jacobian.values.to(radii).square().sum(1).sqrt() * (float(radii[-1]) / math.sqrt(jacobian.n))
-    return checked_steps(outputs, steps, gradient, bent, widths, radii, lower, upper)
+    return LinearOutputs(valued, output.flatten(), matvec, rmatvec)
 
 
 def checked_steps(

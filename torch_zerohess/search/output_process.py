@@ -117,6 +117,9 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
                 known, points = self._begun_newton(known, (_WORTH_EARLY if early else _WORTH) * abs(now), generator)
             elif self.tells_noise(known) and self._is_due(known):
                 known, points = self._begun_newton(known, max(known.alone_from - now, 0.0) / known.alone, generator)
+            elif known.due and not known.is_solved:  # its first step may have promised too little before
+                begun, points = self._begun_newton(known, math.inf, generator)
+                known = begun if begun.finishing else known
             if known.finishing:
                 return known, points
         return self._went_on(known), evaluated.points[:0]

@@ -32,7 +32,7 @@ def finishing(found):
 
 
 @pytest.mark.parametrize(
-    ("n", "seed", "kind"), [(4, 4, "largest"), (4, 1, "curved"), (2, 1, "largest"), (2, 1, "mean")]
+    ("n", "seed", "kind"), [(4, 4, "largest"), (4, 1, "curved"), (2, 1, "largest"), (2, 1, "mean"), (2, 5, "curved")]
 )
 def test_at_kinks_gauss_newton_goes_on_from_where_the_process_arrives(n, seed, kind):
     """By itself the process ends 1e-3 or more of the loss at the start above the minimum.

@@ -239,22 +239,22 @@ class Running:
 
     def _resume(self, saved: dict[str, Any]) -> None:
         """Go on from what `write` has saved; ValueError if that is of a search with other settings."""
-        names = "noise", "sure", "decided", "deciding", "search", *self.record.state_dict(), "version"
-        check_state(saved, dict.fromkeys(names), "minimize")
+        names = "noise", "sure", "decided", "deciding", "looking", "limits", "unmeasured", "search", "version"
+        check_state(saved, dict.fromkeys([*names, *self.record.state_dict()]), "minimize")
         given, before = self.noise, saved["noise"]
         self.noise = given if given and before else before  # noise of another size is no other search
         self.search = self._make(self.noise or 0.0)
         self.record.load_state_dict(saved, x := self.search.x)
         self.search.load_state_dict(saved["search"])
-        self._deciding, self._looking = saved["deciding"], saved.get("looking")
+        self._deciding, self._looking = saved["deciding"], saved["looking"]
         if saved["decided"] is not None:
             self._decided = Decision(**saved["decided"] | {"x": saved["decided"]["x"].to(x)})
-        self._unmeasured = saved.get("unmeasured", False) and given is None
+        self._unmeasured = saved["unmeasured"] and given is None
         if given is not None and given != self.noise:  # a new search, which keeps the evaluations
             self.record.note_known()
             self.noise, self.search, self._decided, self._deciding = given, self._again(given), None, None
         elif self.search.done:
-            check_limits(self._limits, saved.get("limits", self._limits), self.search.message)
+            check_limits(self._limits, saved["limits"], self.search.message)
         self._sure = saved["sure"] or given is not None
 
     def _again(self, noise: float, at: Tensor | None = None) -> TrustRegion:

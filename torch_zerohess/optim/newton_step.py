@@ -43,8 +43,7 @@ class NewtonStep(SecondOrder):
     Layers in training mode see every call of the closure with `adapt`. BatchNorm updates its running statistics at the
     start of the step and again at its end, also where the step is taken back.
 
-    The first radius is a setting of the group, `first_radius`, and so part of the state. A state of an earlier version
-    lacks it. An optimizer that loads such a state keeps its own first radius.
+    The first radius is a setting of the group, `first_radius`, and so part of the state.
 
     Without `adapt` every step is taken, as suits a loss whose values have noise: over small batches, or of a layer with
     `value="smoothed"`. A test of such values near a minimum shrinks the radius for good.
@@ -55,13 +54,6 @@ class NewtonStep(SecondOrder):
 
     def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any], *, distributed: bool = False) -> None:
         super().__init__(params, defaults | {"first_radius": defaults["radius"]}, distributed=distributed)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take a loaded state, of an earlier version with the first radius of this optimizer."""
-        if hasattr(self, "defaults"):  # a copy of an optimizer has everything in the state
-            for group in state["param_groups"]:
-                group.setdefault("first_radius", self.defaults["first_radius"])
-        super().__setstate__(state)
 
     @abstractmethod
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:

@@ -27,9 +27,6 @@ from torch_zerohess.search.white_box import checked_loss
 from torch_zerohess.smoothing import random_seed
 from torch_zerohess.version import VERSION
 
-_LATER = "seed", "reference"
-"""What a state may lack: earlier versions did not write it."""
-
 
 class AskTell(Standing[P]):
     """A search whose evaluations the caller owns: `ask` for points, evaluate them, `tell` their values.
@@ -183,19 +180,19 @@ class AskTell(Standing[P]):
         loss that is random is not compared: one whose values of these outputs differ from call to call. What the loss
         raises passes, and the search is then as before.
         """
-        check_state(state, {name: None for name in self.state_dict() if name not in _LATER}, "a search")
+        check_state(state, self.state_dict(), "a search")
         if state["search"] != self._kind:
             raise ValueError(f"state must be of a search by {self._kind}, got one by {state['search']}")
         self._space.check_state(state)
         device = self.unit.device
         progress = restored_progress(self._method.progress, state, device)
-        known = None if state.get("reference") is None else restored(Reference, state["reference"], device)
+        known = None if state["reference"] is None else restored(Reference, state["reference"], device)
         if known is not None and self.loss is not None:
             known.check(self.loss)
         early = {k: value.to(device) for k, value in state["early"].items()}
         out = None if state["out"] is None else state["out"].to(device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
-        self.seed, self.reference, self.told = state.get("seed", self.seed), known, self.told[:0]
+        self.seed, self.reference, self.told = state["seed"], known, self.told[:0]
         self._out, self._early, self._drawn = out, early, None
 
     @property

@@ -261,8 +261,6 @@ class Memory:
         self._size, self.evaluations = len(points), state["evaluations"]
         self.regression.moments = [list(one) for one in state["moments"]]
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
-        if isinstance(self.pathwise, bool):  # of earlier versions
-            self.pathwise = 2 * self.pathwise
         self._known = state["known"]
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
             self.surrogate.load_state_dict(state["surrogate"])

@@ -216,11 +216,6 @@ def test_a_resumed_search_has_the_first_radius(optimizer, tmp_path) -> None:
     resumed = optimizer([x], radius=1.0)
     resumed.load_state_dict(state)
     assert [*radii(resumed, x)] == [0.5, 1.0, 2.0, 4.0]
-    del state["param_groups"][0]["first_radius"]  # of an earlier version
-    resumed = optimizer([x], radius=1.0)
-    resumed.load_state_dict(state)
-    assert [*radii(resumed, x)] == [0.5, 1.0, 1.0, 1.0]
-    assert "first_radius" not in state["param_groups"][0]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

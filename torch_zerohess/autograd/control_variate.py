@@ -1,6 +1,7 @@
 """A layer with a memory: the smoothed surrogate, differentiable by torch, plus an estimate of the residual."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,6 +15,33 @@ from torch_zerohess.estimation.surrogate_term import MOST_STEIN, measure
 
 Part = Callable[[Tensor], Tensor]
 """x [B, n] -> [B, *out], differentiable."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fresh:
+    """Elements of a batch of B that are evaluated anew."""
+
+    part: Tensor
+    """Their numbers, int64 [fresh]."""
+    B: int
+
+    @classmethod
+    def drawn(cls, fresh: int | None, center: Tensor, seed: int) -> "_Fresh":
+        """Draw so many elements of the batch center [B, n], or take all if `fresh` is None."""
+        B = len(center)
+        with transforms.outside(), transforms.random_numbers_allowed(), transforms.unrecorded():
+            generator = torch.Generator().manual_seed(seed)
+            order = torch.randperm(B, generator=generator, device="cpu")
+            return cls(order[:fresh].sort().values.to(center.device), B)
+
+    def of(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Return the rows of the fresh elements, of tensors [B, ...]."""
+        return [one[self.part] for one in tensors]
+
+    def spread(self, change: Tensor) -> Tensor:
+        """Put values [fresh, *out] into the batch, with the weight of the fresh elements: [B, *out]."""
+        whole = change.new_zeros(self.B, *change.shape[1:])
+        return whole.index_add(0, self.part, self.B / len(self.part) * change)
 
 
 def _pathwise(control: Control, center: Tensor, aux: Sequence[Tensor], sigma: Tensor, order: int, seed: int) -> int:
@@ -60,29 +88,22 @@ def around(
         value: "center" or "smoothed", see `BlackBox`.
         zero: promises that the function is called with the center alone.
     """
-    B, memory, outer = len(center), control.memory, control.outer
-    fresh = B if memory.fresh is None else min(memory.fresh, B)
-    with transforms.outside(), transforms.random_numbers_allowed(), transforms.unrecorded():
-        generator = torch.Generator().manual_seed(seed)
-        part = torch.randperm(B, generator=generator, device="cpu")[:fresh].sort().values.to(center.device)
-
-    def spread(change: Tensor) -> Tensor:
-        """Put the values [fresh, *out] of the fresh elements into the batch, with their weight."""
-        return change.new_zeros(B, *change.shape[1:]).index_add(0, part, B / fresh * change)
-
+    memory, outer = control.memory, control.outer
+    fresh = _Fresh.drawn(memory.fresh, center, seed)
+    part, spread = fresh.part, fresh.spread
     if not control.active:
-        alone, constants = estimated(center[part], [one[part] for one in aux])
-        around = None if zero else alone(center[part]).detach()
-        return lambda x: spread(outer.value(alone(x.index_select(0, part)), constants, value, around))
+        alone, constants = estimated(center[part], fresh.of(aux))
+        start = None if zero else alone(center[part]).detach()
+        return lambda x: spread(outer.value(alone(x.index_select(0, part)), constants, value, start))
     with torch.no_grad():
         predicted = Prediction(control, surrogate, aux)
     excess = predicted.excess(sigma) if outer.linear else None
     if excess is None:
         pathwise = _pathwise(control, center, aux, sigma, order, seed)
-        u = nodes(per_element(memory.draws, center.shape[1], B, pathwise=pathwise))
+        u = nodes(per_element(memory.draws, center.shape[1], len(center), pathwise=pathwise))
     else:  # the mean over all points is known from the center
         u, pathwise = sigma.new_zeros(1, 1, len(sigma)), 2
-    if not fresh:
+    if not len(part):
         predicted.check_head(center)
     with torch.no_grad():
         at_center = control.coefficient * predicted(center[:, None])[:, 0] if value == "center" else center[:, 0]
@@ -90,7 +111,7 @@ def around(
             lambda: predicted((center[:, None] + sigma * u).to(center.dtype)), lambda losses: losses.mean(1)
         )
     whole_aux = [*aux, *predicted.encoded, *([] if scales is None else [scales])]
-    rest = estimated(center[part], [one[part] for one in whole_aux]) if fresh else None
+    rest = estimated(center[part], fresh.of(whole_aux)) if len(part) else None
 
     def values(z: Tensor) -> Tensor:
         inner = outer.inner(predicted(z), scales)
@@ -108,10 +129,10 @@ def around(
         result, new = expected(x)
         if value == "smoothed":
             return result
-        around, new = (result, new) if fixed is None else fixed
+        start, new = (result, new) if fixed is None else fixed
         at = at_center
         if rest is not None and new is not None:
             at = at + spread(outer.value(new, rest[1], value).detach() - at[part])
-        return result - around.detach() + at.to(x.dtype)
+        return result - start.detach() + at.to(x.dtype)
 
     return whole

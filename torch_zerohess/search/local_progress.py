@@ -160,5 +160,5 @@ def check_range(search: str, changes: Tensor) -> None:
 
 def in_range(changes: Tensor) -> bool:
     """Whether the largest of these numbers is a normal number in float32, or all are 0."""
-    largest, known = float(changes.abs().max()), torch.finfo(torch.float32)
-    return largest == 0.0 or known.tiny <= largest <= known.max
+    largest, limits = float(changes.abs().max()), torch.finfo(torch.float32)
+    return largest == 0.0 or limits.tiny <= largest <= limits.max

@@ -5,22 +5,22 @@ All of these names were tried with torch 2.15. If a version of torch drops one, 
 | question | private name | why no public name serves |
 |---|---|---|
 | is a functorch transform active | `torch._C._functorch.maybe_current_level` | `torch.func` does not tell |
-| which tensor a functorch wrapper holds | `torch._C._functorch.get_unwrapped`, `is_functorch_wrapped_tensor` |
+| which tensor a functorch wrapper holds | `torch._C._functorch.get_unwrapped`, `is_functorch_wrapped_tensor` | \
 `torch.func.debug_unwrap` skips all levels at once |
 | is a forward-mode level open | `forward_ad._current_level` | `forward_ad.unpack_dual` answers for one tensor only |
-| how large is a batch under vmap | `torch._C._functorch.is_batchedtensor`, `maybe_get_level`, `maybe_get_bdim` |
+| how large is a batch under vmap | `torch._C._functorch.is_batchedtensor`, `maybe_get_level`, `maybe_get_bdim` | \
 `torch.func` does not tell |
 | does `is_grads_batched` map over it | `torch._C._functorch.is_legacy_batchedtensor` | it is a vmap of its own |
-| which `randomness` has a vmap | `torch._C._functorch.get_interpreter_stack`, `CVmapInterpreterPtr`, `TransformType`,
+| which `randomness` has a vmap | `torch._C._functorch.get_interpreter_stack`, `CVmapInterpreterPtr`, `TransformType`, \
 `RandomnessType` | a vmap rule is told, but is not called where it maps over nothing |
 | how often is forward mode nested | `torch._C._functorch.get_interpreter_stack`, `TransformType` | `torch.func` does \
 not tell |
 | is every operation watched | `torch._C._len_torch_dispatch_stack` | `torch.utils._python_dispatch` is private too |
-| does `make_fx` record operations, and on which inputs a tensor depends | `torch._C._get_dispatch_mode`,
+| does `make_fx` record operations, and on which inputs a tensor depends | `torch._C._get_dispatch_mode`, \
 `torch.fx.experimental.proxy_tensor` | `torch.func.linearize` records operations on constants, too |
-| may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` |
+| may random numbers be drawn | `torch._C._ExcludeDispatchKeyGuard`, `DispatchKeySet`, `_parse_dispatch_key` | \
 `torch.autograd.functional` does not pass on the `randomness` of `torch.vmap` |
-| let torch see what a custom operator does | `torch._C._ForceDispatchKeyGuard`, `_dispatch_tls_local_include_set`,
+| let torch see what a custom operator does | `torch._C._ForceDispatchKeyGuard`, `_dispatch_tls_local_include_set`, \
 `_dispatch_tls_local_exclude_set` | autograd never sees it, `torch.func` and others do not see it where torch compiles |
 | leave all transforms for a while | `torch._functorch.pyfunctorch.temporarily_clear_interpreter_stack` | \
 a random seed is drawn once, whatever maps over the layer |

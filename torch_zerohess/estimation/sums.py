@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_zerohess.estimation.evaluations import Evaluations
+from torch_zerohess.estimation.evaluation import Evaluations
 from torch_zerohess.estimation.perturbations import draws
 from torch_zerohess.estimation.skewness import Shape
 from torch_zerohess.estimation.stein import Quantity, Stein

@@ -42,7 +42,7 @@ class Minimum:
 
     Attributes:
         x: [n], the point with the lowest loss; in noise, with the lowest expected loss. It has the type and device of
-            x0. Where some parameters stay at x0 (the message says which), it is the best of the points with that.
+            x0. Some parameters may stay at x0; the message says which. Then x is the best point with these values.
         value: the loss at x. In noise it is the mean of evaluations at x that were made for it. If the search was
             interrupted before them, it is the prediction of a Gaussian process of all evaluations.
         value_error: standard error of `value`; 0 without noise.

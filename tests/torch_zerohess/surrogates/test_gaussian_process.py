@@ -17,7 +17,7 @@ from torch_zerohess.surrogates.gaussian_process import (
 )
 from torch_zerohess.surrogates.kernels import KERNELS, gaussian, matern
 from torch_zerohess.surrogates.lengths import log_evidence, most_likely
-from torch_zerohess.surrogates.process import ProcessSurrogate
+from torch_zerohess.surrogates.process_surrogate import ProcessSurrogate
 from truths import normal, vector
 
 

@@ -5,7 +5,7 @@ import torch
 
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
-from torch_zerohess.surrogates.process import ProcessSurrogate
+from torch_zerohess.surrogates.process_surrogate import ProcessSurrogate
 from truths import normal
 
 

@@ -98,7 +98,8 @@ def minimize(
         callback: gets an `Iterate` after every batch, those of a decision in noise, too; the search ends if it returns
             True, of Python, NumPy or torch.
         verbose: whether to write a line to stderr every second, and one at the end.
-        seed: of the samples; from torch's global generator if None.
+        seed: of the samples; from torch's global generator if None. The same seed gives the same bits with the same
+            number of threads of torch: factorizations of LAPACK round differently with another one.
         target: the search ends when the value is at most this. In noise a single value is too uncertain: the search
             ends when a value lies below the target by twice the noise, or when its last decision finds it reached.
         xtol: the search ends when the region in which it looks is at most this wide on either side of the best point,

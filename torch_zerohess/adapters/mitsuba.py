@@ -113,8 +113,8 @@ class MitsubaScene:
         threads: int | None = None,
     ) -> None:
         _check(film, spp, depth, integrator, seed, noise, nan)
-        if not parameters:
-            raise ValueError("parameters must name at least one part of the scene, got none")
+        if not isinstance(parameters, Sequence) or not parameters:
+            raise ValueError(f"parameters must be a list of at least one Transform or Value, got {parameters!r}")
         self.mi: Any = select_variant(variant, threads)
         self.variant: str = self.mi.variant()
         self.spp, self.seed, self.noise, self.loss, self.nan = spp, int(seed), noise, loss, nan  # no seed of NumPy

@@ -4,15 +4,17 @@ import contextlib
 import copy
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import control_variate, opaque, tracing, transforms
 from torch_zerohess.autograd.closed_form import ClosedForm
 from torch_zerohess.autograd.expanded import general, tangent
+from torch_zerohess.autograd.layer import Layer
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.call import BlackBoxCall, ValueMode
 from torch_zerohess.estimation.control import Control
@@ -21,11 +23,11 @@ from torch_zerohess.estimation.head import Head
 from torch_zerohess.estimation.inputs import check_aux, checked_input, folded_aux, working
 from torch_zerohess.estimation.perturbations import stored
 from torch_zerohess.evaluators.inline import Evaluator
-from torch_zerohess.smoothing import Smoothing, check_smoothing, settings_of, smoothing_of
+from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
 from torch_zerohess.surrogates.memory import Memory, check_memory
 
 
-class BlackBox(nn.Module):
+class BlackBox(Layer):
     """A black box, convolved with a Gaussian, as a layer: F(x) = E fn(x + sigma u), u ~ N(0, I).
 
     One forward call is one batch of evaluations. Gradients, Hessians and Hessian-vector products, by any transform of
@@ -46,7 +48,7 @@ class BlackBox(nn.Module):
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
             are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless value="smoothed". Calls of several
             threads that share a memory follow one another.
-        smoothing: how to sample; may be replaced between calls (`layer.smoothing = layer.smoothing.replace(...)`).
+        smoothing: how to sample. This and `value` may be set between calls: `layer.smoothing = Smoothing(...)`.
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
         value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
@@ -86,8 +88,6 @@ class BlackBox(nn.Module):
         True
     """
 
-    smoothing: Smoothing
-
     def __init__(
         self,
         fn: Callable[..., Any],
@@ -101,7 +101,6 @@ class BlackBox(nn.Module):
         on_nonfinite: str | float = "raise",
     ) -> None:
         super().__init__()
-        check_smoothing(smoothing)
         self.smoothing = smoothing
         check_memory(memory)
         self.call = BlackBoxCall(fn, vectorized, evaluator, value, on_nonfinite, head)
@@ -110,6 +109,15 @@ class BlackBox(nn.Module):
         """The memory during the present call."""
         self.output_shapes: dict[tuple[int | torch.Size, ...], torch.Size] = {}
         self._handle = opaque.register(self)
+
+    @property
+    def value(self) -> ValueMode:
+        """What the layer returns: "center" or "smoothed"."""
+        return self.call.value
+
+    @value.setter
+    def value(self, value: ValueMode) -> None:
+        self.call = replace(self.call, value=value)
 
     def forward(self, x: Tensor, *aux: Tensor) -> Tensor:
         """Return values [*batch, *out] for x [*batch, n] and auxiliary inputs [*batch, ...]."""
@@ -228,11 +236,6 @@ class BlackBox(nn.Module):
             return result
         return opaque.center(self, x, aux)
 
-    @property
-    def fn(self) -> Callable[..., Any]:
-        """The black box itself."""
-        return self.call.fn
-
     def get_extra_state(self) -> dict[str, Any]:
         """Return the settings, so that a state_dict resumes an annealed sigma, and what the memory keeps."""
         settings = settings_of(self.smoothing)
@@ -252,9 +255,6 @@ class BlackBox(nn.Module):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._handle = opaque.register(self)  # a copy serves its own calls
-
-    def extra_repr(self) -> str:
-        return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"
 
 
 def smooth(

@@ -109,6 +109,9 @@ class CurvatureOperator:
             return flattened(_grad(self._curved, self._inputs, t))
         return self.pull(self.output_curvature(self.output_step(v)))
 
+    def __repr__(self) -> str:
+        return f"CurvatureOperator(mode={self.mode!r}, shape={self.shape}, dtype={self.dtype})"
+
     @property
     def inputs(self) -> list[Tensor]:
         """The parameters."""

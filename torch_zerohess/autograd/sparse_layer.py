@@ -4,10 +4,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_zerohess.arguments import check_state
 from torch_zerohess.autograd import transforms
+from torch_zerohess.autograd.layer import Layer
 from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.evaluation import evaluate_center
@@ -15,12 +16,12 @@ from torch_zerohess.estimation.inputs import checked_input, working
 from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.precision import without_autocast
-from torch_zerohess.smoothing import Smoothing, check_smoothing, settings_of, smoothing_of
+from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_grid, checked_rate
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 
-class SparseBlackBox(nn.Module):
+class SparseBlackBox(Layer):
     """A black box whose outputs depend on few parameters each, as a layer: y = f(x), dy/dx = the smoothed Jacobian.
 
     `BlackBox` estimates first derivatives without bias and with a noise that grows with n. This layer finds which
@@ -77,7 +78,6 @@ class SparseBlackBox(nn.Module):
         on_nonfinite: str | float = "raise",
     ) -> None:
         super().__init__()
-        check_smoothing(smoothing)
         checked_rate(rate)
         if grid is not None:
             check_grid(grid)
@@ -135,6 +135,3 @@ class SparseBlackBox(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         check_state(state, {}, "a SparseBlackBox")
         self.smoothing = smoothing_of(state, "a SparseBlackBox")
-
-    def extra_repr(self) -> str:
-        return f"{getattr(self.call.fn, '__name__', self.call.fn)!s}, {self.smoothing}"

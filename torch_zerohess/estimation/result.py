@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.call import ValueMode
-from torch_zerohess.estimation.inputs import all_finite, short
+from torch_zerohess.estimation.inputs import all_finite, named, short
 from torch_zerohess.estimation.skewness import Shape, extension
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
@@ -218,7 +218,7 @@ class Estimate:
 
     def __repr__(self) -> str:
         shape = f"x {list(self._x.shape)}, output {[*self._batch, *self._out]}"
-        parts = [shape, f"value={short(self.value)}", f"gradient={short(self.gradient)}"]
+        parts = [shape, named("value", self.value), named("gradient", self.gradient)]
         parts += [f"auto: {self._chosen}"] * bool(self._chosen)
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"
@@ -289,7 +289,8 @@ class Estimate:
         (n,) = self._sigma.shape
         if not isinstance(v, Tensor) or v.shape not in ((n,), (*self._batch, n)):
             given = list(v.shape) if isinstance(v, Tensor) else type(v).__name__
-            raise ValueError(f"v must be a tensor of shape [{n}] or {[*self._batch, n]}, got {given}")
+            wanted = " or ".join(map(str, dict.fromkeys((f"[{n}]", f"{[*self._batch, n]}"))))
+            raise ValueError(f"v must be a tensor of shape {wanted}, got {given}")
         if not all_finite(v):
             raise ValueError(f"v must be finite, got {short(v)}")
         v = v.detach().to(self._sigma)

@@ -107,8 +107,10 @@ class Minimum:
         the end: the lowest loss lies below it by luck.
         """
         if axes is None:
-            from matplotlib import pyplot
-
+            try:
+                from matplotlib import pyplot
+            except ImportError as error:
+                raise ImportError("plot needs matplotlib: pip install matplotlib", name="matplotlib") from error
             axes = pyplot.subplots()[1]
         values = self.values.detach().double().cpu()
         known = torch.where(values.isnan(), torch.inf, values)

@@ -296,5 +296,5 @@ class Running:
         """Write a line on how far the search is to stderr, if it is `verbose`."""
         if not self._verbose:
             return
-        said = f"{self.evaluations} evaluations, value {self.best.value:.6g}, sigma {self.search.sigma:.3g}"
+        said = f"{self.evaluations} evaluations, value {self.best.value:.6g}, sigma / its start {self.search.sigma:.3g}"
         print(f"{said}, {self.seconds:.0f} s", file=sys.stderr, flush=True)

@@ -49,6 +49,9 @@ class LinearSigma:
         share = min(max(self.count - self.hold, 0) / self.steps, 1.0)
         return (1.0 - share) * self.start + share * self.end  # without rounding at both ends
 
+    def __repr__(self) -> str:
+        return f"LinearSigma({self.start} to {self.end}, steps={self.steps}, hold={self.hold}, count={self.count})"
+
     def step(self) -> None:
         """Go on by one step; beyond the last, sigma stays at its end."""
         self.count += 1

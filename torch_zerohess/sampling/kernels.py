@@ -4,7 +4,8 @@ CPU tensors go to the extension if it was built. On CUDA devices, with triton in
 and sums of rows that are drawn again go to Triton kernels. The first call on a device compares some of their
 numbers with the reference. If they differ, or a kernel fails, a warning says so and the reference is used from then on.
 All other tensors go to the reference, and so do CPU tensors without the extension. All of them draw the same bits.
-Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most.
+Their sums of n terms differ by rounding: n units in the last place of the sum of magnitudes at most. Blocks of sampler
+"orthogonal" are made of such sums.
 """
 
 import itertools

@@ -43,7 +43,8 @@ class AskTell(Standing[P]):
         tolerance: length, in units of the first sigma, below which the search has arrived.
         noise: standard deviation of repeated losses at one point, if it is known.
         pool: evaluations kept; a default by the number of parameters if None.
-        seed: of the samples; from torch's global generator if None.
+        seed: of the samples; from torch's global generator if None. The same seed gives the same bits with the same
+            number of threads of torch.
 
     Raises ValueError for settings out of range, TypeError for settings of another type.
     """

@@ -118,7 +118,7 @@ class Standing(ABC, Generic[P]):
         return self._state.progress.message
 
     def __repr__(self) -> str:
-        end = f"done: {self.message}" if self.done else f"sigma={self.sigma:.4g}"
+        end = f"done: {self.message}" if self.done else f"sigma / its start = {self.sigma:.4g}"
         told = f"value={self.value:.6g}, {named('x', self.x)}" if self.evaluations else named("start", self.x)
         name = type(self).__name__
         return f"{name}(engine={self.engine!r}, n={len(self.unit)}, evaluations={self.evaluations}, {told}, {end})"

@@ -51,7 +51,8 @@ class Memory:
     The first term takes no evaluations; its derivatives come from h and g. The second term is estimated from the
     evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g. A bad g costs
     variance, and c falls to zero. A `Smoothing` with a fixed seed draws other samples at every call that adds
-    evaluations: g would explain the old samples too well.
+    evaluations: g would explain the old samples too well. With another number of threads of torch the fit of g differs
+    by rounding, and so does the estimate.
 
     Torch differentiates the first term as far as h(g(z), r) is smooth in z, and Stein's identity does the rest: the
     second derivatives where slopes jump (an absolute error, ReLUs), and all of them where values jump (a threshold, a

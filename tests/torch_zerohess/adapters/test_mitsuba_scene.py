@@ -576,7 +576,8 @@ def test_an_environment_map_is_not_negative() -> None:
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ([], "parameters must name at least one"),
+        ([], r"parameters must be a list of at least one Transform or Value, got \[\]"),
+        (3, "parameters must be a list of at least one Transform or Value, got 3"),
         ([Value("plane.bsdf.reflectanse.value")], f"no parameter .*; near ones: {REFLECTANCE}"),
         ([Value(REFLECTANCE), Value(REFLECTANCE)], "more than once"),
         ([Value(REFLECTANCE, bounds=(0, 2))], "bounds of .* must lie within 0 to 1.*got 0 to 2"),

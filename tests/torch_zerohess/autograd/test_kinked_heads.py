@@ -337,15 +337,6 @@ def test_with_kinks_an_element_has_more_points() -> None:
     assert per_element(12, 40, 8, pathwise=1) == 12
 
 
-def test_a_state_of_an_earlier_version() -> None:
-    memory, again = zh.Memory(), zh.Memory()
-    layer(identity, "square", memory, 2)
-    for before, after in ((True, 2), (False, 0), (None, None), (1, 1)):
-        again.load_state_dict({**memory.state_dict(), "pathwise": before})
-        assert again.pathwise == after
-        assert type(again.pathwise) is type(after)
-
-
 class Product(torch.nn.Module):
     """A surrogate with a product of matrices."""
 

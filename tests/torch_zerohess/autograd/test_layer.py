@@ -210,6 +210,25 @@ def module_level(z: Tensor) -> Tensor:
     return SCALAR.f(z)
 
 
+@pytest.mark.parametrize("kind", [BlackBox, SparseBlackBox])
+def test_settings_are_checked_when_they_are_set(kind: type[nn.Module]) -> None:
+    layer = kind(lambda z: z.expand(-1, 3), Smoothing(sigma=0.5, seed=0))
+    with pytest.raises(TypeError, match="smoothing must be a Smoothing"):
+        layer.smoothing = 0.3
+    layer.smoothing = Smoothing(sigma=0.1)
+    assert layer.smoothing.sigma == 0.1
+
+
+def test_the_value_that_a_layer_returns_may_be_set() -> None:
+    layer = BlackBox(lambda z: (z[:, 0] > 0.0).double(), Smoothing(sigma=0.5, samples=64, seed=0))
+    x = torch.full((1,), 0.1)
+    assert layer.value == "center" and float(layer(x)) == 1.0
+    layer.value = "smoothed"
+    assert layer.value == "smoothed" and 0.3 < float(layer(x)) < 0.9
+    with pytest.raises(ValueError, match="value must be 'center' or 'smoothed', got 'mean'"):
+        layer.value = "mean"
+
+
 def test_state_dict_resumes_the_settings() -> None:
     annealed = AGGREGATE.replace(sigma=0.0123, samples=4)
     source = nn.Sequential(nn.Linear(2, N), BlackBox(module_level, annealed)).double()

@@ -222,9 +222,11 @@ def test_settings_are_checked_when_they_are_set(kind: type[nn.Module]) -> None:
 def test_the_value_that_a_layer_returns_may_be_set() -> None:
     layer = BlackBox(lambda z: (z[:, 0] > 0.0).double(), Smoothing(sigma=0.5, samples=64, seed=0))
     x = torch.full((1,), 0.1)
-    assert layer.value == "center" and float(layer(x)) == 1.0
+    assert layer.value == "center"
+    assert float(layer(x)) == 1.0
     layer.value = "smoothed"
-    assert layer.value == "smoothed" and 0.3 < float(layer(x)) < 0.9
+    assert layer.value == "smoothed"
+    assert 0.3 < float(layer(x)) < 0.9
     with pytest.raises(ValueError, match="value must be 'center' or 'smoothed', got 'mean'"):
         layer.value = "mean"
 

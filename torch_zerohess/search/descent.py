@@ -11,7 +11,7 @@ from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.random_points import further_start, normal, orthonormal
+from torch_zerohess.search.random_points import normal, orthonormal
 from torch_zerohess.search.state import LOST, Best, Evaluated, not_finite
 from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.pool import Pool
@@ -130,7 +130,7 @@ class LocalQuadratics(Method[DescentProgress]):
     def begun(self, best: Best) -> DescentProgress:
         """Return a round that begins at a point."""
         start, pool = best.point, Pool.empty(self._n, best.point.device)
-        return DescentProgress(best=best, lowest=best, center=start, first=start, step=start, pool=pool)
+        return DescentProgress(best=best, lowest=best, center=start, step=start, pool=pool)
 
     # What was evaluated.
 
@@ -165,9 +165,7 @@ class LocalQuadratics(Method[DescentProgress]):
         known = known.ended_round(reason, 0 if last else settings.restarts)
         if known.done:
             return known
-        center = known.best.point
-        if known.rounds % 2:
-            center = further_start(generator, known.first, settings.lower, settings.upper)
+        center = settings.further_start(generator) if known.rounds % 2 else known.best.point
         return replace(
             known,
             phase="start",

@@ -22,7 +22,6 @@ from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_progress import MetricProgress
-from torch_zerohess.search.random_points import further_start
 from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.state import Best, Evaluated, are_same
 from torch_zerohess.surrogates.least_change import least_change
@@ -186,8 +185,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def _further(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Start another round elsewhere."""
-        center = further_start(generator, known.first, self.settings.lower, self.settings.upper)
-        return self._round_at(known, center, 1.0, generator)
+        return self._round_at(known, self.settings.further_start(generator), 1.0, generator)
 
     def _round_at(
         self, known: MetricProgress, center: Tensor, sigma: float, generator: torch.Generator
@@ -221,7 +219,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _on_plateau(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let isotropic quadratics go on from the best point."""
         pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
-        wide = self._wide.go_on(pool, known.lowest, 1.0).taking(known, "first", "iterations", *_SHARED)
+        wide = self._wide.go_on(pool, known.lowest, 1.0).taking(known, "iterations", *_SHARED)
         wide = wide.sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
@@ -235,7 +233,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Return from isotropic quadratics: parameters along whose axes nothing changes are no plateau."""
         begun = self.go_on(wide.pool.points, wide.pool.values, wide.lowest, 1.0)
-        begun = begun.taking(wide, "first", "iterations", *_SHARED).taking(known, *_QUADRATIC)
+        begun = begun.taking(wide, "iterations", *_SHARED).taking(known, *_QUADRATIC)
         return self.plan(begun, generator)
 
     # Models.

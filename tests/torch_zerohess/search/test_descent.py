@@ -11,7 +11,7 @@ from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import descent
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.state import Evaluated
+from torch_zerohess.search.state import Best, Evaluated
 from truths import vector
 
 # Functions with known minima.
@@ -324,6 +324,15 @@ def test_a_further_round_begins_at_another_point():
     boxed = torch.stack([second_round(seed, (-3.0, 6.0)).center for seed in range(40)])
     assert float(boxed.min()) < -2.5
     assert float(boxed.max()) > 5.5
+
+
+def test_a_search_that_has_taken_over_begins_further_rounds_around_the_start_of_the_caller():
+    """Far away from where it has taken over: six standard deviations, of a false-alarm rate of 4e-9."""
+    unbounded = torch.full((2,), math.inf, dtype=torch.float64)
+    method = LocalQuadratics(Settings(zeros(2), -unbounded, unbounded, None, 10, 1e-2, 0.0, None))
+    taken_over = method.begun(Best(vector(100.0, 100.0)))
+    further = method.arrive(taken_over, "it ends", torch.Generator().manual_seed(0))
+    assert float(further.center.abs().max()) < 6 * 2.0
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0, 100.0])

@@ -20,8 +20,6 @@ _APART = 0.03
 """Least distance from the best point, over the first sigma, of evaluations that tell the largest curvature."""
 _ASIDE = 0.1
 """Distance of the two points from the best point, over the first sigma."""
-_WIDER = 2.0
-"""Sigma with which the search goes on, over this distance."""
 _GAIN = 1e-6
 """Least decrease of the loss that counts, over what the largest curvature adds at this distance."""
 
@@ -38,9 +36,7 @@ class InflectionQuadratics(TwoSidedQuadratics):
         known = known.remembered(evaluated, self._capacity)
         if known.lowest.loss >= before - _GAIN * largest * _ASIDE**2:
             return super()._arrived(known, known.reason, generator)
-        root = torch.eye(self._n, dtype=known.root.dtype, device=known.root.device)
-        known = replace(known, phase="geometry", root=root, sigma=_WIDER * _ASIDE, rejected=0, tied=0)
-        return self.plan(known, generator)
+        return self._beside_end(known, _ASIDE, generator)
 
     def more(self, known: MetricProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
         return points[:0] if known.phase == "aside" else super().more(known, points, count, generator)

@@ -49,8 +49,6 @@ _LENGTHS = (0.3, 1.0, 3.0, 10.0, 100.0, 1e3, 1e4)
 measured."""
 _ROOM = 3.0
 """No slopes are measured if a bound is nearer than this, over the same distance."""
-_WIDER = 2.0
-"""Sigma with which the search goes on, over the length of the step that has found a lower point."""
 
 
 class KinkedQuadratics(InflectionQuadratics):
@@ -65,9 +63,7 @@ class KinkedQuadratics(InflectionQuadratics):
         after = known.remembered(evaluated, self._capacity)
         if after.lowest.loss < before.loss:
             step = float((after.lowest.point - before.point).norm())
-            root = torch.eye(n, dtype=known.root.dtype, device=known.root.device)
-            after = replace(after, slopes=None, phase="geometry", root=root, sigma=_WIDER * step, rejected=0, tied=0)
-            return self.plan(after, generator)
+            return self._beside_end(replace(after, slopes=None), step, generator)
         known = replace(known, evaluations=after.evaluations)
         simplex = evaluated.needed.those(slice(-n - 1, None))
         complete = len(evaluated.needed) == n + 1 + (len(_LENGTHS) if len(sampled) >= n else 0)

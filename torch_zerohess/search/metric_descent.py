@@ -53,6 +53,8 @@ the minimum must fall to at most the second number of what it was at the predict
 _UNIQUE = 1e-4
 """Smallest curvature, over the largest, of a quadratic that is kept. On the floor of a valley rounds arrive at several
 points."""
+_WIDER = 2.0
+"""Sigma with which a round goes on from a lower point beside its end, over the distance of this point."""
 _SURE = 0.1
 """Largest relative error of a fitted Hessian that replaces the last one of the round."""
 
@@ -193,6 +195,14 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Start another round at a point [n] with this sigma."""
         begun = replace(self._begun(Best(center)), sigma=sigma, lines=known.lines)
         return self._started(begun.taking(known, "iterations", *_QUADRATIC, *_SHARED), generator)
+
+    def _beside_end(
+        self, known: MetricProgress, distance: float, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        """Let a round go on from a lower point that was found at a distance from its end."""
+        root = torch.eye(self._n, dtype=known.root.dtype, device=known.root.device)
+        sigma = _WIDER * distance
+        return self.plan(replace(known, phase="geometry", root=root, sigma=sigma, rejected=0, tied=0), generator)
 
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the lowest new loss, and all losses at the start of a round, with the quadratic that is kept."""

@@ -93,6 +93,10 @@ class Pool:
         ratio = (target - torch.logsumexp(each, 1)) * min(1.0, _FLAT / n)
         return torch.where(here == 0, 1.0, ratio.exp().clamp(max=_CAP))
 
+    def normal_weights(self, x: Tensor, sigma: float) -> Tensor:
+        """Return exp(-|z - x|^2 / 2 sigma^2) for every evaluation z [P]; x [n]."""
+        return torch.exp(-0.5 * ((self.points - x) / sigma).square().sum(1))
+
     def _those(self, which: Tensor) -> "Pool":
         outputs = None if self.outputs is None else self.outputs[which]
         groups, origin = torch.unique(self.origin[which], return_inverse=True)

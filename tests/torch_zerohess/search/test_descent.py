@@ -8,7 +8,7 @@ import torch
 from searches import TARGET, bowl, plateau, rays, rays_loss, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
-from torch_zerohess.search import descent
+from torch_zerohess.search import pool_quadratic
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.state import Best, Evaluated
@@ -383,8 +383,8 @@ def test_an_output_is_followed_from_three_parameters_on(n, follows, monkeypatch)
     """Of up to two parameters the quadratic is of the loss."""
     fitted = []
     for name in ("fit_values", "fit_outputs"):
-        fit = getattr(descent, name)
-        monkeypatch.setattr(descent, name, lambda *told, name=name, fit=fit: fitted.append(name) or fit(*told))
+        fit = getattr(pool_quadratic, name)
+        monkeypatch.setattr(pool_quadratic, name, lambda *told, name=name, fit=fit: fitted.append(name) or fit(*told))
     search = Descent(zeros(n), sigma=1.0, loss=torch.sum, noise=0.1, seed=0)  # in noise it only follows
     search.tell(search.ask().square())
     assert set(fitted) == {"fit_outputs" if follows else "fit_values"}

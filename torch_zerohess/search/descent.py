@@ -63,11 +63,10 @@ class LocalQuadratics(Method[DescentProgress]):
         known = self.begun(Best(self.settings.start))
         return known, self.points(known, generator)
 
-    def go_on(self, pool: Pool, best: Best, sigma: float) -> DescentProgress:
-        """Return a round that begins at the best point of another search, with the evaluations of that search."""
-        known = self.begun(best)
-        pool = known.pool.add(pool.points, pool.values, None, best.point, 1.0).latest(self.capacity, best.point)
-        return self._planned(replace(known, pool=pool, value=best.loss, sigma=sigma).trying())
+    def go_on(self, points: Tensor, values: Tensor, best: Best, sigma: float) -> DescentProgress:
+        """Return a round that begins at the best point of another search, with its evaluations [P, n] and [P]."""
+        pool = Pool.of(points, values, None, best.point).latest(self.capacity, best.point)
+        return self._planned(replace(self.begun(best), pool=pool, value=best.loss, sigma=sigma).trying())
 
     def next(
         self, known: DescentProgress, evaluated: Evaluated, generator: torch.Generator

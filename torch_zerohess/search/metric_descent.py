@@ -27,7 +27,6 @@ from torch_zerohess.search.state import Best, Evaluated, are_same
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.plateau import is_plateau
-from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
 MOST = 200
@@ -228,8 +227,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def _on_plateau(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let isotropic quadratics go on from the best point."""
-        pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
-        wide = self._wide.go_on(pool, known.lowest, 1.0).taking(known, "iterations", *_SHARED)
+        wide = self._wide.go_on(known.points, known.values, known.lowest, 1.0).taking(known, "iterations", *_SHARED)
         wide = wide.sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 

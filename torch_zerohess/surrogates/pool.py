@@ -42,6 +42,11 @@ class Pool:
         none = torch.empty(0, dtype=torch.float64, device=device)
         return cls(none.reshape(0, n), none, None, none.reshape(0, n), none, none.long())
 
+    @classmethod
+    def of(cls, points: Tensor, values: Tensor, outputs: Tensor | None, center: Tensor) -> "Pool":
+        """Return a pool of evaluations [P, n], [P] and [P, m] of another search, as if drawn from N(center, 1)."""
+        return cls.empty(len(center), center.device).add(points, values, outputs, center, 1.0)
+
     def __len__(self) -> int:
         return len(self.values)
 
@@ -79,6 +84,10 @@ class Pool:
     def ties(self, x: Tensor, value: float, distance: float) -> bool:
         """Whether x [n] lies on a plateau, by evaluations farther away than this, root mean square."""
         return is_plateau((self.points - x).square().mean(1).sqrt(), self.values, value, beyond=distance)
+
+    def reach(self, x: Tensor) -> float:
+        """Return the distance from x [n] to the (n + 1)-th nearest evaluation."""
+        return float((self.points - x).norm(dim=1).sort().values[len(x)])
 
     def weights(self, x: Tensor, sigma: float) -> Tensor:
         """Weights [P] for a fit around x [n], at most 7.4; 1 for an evaluation at x itself."""

@@ -64,7 +64,7 @@ _QUADRATIC = ("bottom", "slope", "bend")
 
 
 class MetricQuadratics(RegionDescent[MetricProgress]):
-    """Descent on quadratics of a loss alone without noise; it ends at kinks, see `KinkedQuadratics`."""
+    """Descent on quadratics of a loss alone without noise; it ends at kinks, see `LossQuadratics`."""
 
     engine = "descent"
     progress = MetricProgress

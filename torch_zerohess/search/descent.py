@@ -11,16 +11,14 @@ from torch_zerohess.search.descent_progress import BATCH, DescentProgress
 from torch_zerohess.search.loss_step import after_loss
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_step import after_output
-from torch_zerohess.search.random_points import further_start, normal, orthonormal
+from torch_zerohess.search.pool_quadratic import NEAR, fit_pool, quadratic_of_pool
+from torch_zerohess.search.random_points import normal, orthonormal
 from torch_zerohess.search.state import LOST, Best, Evaluated, not_finite
-from torch_zerohess.surrogates.determined import with_true_errors
 from torch_zerohess.surrogates.pool import Pool
-from torch_zerohess.surrogates.quadratic import LocalModel, fit_outputs, fit_values
+from torch_zerohess.surrogates.quadratic import LocalModel
 
 _FEW = 2
 """Parameters up to which a full quadratic of the loss takes so few evaluations that an output is not needed."""
-_NEAR = 1e-3
-"""Weight from which an evaluation counts as near."""
 _ENOUGH = 4
 """Near evaluations, besides the center, that a model needs at least; n if that is less."""
 _SHARPNESS = 0.1
@@ -33,8 +31,8 @@ _RESTART = 1.5
 """First sigma of a further round."""
 _DAMPING = 1e-3
 """Added to the curvature of the model of an output that a step follows, over its mean curvature."""
-_WIDENINGS, _WIDENING = 8, 1.5
-"""How often, and by which factor, sigma is widened to find evaluations around the best point."""
+_WIDEST = 20.0
+"""Factor by which sigma is widened, at most, to find evaluations around the best point."""
 
 _POOL, _POOL_PER_PARAMETER, _POOL_OF_QUADRATIC = 60, 6, 500
 """Evaluations kept at least, per parameter at least, and at most for a full quadratic of the loss."""
@@ -58,17 +56,17 @@ class LocalQuadratics(Method[DescentProgress]):
         self._n = n = settings.n
         self.follows = settings.loss is not None and n > _FEW
         """Whether it models the output, not the loss."""
+        self._loss = settings.loss if self.follows else None
         self.capacity = settings.pool or _capacity(n, loss_alone=settings.loss is None)
 
     def first(self, generator: torch.Generator) -> tuple[DescentProgress, Tensor]:
         known = self.begun(Best(self.settings.start))
         return known, self.points(known, generator)
 
-    def go_on(self, pool: Pool, best: Best, sigma: float) -> DescentProgress:
-        """Return a round that begins at the best point of another search, with the evaluations of that search."""
-        known = self.begun(best)
-        pool = known.pool.add(pool.points, pool.values, None, best.point, 1.0).latest(self.capacity, best.point)
-        return self._planned(replace(known, pool=pool, value=best.loss, sigma=sigma).trying())
+    def go_on(self, points: Tensor, values: Tensor, best: Best, sigma: float) -> DescentProgress:
+        """Return a round that begins at the best point of another search, with its evaluations [P, n] and [P]."""
+        pool = Pool.of(points, values, None, best.point).latest(self.capacity, best.point)
+        return self._planned(replace(self.begun(best), pool=pool, value=best.loss, sigma=sigma).trying())
 
     def next(
         self, known: DescentProgress, evaluated: Evaluated, generator: torch.Generator
@@ -113,15 +111,9 @@ class LocalQuadratics(Method[DescentProgress]):
         return self._drawn(around, count, generator, paired=False)
 
     def model_at_best(self, known: DescentProgress) -> tuple[LocalModel, float] | None:
-        best, sigma = known.best.point, known.best.sigma
-        for _ in range(_WIDENINGS):
-            weights = known.pool.weights(best, sigma)
-            near = weights > _NEAR
-            if int(near.sum()) > min(self._n, self.capacity - 2):
-                u = (known.pool.points[near] - best) / sigma
-                return with_true_errors(self._fitted(known, u, near, weights[near]), u, weights[near]), sigma
-            sigma *= _WIDENING
-        return None
+        best, pool = known.best, known.pool
+        least, widest = min(self._n, self.capacity - 2) + 1, _WIDEST * best.sigma
+        return quadratic_of_pool(best, pool, self._loss, known.shape, least, widest, pool.weights)
 
     def width(self, known: DescentProgress) -> Tensor:
         """Return sigma for every parameter, and infinity before a step."""
@@ -130,7 +122,7 @@ class LocalQuadratics(Method[DescentProgress]):
     def begun(self, best: Best) -> DescentProgress:
         """Return a round that begins at a point."""
         start, pool = best.point, Pool.empty(self._n, best.point.device)
-        return DescentProgress(best=best, lowest=best, center=start, first=start, step=start, pool=pool)
+        return DescentProgress(best=best, lowest=best, center=start, step=start, pool=pool)
 
     # What was evaluated.
 
@@ -165,9 +157,7 @@ class LocalQuadratics(Method[DescentProgress]):
         known = known.ended_round(reason, 0 if last else settings.restarts)
         if known.done:
             return known
-        center = known.best.point
-        if known.rounds % 2:
-            center = further_start(generator, known.first, settings.lower, settings.upper)
+        center = settings.further_start(generator) if known.rounds % 2 else known.best.point
         return replace(
             known,
             phase="start",
@@ -227,10 +217,11 @@ class LocalQuadratics(Method[DescentProgress]):
         if known.faithful:  # the model is about to interpolate: the nearest evaluations count most
             distance = ((points - center) / sigma).square().mean(1)
             weights = weights / (_SHARPNESS + distance).square()
-        near = weights > _NEAR
+        near = weights > NEAR
         if int(near.sum()) < (min(self._n, _ENOUGH) + 1 if known.need == 0 else 1):
             return known.sampling(2)
-        model = self._fitted(known, (points[near] - center) / sigma, near, weights[near], _DAMPING)
+        u = (points[near] - center) / sigma
+        model = fit_pool(u, known.pool, near, weights[near], self._loss, known.shape, _DAMPING)
         radius = known.reach * math.sqrt(self._n)
         lower, upper = (self.settings.lower - center) / sigma, (self.settings.upper - center) / sigma
         if model.basis is None:
@@ -239,15 +230,6 @@ class LocalQuadratics(Method[DescentProgress]):
             s = ball_step(model.gradient, model.hessian, radius)
             step = model.reduce(model.expand(s).clamp(lower, upper))
         return replace(known, model=model, step=step, need=0)
-
-    def _fitted(
-        self, known: DescentProgress, u: Tensor, near: Tensor, weights: Tensor, damping: float = 0.0
-    ) -> LocalModel:
-        """Fit a model to the evaluations that are near, at u [P, n] with weights [P]."""
-        outputs = known.pool.outputs
-        if self.settings.loss is None or outputs is None or not self.follows:
-            return fit_values(u, known.pool.values[near], weights)
-        return fit_outputs(u, outputs[near], weights, self.settings.loss, known.shape, damping)
 
 
 def _capacity(n: int, *, loss_alone: bool) -> int:

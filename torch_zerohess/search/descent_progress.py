@@ -24,8 +24,6 @@ class DescentProgress(Progress):
     pool: Pool
     phase: Literal["start", "sample", "trial"] = "start"
     """What is asked for: the center and samples, samples, or the end of a step."""
-    first: Tensor
-    """Where the search began [n]."""
     value: float = math.inf
     """Loss at the center."""
     lowest: Best

@@ -3,8 +3,8 @@
 from typing import Any
 
 from torch_zerohess.search import metric_descent, noisy_descent
-from torch_zerohess.search.additive_descent import AdditiveQuadratics
 from torch_zerohess.search.descent import LocalQuadratics
+from torch_zerohess.search.loss_descent import LossQuadratics
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.noisy_descent import NoisyQuadratics
 from torch_zerohess.search.output_descent import OutputDescent
@@ -79,12 +79,12 @@ class Descent(AskTell[Any]):
         return descent_method(settings)
 
 
-def descent_method(settings: Settings) -> LocalQuadratics | AdditiveQuadratics | NoisyQuadratics | OutputDescent:
+def descent_method(settings: Settings) -> LocalQuadratics | LossQuadratics | NoisyQuadratics | OutputDescent:
     """Return the method for an output, for a loss alone, or for a loss with noise or of many parameters."""
     if settings.loss is not None:
         return OutputDescent(settings)
     if settings.noise:
         return NoisyQuadratics(settings) if settings.n <= noisy_descent.MOST else LocalQuadratics(settings)
     if settings.n <= metric_descent.MOST:
-        return AdditiveQuadratics(settings)
+        return LossQuadratics(settings)
     return LocalQuadratics(settings, arrives=False)

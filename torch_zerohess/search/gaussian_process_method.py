@@ -50,6 +50,8 @@ _EXPANSIONS = 3
 """Expansions of the loss around predicted minima. If none predicts the loss there, the loss itself is modelled."""
 _POOL, _BATCHES = 60, 8
 """Evaluations kept, and batches of several points kept at least, unless `pool` says it."""
+_WIDEST = 10.0
+"""Sigma of the model at the best point, at most."""
 
 Q = TypeVar("Q", bound=ProcessProgress)
 
@@ -123,7 +125,8 @@ class ProcessMethod(Method[Q]):
 
     def model_at_best(self, known: Q) -> tuple[LocalModel, float] | None:
         least = min(self.settings.n, self.capacity - 2) + 1
-        return quadratic_of_pool(known.best, known.pool, self.settings.loss, known.shape, least)
+        best, pool = known.best, known.pool
+        return quadratic_of_pool(best, pool, self.settings.loss, known.shape, least, _WIDEST, pool.normal_weights)
 
     def begun(self) -> Q:
         """Return the progress before anything was evaluated."""

@@ -1,6 +1,6 @@
 """A Gaussian process of the loss that quadratics finish: `GaussianProcessSearch` where the black box returns the loss.
 
-Quadratics are fitted next to the minimum (`MetricQuadratics`). They begin where the steps of the process are short, or
+Quadratics are fitted next to the minimum (`LossQuadratics`). They begin where the steps of the process are short, or
 where a quadratic has predicted the end of a step. If a function has more minima than the process can tell apart, the
 process finds nothing better. Then quadratics begin at a random point of the box. Lower minima are often close to each
 other: while arrivals disagree, quadratics begin beside the best point every other time (monotonic basin hopping: Wales
@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_zerohess.search.axis_search import AxisLines, AxisSearch
 from torch_zerohess.search.gaussian_process_finish import PATIENCE, FinishedProcess, FinishedProgress
 from torch_zerohess.search.gaussian_process_method import APART, ROUND
-from torch_zerohess.search.kinked_descent import KinkedQuadratics
+from torch_zerohess.search.loss_descent import LossQuadratics
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.random_points import fractions, uniform
@@ -68,11 +68,11 @@ class LossProcess(FinishedProcess[LossProgress]):
     """A process of the loss and quadratics in turn."""
 
     progress = LossProgress
-    local: KinkedQuadratics
+    local: LossQuadratics
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        self.local = KinkedQuadratics(replace(settings, restarts=0))
+        self.local = LossQuadratics(replace(settings, restarts=0))
         self._axes = AxisSearch(settings)
 
     def model_at_best(self, known: LossProgress) -> tuple[LocalModel, float] | None:

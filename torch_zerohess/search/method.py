@@ -13,10 +13,13 @@ from typing import ClassVar, Generic
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.random_points import normal, reflect
+from torch_zerohess.search.random_points import normal, reflect, uniform
 from torch_zerohess.search.state import Evaluated, P
 from torch_zerohess.search.told import moderate
 from torch_zerohess.surrogates.quadratic import LocalModel
+
+_AWAY = 2.0
+"""Standard deviation of a further start from the first one, where there is no box to draw it from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,12 @@ class Settings:
     def drawn(self, x: Tensor, sigma: float, count: int, generator: torch.Generator) -> Tensor:
         """Draw points [count, n] from N(x, sigma^2), mirrored into the bounds."""
         return self.inside(x + sigma * normal(generator, x, count, self.n))
+
+    def further_start(self, generator: torch.Generator) -> Tensor:
+        """Draw the point [n] where another round begins: anywhere in a finite box, otherwise around the start."""
+        if self.bounded:
+            return uniform(generator, self.lower, self.upper, 1)[0]
+        return (self.start + _AWAY * normal(generator, self.start, self.n)).clamp(self.lower, self.upper)
 
 
 class Method(ABC, Generic[P]):

@@ -22,13 +22,11 @@ from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_progress import MetricProgress
-from torch_zerohess.search.random_points import further_start
 from torch_zerohess.search.region_descent import RegionDescent
 from torch_zerohess.search.state import Best, Evaluated, are_same
 from torch_zerohess.surrogates.least_change import least_change
 from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.plateau import is_plateau
-from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
 
 MOST = 200
@@ -54,6 +52,8 @@ the minimum must fall to at most the second number of what it was at the predict
 _UNIQUE = 1e-4
 """Smallest curvature, over the largest, of a quadratic that is kept. On the floor of a valley rounds arrive at several
 points."""
+_WIDER = 2.0
+"""Sigma with which a round goes on from a lower point beside its end, over the distance of this point."""
 _SURE = 0.1
 """Largest relative error of a fitted Hessian that replaces the last one of the round."""
 
@@ -64,7 +64,7 @@ _QUADRATIC = ("bottom", "slope", "bend")
 
 
 class MetricQuadratics(RegionDescent[MetricProgress]):
-    """Descent on quadratics of a loss alone without noise; it ends at kinks, see `KinkedQuadratics`."""
+    """Descent on quadratics of a loss alone without noise; it ends at kinks, see `LossQuadratics`."""
 
     engine = "descent"
     progress = MetricProgress
@@ -186,8 +186,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def _further(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Start another round elsewhere."""
-        center = further_start(generator, known.first, self.settings.lower, self.settings.upper)
-        return self._round_at(known, center, 1.0, generator)
+        return self._round_at(known, self.settings.further_start(generator), 1.0, generator)
 
     def _round_at(
         self, known: MetricProgress, center: Tensor, sigma: float, generator: torch.Generator
@@ -195,6 +194,14 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Start another round at a point [n] with this sigma."""
         begun = replace(self._begun(Best(center)), sigma=sigma, lines=known.lines)
         return self._started(begun.taking(known, "iterations", *_QUADRATIC, *_SHARED), generator)
+
+    def _beside_end(
+        self, known: MetricProgress, distance: float, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        """Let a round go on from a lower point that was found at a distance from its end."""
+        root = torch.eye(self._n, dtype=known.root.dtype, device=known.root.device)
+        sigma = _WIDER * distance
+        return self.plan(replace(known, phase="geometry", root=root, sigma=sigma, rejected=0, tied=0), generator)
 
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the lowest new loss, and all losses at the start of a round, with the quadratic that is kept."""
@@ -220,8 +227,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
 
     def _on_plateau(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
         """Let isotropic quadratics go on from the best point."""
-        pool = Pool.empty(self._n, known.center.device).add(known.points, known.values, None, known.lowest.point, 1.0)
-        wide = self._wide.go_on(pool, known.lowest, 1.0).taking(known, "first", "iterations", *_SHARED)
+        wide = self._wide.go_on(known.points, known.values, known.lowest, 1.0).taking(known, "iterations", *_SHARED)
         wide = wide.sampling(self._n, paired=False)
         return self._widely(known, wide, self._wide.points(wide, generator))
 
@@ -235,7 +241,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     ) -> tuple[MetricProgress, Tensor]:
         """Return from isotropic quadratics: parameters along whose axes nothing changes are no plateau."""
         begun = self.go_on(wide.pool.points, wide.pool.values, wide.lowest, 1.0)
-        begun = begun.taking(wide, "first", "iterations", *_SHARED).taking(known, *_QUADRATIC)
+        begun = begun.taking(wide, "iterations", *_SHARED).taking(known, *_QUADRATIC)
         return self.plan(begun, generator)
 
     # Models.

@@ -57,8 +57,8 @@ class MetricProgress(RegionProgress):
     evidence: float = 0.0
     """How much better two quadratics have predicted the latest losses than one."""
     slopes: Tensor | None = None
-    """Gradients [m, n] at random points around a kink, see `KinkedQuadratics`; None where there is none."""
+    """Gradients [m, n] at random points around a kink, see `KinkCheck`; None where there is none."""
     reason: str = ""
     """Why the round has come to it."""
     lines: AxisLines | None = None
-    """What is known along the axes, see `AdditiveQuadratics`; None before rounds are compared with it."""
+    """What is known along the axes, see `AxisSearch`; None before rounds are compared with it."""

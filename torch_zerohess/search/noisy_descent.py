@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.random_points import further_start, normal
+from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import LOST, Best, Evaluated, Progress, not_finite
 from torch_zerohess.surrogates.noisy_quadratic import NoisyQuadratic, fit_noisy
 from torch_zerohess.surrogates.pool import latest
@@ -68,8 +68,6 @@ class NoisyProgress(Progress):
     """Of the last quadratic [n, n]."""
     settled: Best
     """The best end of the rounds before."""
-    first: Tensor
-    """Where the search began [n]."""
     before: Tensor
     """Center before the last step [n]."""
     home: Tensor
@@ -168,7 +166,6 @@ class NoisyQuadratics(Method[NoisyProgress]):
             values=nothing[:0, 0],
             root=torch.eye(n, dtype=center.dtype, device=center.device),
             hessian=nothing,
-            first=self.settings.start,
             before=center,
             home=center,
         )
@@ -180,13 +177,11 @@ class NoisyQuadratics(Method[NoisyProgress]):
         self, known: NoisyProgress, reason: str, generator: torch.Generator, *, last: bool = False
     ) -> tuple[NoisyProgress, Tensor]:
         """End, or start another round at a random point."""
-        settings = self.settings
-        known = known.arriving(known.best).ended_round(reason, 0 if last else settings.restarts)
+        known = known.arriving(known.best).ended_round(reason, 0 if last else self.settings.restarts)
         if known.done:
             return known, known.points[:0]
-        center = further_start(generator, known.first, settings.lower, settings.upper)
-        fresh = self._begun(center, known.best)
-        return self._started(fresh.taking(known, "first", "evaluations", "iterations", "arrivals"), generator)
+        fresh = self._begun(self.settings.further_start(generator), known.best)
+        return self._started(fresh.taking(known, "evaluations", "iterations", "arrivals"), generator)
 
     # An iteration.
 

@@ -80,7 +80,8 @@ class OutputDescent(Relay[OutputDescentProgress]):
         known = replace(known, descent=descent)
         if self._is_smooth(before, descent, evaluated):
             step = float((evaluated.points[0] - before.center).norm())
-            smooth = self._smooth.taking_over(descent, descent.lowest, max(step, _LEAST * _reach(descent)))
+            reach = min(descent.pool.reach(descent.lowest.point), descent.sigma)
+            smooth = self._smooth.taking_over(descent, descent.lowest, max(step, _LEAST * reach))
             return self._went_on(known, *self._smooth.plan(smooth, generator), generator)
         return known.taking(descent), self._follow.points(descent, generator)
 
@@ -119,14 +120,6 @@ class OutputDescent(Relay[OutputDescentProgress]):
 
     def _with_evaluations(self, descent: DescentProgress, smooth: OutputProgress) -> DescentProgress:
         """Return the descent with the evaluations of Gauss-Newton."""
-        pool = Pool.empty(descent.n, smooth.points.device)
         outputs = smooth.outputs if len(smooth.points) else None
-        pool = pool.add(smooth.points, smooth.values, outputs, smooth.lowest.point, 1.0)
-        descent = replace(descent, pool=pool)
-        return descent.taking(smooth, "best", "lowest", "evaluations", "iterations", "shape")
-
-
-def _reach(descent: DescentProgress) -> float:
-    """Return how far the n + 1 evaluations lie that are nearest to the best point, at most sigma."""
-    distance = (descent.pool.points - descent.lowest.point).norm(dim=1)
-    return min(float(distance.sort().values[descent.n]), descent.sigma)
+        pool = Pool.of(smooth.points, smooth.values, outputs, smooth.lowest.point)
+        return replace(descent, pool=pool).taking(smooth, "best", "lowest", "evaluations", "iterations", "shape")

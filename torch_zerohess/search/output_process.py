@@ -81,8 +81,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:
         newton, best = known.local, known.best
         if newton is not None and torch.equal(newton.best.point, best.point):  # the process has not all of these
-            pool = Pool.empty(self.settings.n, best.point.device)
-            known = replace(known, pool=pool.add(newton.points, newton.values, newton.outputs, best.point, 1.0))
+            known = replace(known, pool=Pool.of(newton.points, newton.values, newton.outputs, best.point))
         if not known.noisy:  # the nearest evaluations that tell a Jacobian, however the best one was found
             known = replace(known, best=replace(best, sigma=self.settings.tolerance))
         return super().model_at_best(known)
@@ -162,8 +161,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
                 begun, rejected=0, short=0, tied=0, lost=0, good=False, kept=False, failed=False, done=False
             )
         else:
-            distance = (known.pool.points - best.point).norm(dim=1).sort().values[n]
-            sigma = min(max(float(distance), self.settings.tolerance), _WIDEST)
+            sigma = min(max(known.pool.reach(best.point), self.settings.tolerance), _WIDEST)
             begun = self.local.taking_over(known, best, sigma)
         newton, points = self.local.plan(begun, generator)
         if known.due and len(points):

@@ -32,8 +32,8 @@ _SHORTER, _RETRY = 0.4, 0.9
 _STALLED = 8
 """Latest steps, in which the smoothed loss must have fallen."""
 _FALL, _HURRY = 0.95, 0.8
-"""If the lowest smoothed loss of the latest steps is above this part of the lowest one before, sigma shrinks more, by
-the second factor."""
+"""Compare the lowest smoothed loss of the latest steps with the lowest one of the steps before. Where it is above the
+first number times that one, sigma is also multiplied by the second number."""
 _FLAT = 0.03
 """Relative change of the loss below which a step has stayed on a plateau."""
 _PLATEAU, _PATIENCE = 1.3, 4

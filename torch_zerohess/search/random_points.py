@@ -3,9 +3,6 @@
 import torch
 from torch import Tensor
 
-_AWAY = 2.0
-"""Standard deviation of a further start from the first one, where there is no box to draw it from."""
-
 
 def normal(generator: torch.Generator, like: Tensor, *shape: int) -> Tensor:
     """Standard normal numbers on the device of `like`."""
@@ -30,13 +27,6 @@ def orthonormal(columns: Tensor) -> Tensor:
     """
     q, r = torch.linalg.qr(columns)
     return q * torch.where(r.diagonal() < 0, -1.0, 1.0).to(q)
-
-
-def further_start(generator: torch.Generator, first: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Point [n] where another round begins: anywhere in a finite box, otherwise around the first start."""
-    if bool(torch.isfinite(torch.cat([lower, upper])).all()):
-        return uniform(generator, lower, upper, 1)[0]
-    return (first + _AWAY * normal(generator, first, len(first))).clamp(lower, upper)
 
 
 def reflect(z: Tensor, lower: Tensor, upper: Tensor) -> Tensor:

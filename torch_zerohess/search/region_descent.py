@@ -210,7 +210,6 @@ class RegionDescent(Method[R]):
             best=best,
             lowest=best,
             center=start,
-            first=self.settings.start,
             points=nothing[:0],
             values=nothing[:0, 0],
             holes=torch.zeros(0, dtype=torch.bool, device=start.device),

@@ -38,8 +38,6 @@ class RegionProgress(Progress):
     """Largest difference of the values that the last quadratic was fitted to."""
     lowest: Best
     """The best point of the round."""
-    first: Tensor
-    """Where the search began [n]."""
     phase: Literal["start", "axes", "trial", "geometry", "slope", "aside", "lines"] = "start"
     """What is asked for: the start and n points, n further ones, the end of a step, a point for the model, a slope at
     a kink, two points beside a flat end, or points along the axes."""

@@ -1,4 +1,4 @@
-"""A search that hands its turn to other searches: who asks it is answered by the one whose turn it is."""
+"""A search that forwards every question to the inner search whose turn it is."""
 
 from abc import abstractmethod
 from dataclasses import replace

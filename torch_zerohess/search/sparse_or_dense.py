@@ -33,7 +33,8 @@ _FIRST = 32
 _MOST = 0.5
 """Share of the held-out change from which on a sparse Jacobian is chosen for good: early, or in place of descent."""
 _DETERMINED = 0.7, 0.9
-"""`_MOST` where the whole batch determines a dense Jacobian: after its first part, and after all of it."""
+"""These replace `_MOST` if the first batch has more points than there are parameters, so that it determines a dense
+Jacobian: the first number after the first part of the batch, the second number after all of it."""
 _MORE = 0.1
 """Share by which one Jacobian must predict more than the other one."""
 _HELD = 1 << 25

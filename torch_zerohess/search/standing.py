@@ -59,7 +59,7 @@ class Standing(ABC, Generic[P]):
 
     @property
     def unit(self) -> Tensor:
-        """The first sigma per parameter [n]: what `sigma` and `LocalModel` are in units of."""
+        """The first sigma of every parameter [n]: the unit of `sigma` and of `LocalModel`."""
         return self._space.unit.clone()
 
     @property

@@ -25,7 +25,7 @@ _MOST = 10
 """Parameters up to which two quadratics are fitted."""
 _FADING, _LARGEST = 0.8, 2.0
 """The evidence is a sum over evaluations of log(error of one quadratic / error of two). Each term is at most the second
-number in magnitude. A term counts the first number times as much as the next one."""
+number in magnitude. Each new term multiplies the sum so far by the first number."""
 _ENOUGH = 2.0
 """Evidence from which steps follow two quadratics."""
 _ROUNDING, _SMALLEST = 1e-14, 1e-300

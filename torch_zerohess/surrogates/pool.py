@@ -42,6 +42,11 @@ class Pool:
         none = torch.empty(0, dtype=torch.float64, device=device)
         return cls(none.reshape(0, n), none, None, none.reshape(0, n), none, none.long())
 
+    @classmethod
+    def of(cls, points: Tensor, values: Tensor, outputs: Tensor | None, center: Tensor) -> "Pool":
+        """Return a pool of evaluations [P, n], [P] and [P, m] of another search, as if drawn from N(center, 1)."""
+        return cls.empty(len(center), center.device).add(points, values, outputs, center, 1.0)
+
     def __len__(self) -> int:
         return len(self.values)
 
@@ -80,6 +85,10 @@ class Pool:
         """Whether x [n] lies on a plateau, by evaluations farther away than this, root mean square."""
         return is_plateau((self.points - x).square().mean(1).sqrt(), self.values, value, beyond=distance)
 
+    def reach(self, x: Tensor) -> float:
+        """Return the distance from x [n] to the (n + 1)-th nearest evaluation."""
+        return float((self.points - x).norm(dim=1).sort().values[len(x)])
+
     def weights(self, x: Tensor, sigma: float) -> Tensor:
         """Weights [P] for a fit around x [n], at most 7.4; 1 for an evaluation at x itself."""
         if not len(self):
@@ -92,6 +101,10 @@ class Pool:
         each = share.log() - 0.5 * (distance / self.sigmas).square() - n * self.sigmas.log()
         ratio = (target - torch.logsumexp(each, 1)) * min(1.0, _FLAT / n)
         return torch.where(here == 0, 1.0, ratio.exp().clamp(max=_CAP))
+
+    def normal_weights(self, x: Tensor, sigma: float) -> Tensor:
+        """Return exp(-|z - x|^2 / 2 sigma^2) for every evaluation z [P]; x [n]."""
+        return torch.exp(-0.5 * ((self.points - x) / sigma).square().sum(1))
 
     def _those(self, which: Tensor) -> "Pool":
         outputs = None if self.outputs is None else self.outputs[which]

@@ -8,10 +8,10 @@ import torch
 from searches import TARGET, bowl, plateau, rays, rays_loss, rosenbrock, run, zeros
 
 from torch_zerohess.optim import Descent, TrustRegion
-from torch_zerohess.search import descent
+from torch_zerohess.search import pool_quadratic
 from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.state import Evaluated
+from torch_zerohess.search.state import Best, Evaluated
 from truths import vector
 
 # Functions with known minima.
@@ -326,6 +326,15 @@ def test_a_further_round_begins_at_another_point():
     assert float(boxed.max()) > 5.5
 
 
+def test_a_search_that_has_taken_over_begins_further_rounds_around_the_start_of_the_caller():
+    """Far away from where it has taken over: six standard deviations, of a false-alarm rate of 4e-9."""
+    unbounded = torch.full((2,), math.inf, dtype=torch.float64)
+    method = LocalQuadratics(Settings(zeros(2), -unbounded, unbounded, None, 10, 1e-2, 0.0, None))
+    taken_over = method.begun(Best(vector(100.0, 100.0)))
+    further = method.arrive(taken_over, "it ends", torch.Generator().manual_seed(0))
+    assert float(further.center.abs().max()) < 6 * 2.0
+
+
 @pytest.mark.parametrize("factor", [1.0, 3.0, 100.0])
 def test_the_model_at_the_best_point_is_as_wide_as_evaluations_are_near(factor):
     """Wider by a power of 3/2, up to the seventh; there is none if all evaluations are farther away."""
@@ -374,8 +383,8 @@ def test_an_output_is_followed_from_three_parameters_on(n, follows, monkeypatch)
     """Of up to two parameters the quadratic is of the loss."""
     fitted = []
     for name in ("fit_values", "fit_outputs"):
-        fit = getattr(descent, name)
-        monkeypatch.setattr(descent, name, lambda *told, name=name, fit=fit: fitted.append(name) or fit(*told))
+        fit = getattr(pool_quadratic, name)
+        monkeypatch.setattr(pool_quadratic, name, lambda *told, name=name, fit=fit: fitted.append(name) or fit(*told))
     search = Descent(zeros(n), sigma=1.0, loss=torch.sum, noise=0.1, seed=0)  # in noise it only follows
     search.tell(search.ask().square())
     assert set(fitted) == {"fit_outputs" if follows else "fit_values"}

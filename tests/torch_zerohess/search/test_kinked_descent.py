@@ -8,7 +8,7 @@ from torch import Tensor
 
 import torch_zerohess as zh
 from torch_zerohess.search.descent_search import Descent
-from torch_zerohess.search.kinked_descent import KinkedQuadratics
+from torch_zerohess.search.loss_descent import LossQuadratics
 from torch_zerohess.search.state import Evaluated
 
 
@@ -116,14 +116,14 @@ def test_differences_across_a_kink_tell_no_slope() -> None:
     while search._state.progress.slopes is None:
         search.tell(penalised(search.ask()))
     method, known = search._method, search._state.progress
-    assert isinstance(method, KinkedQuadratics)
+    assert isinstance(method, LossQuadratics)
     along = torch.tensor([2e-4, -3e-4, 0.0]).double()
     for inside, straddled in ((-1e-5, False), (1e-5, False), (6e-7, True)):  # the corners are 1e-6 apart
         corner = known.lowest.point + along - inside * normal
         points = torch.cat([corner[None], corner + 1e-6 * torch.eye(3).double()])
         losses = penalised(points)
         slope = (losses[1:] - losses[0]) / 1e-6
-        assert method._is_straddled(known, Evaluated(points, losses), slope) == straddled
+        assert method._kinks._is_straddled(known, Evaluated(points, losses), slope) == straddled
 
 
 def test_zero_is_small_beside_the_shortest_slope() -> None:
@@ -132,11 +132,11 @@ def test_zero_is_small_beside_the_shortest_slope() -> None:
     search = Descent(torch.full((2,), 0.9).double(), sigma=0.5, seed=18, restarts=0)
     search.tell(f(search.ask()))
     method, known = search._method, search._state.progress
-    assert isinstance(method, KinkedQuadratics)
+    assert isinstance(method, LossQuadratics)
     for gentle, falls in ((0.5, True), (1e-4, False)):
         slopes = torch.tensor([[1e4, gentle], [-1.0, gentle]]).double()
-        after, _ = method._measuring(replace(known, slopes=slopes, reason="arrived"), torch.Generator())
-        assert (after.phase == "slope") == falls
+        verdict, *_ = method._kinks.measuring(known, slopes, torch.Generator())
+        assert verdict == ("open" if falls else "end")
 
 
 def test_a_penalty_may_have_its_minimum_at_the_kink() -> None:

@@ -30,7 +30,7 @@ def step(*, length=0.6, promised=1.0, rank=4, significance=1.0, **known):
         significance,
     )
     settings = {"value": 10.0, "lowest": Best(BEST, 10.0), "model": model, "step": s, "phase": "trial", **known}
-    return DescentProgress(best=Best(BEST, 10.0), center=zeros(4), first=zeros(4), pool=Pool.empty(4), **settings)
+    return DescentProgress(best=Best(BEST, 10.0), center=zeros(4), pool=Pool.empty(4), **settings)
 
 
 @pytest.mark.parametrize(

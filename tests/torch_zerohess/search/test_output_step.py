@@ -28,7 +28,7 @@ def step(*, length=0.4, rank=N, smoothed=1.0, **known):
     hessian, errors = torch.zeros(rank, rank, dtype=torch.float64), (zeros(rank), zeros(rank))
     model = LocalModel(smoothed, zeros(rank), hessian, basis, *errors, intercept=zeros(2), jacobian=jacobian)
     settings = {"value": 10.0, "lowest": Best(BEST, 10.0), "model": model, "step": s, "phase": "trial", **known}
-    return DescentProgress(best=Best(BEST, 10.0), center=zeros(N), first=zeros(N), pool=Pool.empty(N), **settings)
+    return DescentProgress(best=Best(BEST, 10.0), center=zeros(N), pool=Pool.empty(N), **settings)
 
 
 def after(known, *, misfit, loss):

@@ -11,7 +11,6 @@ from torch_zerohess.search.descent_search import Descent
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.search.two_sided_descent import TwoSidedQuadratics, _in_use
-from torch_zerohess.surrogates.pool import Pool
 
 
 def half_space(z: Tensor, weight: float) -> Tensor:
@@ -115,7 +114,7 @@ def test_evidence() -> None:
     assert after(one) == pytest.approx(0.8 - 2.0)
     assert after(two + (one - two) / (1 + 2.71828)) == pytest.approx(0.8 + 1.0, abs=1e-4)
     assert after(two, phase="slope") == after(float("nan")) == after(two, sides=None) == 1.0
-    wide = method._wide.go_on(Pool.empty(2, x.device), known.lowest, 1.0)
+    wide = method._wide.go_on(x[None][:0], x[:0], known.lowest, 1.0)
     assert after(two, wide=wide) == 1.0
 
 

@@ -1,4 +1,4 @@
-"""Descent on quadratics that does not take a kink for a minimum.
+"""A check of the end of a round: no kink is taken for a minimum.
 
 Near a kink the quadratics of a loss predict nothing, and their region shrinks wherever it is. So where the loss rises
 as steeply beside the best point as farther away, slopes are measured at random points around it, and their convex hull
@@ -11,12 +11,13 @@ whether the best point is a minimum.
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.hull import shortest
-from torch_zerohess.search.inflection_descent import InflectionQuadratics
+from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Evaluated
@@ -41,7 +42,6 @@ _AROUND, _CLOSE = 1e-2, 1e-2
 """Distance over the tolerance of the points whose slopes are measured; that of the differences, over this distance."""
 _MOST = 6
 """Slopes that are measured, over n + 1, at most."""
-_UNKNOWN = "the slopes around a kink do not tell whether it is a minimum"
 _ZERO = 1e-3
 """Length of a vector in the hull that counts as zero, over the length of the shortest slope."""
 _LENGTHS = (0.3, 1.0, 3.0, 10.0, 100.0, 1e3, 1e4)
@@ -49,59 +49,45 @@ _LENGTHS = (0.3, 1.0, 3.0, 10.0, 100.0, 1e3, 1e4)
 measured."""
 _ROOM = 3.0
 """No slopes are measured if a bound is nearer than this, over the same distance."""
-_WIDER = 2.0
-"""Sigma with which the search goes on, over the length of the step that has found a lower point."""
+
+Verdict = Literal["open", "end", "unknown"]
+"""Whether more points are asked for around a kink; the slopes there tell no descent; or they tell nothing."""
 
 
-class KinkedQuadratics(InflectionQuadratics):
-    """Descent on quadratics that looks at kinks before it ends at them."""
+class KinkCheck:
+    """Whether the end of a round is a kink, and whether the loss falls from there.
+
+    Its questions are answered by the evaluations of the round, and by slopes around its end (`MetricProgress.slopes`).
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._beside = _BESIDE * settings.tolerance
 
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
-    ) -> tuple[MetricProgress, Tensor]:
-        if known.slopes is None:
-            return super().next(known, evaluated, generator)
-        before, sampled, n = known.lowest, known.slopes, self._n
-        after = known.remembered(evaluated, self._capacity)
-        if after.lowest.loss < before.loss:
-            step = float((after.lowest.point - before.point).norm())
-            root = torch.eye(n, dtype=known.root.dtype, device=known.root.device)
-            after = replace(after, slopes=None, phase="geometry", root=root, sigma=_WIDER * step, rejected=0, tied=0)
-            return self.plan(after, generator)
-        known = replace(known, evaluations=after.evaluations)
+    ) -> tuple[Verdict, MetricProgress, Tensor]:
+        """Judge by one more slope, of an evaluation that found nothing lower. Return the next points [K, n], too."""
+        n, slopes, nothing = self._settings.n, known.slopes, evaluated.points[:0]
+        assert slopes is not None
         simplex = evaluated.needed.those(slice(-n - 1, None))
-        complete = len(evaluated.needed) == n + 1 + (len(_LENGTHS) if len(sampled) >= n else 0)
+        complete = len(evaluated.needed) == n + 1 + (len(_LENGTHS) if len(slopes) >= n else 0)
         if not bool(evaluated.finite.all()):  # it is a border
-            return self._arrived(known, known.reason, generator)
+            return "end", known, nothing
         if not complete:
-            return self._ended(replace(known, slopes=None), None, _UNKNOWN, generator)
+            return "unknown", known, nothing
         rises = simplex.losses[1:] - simplex.losses[0]
         slope = rises / (simplex.points[1:] - simplex.points[0]).diagonal()
-        if not len(sampled):
+        if not len(slopes):
             if not self._is_straight(known, simplex):
-                return self._arrived(known, known.reason, generator)
+                return "end", known, nothing
         elif self._is_straddled(known, simplex, slope):
-            slope = sampled[-1]  # nothing new
-        return self._measuring(replace(known, slopes=torch.cat([sampled, slope[None]])), generator)
+            slope = slopes[-1]  # nothing new
+        return self.measuring(known, torch.cat([slopes, slope[None]]), generator)
 
-    def more(self, known: MetricProgress, points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        return points[:0] if known.slopes is not None else super().more(known, points, count, generator)
-
-    @property
-    def _beside(self) -> float:
-        return _BESIDE * self.settings.tolerance
-
-    def _arrived(
-        self, known: MetricProgress, reason: str, generator: torch.Generator, *, last: bool = False
-    ) -> tuple[MetricProgress, Tensor]:
-        if known.slopes is None and not known.is_lost and self._is_kink(known):
-            nothing = known.root[:0]
-            return self._measuring(replace(known, slopes=nothing, reason=reason), generator)
-        return super()._arrived(replace(known, slopes=None), reason, generator, last=last)
-
-    def _is_kink(self, known: MetricProgress) -> bool:
+    def is_kink(self, known: MetricProgress) -> bool:
         """Whether the loss rises as steeply next to the best point as farther away, and no bound is near."""
-        x, settings = known.lowest.point, self.settings
+        x, settings = known.lowest.point, self._settings
         room = float(torch.minimum(x - settings.lower, settings.upper - x).min())
         if known.lowest.loss > known.best.loss or room <= _ROOM * _AROUND * settings.tolerance:
             return False
@@ -112,7 +98,7 @@ class KinkedQuadratics(InflectionQuadratics):
 
     def _beside_and_apart(self, known: MetricProgress) -> tuple[Tensor, Tensor]:
         """Return how steeply the loss rises to evaluations beside the best point, and to those apart from it."""
-        tolerance = self.settings.tolerance
+        tolerance = self._settings.tolerance
         ranges = ((a * tolerance, b * tolerance) for a, b in _APART)
         apart = next(filter(len, (_rises(known, *one)[1] for one in ranges)), known.values[:0])
         return _rises(known, 0.0, self._beside)[1], apart
@@ -139,17 +125,18 @@ class KinkedQuadratics(InflectionQuadratics):
             return True
         return steepest / _BENT < steepness < _BENT * steepest
 
-    def _measuring(self, known: MetricProgress, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
-        """Ask for steps against the shortest vector of the hull, and for a further slope; end where it is zero."""
-        x, slopes, n, distance = known.lowest.point, known.slopes, self._n, _AROUND * self.settings.tolerance
-        assert slopes is not None
+    def measuring(
+        self, known: MetricProgress, slopes: Tensor, generator: torch.Generator
+    ) -> tuple[Verdict, MetricProgress, Tensor]:
+        """Ask for a further slope and, from n slopes [m, n] on, for steps against the shortest vector of their hull."""
+        x, n, distance = known.lowest.point, self._settings.n, _AROUND * self._settings.tolerance
         steps = x[None][:0]
         if len(slopes) >= n:
             least = shortest(slopes)
             if float(least.norm()) <= _ZERO * float(slopes.norm(dim=1).min()):
-                return self._arrived(known, known.reason, generator)
+                return "end", known, steps
             if len(slopes) >= _MOST * (n + 1):
-                return self._ended(replace(known, slopes=None), None, _UNKNOWN, generator)
+                return "unknown", known, steps
             lengths = torch.tensor(_LENGTHS, dtype=x.dtype, device=x.device)[:, None]
             steps = x - distance * lengths * torch.nn.functional.normalize(least, dim=0)
         towards = normal(generator, x, n) / math.sqrt(n)
@@ -158,7 +145,8 @@ class KinkedQuadratics(InflectionQuadratics):
             towards = torch.nn.functional.normalize(points[int(steepness.argmax())] - x, dim=0)
         corner = x + distance * towards
         sides = corner + _CLOSE * distance * torch.eye(n, dtype=x.dtype, device=x.device)
-        return replace(known, phase="slope"), self.settings.inside(torch.cat([steps, corner[None], sides]))
+        points = self._settings.inside(torch.cat([steps, corner[None], sides]))
+        return "open", replace(known, phase="slope", slopes=slopes), points
 
 
 def _rises(known: MetricProgress, nearest: float, farthest: float) -> tuple[Tensor, Tensor]:

@@ -429,7 +429,7 @@ def test_a_search_says_where_it_is() -> None:
     for kind, engine in ((TrustRegion, "descent"), (Descent, "descent"), (GaussianProcessSearch, "gaussian_process")):
         box = (-5.0, 5.0) if kind is GaussianProcessSearch else None
         search = kind(vector(1.0, 2.0), sigma=1.0, bounds=box, seed=0, restarts=0)
-        start = f"{kind.__name__}(engine='{engine}', n=2, evaluations=0, start=[1, 2], sigma=1)"
+        start = f"{kind.__name__}(engine='{engine}', n=2, evaluations=0, start=[1, 2], sigma / its start = 1)"
         assert repr(search) == start
         search.tell((search.ask() ** 2).sum(1))
         assert f"evaluations={search.evaluations}, value={search.value:.6g}, x=[" in repr(search)

@@ -5,14 +5,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.levenberg_marquardt import levenberg_steps
+from torch_zerohess.linalg.subproblem import diagonal_steps
 
 _INVARIANT = 1e-10
 """Length of a new direction, relative to the largest curvature, from which on the space is complete."""
-_SHIFTS = (1e-10, 1e8)
-"""Range of the shift that shortens a step, in units of the largest curvature."""
-_BISECTIONS = 60
-"""Halvings of the logarithm of that range: a shift is then known to 16 digits."""
+_SINGULAR = 1e-12
+"""Curvature, relative to the largest one, that may as well be zero: eigenvalues of the products have such errors."""
 
 
 def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: Tensor, *, iterations: int) -> Tensor:
@@ -46,9 +44,7 @@ def krylov_steps(product: Callable[[Tensor], Tensor], gradient: Tensor, radii: T
         torch.diag(gradient.new_tensor(diagonal)) + torch.diag(off, 1) + torch.diag(off, -1)
     )
     curvature, slope = values.clamp_min(0.0), length * vectors[0]
-    size = float(curvature.max()) or length
-    low, high = _SHIFTS
-    return levenberg_steps(slope, curvature, radii, (low * size, high * size), _BISECTIONS) @ vectors.mT @ known
+    return diagonal_steps(slope, curvature, radii, _SINGULAR) @ vectors.mT @ known
 
 
 def are_free(s: Tensor, slope: Tensor, lower: Tensor, upper: Tensor) -> Tensor:

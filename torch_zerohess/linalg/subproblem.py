@@ -1,4 +1,4 @@
-"""Minimum of a quadratic in a ball and a box: the step of a trust region."""
+"""Minimum of a quadratic in a ball and a box: the step of a trust region. Steps of several lengths."""
 
 import math
 
@@ -17,6 +17,8 @@ _SMALLEST = 1e-300
 """Least number that is divided by."""
 _LONGEST, _HALVINGS = 8, 24
 """Lengths tried along the gradient where bounds are hit: radius times 2^8 and less."""
+_ROUNDED = 1e-10
+"""`SINGULAR` for eigenvalues in float32: their errors are below a thousand times this share of the largest one."""
 
 
 def ball_step(gradient: Tensor, hessian: Tensor, radius: float, singular: float = SINGULAR) -> Tensor:
@@ -26,6 +28,22 @@ def ball_step(gradient: Tensor, hessian: Tensor, radius: float, singular: float 
     """
     curvature, vectors = torch.linalg.eigh(hessian)
     return vectors @ diagonal_step(vectors.mT @ gradient, curvature, radius, singular)
+
+
+def damped_steps(gradient: Tensor, hessian: Tensor, radii: Tensor) -> Tensor:
+    """Return steps s [k, n] that minimise gradient.s + s.hessian s/2 within each of the radii [k], all float64.
+
+    Negative curvature counts as none. Eigenvectors are in float32, as a Jacobian in float32 is not more exact.
+    """
+    size = float(hessian.abs().max()) or 1.0
+    values, basis = torch.linalg.eigh((hessian / size).float())
+    curvature, vectors = size * values.double().clamp_min(0.0), basis.double()
+    return diagonal_steps(vectors.mT @ gradient, curvature, radii, _ROUNDED) @ vectors.mT
+
+
+def diagonal_steps(a: Tensor, curvature: Tensor, radii: Tensor, singular: float) -> Tensor:
+    """Return steps [k, r] of `diagonal_step` for each of the radii [k]."""
+    return torch.stack([diagonal_step(a, curvature, radius, singular) for radius in radii.tolist()])
 
 
 def diagonal_step(a: Tensor, curvature: Tensor, radius: float, singular: float = SINGULAR) -> Tensor:

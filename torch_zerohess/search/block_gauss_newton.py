@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.krylov import are_free
-from torch_zerohess.linalg.levenberg_marquardt import damped_steps
+from torch_zerohess.linalg.subproblem import damped_steps
 from torch_zerohess.search.gauss_newton import LENGTHS, GaussNewton, JacobianProgress
 from torch_zerohess.search.local_progress import check_range
 from torch_zerohess.search.local_steps import LITTLE, LocalSteps, checked_steps, linear_outputs

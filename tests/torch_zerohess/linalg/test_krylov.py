@@ -37,6 +37,20 @@ def test_few_products_are_enough_where_eigenvalues_are_few():
     torch.testing.assert_close(steps[1], -torch.linalg.solve(H, g), rtol=1e-6, atol=1e-9)
 
 
+def test_a_weak_curvature_counts():
+    values, g = torch.tensor([1.0, 1e-6]).double(), torch.tensor([1.0, 1e-5]).double()
+    (s,) = krylov_steps(lambda v: values * v, g, g.new_tensor([100.0]), iterations=2)
+    torch.testing.assert_close(s, -g / values)
+
+
+@pytest.mark.parametrize("bent", [1.0, 1e-6, 1e-9, 0.0])
+def test_no_step_is_longer_than_its_radius(bent):
+    """Also where the curvature is too weak to shorten it."""
+    g, radii = torch.tensor([1.0, -1.4]).double(), torch.tensor([1e-3, 0.1]).double()
+    steps = krylov_steps(lambda v: bent * v, g, radii, iterations=2)
+    torch.testing.assert_close(steps, -radii[:, None] * g / g.norm())
+
+
 def test_no_gradient_and_negative_curvature():
     assert not bool(krylov_steps(lambda v: v, torch.zeros(3).double(), torch.ones(2).double(), iterations=3).any())
     g = torch.tensor([1.0, 1.0]).double()

@@ -1,9 +1,9 @@
-"""Levenberg-Marquardt steps: conditions of optimality, and least squares at any radius."""
+"""Steps of several lengths on one Hessian: conditions of optimality, and least squares at any radius."""
 
 import pytest
 import torch
 
-from torch_zerohess.linalg.levenberg_marquardt import damped_steps
+from torch_zerohess.linalg.subproblem import damped_steps
 from truths import normal, vector
 
 
@@ -27,6 +27,15 @@ def test_a_step_is_short_enough_whatever_the_scales():
     short, long = damped_steps(a @ r, a @ a.mT, vector(1e-6, 1e6) * newton)
     torch.testing.assert_close(short.norm(), 1e-6 * newton, rtol=1e-3, atol=0)
     torch.testing.assert_close(long.norm(), newton, rtol=1e-3, atol=0)
+
+
+def test_a_weak_curvature_counts_and_rounding_does_not():
+    """Eigenvalues are in float32."""
+    gradient = vector(1.0, 1e-3)
+    (step,) = damped_steps(gradient, torch.diag(vector(1.0, 1e-4)), vector(100.0))
+    torch.testing.assert_close(step, vector(-1.0, -10.0), rtol=1e-3, atol=1e-3)
+    (step,) = damped_steps(vector(1.0, 1e-9), torch.diag(vector(1.0, 1e-12)), vector(100.0))
+    assert abs(float(step[1])) < 1.0
 
 
 def test_negative_curvature_counts_as_none():

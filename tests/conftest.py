@@ -1,0 +1,30 @@
+"""What every run of the tests does, and what several folders share."""
+
+import gc
+
+import pytest
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """Leave what thousands of tests are made of out of garbage collections, which take up to a second with it."""
+    gc.freeze()
+
+
+def pytest_unconfigure() -> None:
+    gc.unfreeze()
+
+
+@pytest.fixture
+def quick_inductor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It compiles here, and not in processes that import torch first, and no headers ahead of a few small kernels."""
+    from torch._inductor import config
+
+    monkeypatch.setattr(config, "compile_threads", 1)
+    monkeypatch.setattr(config, "cpp_cache_precompile_headers", False)
+
+
+@pytest.fixture
+def short_climbs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The surrogate of a memory takes a fifth of the steps to its lengths, which are most of the time of a fit."""
+    monkeypatch.setattr("torch_zerohess.surrogates.lengths._ITERATIONS", 4)

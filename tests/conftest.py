@@ -1,6 +1,7 @@
 """What every run of the tests does, and what several folders share."""
 
 import gc
+from collections.abc import Iterator
 
 import pytest
 
@@ -16,12 +17,12 @@ def pytest_unconfigure() -> None:
 
 
 @pytest.fixture
-def quick_inductor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It compiles here, and not in processes that import torch first, and no headers ahead of a few small kernels."""
+def quick_inductor() -> Iterator[None]:
+    """It compiles here, not in processes that import torch first, and tries no programs for every instruction set."""
     from torch._inductor import config
 
-    monkeypatch.setattr(config, "compile_threads", 1)
-    monkeypatch.setattr(config, "cpp_cache_precompile_headers", False)
+    with config.patch({"compile_threads": 1, "cpp.vec_isa_ok": True}):
+        yield
 
 
 @pytest.fixture

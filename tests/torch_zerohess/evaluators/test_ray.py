@@ -111,7 +111,7 @@ sys.meta_path.insert(0, Missing())
 
 @pytest.mark.filterwarnings("ignore")
 def test_actors_that_cannot_start_are_an_error(actors, tmp_path):
-    with Ray(1, retries=0, **without_package(tmp_path, 1)) as missing:
+    with Ray(1, retries=1, **without_package(tmp_path, 2)) as missing:
         with pytest.raises(RuntimeError, match=r"^no actor of Ray can start: .*the wheel is missing$"):
             missing(black_boxes.waves, Z)
         assert torch.equal(missing(black_boxes.waves, Z), black_boxes.waves(Z))  # it was installed meanwhile

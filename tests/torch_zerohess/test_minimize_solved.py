@@ -244,7 +244,7 @@ def test_a_better_point_of_a_round_that_goes_on_is_no_arrival(beyond, engine):
         return torch.where(z.sum(1) < 1.0, beyond, (z.square().sum(1) - 0.5) / 5.625)
 
     settings = {"sigma": 1.0, "bounds": (-4.0, 4.0), "engine": engine, "max_evaluations": 200, "target": 1e-3}
-    for seed in range(3):
+    for seed in range(2):
         found = zh.minimize(cut, torch.tensor([1.75, 1.75]).double(), seed=seed, **settings)
         assert not found.success or found.value <= 1e-3
 
@@ -291,7 +291,7 @@ def test_minus_infinity_beside_x_is_no_minimum(bounds, most):
 @pytest.mark.parametrize("bounds", [None, (-2.0, 2.0)])
 def test_a_cusp_is_no_evidence_of_a_minimum(bounds):
     """Parameters that sit in a cusp shrink the region for all others, which are not at their minimum."""
-    for seed in range(3):
+    for seed in range(2):
         start = 2.0 * torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1.0
         settings = {"sigma": 0.5, "bounds": bounds, "restarts": 0, "seed": seed}
         fit = zh.minimize(lambda z: (z - 0.3).abs().sqrt().sum(1), start, **settings)
@@ -307,7 +307,7 @@ def test_penalties_do_not_make_two_minima_the_same():
         inside = 20.0 + (z.square() - 10.0 * (2 * math.pi * z).cos()).sum(1)
         return torch.where(z.abs().amax(1) < 1.6, inside, 1e12)
 
-    for seed in range(6):
+    for seed in range(3):
         fit = zh.minimize(rastrigin, [0.9, 0.9], sigma=1.0, bounds=(-8, 8), seed=seed, max_evaluations=200)
         assert "not unique" not in fit.message
 
@@ -355,5 +355,5 @@ def test_every_engine_says_that_a_minimum_may_not_be_unique(loss):
 
     box = {"bounds": ([0.1] * 3, [8, 8, 3]), "restarts": 0}
     maybe = "along some direction the loss hardly changes: the minimum may not be unique"
-    assert sum(said(seed, **box).endswith(maybe) for seed in range(6)) >= 4  # the others have evaluated too little
+    assert sum(said(seed, **box).endswith(maybe) for seed in range(3)) >= 2  # the others have evaluated too little
     assert said(0).endswith("the minimum is not unique")

@@ -18,6 +18,7 @@ def f(z: torch.Tensor) -> torch.Tensor:
     return (z**3).sin().sum(1)
 
 
+@pytest.mark.usefixtures("quick_inductor")
 def test_compiled_code_does_not_write_into_the_settings():
     layer = zh.BlackBox(f, S.replace(sigma=vector(0.1, 0.2)))
     x = torch.ones(1, 2, dtype=torch.float64, requires_grad=True)

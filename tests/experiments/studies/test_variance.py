@@ -24,6 +24,8 @@ from experiments.studies.estimator_problems import looked_up, made_problem, quad
 from experiments.studies.estimators import ESTIMATORS, OURS, PAPER
 from experiments.studies.variance import VarianceReport, variance
 
+pytestmark = pytest.mark.usefixtures("short_climbs")
+
 SOBOL = "aggregate + center, sobol"
 
 

@@ -57,6 +57,7 @@ def test_compiled_layer_stores_perturbations_whatever_their_size(monkeypatch: py
     close(x.grad, estimate(SCALAR.f, BATCH, AGGREGATE).gradient)
 
 
+@pytest.mark.usefixtures("quick_inductor")
 @pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
 def test_compiled_inside_a_network(backend: str) -> None:
     model, inputs = network(BlackBox(IMAGE.f, AGGREGATE))
@@ -68,6 +69,7 @@ def test_compiled_inside_a_network(backend: str) -> None:
         close(p.grad, gradient)
 
 
+@pytest.mark.usefixtures("quick_inductor")
 @pytest.mark.parametrize(("value", "backend"), [("center", "aot_eager"), ("smoothed", "inductor")])
 def test_a_compiled_layer_refuses_a_trainable_head_where_gradients_are_wanted(value: str, backend: str) -> None:
     """Compiled code runs its graph without autograd, whatever the caller wants."""
@@ -124,6 +126,7 @@ def test_the_call_that_compiles_runs_the_function_as_every_call_does(fn, seen: b
         close(compiled(BATCH.clone()), expected.detach())
 
 
+@pytest.mark.usefixtures("quick_inductor")
 def test_outputs_of_any_strides_in_compiled_code() -> None:
     """Compiled code reads the outputs by the strides of the fake kernel."""
     layer = BlackBox(lambda z: torch.stack([z[:, 0], z.sum(1), z.prod(1)]).T, AGGREGATE)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 import torch_zerohess as zh
 
 pytestmark = [
-    pytest.mark.usefixtures("fresh_compiler"),
+    pytest.mark.usefixtures("fresh_compiler", "quick_inductor"),
     pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf"),  # dynamo looks at it
 ]
 

@@ -18,6 +18,8 @@ import torch_zerohess as zh
 from torch_zerohess.estimation.surrogate_mean import per_element
 from truths import deviation
 
+pytestmark = pytest.mark.usefixtures("short_climbs")
+
 SIGMA, REFERENCE = 0.3, 0.5
 GRID = torch.linspace(-3.0, 4.0, 14001, dtype=torch.float64)
 
@@ -139,8 +141,8 @@ def test_estimates_are_unbiased(name: str) -> None:
         one = zh.estimate(identity, x, smoothing, r, head=head(name), memory=memory, value="smoothed")
         found.append([one.value, one.gradient, one.hvp(v), one.hessian()])
         torch.testing.assert_close(one.hvp(v), (one.hessian() @ v[..., None])[..., 0])
-        torch.testing.assert_close(one.hessian_diagonal(), one.hessian().diagonal(dim1=1, dim2=2))
-        assert bool(one.standard_error("hessian").isfinite().all())
+    torch.testing.assert_close(one.hessian_diagonal(), one.hessian().diagonal(dim1=1, dim2=2))
+    assert bool(one.standard_error("hessian").isfinite().all())
     close(found, [*exact, hessian])
 
 
@@ -281,7 +283,7 @@ class Once(Square):
         return result
 
 
-@pytest.mark.parametrize("n", [2, 20])
+@pytest.mark.parametrize("n", [2, 10])
 @pytest.mark.parametrize("function", [Square, Once])
 @pytest.mark.parametrize("door", ["head", "surrogate", "both"])
 def test_operations_without_a_forward_mode(door: str, function: Any, n: int) -> None:
@@ -296,7 +298,7 @@ def test_operations_without_a_forward_mode(door: str, function: Any, n: int) -> 
         box((x + SIGMA * torch.randn_like(x)).requires_grad_(), r)
     exact = derivatives(lambda y: truth("square", identity, y), x, v)
     close([derivatives(lambda y: box(y, r), x, v) for _ in range(20)], exact)
-    if n == 20:
+    if n == 10:
         assert memory.pathwise == (2 if function is Square else 1)
     one = zh.estimate(identity, x, smoothing, r, head=lambda y, r: loss(y - r).mean(1), memory=memory)
     assert bool(one.hessian().isfinite().all())

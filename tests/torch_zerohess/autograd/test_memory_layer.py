@@ -14,6 +14,8 @@ from torch import Tensor, nn
 
 import torch_zerohess as zh
 
+pytestmark = pytest.mark.usefixtures("short_climbs")
+
 SIGMA = 0.5
 FREQUENCIES = torch.tensor([[1.0, 0.4], [-0.3, 1.2], [0.7, 0.9]], dtype=torch.float64)  # [m, n]
 

@@ -253,6 +253,7 @@ def test_a_linearized_layer_is_one_linear_function(
         assert len(calls) == before
 
 
+@pytest.mark.usefixtures("short_climbs")
 @pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node")
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("fresh", [None, 2])

@@ -16,6 +16,8 @@ from torch_zerohess.estimation.control import _negligible
 from torch_zerohess.heads import LocalEntropy, SquaredError
 from truths import deviation, vector
 
+pytestmark = pytest.mark.usefixtures("short_climbs")
+
 K, X, R, V = vector(1.0, 0.5), vector(0.3, -0.4), vector(0.8, -0.5), vector(0.7, -1.1)
 SIGMA = 0.6
 SMOOTHING = Smoothing(sigma=SIGMA, samples=8, seed=0)

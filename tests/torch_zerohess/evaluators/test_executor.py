@@ -33,17 +33,23 @@ def loky():
     return loky.ProcessPoolExecutor(1)
 
 
+@pytest.fixture(scope="module")
+def processes():
+    """One process of each kind for several tests: each takes seconds to start."""
+    with standard() as one, loky() as other:
+        yield {standard: one, loky: other}
+
+
 @pytest.mark.parametrize("make", [standard, loky])
-def test_an_error_that_cannot_be_read_is_named_and_breaks_no_pool(make):
-    with make() as pool:
-        evaluator = Executor(pool)
-        for _ in range(2):
-            with pytest.raises(RuntimeError, match=r"^Odd: a$") as raised:
-                evaluator(black_boxes.odd, Z)
-            assert "in odd" in str(raised.value.__cause__)
-            assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
-        with pytest.raises(SystemExit, match="done"):
-            evaluator(black_boxes.leaving, Z)
+def test_an_error_that_cannot_be_read_is_named_and_breaks_no_pool(make, processes):
+    evaluator = Executor(processes[make])
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match=r"^Odd: a$") as raised:
+            evaluator(black_boxes.odd, Z)
+        assert "in odd" in str(raised.value.__cause__)
+        assert torch.equal(evaluator(black_boxes.waves, Z), black_boxes.waves(Z))
+    with pytest.raises(SystemExit, match="done"):
+        evaluator(black_boxes.leaving, Z)
 
 
 def test_a_thread_raises_the_error_itself(threads):
@@ -65,25 +71,23 @@ def test_pools_of_processes(make, tmp_path):
             evaluator(black_boxes.never, Z)
 
 
-def test_workers_have_the_default_type_of_the_caller():
+def test_workers_have_the_default_type_of_the_caller(processes):
     before = torch.get_default_dtype()
     try:
-        with standard() as pool:
-            for dtype in (torch.float64, torch.float32):
-                torch.set_default_dtype(dtype)
-                assert Executor(pool)(black_boxes.in_default_type, Z).dtype == dtype
+        for dtype in (torch.float64, torch.float32):
+            torch.set_default_dtype(dtype)
+            assert Executor(processes[standard])(black_boxes.in_default_type, Z).dtype == dtype
     finally:
         torch.set_default_dtype(before)
 
 
-def test_a_process_keeps_several_black_boxes(tmp_path):
+def test_a_process_keeps_several_black_boxes(tmp_path, processes):
     boxes = [Factory(black_boxes.Counted, tmp_path / "made") for _ in range(5)]
-    with standard() as pool:
-        evaluator = Executor(pool)
-        for k in (0, 1, 2, 0, 3, 4, 0, 2, 0):  # the fifth takes the place of the second
-            assert torch.equal(evaluator(boxes[k], Z), black_boxes.waves(Z))
-        assert len((tmp_path / "made").read_text().split()) == 5
-        evaluator(boxes[1], Z)
+    evaluator = Executor(processes[standard])
+    for k in (0, 1, 2, 0, 3, 4, 0, 2, 0):  # the fifth takes the place of the second
+        assert torch.equal(evaluator(boxes[k], Z), black_boxes.waves(Z))
+    assert len((tmp_path / "made").read_text().split()) == 5
+    evaluator(boxes[1], Z)
     assert len((tmp_path / "made").read_text().split()) == 6
 
 
@@ -164,18 +168,16 @@ def test_what_is_no_executor_is_refused():
         Executor(3)
 
 
-def test_a_function_of_a_script_has_the_global_variables_of_each_call():
+def test_a_function_of_a_script_has_the_global_variables_of_each_call(processes):
     names = {"__name__": "__main__", "factor": 1.0}
     exec("def scaled(z): return factor * z.sum(1)", names)
-    with loky() as pool:
-        evaluator = Executor(pool)
-        for names["factor"] in (1.0, 10.0):
-            assert torch.equal(evaluator(names["scaled"], Z), names["factor"] * Z.sum(1))
+    evaluator = Executor(processes[loky])
+    for names["factor"] in (1.0, 10.0):
+        assert torch.equal(evaluator(names["scaled"], Z), names["factor"] * Z.sum(1))
 
 
-def test_a_black_box_that_has_changed_is_sent_again():
-    with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-        evaluator, fn = Executor(pool), black_boxes.Scaled()
-        assert torch.equal(evaluator(fn, Z), Z.sum(1))
-        fn.factor = 10.0
-        assert torch.equal(evaluator(fn, Z), 10.0 * Z.sum(1))
+def test_a_black_box_that_has_changed_is_sent_again(processes):
+    evaluator, fn = Executor(processes[standard]), black_boxes.Scaled()
+    assert torch.equal(evaluator(fn, Z), Z.sum(1))
+    fn.factor = 10.0
+    assert torch.equal(evaluator(fn, Z), 10.0 * Z.sum(1))

@@ -19,9 +19,14 @@ def standard(method):
 
 
 def values_of(make):
-    """Values at Z in one worker."""
+    """Values at Z in one worker: the same in every call. Before, a process of one's own keeps its seeds."""
     with make() as pool:
-        return (pool if isinstance(pool, ProcessPool) else Executor(pool))(numbered, Z)
+        if not isinstance(pool, ProcessPool):
+            assert torch.equal(pool.submit(numbered, Z).result(), Z[:, 0])
+        evaluator = pool if isinstance(pool, ProcessPool) else Executor(pool)
+        values = evaluator(numbered, Z)
+        assert torch.equal(evaluator(numbered, Z), values)
+        return values
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -36,19 +41,9 @@ def test_seeds_differ_between_workers_and_from_those_here():
     assert bool((seeds >= 0).all() and (seeds < 2**31).all())
 
 
-def test_seeds_are_the_same_in_every_call_of_a_process():
-    with ProcessPool(1) as one:
-        assert torch.equal(one(numbered, Z), one(numbered, Z))
-
-
 def test_this_process_keeps_its_seeds():
     """Also after it has had workers, and in its threads."""
     with concurrent.futures.ThreadPoolExecutor(2) as threads:
         for evaluator in (Executor(threads), Inline()):
             assert torch.equal(evaluator(numbered, Z), Z[:, 0])
     assert own_seed(7, 2**31) == 7
-
-
-def test_a_process_of_ones_own_keeps_its_seeds():
-    with standard("spawn") as executor:
-        assert torch.equal(executor.submit(numbered, Z).result(), Z[:, 0])

@@ -187,7 +187,7 @@ def test_a_process_that_the_black_box_forks_does_not_answer(pool):
 
 
 def test_the_black_box_may_have_processes_of_its_own(pool):
-    z = points(2)  # one for each worker: a process takes seconds to start there
+    z = points(1)  # for one worker: a process takes seconds to start there
     assert torch.equal(pool(black_boxes.with_processes, z), z.sum(1))
 
 
@@ -196,7 +196,8 @@ def collated(evaluator, rows):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_worker_of_a_data_loader_is_told_that_it_cannot_have_workers():
+def test_a_worker_of_a_data_loader_is_told_that_it_cannot_have_workers(monkeypatch):
+    monkeypatch.setattr("torch.utils.data._utils.MP_STATUS_CHECK_INTERVAL", 0.2)  # the loader waits so long for its end
     with ProcessPool(1) as pool:
         loader = torch.utils.data.DataLoader(points(3), num_workers=1, collate_fn=functools.partial(collated, pool))
         with pytest.raises(RuntimeError, match=r"such as a worker of a DataLoader: leave evaluator=None there"):
@@ -329,13 +330,14 @@ def test_a_slow_point_is_waited_for_before_a_call_is_hopeless():
     assert batch.hopeless
 
 
-def test_a_black_box_that_always_ends_its_process_is_given_up_early(tmp_path):
-    """The search needs 4 values at first, with 3 tries each: 12 evaluations."""
+def test_a_black_box_that_always_ends_its_process_is_given_up_early(tmp_path, monkeypatch):
+    """The search needs 4 values at first, with 3 tries each: 12 evaluations. After 3 it is given up here."""
+    monkeypatch.setattr("torch_zerohess.evaluators.batch._FAILURES", 2)
     fn = black_boxes.Dying(tmp_path / "calls")
-    message = r"no value in any of 1[01] .* these 4 .*\(exit code 3\)\. To see why, .*, at \[0, 0\]\. An evaluator with"
+    message = r"no value in any of [34] .* these 4 .*\(exit code 3\)\. To see why, .*, at \[0, 0\]\. An evaluator with"
     with pytest.raises(LostEvaluationError, match=message):
         zh.minimize(fn, torch.zeros(2), sigma=0.5, workers=2, batch=4)
-    assert len(fn.file.read_text().splitlines()) <= 11  # the eleventh may be under way
+    assert len(fn.file.read_text().splitlines()) <= 4  # the fourth may be under way
 
 
 def test_the_first_error_is_raised_whichever_comes_first():
@@ -428,7 +430,7 @@ def test_kills_and_hangs_change_no_bit(tmp_path):
     with ProcessPool(2, timeout=20.0, retries=5) as pool:
         assert torch.equal(pool(fn, z), black_boxes.waves(z))
         pool.timeout = 1.0  # of one evaluation, once the workers are there
-        for name in ("kill-0", "kill-1", "hang-0"):
+        for name in ("kill-0", "hang-0"):
             (tmp_path / name).touch()
         assert torch.equal(pool(fn, z), black_boxes.waves(z))
         assert not list(tmp_path.iterdir())

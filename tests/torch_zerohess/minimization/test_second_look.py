@@ -105,7 +105,7 @@ def test_x_is_not_evaluated_again_before_there_is_a_step() -> None:
 
 def test_noise_that_is_absent_at_the_start_is_found():
     """A queue without customers has no noise. The mean of the loss is 0 at its minimum; the luckiest draw is below."""
-    for seed in range(6):
+    for seed in range(3):
         generator = torch.Generator().manual_seed(seed)
 
         def fn(z, generator=generator):

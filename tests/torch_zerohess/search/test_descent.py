@@ -221,7 +221,7 @@ def test_finite_only_at_the_start():
     assert search.value == 4.0
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_half_of_the_values_missing(seed):
     generator = torch.Generator().manual_seed(seed)
     search = Descent(zeros(2), sigma=2.0, seed=seed)
@@ -243,9 +243,9 @@ def test_rounds_that_start_where_nothing_is_finite():
 
 
 def test_a_hopeless_round_is_not_the_last_one():
-    search = Descent(zeros(2), sigma=1.0, seed=0, restarts=2)
+    search = Descent(zeros(2), sigma=1.0, seed=0, restarts=1)
     run(search, lambda z: torch.where(z[:, 0] > 1.2, math.nan, bowl(z)), 10_000)
-    assert search.rounds == 3
+    assert search.rounds == 2
 
 
 def test_a_round_whose_start_is_not_finite_goes_on_to_what_is():
@@ -287,7 +287,7 @@ def test_as_many_evaluations_are_kept_as_models_take(n, with_loss, pool, expecte
     """A quadratic of a loss is fitted to (n + 1)(n + 2)/2 + n evaluations, at most 300; a linear output to n + 1."""
     search = Descent(zeros(n), sigma=1.0, loss=torch.sum if with_loss else None, pool=pool, seed=0)
     while search.evaluations < expected + 10:
-        points = search.ask()
+        points = search.ask(64)
         noise = torch.randn(len(points), generator=torch.Generator().manual_seed(search.evaluations)).double()
         endless = (0.01 * noise + points.sum(1)) if n <= 10 else noise  # the first round does not end
         search.tell(noise[:, None] if with_loss else endless)

@@ -31,7 +31,7 @@ def kinked(seed: int, n: int, largest: bool = False):
 def test_a_kink_is_no_minimum(n, largest, seed) -> None:
     """Quadratics of such a loss shrink the region at a kink, from which the loss falls along the kink."""
     f, start = kinked(seed, n, largest)
-    fit = zh.minimize(f, [0.9] * n, sigma=0.5, restarts=0, seed=seed, max_evaluations=1000)
+    fit = zh.minimize(f, [0.9] * n, sigma=0.5, restarts=0, seed=seed, max_evaluations=400, target=0.01 * start)
     assert not fit.success or fit.value < 0.01 * start
 
 

@@ -277,9 +277,9 @@ class Largest(TorchDispatchMode):
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_no_tensor_of_a_fit_has_as_many_elements_as_the_jacobian(compiled, monkeypatch):
-    """The memory of a fit is a constant times the entries that it keeps, here 4 of 6 400 per pixel."""
+    """The memory of a fit is a constant times the entries that it keeps, here 4 of 4 096 per pixel."""
     monkeypatch.setattr(extension, "available", compiled and extension.available)
-    side, settings = 80, SparseSettings(4, grid=(80, 80, 1))
+    side, settings = 64, SparseSettings(4, grid=(64, 64, 1))
     u = normal(32, side**2).float()
     with Largest() as largest:
         J = fit_sparse(u, u, torch.Size([side, side]), settings)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.krylov import are_free, krylov_steps
+from torch_zerohess.linalg.bounded_krylov import bounded_krylov_step
 
 _OFFSETS = 8
 """Points of a mean."""
@@ -108,13 +108,12 @@ def _newton(
 ) -> Tensor:
     """Return the step from s [n] to the minimum of a quadratic within ball and box; held parameters stay."""
     slope = outputs.rmatvec(now.slope)
-    free = are_free(s, slope, lower, upper)
 
     def product(v: Tensor) -> Tensor:
-        return free * outputs.rmatvec(curvature * outputs.matvec(free * v))
+        return outputs.rmatvec(curvature * outputs.matvec(v))
 
-    end = krylov_steps(product, free * slope - product(s), slope.new_tensor([radius]), iterations=_PRODUCTS)[0]
-    return free * (end.clamp(lower, upper) - s)
+    end = bounded_krylov_step(product, slope - product(s), radius, lower, upper, s, iterations=_PRODUCTS)
+    return end - s
 
 
 def _descended(

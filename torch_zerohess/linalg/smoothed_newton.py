@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_zerohess.linalg.bounded_krylov import bounded_krylov_step
+from torch_zerohess.linalg.krylov import are_free, krylov_steps
 
 _OFFSETS = 8
 """Points of a mean."""
@@ -108,12 +108,13 @@ def _newton(
 ) -> Tensor:
     """Return the step from s [n] to the minimum of a quadratic within ball and box; held parameters stay."""
     slope = outputs.rmatvec(now.slope)
+    free = are_free(s, slope, lower, upper)
 
     def product(v: Tensor) -> Tensor:
-        return outputs.rmatvec(curvature * outputs.matvec(v))
+        return free * outputs.rmatvec(curvature * outputs.matvec(free * v))
 
-    end = bounded_krylov_step(product, slope - product(s), radius, lower, upper, s, iterations=_PRODUCTS)
-    return end - s
+    end = krylov_steps(product, free * slope - product(s), slope.new_tensor([radius]), iterations=_PRODUCTS)[0]
+    return free * (end.clamp(lower, upper) - s)
 
 
 def _descended(

@@ -64,7 +64,6 @@ def bounded_krylov_step(
         whole = held + free * moved
         hit = (whole <= lower) & free & (moved < 0) | (whole >= upper) & free & (moved > 0)
         s = whole.clamp(lower, upper)
-        s = s * min(1.0, radius / max(float(s.norm()), _LEAST))
         image = product(s)
         now = value(s, image)
         if now < lowest:

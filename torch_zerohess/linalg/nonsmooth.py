@@ -102,10 +102,10 @@ def bounded_kinked_minimum(
         value, slope = function(inside)
         return value, signs * slope
 
-    generator, best = torch.Generator().manual_seed(0), start
+    generator, best = torch.Generator(device="cpu").manual_seed(0), start
     lowest = function(start)[0]
     for number in range(tries):
-        direction = torch.randn(len(start), generator=generator, dtype=start.dtype).to(start.device)
+        direction = torch.randn(len(start), generator=generator, dtype=start.dtype, device="cpu").to(start.device)
         beside = mirrored(best + _BESIDE * radius / float(direction.norm()) * direction, lower, upper)[0]
         end = kinked_minimum(folded, beside if number else best, _ITERATIONS, radius, _LEAST_GAIN)
         end = mirrored(end, lower, upper)[0]

@@ -519,6 +519,14 @@ def test_short_steps_at_a_kink_are_an_arrival_where_the_loss_of_linear_outputs_p
     assert (after.arrivals.lowest is not None) == (agreed == 1)
 
 
+def test_samples_at_the_center_are_asked_for_before_it_arrives_with_a_jacobian_that_is_not_exact():
+    method, known = kinked(MEDIANS)
+    after = method.arrived(replace(known, jacobian=replace(known.jacobian, explained=0.9)))
+    assert after.phase == "sample"
+    assert after.rounds == 0
+    assert method.arrived(replace(known, missed=0.1)).phase == "sample"
+
+
 def test_at_a_kink_nearer_samples_are_asked_for_before_it_arrives():
     method, known = kinked(MEDIANS)
     generator = torch.Generator().manual_seed(0)

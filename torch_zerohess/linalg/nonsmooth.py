@@ -11,6 +11,8 @@ _BISECTIONS = 30
 """Points of a line search at most."""
 _LATEST = 10
 """Iterations whose decrease is compared with the whole decrease."""
+_ITERATIONS, _LEAST_GAIN, _BESIDE = 1000, 1e-6, 0.01
+"""Of several tries in a box: iterations, least gains, and the distance of their starts over the radius."""
 
 
 def kinked_minimum(
@@ -69,6 +71,50 @@ def kinked_minimum(
         left = one - torch.outer(step, change) / curvature
         inverse = left @ inverse @ left.mT + torch.outer(step, step) / curvature
     return x
+
+
+def bounded_kinked_minimum(
+    function: Callable[[Tensor], tuple[float, Tensor]],
+    start: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    radius: float,
+    tries: int,
+    least_gain: float,
+) -> Tensor:
+    """Return the lowest point [n] of a box that BFGS finds from a start, and from points beside the lowest one.
+
+    Where kinks meet, and sides of the box are kinks, too, a slope may point to no decrease although there is one. So
+    there are several tries.
+
+    Args:
+        function: as of `kinked_minimum`, within the box.
+        start: [n], within the box.
+        lower: finite [n], below `upper`.
+        upper: finite [n].
+        radius: as of `kinked_minimum`.
+        tries: how often BFGS begins.
+        least_gain: decrease, over the value at the lowest point, of a try after which no other one follows.
+    """
+
+    def folded(x: Tensor) -> tuple[float, Tensor]:
+        inside, signs = mirrored(x, lower, upper)
+        value, slope = function(inside)
+        return value, signs * slope
+
+    generator, best = torch.Generator(device="cpu").manual_seed(0), start
+    lowest = function(start)[0]
+    for number in range(tries):
+        direction = torch.randn(len(start), generator=generator, dtype=start.dtype, device="cpu").to(start.device)
+        beside = mirrored(best + _BESIDE * radius / float(direction.norm()) * direction, lower, upper)[0]
+        end = kinked_minimum(folded, beside if number else best, _ITERATIONS, radius, _LEAST_GAIN)
+        end = mirrored(end, lower, upper)[0]
+        before, now = lowest, function(end)[0]
+        if now < lowest:
+            best, lowest = end, now
+        if number and before - lowest <= least_gain * abs(lowest):
+            break
+    return best
 
 
 def mirrored(x: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:

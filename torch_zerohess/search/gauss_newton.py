@@ -139,10 +139,14 @@ class GaussNewton(Method[Q]):
             loss, radius = float(evaluated.losses[k]), float(step.norm()) / math.sqrt(self.settings.n)
             known = self.moved(replace(known, center=point, loss=loss, radius=radius, output=output), step, change)
         else:
-            known = replace(known, radius=SHRINKING * known.radius)
+            known = self.rejected(known)
         if known.radius < self.settings.tolerance:
             known = self.arrived(known)
         return replace(known, sigma=self.distance(known.radius))
+
+    def rejected(self, known: Q) -> Q:
+        """Shrink the radius where no step lowers the loss."""
+        return replace(known, radius=SHRINKING * known.radius)
 
     def arrived(self, known: Q) -> Q:
         """Start again with the first radius, or end."""

@@ -20,15 +20,14 @@ else to its slow steps until it arrives (monotonic basin hopping: Wales and Doye
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
+from torch_zerohess.search.local_arrival import MOST, LocalArrivals
 from torch_zerohess.search.local_progress import LocalProgress, in_range
-from torch_zerohess.search.local_settings import LocalSettings
-from torch_zerohess.search.local_steps import LITTLE, LocalSteps, derivatives, local_steps
-from torch_zerohess.search.method import Settings
+from torch_zerohess.search.local_steps import derivatives
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
@@ -41,41 +40,28 @@ _TRUSTED = 0.9
 """Share of the held-out change. If the Jacobian predicts more, the first radius is at least 1, as for the samples."""
 _FAITHFUL = 0.1
 """Squared error of a predicted output, over its squared change, up to which the Jacobian needs no new samples."""
-_SLOW, _FAST, _MOST = 0.02, 0.1, 2
+_SLOW, _FAST = 0.02, 0.1
 """The next batch has twice the samples if the loss fell by less than the first share of it, and half of them if it fell
-by more than the second. It has so many times the first number of samples at most."""
+by more than the second."""
 _STALLED = 2
 """Such small gains in a row are followed by a hop."""
 _HOP = 0.3
 """Standard deviation of a hop, in units of the first sigma."""
-_SAME = 0.01
-"""A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
 _FOUND = 0.3
 """Share of the entries that must be of parameters that were found, before steps follow, or else more samples."""
 _NOTHING = 1e-8
 """Decrease that the loss of linear outputs promises, over the loss: so small that no step is tried."""
-_INSIDE = 0.5
-"""Length of the step to the minimum of that loss, over the longest one, up to which the region contains the minimum."""
+_LEAST = 1e-300
+"""Least number that is divided by."""
 _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
-_SHARED = (
-    *("best", "evaluations", "iterations", "arrivals", "lost", "evidence", "grid"),
-    *("points", "outputs", "variance", "pairs"),
-)
-"""What a search that returns from a hop keeps."""
 
-
-class LocalMethod(GaussNewton[LocalProgress]):
+class LocalMethod(LocalArrivals):
     """The search of `LocalGaussNewton`, in units of its sigma."""
 
     engine = "local"
     progress = LocalProgress
-
-    def __init__(self, settings: Settings, own: LocalSettings) -> None:
-        super().__init__(settings)
-        self.own, self.radius = own, own.radius
-        self._last: tuple[LocalProgress, Tensor, LocalSteps] | None = None  # progress, lengths and steps
 
     def begun(self) -> LocalProgress:
         start = self.settings.start
@@ -110,6 +96,8 @@ class LocalMethod(GaussNewton[LocalProgress]):
         return known, torch.cat([known.center[None], points]) if hops else points
 
     def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+        if math.isnan(known.first):
+            known = replace(known, first=float(evaluated.losses[0]))
         if not known.hops:
             return super().sampled(known, evaluated)
         if not bool(evaluated.finite[0]):
@@ -128,9 +116,11 @@ class LocalMethod(GaussNewton[LocalProgress]):
         known = replace(known, grid=grid)
         evidence = known.evidence or Evidence.none(self.settings.n, u.device)
         known = known.fitting(fitted, evidence.with_batch(fitted, known.fitted, u, changes))
-        if known.found_share < _FOUND and known.samples < _MOST * self.own.samples:
-            return replace(known, samples=_MOST * self.own.samples, phase="sample")
-        if first and fitted.explained > _TRUSTED:
+        if known.found_share < _FOUND and known.samples < MOST * self.own.samples:
+            return replace(known, samples=MOST * self.own.samples, phase="sample")
+        near = known.sigma <= self.own.least_sigma
+        known = replace(known.with_dense(u, changes), fresh=near, missed=0.0)
+        if first and known.jacobian is not None and known.jacobian.explained > _TRUSTED:
             known = replace(known, radius=max(1.0, known.radius))
         return replace(known, phase="trial")
 
@@ -149,10 +139,13 @@ class LocalMethod(GaussNewton[LocalProgress]):
 
     def asked(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
         """Ask for what the phase says; for no steps where the loss of linear outputs promises nothing."""
+        if known.phase == "trial" and known.fresh and known.radius < self.settings.tolerance and not known.done:
+            known = self.arrived(known)
+            known = replace(known, sigma=self.distance(known.radius))
         if known.phase == "trial" and not known.done:
             promised = self._solved(known, self.radii(known)).promised
             if promised is not None and promised <= _NOTHING * abs(known.loss):
-                known = self._at_kink(known)
+                known = self.at_kink(known)
         if known.done:
             return known, known.center[None][:0]
         if known.phase != "aside":
@@ -161,30 +154,6 @@ class LocalMethod(GaussNewton[LocalProgress]):
         step = ~known.evidence.found * normal(generator, known.center, self.settings.n)
         return known, self.settings.inside(known.center + torch.stack([step, -step]))
 
-    def steps(self, known: LocalProgress, radii: Tensor) -> Tensor:
-        """Solve the model, see `local_steps`."""
-        return self._solved(known, radii).steps
-
-    def _solved(self, known: LocalProgress, radii: Tensor) -> LocalSteps:
-        last, settings = self._last, self.settings
-        if last is not None and last[0] is known and torch.equal(last[1], radii):
-            return last[2]
-        assert known.jacobian is not None
-        box = settings.lower - known.center, settings.upper - known.center
-        found = local_steps(settings.white_box, known.output.view(known.shape), known.jacobian, radii, *box)
-        self._last = known, radii, found
-        return found
-
-    def _at_kink(self, known: LocalProgress) -> LocalProgress:
-        """Sample as near as samples get, then arrive. Where the Jacobian does not predict, shrink the radius."""
-        own, radius, near = self.own, SHRINKING * known.radius, known.sigma <= self.own.least_sigma
-        if known.predicts and not near:
-            radius = min(radius, own.least_sigma / own.share)
-        known = replace(known, radius=radius, phase="sample")
-        if (known.predicts and near) or radius < self.settings.tolerance:
-            known = self.arrived(known)
-        return replace(known, sigma=self.distance(known.radius))
-
     def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
         """Take the best step; double the samples after a small gain, and halve them after a large one; or hop."""
         after = super().taken(known, evaluated)
@@ -192,9 +161,9 @@ class LocalMethod(GaussNewton[LocalProgress]):
             return after
         before, gain = known.loss, known.loss - after.loss
         count = known.samples * (2 if gain < _SLOW * abs(before) else 1) // (2 if gain > _FAST * abs(before) else 1)
-        count = min(max(count, self.own.samples), _MOST * self.own.samples)
+        count = min(max(count, self.own.samples), MOST * self.own.samples)
         after = replace(after, samples=count, slow=known.slow + 1 if gain < _SLOW * abs(before) else 0)
-        return self._stalled(after) if after.slow >= _STALLED else after
+        return self.stalled(after) if after.slow >= _STALLED and not after.thorough else after
 
     def gradient(self, known: LocalProgress) -> Tensor:
         return self._derivatives(known)[0]
@@ -202,79 +171,10 @@ class LocalMethod(GaussNewton[LocalProgress]):
     def moved(self, known: LocalProgress, step: Tensor, change: Tensor) -> LocalProgress:
         """Keep the Jacobian, without new samples, if it predicted the change of the output."""
         assert known.jacobian is not None
-        miss = change - known.jacobian.matvec(step).flatten()
-        faithful = float(miss.square().sum()) <= _FAITHFUL * float(change.square().sum())
-        return replace(known, phase="trial" if faithful else "sample")
-
-    def arrived(self, known: LocalProgress) -> LocalProgress:
-        """End, hop, or begin again with the first radius where the Jacobian does not predict."""
-        if known.failed:
-            return self._returned(known)
-        if not (known.predicts and self._is_minimum(known)):
-            return super().arrived(known)
-        if known.some_stay and not (known.moved or self.settings.noise):
-            return replace(known, phase="aside")
-        end = Best(known.center, known.loss, known.sigma)
-        known = super().arrived(known.arriving(end).agreeing(end, self.settings.tolerance))
-        return known if known.done else self._hopping(replace(known, finished=True))
-
-    def _is_minimum(self, known: LocalProgress) -> bool:
-        """Whether the loss of linear outputs promises next to nothing in the region, or has its minimum inside."""
-        longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
-        found = self._solved(known, known.center.new_tensor([longest]))
-        if found.promised is None or found.promised <= LITTLE * abs(known.loss):
-            return True
-        return float(found.steps.norm()) <= _INSIDE * longest
-
-    def _stalled(self, known: LocalProgress) -> LocalProgress:
-        """Hop, or return from a hop; go on where neither may help."""
-        if known.failed:
-            return self._returned(known)
-        if known.patient or known.rounds >= self.settings.restarts or not known.predicts:
-            return known
-        return self._hopping(known)
-
-    def _hopping(self, known: LocalProgress) -> LocalProgress:
-        """Ask for a point close by, and samples around it."""
-        return replace(
-            known,
-            home=replace(known, home=None, points=known.points[:0], outputs=known.outputs[:0]),
-            output=known.output[:0],
-            loss=math.inf,
-            radius=self.radius,
-            sigma=self.distance(self.radius),
-            phase="sample",
-            samples=self.own.samples,
-            slow=0,
-            finished=False,
-            patient=False,
-        )
-
-    def _returned(self, known: LocalProgress) -> LocalProgress:
-        """Return from a hop that has found nothing better; hop again if the search had arrived before."""
-        home = known.home
-        assert home is not None
-        same = known.loss < math.inf and known.loss - home.loss <= _SAME * (known.hopped - home.loss)
-        known = replace(home.taking(known, *_SHARED), phase="sample", patient=True)
-        if not home.finished:
-            return known
-        end = Best(known.center, known.loss, known.sigma)
-        known = known.agreeing(end, self.settings.tolerance) if same else known.with_arrivals(agreed=0)
-        known = super().arrived(known)
-        return known if known.done else self._hopping(known)
-
-    def distance(self, radius: float) -> float:
-        return min(1.0, max(self.own.share * radius, self.own.least_sigma))
-
-    def promise(self, known: LocalProgress) -> float:
-        """Return the promise of a step; it is infinite while a hop has led to nothing better."""
-        if not known.predicts or known.failed or known.phase != "trial":
-            return math.inf
-        found = self._solved(known, self.radii(known))
-        if found.promised is None:
-            return super().promise(known)
-        longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
-        return found.promised if float(found.steps[-1].norm()) <= _INSIDE * longest else math.inf
+        miss = float((change - known.jacobian.matvec(step).flatten()).square().sum())
+        share = miss / max(float(change.square().sum()), _LEAST)
+        phase: Literal["trial", "sample"] = "trial" if share <= _FAITHFUL else "sample"
+        return replace(known, phase=phase, fresh=False, missed=max(known.missed, share))
 
     def untouched(self, known: LocalProgress) -> Tensor | None:
         """Return the parameters that no output was found to depend on, if some were found."""

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.search.gauss_newton import JacobianProgress
 from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.surrogates.determined_jacobian import better_determined
 from torch_zerohess.surrogates.sparse_choices import GridEvidence
 from torch_zerohess.surrogates.sparse_evidence import Evidence
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -46,6 +47,16 @@ class LocalProgress(JacobianProgress):
     """Whether slow steps go on, because a hop from here has found nothing better."""
     moved: bool = False
     """Whether the parameters that stay have been moved once, to see whether outputs change."""
+    first: float = math.nan
+    """Loss at the start."""
+    fresh: bool = False
+    """Whether the Jacobian was sampled at the center, as near as samples get."""
+    missed: float = 0.0
+    """Share of the squared change of the output that it has not predicted along a step since then, at most."""
+    thorough: bool = False
+    """Whether steps are to the minimum of linear outputs that a thorough search finds."""
+    doubted: float = math.inf
+    """Loss where the search has last found that it has not arrived, because that minimum is lower."""
     home: "LocalProgress | None" = None
     """The search before the hop that has led here."""
     hopped: float = math.inf
@@ -72,6 +83,12 @@ class LocalProgress(JacobianProgress):
     def predicts(self) -> bool:
         """Whether the Jacobian predicts so much that the end of a round is a minimum."""
         return self.jacobian is not None and self.jacobian.explained > _PREDICTED
+
+    def misses(self, share: float) -> bool:
+        """Whether what the Jacobian does not predict may hide a decrease of more than a share of the first loss."""
+        assert self.jacobian is not None
+        missed = max(1.0 - self.jacobian.explained, self.missed)
+        return missed * abs(self.loss) > share * abs(self.first)
 
     @property
     def hops(self) -> bool:
@@ -120,6 +137,16 @@ class LocalProgress(JacobianProgress):
             return after
         at = self.home if self.home is not None and self.failed else self
         return replace(after, best=Best(at.center, at.loss, at.sigma))
+
+    def with_dense(self, u: Tensor, changes: Tensor) -> "LocalProgress":
+        """Take the dense Jacobian where the samples of the latest fit determine it, and it predicts better."""
+        assert self.fitted is not None
+        assert self.evidence is not None
+        best = better_determined(self.fitted, u, changes)
+        if best is self.fitted:
+            return self
+        evidence = self.evidence.with_batch(best, None, u, changes)
+        return replace(self, jacobian=best.within(evidence.found), evidence=evidence)
 
     def told_aside(self, evaluated: Evaluated, gain: float) -> "LocalProgress":
         """Take what points tell at which only the parameters that stay have moved.

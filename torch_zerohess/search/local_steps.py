@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.linalg.bounded_krylov import bounded_krylov_step
 from torch_zerohess.linalg.krylov import are_free, krylov_steps
+from torch_zerohess.linalg.nonsmooth import bounded_kinked_minimum
 from torch_zerohess.linalg.smoothed_newton import LinearOutputs, smoothed_minimum
 from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature, value_and_slope
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
@@ -22,6 +24,13 @@ _ITERATIONS = 100
 """Products of the Hessian for a step."""
 _EXPANDED, _ROUNDED = 0.5, 1e-12
 """Error of the quadratic's promise, over the promise and over the loss, with which its steps are taken."""
+
+_CLOSE = 0.01
+"""The same for the step of a thorough search."""
+_TRIES, _NOTHING = 4, 1e-8
+"""Minimisations of a thorough search, at most, and the decrease of one, over the loss, after which it ends."""
+THOROUGH = 200
+"""Parameters up to which it minimises a loss with kinks as it is: it keeps a square matrix of them."""
 
 LITTLE = 1e-5
 """Decrease that the loss of linear outputs promises, over the loss, with which a search has arrived."""
@@ -68,6 +77,48 @@ def local_steps(
     bent = torch.stack([v @ product(v) for v in steps])
     widths = jacobian.values.to(radii).square().sum(1).sqrt() * (float(radii[-1]) / math.sqrt(jacobian.n))
     return checked_steps(outputs, steps, gradient, bent, widths, radii, lower, upper)
+
+
+def thorough_step(
+    loss: Loss, output: Tensor, jacobian: SparseJacobian, longest: float, lower: Tensor, upper: Tensor, start: Tensor
+) -> LocalSteps:
+    """Return one step [1, n] to the lowest point that a thorough search finds, which calls the loss 1000 times.
+
+    The steps of `local_steps` end where bounds and kinks meet, although a longer way leads on: see
+    `bounded_krylov_step` and `bounded_kinked_minimum`. Above `THOROUGH` parameters kinks are smoothed here, too.
+
+    Args:
+        loss: of an output.
+        output: at the center [*out], float64.
+        jacobian: there.
+        longest: length of the step, at most.
+        lower: bounds of steps [n], at most 0.
+        upper: at least 0.
+        start: [n], a step within the bounds.
+    """
+    gradient, product = derivatives(loss_curvature(loss, output), jacobian)
+    rows, columns = jacobian.entries
+    outputs = linear_outputs(loss, output, lambda s: rows.times(s[None])[0], lambda w: columns.times(w[None])[0])
+    zero = torch.zeros_like(gradient)
+    before = outputs.value(zero)
+    s = bounded_krylov_step(product, gradient, longest, lower, upper, zero, iterations=_ITERATIONS)
+    promised = -float(gradient @ s + 0.5 * (s @ product(s)))
+    if abs(before - outputs.value(s) - promised) <= _CLOSE * promised + _ROUNDED * abs(before):
+        return LocalSteps(s[None], promised)
+    start = min(zero, start * min(1.0, longest / max(float(start.norm()), math.ulp(0.0))), s, key=outputs.value)
+    if jacobian.n > THOROUGH:
+        widths = jacobian.values.to(s).square().sum(1).sqrt() * (longest / math.sqrt(jacobian.n))
+        end, promised = smoothed_minimum(outputs, widths, longest, lower, upper, start)
+        return LocalSteps(end[None], promised)
+
+    def function(s: Tensor) -> tuple[float, Tensor]:
+        value, slope = outputs.loss(outputs.output + outputs.matvec(s))
+        return value, outputs.rmatvec(slope)
+
+    lower, upper = (one.clamp(-longest, longest) for one in (lower, upper))
+    end = bounded_kinked_minimum(function, start, lower, upper, longest, _TRIES, _NOTHING)
+    end = end * min(1.0, longest / max(float(end.norm()), math.ulp(0.0)))
+    return LocalSteps(end[None], before - outputs.value(end))
 
 
 def linear_outputs(

@@ -139,7 +139,7 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         sparse, dense, reason = _predicted(start)
         if known.local is None and start is not None and sparse > max(dense + _MORE, _MOST):
             return self._to_local(known, start, reason, generator)
-        jacobian = None if known.local is None else known.local.jacobian
+        jacobian = None if known.local is None else known.local.fitted
         if jacobian is not None and dense > max(jacobian.explained, sparse) + _MORE:
             descent, points = self.descent.taking_over(known, every, generator)
             known = replace(known, chosen="descent", reason=reason, descent=descent, local=None).taking(descent)
@@ -152,8 +152,8 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         begun = start.taking(known, "iterations").with_arrivals(rounds=known.rounds)
         local, points = self.local.asked(begun, generator)
         known = replace(known, chosen="local", reason=reason, descent=None, local=local).taking(local)
-        assert start.jacobian is not None
-        return self._decided(known, final=start.jacobian.explained > _MOST), points
+        assert start.fitted is not None
+        return self._decided(known, final=start.fitted.explained > _MOST), points
 
     def _decided(self, known: SparseOrDenseProgress, *, final: bool = False) -> SparseOrDenseProgress:
         """Say when the choice is made again, or forget the evaluations: the chosen search has them."""
@@ -171,9 +171,9 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
 
 def _predicted(start: LocalProgress | None) -> tuple[float, float, str]:
     """Return the shares of the held-out change that a sparse and a dense Jacobian predict, and both in words."""
-    if start is None or start.jacobian is None:
+    if start is None or start.fitted is None:
         return 0.0, 0.0, "a sparse Jacobian predicts nothing: the output is one number, or too few outputs are finite"
-    sparse, dense = start.jacobian.explained, max(start.jacobian.explained_dense, 0.0)
+    sparse, dense = start.fitted.explained, max(start.fitted.explained_dense, 0.0)
     words = (
         f"a sparse Jacobian predicts {max(sparse, 0.0):.0%} of the change of held-out outputs, a dense one {dense:.0%}"
     )

@@ -90,3 +90,26 @@ def test_a_minimum_on_the_side_of_a_box_is_found_by_reflection() -> None:
 
     found, _ = mirrored(minimum(folded), lower, upper)
     torch.testing.assert_close(found, (3.0 * PLACES.median(0).values).clamp(-1.0, 1.0), rtol=0.0, atol=1e-6)
+
+
+def test_the_lowest_sum_of_distances_in_a_box_is_at_the_nearest_points_to_the_medians() -> None:
+    median, lower, upper = PLACES.median(0).values, vector(-1.0, -1.0, 0.5, 0.3), vector(-0.4, 1.0, 2.0, 2.0)
+
+    def distances(x):
+        return float((x - PLACES).abs().sum()), (x - PLACES).sign().sum(0)
+
+    found = nonsmooth.bounded_kinked_minimum(distances, vector(-0.5, 0.0, 1.5, 1.0), lower, upper, 1.0, 4, 1e-8)
+    torch.testing.assert_close(found, median.clamp(lower, upper), rtol=0.0, atol=1e-5)
+
+
+def test_a_slope_that_points_to_no_decrease_where_kinks_meet_does_not_end_a_search_in_a_box() -> None:
+    """max(|x - y|, |x + y|, ...) at a corner of its level: the slope of one piece leads up along the others."""
+
+    def pieces(x):
+        each = torch.stack([x[0] - 2.0 * x[1], 2.0 * x[1] + x[0]])
+        k = int(each.argmax())
+        return float(each[k]), vector(1.0, -2.0 if k == 0 else 2.0)
+
+    start, one = vector(0.9, 0.0), vector(1.0, 1.0)
+    found = nonsmooth.bounded_kinked_minimum(pieces, start, -one, one, 1.0, 4, 1e-8)
+    assert pieces(found)[0] == pytest.approx(-1.0, abs=1e-5)

@@ -327,7 +327,7 @@ def test_parameters_without_effect_take_two_evaluations():
 
 def test_a_look_at_parameters_that_stay_survives_in_a_state():
     def search():
-        return LocalGaussNewton(vector(0.01, 0.5), sigma=0.5, loss=square(0.0), restarts=0, seed=2)
+        return LocalGaussNewton(vector(0.0, 0.5), sigma=0.5, loss=square(0.0), restarts=0, seed=2)
 
     one, looked = search(), 0
     while not one.done:
@@ -509,7 +509,7 @@ def kinked(x, size=1.0):
     return search._method, replace(known, radius=1e-4, phase="trial")
 
 
-@pytest.mark.parametrize(("away", "size", "agreed"), [(0.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 1e-3, 1)])
+@pytest.mark.parametrize(("away", "size", "agreed"), [(0.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 1e-6, 1)])
 def test_short_steps_at_a_kink_are_an_arrival_where_the_loss_of_linear_outputs_promises_nothing(away, size, agreed):
     """Half a unit beside the minimum the loss falls along the whole step; next to not, where outputs hardly change."""
     method, known = kinked(MEDIANS + away, size)
@@ -517,6 +517,14 @@ def test_short_steps_at_a_kink_are_an_arrival_where_the_loss_of_linear_outputs_p
     after = method.arrived(known)
     assert after.agreed == agreed
     assert (after.arrivals.lowest is not None) == (agreed == 1)
+
+
+def test_samples_at_the_center_are_asked_for_before_it_arrives_with_a_jacobian_that_is_not_exact():
+    method, known = kinked(MEDIANS)
+    after = method.arrived(replace(known, jacobian=replace(known.jacobian, explained=0.9)))
+    assert after.phase == "sample"
+    assert after.rounds == 0
+    assert method.arrived(replace(known, missed=0.1)).rounds == 0
 
 
 def test_at_a_kink_nearer_samples_are_asked_for_before_it_arrives():

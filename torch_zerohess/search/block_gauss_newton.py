@@ -213,11 +213,11 @@ class BlockGaussNewton(AskTell[BlockProgress]):
             checked_number(name, value, above=0.0, most=most, below=math.inf)
         if not callable(loss):
             raise ValueError(f"loss must be a function of one output, got {loss!r}: without one use Descent")
-        self._shape = {"radius": radius, "share": share, "block": block}
+        self._own = {"radius": radius, "share": share, "block": block}
         super().__init__(x0, sigma=sigma, bounds=bounds, loss=loss, restarts=restarts, tolerance=tolerance, seed=seed)
 
     def _make(self, settings: Settings) -> BlockMethod:
-        return BlockMethod(settings, **self._shape)
+        return BlockMethod(settings, **self._own)
 
 
 def broyden_update(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:

@@ -96,7 +96,7 @@ class LocalMethod(LocalArrivals):
         return known, torch.cat([known.center[None], points]) if hops else points
 
     def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
-        if math.isnan(known.first):
+        if known.first == math.inf and bool(evaluated.finite[0]):
             known = replace(known, first=float(evaluated.losses[0]))
         if not known.hops:
             return super().sampled(known, evaluated)

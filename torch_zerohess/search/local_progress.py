@@ -47,8 +47,8 @@ class LocalProgress(JacobianProgress):
     """Whether slow steps go on, because a hop from here has found nothing better."""
     moved: bool = False
     """Whether the parameters that stay have been moved once, to see whether outputs change."""
-    first: float = math.nan
-    """Loss at the start."""
+    first: float = math.inf
+    """Loss at the start, or at another early point if it is not finite there."""
     fresh: bool = False
     """Whether the Jacobian was sampled at the center, as near as samples get."""
     missed: float = 0.0

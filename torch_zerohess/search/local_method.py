@@ -8,9 +8,8 @@ An iteration fits the Jacobian J to new samples, with the old J as the prior. St
 `surrogates.sparse_evidence`. If the output at the end of the step was predicted well, the next steps use the same J.
 Sigma is a share of the radius.
 
-At a kink of the loss all steps may fail, although the search has not arrived. So it arrives there only where the loss
-of linear outputs promises next to nothing, or has its minimum within the region. Where it promises nothing, no step is
-tried: after samples as near as samples get the search has arrived.
+At a kink of the loss, and at bounds, all steps may fail although the search has not arrived. What follows before it
+arrives is in `local_arrival`.
 
 Where steps hardly lower the loss, the search hops: it goes on from a random point close by, with the J that it has. It
 stays with what the hop leads to if the loss is lower there. Otherwise it returns: to another hop if it had arrived,

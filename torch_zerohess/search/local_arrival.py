@@ -27,8 +27,6 @@ _INSIDE = 0.5
 """Length of the step to the minimum of that loss, over the longest one, up to which the region contains the minimum."""
 _ZERO = 1e-6
 """Decrease that they promise, over the first loss, that is nothing, too: where outputs are fitted."""
-_AGAIN = 10.0
-"""How many times as much it must be where the search has doubted before: every doubt takes samples."""
 _UNSURE = 1e-3
 """Decrease, over the first loss, that an inexact Jacobian may hide where the search arrives."""
 _SHORTER = 0.1
@@ -114,8 +112,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         root = math.sqrt(self.settings.n)
         found = self._thorough(known, self.radius * root, torch.zeros_like(known.center))
         assert found.promised is not None
-        share = LITTLE if known.doubted == math.inf else _AGAIN * LITTLE
-        little = found.promised <= max(share * abs(known.loss), _ZERO * abs(known.first))
+        little = found.promised <= max(LITTLE * abs(known.loss), _ZERO * abs(known.first))
         short = float(found.steps.norm()) <= _INSIDE * LENGTHS[-1] * self.settings.tolerance * root
         return None if little or short else found.steps[0]
 

@@ -25,12 +25,6 @@ _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
 _INSIDE = 0.5
 """Length of the step to the minimum of that loss, over the longest one, up to which the region contains the minimum."""
-_ZERO = 1e-6
-"""Decrease that they promise, over the first loss, that is nothing, too: where outputs are fitted."""
-_UNSURE = 1e-3
-"""Decrease, over the first loss, that an inexact Jacobian may hide where the search arrives."""
-_SHORTER = 0.1
-"""Factor of the radius where no step lowers the loss although the Jacobian was sampled at the center."""
 
 _SHARED = (
     *("best", "evaluations", "iterations", "arrivals", "lost", "evidence", "grid"),
@@ -88,14 +82,14 @@ class LocalArrivals(GaussNewton[LocalProgress]):
             return self._returned(known)
         if not known.predicts:
             return super().arrived(known)
-        if known.misses(LITTLE) and not (known.fresh or self.settings.noise):
+        if known.misses and not (known.fresh or self.settings.noise):
             return replace(known, phase="sample", samples=max(known.samples, self._enough))
         found = None if self.settings.noise else self._lower_end(known)
         if found is not None and known.loss < known.doubted - LITTLE * abs(known.loss):
             return self._doubting(known, found)
         if known.some_stay and not (known.moved or self.settings.noise):
             return replace(known, phase="aside")
-        if found is None and not known.misses(_UNSURE):
+        if found is None:
             end = Best(known.center, known.loss, known.sigma)
             known = known.arriving(end).agreeing(end, self.settings.tolerance)
         known = super().arrived(replace(known, thorough=False))
@@ -112,7 +106,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         root = math.sqrt(self.settings.n)
         found = self._thorough(known, self.radius * root, torch.zeros_like(known.center))
         assert found.promised is not None
-        little = found.promised <= max(LITTLE * abs(known.loss), _ZERO * abs(known.first))
+        little = found.promised <= LITTLE * abs(known.loss)
         short = float(found.steps.norm()) <= _INSIDE * LENGTHS[-1] * self.settings.tolerance * root
         return None if little or short else found.steps[0]
 
@@ -126,7 +120,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         if not known.thorough:
             return super().rejected(known)
         if known.fresh:
-            return replace(known, radius=_SHORTER * known.radius, phase="trial")
+            return replace(super().rejected(known), phase="trial")
         return replace(known, radius=min(SHRINKING * known.radius, self.own.least_sigma / self.own.share))
 
     def stalled(self, known: LocalProgress) -> LocalProgress:

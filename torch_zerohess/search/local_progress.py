@@ -15,6 +15,8 @@ from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _PREDICTED = 0.5
 """Share of the held-out change from which on the end of a round is a minimum."""
+_HIDDEN = 1e-5
+"""Share of the first loss that an inexact Jacobian may hide where the search arrives."""
 _PAIRS = 16
 """Outputs at one point that tell the noise, at most about."""
 _ROUNDING = 1e-12
@@ -84,11 +86,12 @@ class LocalProgress(JacobianProgress):
         """Whether the Jacobian predicts so much that the end of a round is a minimum."""
         return self.jacobian is not None and self.jacobian.explained > _PREDICTED
 
-    def misses(self, share: float) -> bool:
-        """Whether what the Jacobian does not predict may hide a decrease of more than a share of the first loss."""
+    @property
+    def misses(self) -> bool:
+        """Whether what the Jacobian does not predict may hide a decrease of more than `_HIDDEN`."""
         assert self.jacobian is not None
         missed = max(1.0 - self.jacobian.explained, self.missed)
-        return missed * abs(self.loss) > share * abs(self.first)
+        return missed * abs(self.loss) > _HIDDEN * abs(self.first)
 
     @property
     def hops(self) -> bool:

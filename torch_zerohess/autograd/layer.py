@@ -15,6 +15,7 @@ class Layer(nn.Module):
     smoothing: Smoothing
     """How to sample; another one may be set between calls."""
     call: BlackBoxCall
+    """The black box, and how it is called."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "smoothing":

@@ -18,7 +18,7 @@ _SMALLEST = 1e-300
 _LONGEST, _HALVINGS = 8, 24
 """Lengths tried along the gradient where bounds are hit: radius times 2^8 and less."""
 _ROUNDED = 1e-10
-"""`SINGULAR` for eigenvalues in float32: their errors are below a thousand times this share of the largest one."""
+"""`SINGULAR` where eigenvalues are in float32. Their errors are near 1e-7 of the largest eigenvalue."""
 
 
 def ball_step(gradient: Tensor, hessian: Tensor, radius: float, singular: float = SINGULAR) -> Tensor:

@@ -1,9 +1,9 @@
 """Where the search by a sparse Jacobian has arrived, and how it hops: the part of `LocalMethod` that ends rounds.
 
 Steps may become short although the search has not arrived: where bounds and kinks meet, or where the Jacobian lacks
-entries. So, before it arrives, a thorough search minimises the loss of linear outputs within the first radius. The
-Jacobian must predict for that; where it is not exact, it is sampled at the center first. If the minimum is lower than
-the center, the search goes on towards it. It has not arrived where such steps achieve nothing.
+entries. So, before it arrives, a thorough search minimises the loss of linear outputs within the first radius. If the
+Jacobian is not exact, it is sampled at the center first. If the minimum is lower than the center, the search goes on
+towards the minimum. If steps towards the minimum do not lower the loss, the round ends without an arrival.
 """
 
 import math
@@ -24,7 +24,8 @@ MOST = 2
 _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
 _INSIDE = 0.5
-"""Length of the step to the minimum of that loss, over the longest one, up to which the region contains the minimum."""
+"""Length of the step to the minimum of the loss of linear outputs, over the longest step, up to which the region
+contains the minimum."""
 
 _SHARED = (
     *("best", "evaluations", "iterations", "arrivals", "lost", "evidence", "grid"),
@@ -102,7 +103,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         return enough if enough <= MOST * self.own.samples else 0
 
     def _lower_end(self, known: LocalProgress) -> Tensor | None:
-        """Return a step [n] that lowers the loss of linear outputs, by more than next to nothing, and is not short."""
+        """Return a step [n] that lowers the loss of linear outputs by more than `LITTLE`, unless it is short."""
         root = math.sqrt(self.settings.n)
         found = self._thorough(known, self.radius * root, torch.zeros_like(known.center))
         assert found.promised is not None
@@ -111,7 +112,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         return None if little or short else found.steps[0]
 
     def _doubting(self, known: LocalProgress, step: Tensor) -> LocalProgress:
-        """Go on along a step [n], by those of a thorough search."""
+        """Go on along a step [n], and take the steps of a thorough search from here on."""
         radius = float(step.norm()) / math.sqrt(self.settings.n)
         return replace(known, thorough=True, doubted=known.loss, radius=radius, phase="trial", slow=0)
 

@@ -54,11 +54,11 @@ class LocalProgress(JacobianProgress):
     fresh: bool = False
     """Whether the Jacobian was sampled at the center, as near as samples get."""
     missed: float = 0.0
-    """Share of the squared change of the output that it has not predicted along a step since then, at most."""
+    """Largest share of the squared change of the output, along a step since then, that the Jacobian did not predict."""
     thorough: bool = False
-    """Whether steps are to the minimum of linear outputs that a thorough search finds."""
+    """Whether steps lead to the minimum of the loss of linear outputs that a thorough search finds."""
     doubted: float = math.inf
-    """Loss where the search has last found that it has not arrived, because that minimum is lower."""
+    """Loss where the search has last found that it has not arrived, because the thorough search found a lower one."""
     home: "LocalProgress | None" = None
     """The search before the hop that has led here."""
     hopped: float = math.inf

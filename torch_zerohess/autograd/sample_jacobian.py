@@ -63,7 +63,7 @@ class SampleJacobian:
 
         Raises ValueError for a parameter that the network does not have, for outputs that are not [B, n], for batch
         normalisation and dropout in training mode, for batch normalisation without running statistics, and for a
-        network that draws random numbers.
+        network that draws random numbers. Raises RuntimeError in inference mode.
         """
         return self.products(parameters).dense()
 
@@ -73,6 +73,10 @@ class SampleJacobian:
         A weight whose only use is one product with a vector per sample, as in `torch.nn.Linear`, needs no row of J.
         Where torch's `vmap` does not know an operation of the network, as of GRU, there are B n backward passes.
         """
+        if torch.is_inference_mode_enabled():
+            raise RuntimeError(
+                "a Jacobian needs derivatives of the network, which inference mode forbids: use torch.no_grad"
+            )
         if (mixing := mixes_in_evaluation(self._network)) is not None:
             raise ValueError(f"network has {mixing}, too: it has no Jacobian per sample")
         for name, one in self._network.named_modules():

@@ -35,7 +35,8 @@ def move_outputs(network: nn.Module, inputs: Tensor, change: Tensor, *, relative
         ValueError: a change of a wrong shape or that is not finite, a damping that is not positive, no inputs, or a
             network whose outputs do not change with its weights, are random or mix samples, or whose Jacobian is not
             finite.
-        RuntimeError: a network in `DistributedDataParallel` of several processes, of which each would step alone.
+        RuntimeError: in inference mode, and for a network in `DistributedDataParallel` of several processes, of which
+            each would step alone.
 
     Example:
         >>> network, x = torch.nn.Linear(3, 2), torch.eye(3)[:2]

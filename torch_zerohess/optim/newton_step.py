@@ -46,7 +46,8 @@ class NewtonStep(SecondOrder):
     The first radius is a setting of the group, `first_radius`, and so part of the state.
 
     Without `adapt` every step is taken, as suits a loss whose values have noise: over small batches, or of a layer with
-    `value="smoothed"`. A test of such values near a minimum shrinks the radius for good.
+    `value="smoothed"` or with a memory that evaluates a part of the batch (`fresh`). A test of such values near a
+    minimum shrinks the radius for good.
     """
 
     exit: str | None = None

@@ -72,8 +72,9 @@ class Memory:
         capacity: evaluations that are kept, at least 8. Beyond it, of points that are close to each other the older are
             dropped. Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
-            None: all of them. 0: none; the estimate is then the first term alone, and biased towards g.
-            Under `vmap` each element is a batch of its own: all of them get new evaluations, unless there are none.
+            Values then have noise, so `optim.NewtonCG` and `optim.Newton` need adapt=False. None: all of them. 0: none;
+            the estimate is then the first term alone, and biased towards g. Under `vmap` each element is a batch of its
+            own: all of them get new evaluations, unless there are none.
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.
         draws: points per element at which the surrogate's term is evaluated, at least 3. None: for more than 32
@@ -202,7 +203,8 @@ class Memory:
 
     def _fit_rows(self) -> None:
         if hasattr(self.surrogate, "fit"):
-            with outside_inference(), without_autocast(self.points.device):
+            # With grad: a surrogate may train itself by gradient descent, also where the caller wants no derivatives.
+            with outside_inference(), torch.enable_grad(), without_autocast(self.points.device):
                 points, outputs = self.points[: self._rows], self.outputs[: self._rows]
                 if type(self.surrogate) is not AutomaticSurrogate:  # another one may change them in place
                     points, outputs = points.clone(), outputs.clone()
@@ -253,7 +255,8 @@ class Memory:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew.
 
-        It is fitted to all evaluations if the memory has dropped some that it knew.
+        It is fitted to all evaluations if the memory has dropped some that it knew. The coefficient is learned anew if
+        one of both surrogates is a module and the other is none.
         """
         check_state(state, self.state_dict(), "a memory")
         with outside_inference():  # the state may have been read in inference mode
@@ -263,6 +266,8 @@ class Memory:
         self.regression.moments = [list(one) for one in state["moments"]]
         self._fitted, self._rows, self.pathwise = state["fitted"], state["rows"], state["pathwise"]
         self._known = state["known"]
+        if isinstance(self.surrogate, nn.Module) == (state["surrogate"] is None):
+            self.regression.moments = []  # of a surrogate of another kind
         if isinstance(self.surrogate, nn.Module) and state["surrogate"] is not None:
             self.surrogate.load_state_dict(state["surrogate"])
         elif self._rows < self._known:

@@ -312,3 +312,14 @@ def test_dropout_of_rate_zero_is_no_dropout() -> None:
     found = SampleJacobian(net, inputs)(parameters)
     net.eval()
     assert torch.equal(found, SampleJacobian(net, inputs)(parameters))
+
+
+@pytest.mark.parametrize("door", ["jacobian", "move_outputs"])
+def test_a_jacobian_in_inference_mode_is_refused(door) -> None:
+    network, change = nn.Linear(4, 2).double(), torch.ones(5, 2, dtype=torch.float64)
+    doors = {
+        "jacobian": lambda: SampleJacobian(network, SAMPLES)(list(network.parameters())),
+        "move_outputs": lambda: move_outputs(network, SAMPLES, change),
+    }
+    with torch.inference_mode(), pytest.raises(RuntimeError, match=r"inference mode forbids: use torch\.no_grad"):
+        doors[door]()

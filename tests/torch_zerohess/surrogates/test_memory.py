@@ -296,3 +296,49 @@ def test_what_copies_a_memory_may_take_its_time() -> None:
     state = store.__getstate__()
     store.add(z, z)
     assert len(state["_points"]) == len(state["_outputs"]) == 1
+
+
+class Trained(nn.Linear):
+    """A surrogate that trains itself by gradient descent."""
+
+    def fit(self, points: Tensor, outputs: Tensor) -> None:
+        optimizer = torch.optim.Adam(self.parameters(), lr=0.1)
+        for _ in range(200):
+            optimizer.zero_grad()
+            (self(points) - outputs).square().mean().backward()
+            optimizer.step()
+
+
+@pytest.mark.parametrize("door", ["layer", "estimate", "load"])
+def test_a_surrogate_may_train_itself_where_no_derivatives_are_wanted(door) -> None:
+    torch.manual_seed(0)
+    slopes, x, memory = normal(2, 3), normal(8, 2, seed=1), Memory(Trained(2, 3).double())
+    smoothing = zh.Smoothing(sigma=1.0, samples=4)
+    layer = zh.BlackBox(lambda z: z @ slopes, smoothing, memory=memory, value="smoothed")
+    if door == "load":
+        filled = Memory()
+        filled.add(x, x @ slopes)
+        filled.fit()
+    with torch.no_grad():
+        if door == "load":
+            memory.load_state_dict(filled.state_dict())
+        for _ in range(2 * (door != "load")):
+            layer(x) if door == "layer" else zh.estimate(layer.call.fn, x, smoothing, memory=memory)
+    torch.testing.assert_close(memory.surrogate(x), x @ slopes, rtol=0.0, atol=0.1)
+
+
+def test_the_coefficient_of_a_surrogate_of_another_kind_is_left_out() -> None:
+    filled = Memory()
+    filled.add(normal(8, 2), normal(8, 3, seed=1))
+    filled.fit()
+    filled.regression.moments = [[0.5, 0.5]]
+    network = nn.Linear(2, 3).double()
+    same, module_, back = Memory(), Memory(network), Memory()
+    same.load_state_dict(filled.state_dict())
+    module_.load_state_dict(filled.state_dict())
+    assert (same.coefficient, module_.coefficient) == (1.0, 0.0)
+    module_.regression.moments = [[0.5, 0.5]]
+    back.load_state_dict(module_.state_dict())
+    again = Memory(nn.Linear(2, 3).double())
+    again.load_state_dict(module_.state_dict())
+    assert (again.coefficient, back.coefficient) == (1.0, 0.0)

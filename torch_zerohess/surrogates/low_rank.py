@@ -36,14 +36,14 @@ class LowRank:
         The draw depends on P alone, so that the same outputs give the same coordinates.
         """
         flat = outputs.reshape(len(outputs), -1)
-        mean = flat.mean(0)
+        mean = flat.mean(0, dtype=torch.promote_types(flat.dtype, torch.float32))  # products in half precision overflow
         chosen = torch.randperm(len(flat), generator=torch.Generator().manual_seed(0), device="cpu")[:rank]
         span = scaled(flat[chosen.to(flat.device)] - mean)[0]
         values, vectors = torch.linalg.eigh((span @ span.mT).double())
         kept = values > max(_FLAT * float(values[-1]), math.ulp(0.0))
         if not bool(kept.any()):  # all outputs are equal: any direction will do
             return cls(mean, torch.full_like(mean, 1 / len(mean))[:, None], outputs.shape[1:])
-        directions = (vectors[:, kept] / values[kept].sqrt()).to(flat.dtype)
+        directions = (vectors[:, kept] / values[kept].sqrt()).to(span.dtype)
         return cls(mean, span.mT @ directions / math.sqrt(flat.shape[1]), outputs.shape[1:])
 
     def encode(self, outputs: Tensor) -> Tensor:

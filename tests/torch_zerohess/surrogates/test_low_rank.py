@@ -106,3 +106,14 @@ def test_what_is_wrong_is_said():
         LowRankSurrogate(LinearSurrogate(), rank=0)
     with pytest.raises(RuntimeError, match="fit the surrogate"):
         LowRankSurrogate(LinearSurrogate()).space  # noqa: B018
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_coordinates_of_half_precision_have_its_rounding_alone(dtype, size) -> None:
+    """Sums of squares of values of 1e4 are beyond float16."""
+    images = size * normal(40, 3) @ normal(3, 200, seed=1) / 4.0
+    half = images.to(dtype)
+    space = LowRank.of(half, 40)
+    again = space.decode(space.encode(half))
+    assert float((again - images).norm()) < torch.finfo(dtype).eps * float(images.norm())

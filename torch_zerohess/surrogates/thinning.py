@@ -12,6 +12,7 @@ def farthest_from_later(points: Tensor, count: int) -> Tensor:
 
     Distances are in units of the standard deviation of every parameter.
     """
+    points = points.to(torch.promote_types(points.dtype, torch.float32))  # half precision has no distances
     deviation = points.std(0)
     scaled = (points - points.mean(0)) / torch.where(deviation > 0, deviation, 1.0)
     nearest = torch.cat([_to_later(scaled, row) for row in range(0, len(scaled), _BLOCK)])

@@ -63,14 +63,15 @@ def test_wrong_shapes_raise(points, outputs) -> None:
         memory.add(normal(*points), normal(*outputs))
 
 
-def test_thinning_drops_older_points_that_are_crowded() -> None:
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_thinning_drops_older_points_that_are_crowded(dtype) -> None:
     memory = Memory(capacity=10)
-    z = torch.arange(11, dtype=torch.float64)[:, None]
-    z[10] = 2.01  # the newest, next to the third
+    z = torch.arange(11, dtype=dtype)[:, None]
+    z[10] = 2.125  # the newest, next to the third
     memory.add(z, z)
     assert len(memory) == 10
     assert 2.0 not in memory.points
-    assert 2.01 in memory.points
+    assert 2.125 in memory.points
     assert torch.equal(memory.points, memory.outputs)
 
 

@@ -24,7 +24,7 @@ template <class... Parts>
 [[noreturn]] void refuse(const char* condition, const Parts&...) { throw std::invalid_argument(condition); }
 #define STD_TORCH_CHECK(condition, ...) \
   if (!(condition)) refuse(#condition, __VA_ARGS__)
-#define STABLE_TORCH_ERROR_CODE_CHECK(call) call
+#define TORCH_ERROR_CODE_CHECK(call) call
 #define ZH_JOINED(a, b) a##b
 #define ZH_UNUSED_TEMPLATE(number) \
   template <class Library>         \

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -44,6 +45,19 @@ def source(folder: Path) -> Path:
     for name in ("torch_zerohess", "csrc"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("_C*", "__pycache__"))
     return copy
+
+
+MACROS = {
+    *("STABLE_TORCH_LIBRARY", "STABLE_TORCH_LIBRARY_FRAGMENT", "STABLE_TORCH_LIBRARY_IMPL", "TORCH_BOX"),
+    *("STD_TORCH_CHECK", "TORCH_ERROR_CODE_CHECK"),
+}
+"""Of the headers of torch 2.10, the oldest release that `setup.py` builds for."""
+
+
+def test_extension_uses_macros_that_the_oldest_torch_has():
+    """`TORCH_TARGET_VERSION` hides newer functions from the compiler, but no newer macros."""
+    code = "\n".join(path.read_text() for path in (ROOT / "csrc").iterdir())
+    assert set(re.findall(r"\b(?:\w+_)?TORCH_(?!ZEROHESS)[A-Z_]+\b", code)) == MACROS
 
 
 def test_extension_is_built_and_doctor_says_so():

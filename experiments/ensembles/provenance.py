@@ -30,10 +30,21 @@ SHARED = ("preset", "variant", "threads", "workers")
 
 
 def read_command(folder: Path) -> dict[str, Any]:
-    """Return the `commands` and the `settings` (task -> method -> name -> value) of a folder."""
+    """Return the `commands` and the `settings` (task -> method -> name -> value) of a folder.
+
+    SystemExit names a file that does not have them.
+    """
     path = folder / NAME
-    known: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"commands": [], "settings": {}}
-    return known
+    if not path.exists():
+        return {"commands": [], "settings": {}}
+    try:
+        known: dict[str, Any] = json.loads(path.read_text())
+        return {"commands": list(known["commands"]), "settings": dict(known["settings"])}
+    except (ValueError, TypeError, KeyError) as error:
+        raise SystemExit(
+            f"{path} must have the commands and settings of the runs beside it, got a file that cannot be read "
+            f"({error}); delete the folder, then the same `run` command makes the runs again"
+        ) from error
 
 
 def preset_and_variant(settings: Mapping[str, Mapping[str, Any]]) -> tuple[Preset, str]:

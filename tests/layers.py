@@ -7,8 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from torch_zerohess import Smoothing
+from torch_zerohess.autograd import tracing
 from truths import Image, spread, truths
 
+in_graphs = pytest.mark.skipif(not tracing.GRAPHS, reason="compiled code contains a layer from torch 2.15 on")
 N = 3
 T = truths(N)
 SCALAR, IMAGE = T["wave"], Image((T["wave"], T["exponential"], T["bump"], T["step"]))

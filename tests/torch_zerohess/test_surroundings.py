@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from layers import in_graphs
 
 import torch_zerohess as zh
 from truths import vector
@@ -18,6 +19,7 @@ def f(z: torch.Tensor) -> torch.Tensor:
     return (z**3).sin().sum(1)
 
 
+@in_graphs
 @pytest.mark.usefixtures("quick_inductor")
 def test_compiled_code_does_not_write_into_the_settings():
     layer = zh.BlackBox(f, S.replace(sigma=vector(0.1, 0.2)))
@@ -29,6 +31,7 @@ def test_compiled_code_does_not_write_into_the_settings():
     assert torch.equal(layer.smoothing.sigma, vector(0.1, 0.2))
 
 
+@in_graphs
 def test_compiled_forward_mode():
     layer, x, v = zh.smooth(f, S), vector(0.3, 0.7), vector(1.0, -2.0)
     compiled = torch.compile(lambda z: torch.func.jvp(layer, (z,), (v,))[1], backend="aot_eager", fullgraph=True)

@@ -8,6 +8,7 @@ from torch.autograd import forward_ad, gradcheck, gradgradcheck
 
 import torch_zerohess as zh
 from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+from torch_zerohess.autograd import tracing
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.sampling import kernels
 from truths import spread, vector
@@ -208,9 +209,10 @@ def test_randomness_of_vmap_is_honoured_or_refused() -> None:
     for call, (randomness, message) in refused.items():
         with pytest.raises(ValueError, match=message):
             call(randomness)
-        torch.compiler.reset()
-        with pytest.raises(Exception, match=message):
-            torch.compile(call, fullgraph=True, backend="aot_eager")(randomness)
+        if tracing.GRAPHS:
+            torch.compiler.reset()
+            with pytest.raises(Exception, match=message):
+                torch.compile(call, fullgraph=True, backend="aot_eager")(randomness)
     layer.smoothing = AGGREGATE
     torch.testing.assert_close(mapped("same"), estimate(SCALAR.f, same_points, AGGREGATE).gradient)
     torch.testing.assert_close(shared("different"), estimate(SCALAR.f, X, AGGREGATE).gradient.expand(3, N))

@@ -5,19 +5,13 @@ import warnings
 
 import pytest
 import torch
-from layers import AGGREGATE, BATCH, IMAGE, SCALAR, SETTINGS, X, close, counting, leaf, network
+from layers import AGGREGATE, BATCH, IMAGE, SCALAR, SETTINGS, X, close, counting, in_graphs, leaf, network
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Memory, Smoothing, estimate
-from torch_zerohess.autograd import tracing
 from torch_zerohess.estimation import perturbations
 
-pytestmark = [
-    pytest.mark.usefixtures("fresh_compiler"),
-    pytest.mark.skipif(
-        not tracing.GRAPHS, reason="the graph of a compiled model contains the layer from torch 2.15 on"
-    ),
-]
+pytestmark = [pytest.mark.usefixtures("fresh_compiler"), in_graphs]
 
 COMPILED = {
     "aggregate": AGGREGATE,

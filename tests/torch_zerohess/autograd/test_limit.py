@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from layers import in_graphs
 from torch import Tensor
 
 from torch_zerohess import BlackBox, Smoothing, estimate
@@ -28,6 +29,7 @@ def compiled(f):
     return torch.compile(f, fullgraph=True, backend="aot_eager")
 
 
+@in_graphs
 @pytest.mark.parametrize("way", ["hessian", "jacrev of jacrev"])
 @pytest.mark.parametrize("smoothing", FIRST.values(), ids=FIRST.keys())
 def test_compiled_second_derivatives_of_first_order_samples_raise(smoothing: Smoothing, way: str) -> None:
@@ -36,6 +38,7 @@ def test_compiled_second_derivatives_of_first_order_samples_raise(smoothing: Smo
         compiled(lambda x: SECOND[way](layer)(x))(X)
 
 
+@in_graphs
 def test_compiled_gradients_of_first_order_samples_are_differentiated_once() -> None:
     layer, e = BlackBox(F, FIRST["fr22"]), estimate(F, X, FIRST["fr22"])
     torch.testing.assert_close(compiled(lambda x: func.grad(layer)(x))(X), e.gradient)
@@ -57,6 +60,7 @@ def test_third_derivatives_of_optimal_samples_raise(way: str) -> None:
                 outer(second)(X)
 
 
+@in_graphs
 def test_third_derivatives_of_optimal_samples_raise_in_plain_and_compiled_code() -> None:
     layer, x = BlackBox(F, OPTIMAL), X.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(layer(x), x, create_graph=True)

@@ -6,6 +6,7 @@ from typing import Literal
 
 import pytest
 import torch
+from layers import in_graphs
 from torch import Tensor
 
 import torch_zerohess as zh
@@ -106,6 +107,7 @@ def test_tempered_losses_never_overflow() -> None:
     assert bool(torch.isfinite(Entropy(square, 0.1).inner(losses, scales)).all())
 
 
+@in_graphs
 def test_a_layer_may_be_compiled_before_its_first_call() -> None:
     smoothing = zh.Smoothing(sigma=0.5, samples=4, seed=1)
     eager, compiled = (zh.BlackBox(identity, smoothing, head=zh.heads.LocalEntropy(square)) for _ in range(2))

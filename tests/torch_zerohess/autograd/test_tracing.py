@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from layers import in_graphs
 from torch import Tensor
 from torch._dynamo.exc import FailOnRecompileLimitHit
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -30,12 +31,14 @@ def memory(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(perturbations, "STORED", 0)
 
 
+@in_graphs
 def test_two_calls_in_compiled_code_are_two_draws() -> None:
     layer = BlackBox(F, S.replace(seed=None), value="smoothed")
     difference = torch.compile(lambda x: (layer(x) - layer(x)).sum(), fullgraph=True, backend="aot_eager")
     assert float(difference(X.clone().requires_grad_()).detach()) != 0.0
 
 
+@in_graphs
 def test_two_calls_of_a_noisy_function_in_compiled_code_are_two_calls() -> None:
     calls: list[int] = []
     layer, w = BlackBox(lambda z: calls.append(len(z)) or F(z) + len(calls), S), torch.ones((), requires_grad=True)
@@ -63,6 +66,7 @@ def test_evaluation_draws_nothing() -> None:
     assert torch.equal(before, torch.get_rng_state())
 
 
+@in_graphs
 def test_compiled_checkpoints_draw_the_same_again() -> None:
     layer = BlackBox(F, S.replace(seed=None))
 
@@ -173,6 +177,7 @@ def test_the_operator_that_draws_nodes(count: int, n: int) -> None:
     torch.library.opcheck(ops.nodes.default, (layer._handle, 0, count, BATCH[:, :1].expand(4, n).float(), []))
 
 
+@in_graphs
 def test_compiled_code_serves_every_seed_and_sigma() -> None:
     layer, graphs = BlackBox(F, S.replace(seed=None)), []
 
@@ -187,6 +192,7 @@ def test_compiled_code_serves_every_seed_and_sigma() -> None:
     assert len(graphs) == 1
 
 
+@in_graphs
 @pytest.mark.parametrize("fullgraph", [True, False])
 def test_a_graph_serves_one_number_of_samples(fullgraph: bool) -> None:
     """Beyond the limit of torch, here two graphs, the layer runs without one, unless fullgraph is asked for."""

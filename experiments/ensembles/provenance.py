@@ -43,7 +43,7 @@ def read_command(folder: Path) -> dict[str, Any]:
     except (ValueError, TypeError, KeyError) as error:
         raise SystemExit(
             f"{path} must have the commands and settings of the runs beside it, got a file that cannot be read "
-            f"({error}); delete the folder, then the same `run` command makes the runs again"
+            f"({error}); move the folder away, then the same `run` command makes the runs again"
         ) from error
 
 

@@ -118,7 +118,7 @@ def test_a_file_in_place_of_a_folder_is_refused_before_the_runs(tmp_path, file):
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"commands": 1, "settings": {}}'])
 def test_a_note_of_commands_that_cannot_be_read_is_named(tmp_path, text):
     (tmp_path / "command.json").write_text(text)
-    with pytest.raises(SystemExit, match=rf"^{tmp_path}/command\.json must have the commands .*; delete the folder"):
+    with pytest.raises(SystemExit, match=rf"^{tmp_path}/command\.json must have the commands .*; move the folder away"):
         ensemble(tmp_path).plan([TASK], [HALVE])
 
 

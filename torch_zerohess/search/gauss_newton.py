@@ -35,7 +35,7 @@ class JacobianProgress(Progress):
 
     phase: Literal["sample", "trial", "aside"] = "sample"
     """What is asked for: samples, after the start itself at first; steps; or points where only the parameters move that
-    have stayed, see `LocalMethod`."""
+    have stayed, see `SparseMethod`."""
     radius: float
     """Root mean square over the parameters."""
     output: Tensor

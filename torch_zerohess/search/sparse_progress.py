@@ -27,7 +27,7 @@ _EQUAL = 1e-5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LocalProgress(JacobianProgress):
+class SparseProgress(JacobianProgress):
     """The output at the center, the sparse Jacobian there, and the samples asked for next."""
 
     jacobian: SparseJacobian | None = None
@@ -59,7 +59,7 @@ class LocalProgress(JacobianProgress):
     """Whether steps lead to the minimum of the loss of linear outputs that a thorough search finds."""
     doubted: float = math.inf
     """Loss where the search has last found that it has not arrived, because the thorough search found a lower one."""
-    home: "LocalProgress | None" = None
+    home: "SparseProgress | None" = None
     """The search before the hop that has led here."""
     hopped: float = math.inf
     """Loss at the start of this hop."""
@@ -124,12 +124,12 @@ class LocalProgress(JacobianProgress):
         """Return directions from the center and changes of the output along them, in units of sigma, float32."""
         return ((points - self.center) / self.sigma).float(), ((outputs - self.output) / self.sigma).float()
 
-    def telling_noise(self, one: Tensor, other: Tensor) -> "LocalProgress":
+    def telling_noise(self, one: Tensor, other: Tensor) -> "SparseProgress":
         """Take what two outputs [m] at one point tell about noise: a mean over all pairs, mostly the latest ones."""
         own, pairs = 0.5 * float((one - other).square().mean()), min(self.pairs + 1, _PAIRS)
         return replace(self, variance=own if pairs == 1 else self.variance + (own - self.variance) / pairs, pairs=pairs)
 
-    def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "LocalProgress":
+    def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "SparseProgress":
         """Return the progress with a new Jacobian.
 
         If it is the first one with which some parameters stay, the best point is the center again: samples move all
@@ -141,7 +141,7 @@ class LocalProgress(JacobianProgress):
         at = self.home if self.home is not None and self.failed else self
         return replace(after, best=Best(at.center, at.loss, at.sigma))
 
-    def with_dense(self, u: Tensor, changes: Tensor) -> "LocalProgress":
+    def with_dense(self, u: Tensor, changes: Tensor) -> "SparseProgress":
         """Take the dense Jacobian where the samples of the latest fit determine it, and it predicts better."""
         assert self.fitted is not None
         assert self.evidence is not None
@@ -151,7 +151,7 @@ class LocalProgress(JacobianProgress):
         evidence = self.evidence.with_batch(best, None, u, changes)
         return replace(self, jacobian=best.within(evidence.found), evidence=evidence)
 
-    def told_aside(self, evaluated: Evaluated, gain: float) -> "LocalProgress":
+    def told_aside(self, evaluated: Evaluated, gain: float) -> "SparseProgress":
         """Take what points tell at which only the parameters that stay have moved.
 
         Slopes may be zero although outputs change, as at the maximum of a parabola. Then no parameter stays any more,
@@ -166,7 +166,7 @@ class LocalProgress(JacobianProgress):
             return known
         return replace(known, center=evaluated.points[k].clone(), output=outputs[k].clone(), loss=float(losses[k]))
 
-    def recorded(self, evaluated: Evaluated) -> "LocalProgress":
+    def recorded(self, evaluated: Evaluated) -> "SparseProgress":
         """Return the progress with the lowest loss as the best one. Samples do not count where parameters stay."""
         if self.some_stay and self.phase == "sample":
             evaluated = evaluated.those(slice(int(self.hops)))

@@ -39,7 +39,7 @@ Loss = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class LocalSteps:
+class SparseSteps:
     """Steps [k, n], and how far the longest one lowers the loss of linear outputs.
 
     None where a quadratic holds that is curved along this step.
@@ -55,9 +55,9 @@ def derivatives(expanded: LossCurvature, jacobian: SparseJacobian) -> tuple[Tens
     return gradient, lambda v: jacobian.rmatvec(expanded.product(jacobian.matvec(v)))
 
 
-def local_steps(
+def sparse_steps(
     loss: Loss, output: Tensor, jacobian: SparseJacobian, radii: Tensor, lower: Tensor, upper: Tensor
-) -> LocalSteps:
+) -> SparseSteps:
     """Return a step within each of the radii [k], the longest one last.
 
     Args:
@@ -81,10 +81,10 @@ def local_steps(
 
 def thorough_step(
     loss: Loss, output: Tensor, jacobian: SparseJacobian, longest: float, lower: Tensor, upper: Tensor, start: Tensor
-) -> LocalSteps:
+) -> SparseSteps:
     """Return one step [1, n] to the lowest point that a thorough search finds, which calls the loss 1000 times.
 
-    The steps of `local_steps` end where bounds and kinks meet, although a longer way leads on: see
+    The steps of `sparse_steps` end where bounds and kinks meet, although a longer way leads on: see
     `bounded_krylov_step` and `bounded_kinked_minimum`. Above `THOROUGH` parameters kinks are smoothed here, too.
 
     Args:
@@ -104,12 +104,12 @@ def thorough_step(
     s = bounded_krylov_step(product, gradient, longest, lower, upper, zero, iterations=_ITERATIONS)
     promised = -float(gradient @ s + 0.5 * (s @ product(s)))
     if abs(before - outputs.value(s) - promised) <= _CLOSE * promised + _ROUNDED * abs(before):
-        return LocalSteps(s[None], promised)
+        return SparseSteps(s[None], promised)
     start = min(zero, start * min(1.0, longest / max(float(start.norm()), math.ulp(0.0))), s, key=outputs.value)
     if jacobian.n > THOROUGH:
         widths = jacobian.values.to(s).square().sum(1).sqrt() * (longest / math.sqrt(jacobian.n))
         end, promised = smoothed_minimum(outputs, widths, longest, lower, upper, start)
-        return LocalSteps(end[None], promised)
+        return SparseSteps(end[None], promised)
 
     def function(s: Tensor) -> tuple[float, Tensor]:
         value, slope = outputs.loss(outputs.output + outputs.matvec(s))
@@ -118,7 +118,7 @@ def thorough_step(
     lower, upper = (one.clamp(-longest, longest) for one in (lower, upper))
     end = bounded_kinked_minimum(function, start, lower, upper, longest, _TRIES, _NOTHING)
     end = end * min(1.0, longest / max(float(end.norm()), math.ulp(0.0)))
-    return LocalSteps(end[None], before - outputs.value(end))
+    return SparseSteps(end[None], before - outputs.value(end))
 
 
 def linear_outputs(
@@ -142,7 +142,7 @@ def checked_steps(
     radii: Tensor,
     lower: Tensor,
     upper: Tensor,
-) -> LocalSteps:
+) -> SparseSteps:
     """Return the steps [k, n] of a quadratic where it holds, and else steps to the minimum of linear outputs.
 
     Args:
@@ -158,10 +158,10 @@ def checked_steps(
     before, down, longest = outputs.value(torch.zeros_like(gradient)), steps @ gradient, float(radii[-1])
     if all(_holds(outputs, before, s, float(one)) for s, one in zip(steps, -(down + 0.5 * bent), strict=True)):
         straight = float(bent[-1]) <= -_ROUNDED * float(down[-1])
-        return LocalSteps(steps, -float(down[-1]) if straight else None)
+        return SparseSteps(steps, -float(down[-1]) if straight else None)
     start = min(steps.clamp(lower, upper), key=outputs.value)
     end, promised = smoothed_minimum(outputs, widths, longest, lower, upper, start)
-    return LocalSteps(radii[:, None] / longest * end, promised)
+    return SparseSteps(radii[:, None] / longest * end, promised)
 
 
 def _holds(outputs: LinearOutputs, before: float, s: Tensor, promised: float) -> bool:

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 from torch import Tensor
 
 from torch_zerohess.search.descent import descent_method
-from torch_zerohess.search.descent_and_process import DescentAndProcess, TurnsProgress
+from torch_zerohess.search.descent_and_gaussian_process import DescentAndProcess, TurnsProgress
 from torch_zerohess.search.gaussian_process_search import process_method
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.noisy_sparse_method import sparse_method

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.gaussian_process_of_output import OutputProcess, OutputProcessProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
-from torch_zerohess.search.output_process import OutputProcess, OutputProcessProgress
 from torch_zerohess.search.relay import Relay
 from torch_zerohess.search.state import Best, Evaluated, Progress
 

@@ -27,13 +27,13 @@ from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.krylov import are_free
 from torch_zerohess.linalg.subproblem import damped_steps
 from torch_zerohess.search.gauss_newton import LENGTHS, GaussNewton, JacobianProgress
+from torch_zerohess.search.kinked_steps import LITTLE, Steps, checked_steps, linear_outputs
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.noisy_step import alternating
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.sparse_progress import check_range
-from torch_zerohess.search.sparse_steps import LITTLE, SparseSteps, checked_steps, linear_outputs
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.surrogate import scaled
@@ -108,7 +108,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         """Solve the model for the parameters that no bound holds, see `damped_steps` and `checked_steps`."""
         return self._solved(known, radii).steps
 
-    def _solved(self, known: BlockProgress, radii: Tensor) -> SparseSteps:
+    def _solved(self, known: BlockProgress, radii: Tensor) -> Steps:
         x, jacobian, (gradient, hessian) = known.center, known.jacobian, self._derivatives(known)
         lower, upper = self.settings.lower - x, self.settings.upper - x
         free = are_free(torch.zeros_like(x), gradient, lower, upper) > 0.0

@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
+from torch_zerohess.search.kinked_steps import LITTLE, Steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.sparse_progress import SparseProgress
 from torch_zerohess.search.sparse_search_settings import SparseSearchSettings
-from torch_zerohess.search.sparse_steps import LITTLE, SparseSteps, sparse_steps, thorough_step
+from torch_zerohess.search.sparse_steps import sparse_steps, thorough_step
 from torch_zerohess.search.state import Best
 
 MOST = 2
@@ -40,13 +41,13 @@ class SparseArrivals(GaussNewton[SparseProgress]):
     def __init__(self, settings: Settings, own: SparseSearchSettings) -> None:
         super().__init__(settings)
         self.own, self.radius = own, own.radius
-        self._last: tuple[SparseProgress, Tensor, SparseSteps] | None = None  # progress, lengths and steps
+        self._last: tuple[SparseProgress, Tensor, Steps] | None = None  # progress, lengths and steps
 
     def steps(self, known: SparseProgress, radii: Tensor) -> Tensor:
         """Solve the model, see `sparse_steps`."""
         return self._solved(known, radii).steps
 
-    def _solved(self, known: SparseProgress, radii: Tensor) -> SparseSteps:
+    def _solved(self, known: SparseProgress, radii: Tensor) -> Steps:
         last, settings = self._last, self.settings
         if last is not None and last[0] is known and torch.equal(last[1], radii):
             return last[2]
@@ -59,7 +60,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
         self._last = known, radii, found
         return found
 
-    def _thorough(self, known: SparseProgress, longest: float, start: Tensor) -> SparseSteps:
+    def _thorough(self, known: SparseProgress, longest: float, start: Tensor) -> Steps:
         """Return the step of a thorough search, from the end of another step [n]."""
         assert known.jacobian is not None
         settings, output = self.settings, known.output.view(known.shape)

@@ -24,6 +24,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.kinked_steps import NOTHING
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.sparse_arrival import MOST, SparseArrivals
 from torch_zerohess.search.sparse_progress import SparseProgress, in_range
@@ -48,8 +49,6 @@ _HOP = 0.3
 """Standard deviation of a hop, in units of the first sigma."""
 _FOUND = 0.3
 """Share of the entries that must be of parameters that were found, before steps follow, or else more samples."""
-_NOTHING = 1e-8
-"""Decrease that the loss of linear outputs promises, over the loss: so small that no step is tried."""
 _LEAST = 1e-300
 """Least number that is divided by."""
 _FULL = 1000
@@ -143,7 +142,7 @@ class SparseMethod(SparseArrivals):
             known = replace(known, sigma=self.distance(known.radius))
         if known.phase == "trial" and not known.done:
             promised = self._solved(known, self.radii(known)).promised
-            if promised is not None and promised <= _NOTHING * abs(known.loss):
+            if promised is not None and promised <= NOTHING * abs(known.loss):
                 known = self.at_kink(known)
         if known.done:
             return known, known.center[None][:0]

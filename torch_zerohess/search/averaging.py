@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.noisy_step import alternating, constants, step_in_noise
+from torch_zerohess.search.noisy_step import constants, step_in_noise
 from torch_zerohess.search.sparse_progress import SparseProgress
 from torch_zerohess.search.sparse_search_settings import SparseSearchSettings
 from torch_zerohess.search.state import Best, Evaluated
-from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.loss_curvature import alternating, loss_curvature
 from torch_zerohess.surrogates.sparse_choices import kept
 from torch_zerohess.surrogates.sparse_evidence import Evidence
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, fit_sparse
@@ -142,7 +142,7 @@ class Averaging:
         if not math.isfinite(after.loss):
             return known
         sigma, radius = self.distance(fitted, rest), self.radius(after, known.loss, error)
-        after = replace(after, radius=radius, best=Best(after.center, after.loss, after.sigma))
+        after = replace(after, radius=radius, best=after.here)
         return replace(self._stepped(after), sigma=sigma)
 
     def combined(self, fitted: SparseProgress, count: float, centers: Tensor) -> tuple[Tensor, float]:

@@ -29,14 +29,13 @@ from torch_zerohess.linalg.subproblem import damped_steps
 from torch_zerohess.search.gauss_newton import LENGTHS, GaussNewton, JacobianProgress
 from torch_zerohess.search.kinked_steps import LITTLE, Steps, checked_steps, linear_outputs
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.noisy_step import alternating
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
-from torch_zerohess.search.sparse_progress import check_range
 from torch_zerohess.search.state import Best, Evaluated
-from torch_zerohess.surrogates.loss_curvature import loss_curvature
-from torch_zerohess.surrogates.surrogate import scaled
+from torch_zerohess.search.told import check_range
+from torch_zerohess.surrogates.loss_curvature import alternating, loss_curvature
+from torch_zerohess.surrogates.surrogate import raised, scaled
 
 _RIDGE = 1e-6
 """Added to D D^T, in units of its mean diagonal: bounds can make the steps of a block dependent."""
@@ -140,7 +139,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         longest = known.center.new_tensor([LENGTHS[-1] * self.radius * math.sqrt(self.settings.n)])
         promised = self._solved(known, longest).promised
         if bool(known.jacobian.any()) and (promised is None or promised <= LITTLE * abs(known.loss)):
-            known = known.arriving(Best(known.center, known.loss, known.sigma))
+            known = known.arriving(known.here)
         return super().arrived(replace(known, wanted=self.settings.n))
 
     def distance(self, radius: float) -> float:
@@ -231,9 +230,8 @@ def broyden_update(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
     steps, changes = steps[long], changes[long]
     length = steps.norm(dim=1).mean().clamp_min(torch.finfo(torch.float64).tiny)
     d, c = (steps / length).float(), (changes / length).float()
-    square = d @ d.mT
-    square.diagonal().add_(_RIDGE * float(square.diagonal().mean()) or 1.0)
-    return torch.addmm(jacobian, d.mT, torch.cholesky_solve(c - d @ jacobian, torch.linalg.cholesky(square)))
+    factor = torch.linalg.cholesky(raised(d @ d.mT, _RIDGE))
+    return torch.addmm(jacobian, d.mT, torch.cholesky_solve(c - d @ jacobian, factor))
 
 
 def _largest(values: Tensor) -> float:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.method import Method
-from torch_zerohess.search.state import LOST, Evaluated, Progress
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
@@ -42,6 +42,11 @@ class JacobianProgress(Progress):
     """At the center [m], float64; empty before the first values."""
     loss: float = math.inf
     """At the center. The best point may be a sample with a lower loss."""
+
+    @property
+    def here(self) -> Best:
+        """The center as a best point."""
+        return Best(self.center, self.loss, self.sigma)
 
     def counted(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with a batch counted; it is done after too many batches without a finite value."""

@@ -16,7 +16,7 @@ from torch_zerohess.search.method import Settings
 from torch_zerohess.search.sparse_method import SparseMethod
 from torch_zerohess.search.sparse_progress import SparseProgress
 from torch_zerohess.search.sparse_search_settings import SparseSearchSettings
-from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.state import Evaluated
 
 _LUCK = 4.0
 """Standard deviations of a loss up to which the change by the best step may be noise."""
@@ -109,5 +109,4 @@ class NoisySparseMethod(SparseMethod):
         return replace(known, points=points[-most:], outputs=outputs[-most:])
 
     def _begin(self, known: SparseProgress) -> SparseProgress:
-        here = Best(known.center, known.loss, known.sigma)
-        return replace(known, averaging=True, best=here, home=None, phase="sample", samples=self.own.samples)
+        return replace(known, averaging=True, best=known.here, home=None, phase="sample", samples=self.own.samples)

@@ -13,7 +13,7 @@ from torch_zerohess.linalg.krylov import are_free, krylov_steps
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.sparse_progress import SparseProgress
 from torch_zerohess.search.sparse_steps import derivatives, sparse_steps
-from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature
+from torch_zerohess.surrogates.loss_curvature import LossCurvature, alternating, loss_curvature
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _CURVED = 3.0
@@ -40,13 +40,6 @@ def step_in_noise(known: SparseProgress, settings: Settings) -> Tensor:
         return free * (product(free * v) + own * v)
 
     return krylov_steps(bent, free * gradient, radii, iterations=_ITERATIONS)[0]
-
-
-def alternating(output: Tensor) -> Tensor:
-    """Return 1, -1, 1, ... in the shape of an output."""
-    signs = torch.ones_like(output).flatten()
-    signs[1::2] = -1.0
-    return signs.view(output.shape)
 
 
 def uncertain(expanded: LossCurvature, jacobian: SparseJacobian, output: Tensor) -> Tensor:

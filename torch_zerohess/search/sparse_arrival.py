@@ -18,7 +18,6 @@ from torch_zerohess.search.method import Settings
 from torch_zerohess.search.sparse_progress import SparseProgress
 from torch_zerohess.search.sparse_search_settings import SparseSearchSettings
 from torch_zerohess.search.sparse_steps import sparse_steps, thorough_step
-from torch_zerohess.search.state import Best
 
 MOST = 2
 """Samples of a batch, over the first number of samples, at most."""
@@ -92,8 +91,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
         if known.some_stay and not (known.moved or self.settings.noise):
             return replace(known, phase="aside")
         if found is None:
-            end = Best(known.center, known.loss, known.sigma)
-            known = known.arriving(end).agreeing(end, self.settings.tolerance)
+            known = known.arriving(known.here).agreeing(known.here, self.settings.tolerance)
         known = super().arrived(replace(known, thorough=False))
         return known if known.done else self._hopping(replace(known, finished=True))
 
@@ -157,8 +155,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
         known = replace(home.taking(known, *_SHARED), phase="sample", patient=True)
         if not home.finished:
             return known
-        end = Best(known.center, known.loss, known.sigma)
-        known = known.agreeing(end, self.settings.tolerance) if same else known.with_arrivals(agreed=0)
+        known = known.agreeing(known.here, self.settings.tolerance) if same else known.with_arrivals(agreed=0)
         known = super().arrived(known)
         return known if known.done else self._hopping(known)
 

@@ -27,9 +27,10 @@ from torch import Tensor
 from torch_zerohess.search.kinked_steps import NOTHING
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.sparse_arrival import MOST, SparseArrivals
-from torch_zerohess.search.sparse_progress import SparseProgress, in_range
+from torch_zerohess.search.sparse_progress import SparseProgress
 from torch_zerohess.search.sparse_steps import derivatives
 from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.told import in_range
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_choices import fit_chosen

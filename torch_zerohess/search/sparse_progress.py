@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass, field, replace
 
-import torch
 from torch import Tensor
 
 from torch_zerohess.search.gauss_newton import JacobianProgress
 from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.told import check_range
 from torch_zerohess.surrogates.determined_jacobian import better_determined
 from torch_zerohess.surrogates.sparse_choices import GridEvidence
 from torch_zerohess.surrogates.sparse_evidence import Evidence
@@ -139,7 +139,7 @@ class SparseProgress(JacobianProgress):
         if self.some_stay or not after.some_stay:
             return after
         at = self.home if self.home is not None and self.failed else self
-        return replace(after, best=Best(at.center, at.loss, at.sigma))
+        return replace(after, best=at.here)
 
     def with_dense(self, u: Tensor, changes: Tensor) -> "SparseProgress":
         """Take the dense Jacobian where the samples of the latest fit determine it, and it predicts better."""
@@ -177,18 +177,3 @@ class SparseProgress(JacobianProgress):
         """Whether a hop has led to a loss that is lower by more than rounding."""
         added = self.hopped - before if self.hopped < math.inf else 0.0
         return loss < before - _ROUNDING * max(abs(before), added)
-
-
-def check_range(search: str, changes: Tensor) -> None:
-    """Raise ValueError for changes of outputs over sigma that float32 cannot hold; `search` says who computes in it."""
-    if not in_range(changes):
-        raise ValueError(
-            f"{search} computes in float32, got outputs whose largest change over sigma is "
-            f"{float(changes.abs().max()):g}: return them in other units, so that it is near 1"
-        )
-
-
-def in_range(changes: Tensor) -> bool:
-    """Whether the largest of these numbers is a normal number in float32, or all are 0."""
-    largest, limits = float(changes.abs().max()), torch.finfo(torch.float32)
-    return largest == 0.0 or limits.tiny <= largest <= limits.max

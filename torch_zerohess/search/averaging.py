@@ -72,12 +72,12 @@ class Averaging:
 
     def error(self, known: SparseProgress, variance: float) -> float:
         """Return the standard error of the loss at the center if the numbers of the output have a variance."""
-        slope = loss_curvature(self.settings.white_box, known.output.view(known.shape)).slope
+        slope = loss_curvature(self.settings.white_box, known.shaped_output).slope
         return math.sqrt(variance) * float(slope.norm())
 
     def raised(self, known: SparseProgress, variance: float) -> float:
         """Return by how much noise with a variance raises the loss of the output at the center, about."""
-        output = known.output.view(known.shape)
+        output = known.shaped_output
         noise = math.sqrt(variance) * alternating(output)
         around = [float(self.settings.white_box(one)) for one in (output + noise, output - noise)]
         return max(0.5 * sum(around) - known.loss, 0.0)

@@ -91,7 +91,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
 
     def renewed(self, known: BlockProgress, evaluated: Evaluated) -> BlockProgress:
         """Correct the Jacobian along the samples; steps follow when no more are wanted."""
-        count, sound = len(evaluated), evaluated.those(evaluated.finite)
+        count, sound = len(evaluated), evaluated.sound
         assert sound.outputs is not None
         if not len(known.jacobian) and len(sound):
             check_range("BlockGaussNewton", (sound.outputs - known.output) / known.sigma)
@@ -117,7 +117,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
 
         outputs = linear_outputs(
             self.settings.white_box,
-            known.output.view(known.shape),
+            known.shaped_output,
             lambda s: (s.float() @ jacobian).double(),
             lambda w: (jacobian @ w.float()).double(),
         )
@@ -154,7 +154,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         size = _largest(known.jacobian)
         jacobian = known.jacobian / size  # squares of float32 do not overflow
         directions = jacobian.view(-1, *known.shape)
-        loss = loss_curvature(self.settings.white_box, known.output.view(known.shape))
+        loss = loss_curvature(self.settings.white_box, known.shaped_output)
         _, unit = scaled(loss.product(alternating(loss.slope)))  # a second derivative may be beyond float32
         slope, bend = loss.slope.flatten(), loss.products(directions, unit)
         steep, bent = _largest(slope), _largest(bend)

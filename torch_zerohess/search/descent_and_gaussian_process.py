@@ -85,7 +85,7 @@ class DescentAndProcess(Relay[TurnsProgress]):
     def next(
         self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[TurnsProgress, Tensor]:
-        new = evaluated.those(evaluated.finite)
+        new = evaluated.sound
         record = known.record.or_lower(new, known.sigma)
         if record is not known.record:
             assert new.outputs is not None

@@ -44,6 +44,11 @@ class JacobianProgress(Progress):
     """At the center. The best point may be a sample with a lower loss."""
 
     @property
+    def shaped_output(self) -> Tensor:
+        """The output at the center [*out]."""
+        return self.output.view(self.shape)
+
+    @property
     def here(self) -> Best:
         """The center as a best point."""
         return Best(self.center, self.loss, self.sigma)
@@ -55,7 +60,7 @@ class JacobianProgress(Progress):
 
     def recorded(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with the lowest loss so far as the best one. Samples count as steps do."""
-        return replace(self, best=self.best.or_lower(evaluated.those(evaluated.finite), self.sigma))
+        return replace(self, best=self.best.or_lower(evaluated.sound, self.sigma))
 
 
 class GaussNewton(Method[Q]):
@@ -107,7 +112,7 @@ class GaussNewton(Method[Q]):
         if not known.done and known.phase == "sample":
             known = self.sampled(known, evaluated)
         elif not known.done:
-            known = self.taken(known, evaluated.those(evaluated.finite))
+            known = self.taken(known, evaluated.sound)
         if known.done:
             return known, known.center[None][:0]
         return self.asked(known, generator)

@@ -206,7 +206,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the lowest new loss, and all losses at the start of a round, with the quadratic that is kept."""
         bottom, holes = known.bottom, not bool(evaluated.finite.all())
-        evaluated = evaluated.those(evaluated.finite)
+        evaluated = evaluated.sound
         if bottom is None or known.slope is None or known.bend is None or not len(evaluated):
             return known
         steps, above = evaluated.points - bottom.point, evaluated.losses - bottom.loss

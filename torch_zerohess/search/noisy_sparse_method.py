@@ -99,7 +99,7 @@ class NoisySparseMethod(SparseMethod):
 
     def _keeping(self, known: SparseProgress, evaluated: Evaluated) -> SparseProgress:
         """Keep the evaluations with finite values, as far as there is room."""
-        sound = evaluated.those(evaluated.finite)
+        sound = evaluated.sound
         assert sound.outputs is not None
         held = max(sound.points.shape[1] + sound.outputs.shape[1], 1)
         most = max(min(_KEPT, _HELD // held), 2 * self.own.samples)

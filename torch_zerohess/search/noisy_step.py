@@ -26,7 +26,7 @@ def step_in_noise(known: SparseProgress, settings: Settings) -> Tensor:
     """Return the step from the center to the minimum of the model within the radius [n]."""
     jacobian, x, loss = known.jacobian, known.center, settings.white_box
     assert jacobian is not None
-    output, radii = known.output.view(known.shape), x.new_tensor([known.radius * math.sqrt(settings.n)])
+    output, radii = known.shaped_output, x.new_tensor([known.radius * math.sqrt(settings.n)])
     lower, upper = settings.lower - x, settings.upper - x
     kinked = sparse_steps(loss, output, jacobian, radii, lower, upper)
     if kinked.promised is not None:

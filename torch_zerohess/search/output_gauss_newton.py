@@ -77,7 +77,7 @@ class OutputProgress(RegionProgress):
 
     def remembered(self, evaluated: Evaluated, capacity: int) -> "OutputProgress":
         """Add evaluations whose values are finite."""
-        new = evaluated.those(evaluated.finite)
+        new = evaluated.sound
         known, outputs = super().remembered(new, capacity), self.outputs
         known = known.taking(self.told(evaluated, lost=evaluated.lacking), "evaluations", "lost", "shape")
         if new.outputs is not None and len(new):

@@ -127,7 +127,7 @@ class SmoothedQuadratics(Method[DescentProgress]):
     # What was evaluated.
 
     def _remembered(self, known: DescentProgress, evaluated: Evaluated) -> DescentProgress:
-        new = evaluated.those(evaluated.finite)
+        new = evaluated.sound
         own, more = new.needed, new.further
         pool = known.pool.add(own.points, own.losses, own.outputs, known.center, known.sigma)
         if len(more):

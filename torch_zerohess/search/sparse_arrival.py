@@ -52,7 +52,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
             return last[2]
         assert known.jacobian is not None
         box = settings.lower - known.center, settings.upper - known.center
-        found = sparse_steps(settings.white_box, known.output.view(known.shape), known.jacobian, radii, *box)
+        found = sparse_steps(settings.white_box, known.shaped_output, known.jacobian, radii, *box)
         if known.thorough:
             found = self._thorough(known, float(radii[-1]), found.steps[-1])
             found = replace(found, steps=radii[:, None] / radii[-1] * found.steps)
@@ -62,7 +62,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
     def _thorough(self, known: SparseProgress, longest: float, start: Tensor) -> Steps:
         """Return the step of a thorough search, from the end of another step [n]."""
         assert known.jacobian is not None
-        settings, output = self.settings, known.output.view(known.shape)
+        settings, output = self.settings, known.shaped_output
         lower, upper = settings.lower - known.center, settings.upper - known.center
         start = start.clamp(lower, upper)
         return thorough_step(settings.white_box, output, known.jacobian, longest, lower, upper, start)

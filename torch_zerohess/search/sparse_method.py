@@ -105,7 +105,7 @@ class SparseMethod(SparseArrivals):
 
     def renewed(self, known: SparseProgress, evaluated: Evaluated) -> SparseProgress:
         """Fit the Jacobian to samples; too few of them are drawn again."""
-        first, sound = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
+        first, sound = known.evaluations == len(evaluated) + 1, evaluated.sound
         assert sound.outputs is not None
         if len(sound) < FEWEST_SAMPLES:
             return known
@@ -129,7 +129,7 @@ class SparseMethod(SparseArrivals):
         if known.phase != "aside":
             return super().next(known, evaluated, generator)
         before = known.counted(evaluated).recorded(evaluated)
-        known = before.told_aside(evaluated.those(evaluated.finite), _SLOW)
+        known = before.told_aside(evaluated.sound, _SLOW)
         if known.center is not before.center:
             known = replace(known, radius=self.radius, sigma=self.distance(self.radius), phase="sample", slow=0)
         elif not known.done:
@@ -195,4 +195,4 @@ class SparseMethod(SparseArrivals):
     def _derivatives(self, known: SparseProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
         assert known.jacobian is not None
-        return derivatives(loss_curvature(self.settings.white_box, known.output.view(known.shape)), known.jacobian)
+        return derivatives(loss_curvature(self.settings.white_box, known.shaped_output), known.jacobian)

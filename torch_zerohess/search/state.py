@@ -196,6 +196,11 @@ class Evaluated:
         return finite if self.outputs is None else finite & torch.isfinite(self.outputs).all(1)
 
     @property
+    def sound(self) -> "Evaluated":
+        """The points with finite values."""
+        return self.those(self.finite)
+
+    @property
     def lacking(self) -> bool:
         """Whether a point that the method itself asked for has no finite value."""
         return not bool(self.needed.finite.all())

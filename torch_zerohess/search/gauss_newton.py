@@ -34,8 +34,8 @@ class JacobianProgress(Progress):
     """The output at the center, and the kind of points asked for next. A subclass adds the Jacobian."""
 
     phase: Literal["sample", "trial", "aside"] = "sample"
-    """What is asked for: samples, after the start itself at first; steps; or points where only the parameters move that
-    have stayed, see `SparseMethod`."""
+    """What is asked for: samples, the first ones after the start; the ends of steps; or points at which only the
+    parameters move that stayed so far, see `SparseMethod`."""
     radius: float
     """Root mean square over the parameters."""
     output: Tensor

@@ -54,10 +54,10 @@ def uncertain(expanded: LossCurvature, jacobian: SparseJacobian, output: Tensor)
 
 
 def constants(predicted: Tensor, left: Tensor, entries: int) -> tuple[Tensor, float, float]:
-    """Return what is left at the center [m], the variance of the rest, and of how many values each is a mean.
+    """Return the constants [m] that the slopes leave, the variance of the rest, and as how many values they are exact.
 
-    Curvature counts as a multiple of the squared prediction, where all outputs together show it. It would otherwise
-    move the constants, which are at the center what the slopes leave.
+    The constants are means of what the slopes leave of the changes. Curvature would move them. So where all outputs
+    together show curvature, it is fitted, too: as a multiple of the squared prediction.
 
     Args:
         predicted: changes [K, m] by the slopes.

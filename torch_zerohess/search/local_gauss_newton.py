@@ -1,6 +1,7 @@
 """Gauss-Newton for outputs whose elements depend on few parameters each: thousands of parameters, few evaluations.
 
-See `search.sparse_method` for how it goes on, and `search.noisy_sparse_method` and `search.averaging` in noise.
+Such outputs are local. Other modules name this search after its Jacobian, which is sparse: see `search.sparse_method`
+for how it goes on, and `search.noisy_sparse_method` and `search.averaging` in noise.
 """
 
 from collections.abc import Callable

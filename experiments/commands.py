@@ -19,7 +19,7 @@ class Command:
     """Where the function of a command is, and one line about it."""
 
     target: str
-    """module:function."""
+    """module:function, in this folder."""
     help: str
     long: bool = False
     """Whether it takes long, so that a line says at once that it has begun."""
@@ -27,66 +27,54 @@ class Command:
     def load(self) -> Callable[..., Any]:
         """Import the module and return the function."""
         module, _, function = self.target.partition(":")
-        found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+        found: Callable[..., Any] = getattr(importlib.import_module(f"experiments.{module}"), function)
         return found
 
 
 COMMANDS = {
-    "list": Command("experiments.listing:list_", "tasks, methods, which go together, and what is missing"),
-    "run": Command("experiments.run:run", "run methods on tasks; called again it goes on where it was", long=True),
-    "table": Command("experiments.reports.summary:table", "evaluations, seconds and shares of a folder of results"),
-    "plot": Command("experiments.reports.error_curves:plot", "error curves of a folder of results"),
-    "report": Command("experiments.reports.ensemble_page:report", "one HTML page about a folder of results"),
-    "store": Command("experiments.reports.store:store", "keep the table of a folder of results, and its origin"),
-    "readme": Command("experiments.reports.documents:readme", "write stored tables into the documents, or check them"),
-    "tune": Command("experiments.studies.tune:tune", "search settings of a method, on starts of its own", long=True),
+    "list": Command("listing:list_", "tasks, methods, which go together, and what is missing"),
+    "run": Command("run:run", "run methods on tasks; called again it goes on where it was", long=True),
+    "table": Command("reports.summary:table", "evaluations, seconds and shares of a folder of results"),
+    "plot": Command("reports.error_curves:plot", "error curves of a folder of results"),
+    "report": Command("reports.ensemble_page:report", "one HTML page about a folder of results"),
+    "store": Command("reports.store:store", "keep the table of a folder of results, and its origin"),
+    "readme": Command("reports.documents:readme", "write stored tables into the documents, or check them"),
+    "tune": Command("studies.tune:tune", "search settings of a method, on starts of its own", long=True),
     "variance": Command(
-        "experiments.studies.variance:variance", "error of every estimator against evaluations and samples", long=True
+        "studies.variance:variance", "error of every estimator against evaluations and samples", long=True
     ),
     "smoothing_laws": Command(
-        "experiments.studies.smoothing_laws:smoothing_laws", "errors with other laws of the noise", long=True
+        "studies.smoothing_laws:smoothing_laws", "errors with other laws of the noise", long=True
     ),
-    "nonpsd": Command("experiments.studies.nonpsd:nonpsd_error", "error of the Hessian where it is indefinite"),
-    "losses": Command("experiments.studies.losses:losses", "a loss inside the black box, or after an image", long=True),
-    "gradients": Command(
-        "experiments.studies.gradients:gradients", "derivatives by the renderer and by sampling", long=True
-    ),
-    "robustness": Command("experiments.studies.robustness:robustness", "other starts, samples and noise", long=True),
+    "nonpsd": Command("studies.nonpsd:nonpsd_error", "error of the Hessian where it is indefinite"),
+    "losses": Command("studies.losses:losses", "a loss inside the black box, or after an image", long=True),
+    "gradients": Command("studies.gradients:gradients", "derivatives by the renderer and by sampling", long=True),
+    "robustness": Command("studies.robustness:robustness", "other starts, samples and noise", long=True),
     "least_squares": Command(
-        "experiments.studies.least_squares:least_squares",
-        "our search and others on least squares of More and Wild",
-        long=True,
+        "studies.least_squares:least_squares", "our search and others on least squares of More and Wild", long=True
     ),
-    "optimizers": Command(
-        "experiments.studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True
-    ),
-    "noise": Command("experiments.studies.noise:noise", "our search and others on noisy functions of BBOB", long=True),
-    "minima": Command("experiments.studies.minima:minima", "what is said at the end of noisy searches", long=True),
-    "endings": Command("experiments.studies.endings:endings", "when searches of convex functions end", long=True),
-    "batches": Command("experiments.studies.batches:batches", "several points at once, in worker processes", long=True),
-    "recovery": Command("experiments.studies.recovery:recovery", "sparse Jacobians from few samples", long=True),
+    "optimizers": Command("studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True),
+    "noise": Command("studies.noise:noise", "our search and others on noisy functions of BBOB", long=True),
+    "minima": Command("studies.minima:minima", "what is said at the end of noisy searches", long=True),
+    "endings": Command("studies.endings:endings", "when searches of convex functions end", long=True),
+    "batches": Command("studies.batches:batches", "several points at once, in worker processes", long=True),
+    "recovery": Command("studies.recovery:recovery", "sparse Jacobians from few samples", long=True),
     "sparse_layers": Command(
-        "experiments.studies.sparse_layers:sparse_layers", "derivatives behind a network by three layers", long=True
+        "studies.sparse_layers:sparse_layers", "derivatives behind a network by three layers", long=True
     ),
     "full_setting": Command(
-        "experiments.studies.full_setting:full_setting", "time that tasks save over the source's setting", long=True
+        "studies.full_setting:full_setting", "time that tasks save over the source's setting", long=True
     ),
-    "figures": Command("experiments.studies.figures:figures", "figures of the source, by their numbers", long=True),
-    "gallery": Command("experiments.studies.gallery:gallery", "pictures and animations of all tasks", long=True),
-    "caustic": Command("experiments.studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),
-    "bench": Command(
-        "experiments.studies.bench:bench", "time of the extension against pure torch and torch", long=True
-    ),
+    "figures": Command("studies.figures:figures", "figures of the source, by their numbers", long=True),
+    "gallery": Command("studies.gallery:gallery", "pictures and animations of all tasks", long=True),
+    "caustic": Command("studies.caustic:check_caustic", "the fitted slab in Mitsuba's particle tracer"),
+    "bench": Command("studies.bench:bench", "time of the extension against pure torch and torch", long=True),
     "bench_device": Command(
-        "experiments.studies.bench_device:bench_device",
-        "the same on a CUDA device, against its memory and torch",
-        long=True,
+        "studies.bench_device:bench_device", "the same on a CUDA device, against its memory and torch", long=True
     ),
-    "workers": Command(
-        "experiments.studies.workers:workers", "cost and gain of worker processes, and faults", long=True
-    ),
-    "stability": Command("experiments.studies.stability:stability", "extreme cases against closed forms", long=True),
-    "doctor": Command("experiments.commands:doctor", "what this installation can do"),
+    "workers": Command("studies.workers:workers", "cost and gain of worker processes, and faults", long=True),
+    "stability": Command("studies.stability:stability", "extreme cases against closed forms", long=True),
+    "doctor": Command("commands:doctor", "what this installation can do"),
 }
 
 

@@ -15,21 +15,34 @@ from torch_zerohess.adapters.mitsuba_variants import find_llvm, probe
 
 MESHES = ("meshfit", "meshfit_color", "suzanne", "banana")
 """Fitting tasks whose unknowns are the vertices of a mesh."""
-FITTING = {
-    name: f"experiments.problems.tasks.{name}"
-    for name in (
-        *("quad", "box2", "box10", "texture", "texture100", "texture317", "dense", "brdf", "nonpsd", "throw"),
-        *("caustic", "caustic64", "discs", "hexagon", *MESHES),
-    )
+_SHARED = {
+    "texture100": "texture",
+    "texture317": "texture",
+    "caustic64": "caustic",
+    "cnn_wide": "cnn",
+    **dict.fromkeys(("meshfit_color", "suzanne", "banana"), "meshfit"),
 }
-"""Tasks whose unknowns are the parameters of the black box: modules with `task(preset) -> Task`."""
-RENDERED = {name: f"experiments.problems.tasks.{name}" for name in ("mug", "shad", "bunny", "mirror", "poster")}
-"""Those of them that Mitsuba renders: modules with `task(preset, variant) -> Task`."""
+"""Modules of tasks that are the function of their name in the module of another one."""
+
+
+def _targets(*names: str) -> dict[str, str]:
+    """Return module:function by name: the function is `task` where a task has a module of its own."""
+    shared = {name: f"{module}:{name}" for name, module in _SHARED.items()}
+    return {name: f"experiments.problems.tasks.{shared.get(name, f'{name}:task')}" for name in names}
+
+
+FITTING = _targets(
+    *("quad", "box2", "box10", "texture", "texture100", "texture317", "dense", "brdf", "nonpsd", "throw"),
+    *("caustic", "caustic64", "discs", "hexagon", *MESHES),
+)
+"""Tasks whose unknowns are the parameters of the black box: functions `(preset) -> Task`."""
+RENDERED = _targets("mug", "shad", "bunny", "mirror", "poster")
+"""Those of them that Mitsuba renders: functions `(preset, variant) -> Task`."""
 FITTING |= RENDERED
 RENDERED_NETWORKS = ("cnn", "cnn_wide", "cnn5", "cnn_texture")
-NETWORKS = {name: f"experiments.problems.tasks.{name}" for name in (*RENDERED_NETWORKS, "cnn_throw")}
-"""Tasks whose unknowns are the weights of a network before the black box: modules with
-`task(preset, variant, threads) -> NetworkTask`."""
+NETWORKS = _targets(*RENDERED_NETWORKS, "cnn_throw")
+"""Tasks whose unknowns are the weights of a network before the black box: functions
+`(preset, variant, threads) -> NetworkTask`."""
 SIMULATED = ("throw", "cnn_throw")
 """Tasks that MuJoCo simulates."""
 TASKS = FITTING | NETWORKS
@@ -48,7 +61,8 @@ def load(name: str, preset: Preset = "fast", variant: str = "auto", threads: int
     """
     more: tuple[Any, ...] = (variant,) if name in RENDERED else (variant, threads) if name in NETWORKS else ()
     with _packages_of(name):
-        task: Task | NetworkTask = importlib.import_module(TASKS[name]).task(preset, *more)
+        module, _, function = TASKS[name].partition(":")
+        task: Task | NetworkTask = getattr(importlib.import_module(module), function)(preset, *more)
     return task
 
 

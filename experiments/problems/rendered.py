@@ -120,7 +120,7 @@ class Reference:
 
 
 def load_scene(
-    description: Callable[[Any], dict[str, Any]], parameter: Parameter, setting: Setting, variant: str
+    description: Callable[[Any], dict[str, Any]], parameter: Parameter, variant: str, setting: Setting
 ) -> MitsubaScene:
     """Return a scene with one parameter in a setting, rendered by one thread; `description` is for `MitsubaScene`."""
     return MitsubaScene(

@@ -1,11 +1,24 @@
 """Plain text tables, whole or row by row."""
 
 import sys
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import TypeVar
 
 from tqdm import tqdm
 
 from experiments.reports.digits import significant
+
+T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
+
+
+def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """Return the items with the same key together, in their order."""
+    groups: dict[K, list[T]] = defaultdict(list)
+    for one in items:
+        groups[key(one)].append(one)
+    return groups
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

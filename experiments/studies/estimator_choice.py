@@ -33,6 +33,7 @@ from torch import Tensor
 import torch_zerohess as zh
 from experiments.problems.closed_forms import PlaneWave, Quadratic, Step
 from experiments.reports.progress import progress
+from experiments.reports.tables import grouped
 from experiments.studies.estimator_problems import Problem
 from torch_zerohess.sampling.quantiles import gradient_lobe_quantile, hessian_lobe_quantile
 
@@ -277,9 +278,7 @@ def summary(rows: list[Row]) -> tuple[list[str], list[list[object]]]:
 
     A ratio below 1 says that "auto" has the least error.
     """
-    groups: dict[tuple[str, int, int, str], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row.quantity, row.n, row.budget, row.kind), []).append(row)
+    groups = grouped(rows, lambda row: (row.quantity, row.n, row.budget, row.kind))
     body: list[list[object]] = []
     for (quantity, n, budget, kind), same in groups.items():
         names = [name for name in ("auto", *RIVALS) if name in same[0].errors]

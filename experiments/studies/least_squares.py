@@ -35,6 +35,7 @@ from experiments.problems.task import Task
 from experiments.reports import data_profiles
 from experiments.reports.progress import progress
 from experiments.reports.result_files import may_keep
+from experiments.reports.tables import grouped
 from experiments.studies.benchmark_suite import Settings, Suite, row_name, solve
 
 OURS = Method("ours", "TrustRegion with its defaults", with_settings(search), uses="image")
@@ -172,7 +173,7 @@ def descent(
 def rows(done: Mapping[Job, Progression]) -> Iterator[list[object]]:
     """Yield a row per kind and method; None for more evaluations than the runs could use."""
     most = min(job.budget for job in done)
-    for (kind, name), group in _grouped(done).items():
+    for (kind, name), group in grouped(done.items(), _row).items():
         counts = _solved(group, _lowest(done))
         shares = [
             sum(count <= budget for count in counts[tau]) / len(group) if budget <= most else None
@@ -187,18 +188,15 @@ def rows(done: Mapping[Job, Progression]) -> Iterator[list[object]]:
 def profiles(done: Mapping[Job, Progression]) -> dict[str, dict[str, data_profiles.Profile]]:
     """Return, by kind with tau and by method, evaluations over n + 1 until problems are solved, and their number."""
     found: dict[str, dict[str, data_profiles.Profile]] = defaultdict(dict)
-    for (kind, name), group in _grouped(done).items():
+    for (kind, name), group in grouped(done.items(), _row).items():
         for tau, counts in _solved(group, _lowest(done)).items():
             found[f"{kind}, tau = {tau:.0e}"][name] = [one for one in counts if math.isfinite(one)], len(counts)
     return found
 
 
-def _grouped(done: Mapping[Job, Progression]) -> dict[tuple[str, str], list[tuple[Job, Progression]]]:
-    """Return the runs by kind and name of the row."""
-    groups: dict[tuple[str, str], list[tuple[Job, Progression]]] = defaultdict(list)
-    for job, one in done.items():
-        groups[job.kind, row_name(job.method, job.settings)].append((job, one))
-    return groups
+def _row(run: tuple[Job, Progression]) -> tuple[str, str]:
+    """Return the kind and the name of the row of a run."""
+    return run[0].kind, row_name(run[0].method, run[0].settings)
 
 
 def _lowest(done: Mapping[Job, Progression]) -> dict[tuple[str, str, int], float]:

@@ -12,7 +12,6 @@ the parameters. Instances 11 to 15 are for tuning, 1 to 5 for tables.
 
 import itertools
 import statistics
-from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -28,6 +27,7 @@ from experiments.problems import bbob
 from experiments.problems.catalogue import chosen
 from experiments.reports.progress import progress
 from experiments.reports.result_files import may_keep, show
+from experiments.reports.tables import grouped
 
 FUNCTIONS: Mapping[int, str] = {
     1: "sphere",
@@ -110,14 +110,12 @@ def noise(
 
 def rows(done: Mapping[Job, End]) -> list[list[object]]:
     """Return a row per function, number of parameters, noise and method."""
-    groups: dict[tuple[int, int, float, str], list[End]] = defaultdict(list)
-    for job, end in done.items():
-        groups[job.function, job.n, job.noise, job.method].append(end)
+    groups = grouped(done.items(), lambda run: (run[0].function, run[0].n, run[0].noise, run[0].method))
     return [
         [
             *(FUNCTIONS.get(function, f"f{function}"), n, size, method),
-            *(statistics.median(one.evaluations for one in group), statistics.median(one.loss for one in group)),
-            *(max(one.loss for one in group), len(group)),
+            *(statistics.median(one.evaluations for _, one in group), statistics.median(one.loss for _, one in group)),
+            *(max(one.loss for _, one in group), len(group)),
         ]
         for (function, n, size, method), group in groups.items()
     ]

@@ -30,6 +30,7 @@ from experiments.problems.task import Task
 from experiments.reports import data_profiles
 from experiments.reports.progress import progress
 from experiments.reports.result_files import may_keep
+from experiments.reports.tables import grouped
 from experiments.studies.benchmark_suite import Settings, Suite, row_name, solve
 from torch_zerohess.optim import TrustRegion
 
@@ -154,30 +155,24 @@ def reached(
 
 def rows(done: Mapping[Job, Reached]) -> list[list[object]]:
     """Return a row per number of parameters and method; None for more evaluations than the runs could use."""
-    return list(_rows(_groups(done)))
+    return list(_rows(grouped(done.items(), _row)))
 
 
 def profiles(done: Mapping[Job, Reached]) -> dict[str, dict[str, data_profiles.Profile]]:
     """Return, by "n = ..." and method, evaluations over n of all pairs reached, and the count of pairs."""
     found: dict[str, dict[str, data_profiles.Profile]] = defaultdict(dict)
-    for (n, name), group in _groups(done).items():
+    for (n, name), group in grouped(done.items(), _row).items():
         counts = [count / n for _, one in group for count in one.evaluations]
         found[f"n = {n}"][name] = counts, len(group) * len(bbob.TARGETS)
     return found
 
 
-def _groups(done: Mapping[Job, Reached]) -> dict[tuple[int, str], list[tuple[Job, Reached]]]:
-    groups: dict[tuple[int, str], list[tuple[Job, Reached]]] = defaultdict(list)
-    for job, result in done.items():
-        groups[job.n, _named(job)].append((job, result))
-    return groups
-
-
-def _named(job: Job) -> str:
-    """Name of a row: the method with its settings; ours with the engine that it chooses."""
+def _row(run: tuple[Job, Reached]) -> tuple[int, str]:
+    """Return n and the name of the row of a run: the method with its settings; ours with the engine that it chooses."""
+    job, _ = run
     if job.method == OURS.name:
-        return f"{job.method}: {TrustRegion(torch.zeros(job.n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
-    return row_name(job.method, job.settings)
+        return job.n, f"{job.method}: {TrustRegion(torch.zeros(job.n), sigma=1.0, bounds=(-5.0, 5.0)).engine}"
+    return job.n, row_name(job.method, job.settings)
 
 
 def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> Iterator[list[object]]:

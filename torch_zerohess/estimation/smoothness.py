@@ -19,9 +19,9 @@ from torch import Tensor
 from torch_zerohess.estimation.control import Control, Prediction, as_constant
 from torch_zerohess.heads import SquaredError
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRankSurrogate
-from torch_zerohess.surrogates.process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
 
 _SMOOTH = (AutomaticSurrogate, LinearSurrogate, ProcessSurrogate, SparseSurrogate)

@@ -30,69 +30,58 @@ class Divisible(Stein):
         v: Tensor | None,
         pooled: Tensor | None = None,
     ) -> Spread:
-        return variance_of_draws(self, quantity, a, share, draws, v, pooled)
+        """Return the variance in units of sigma: of value [B, P], gradient, hessian_diagonal, hvp [B, P, n] or hessian.
 
+        With D independent draws y_d, each of share s_d of the sum Y, the variance is sum_d (y_d - s_d Y)^2 / s_d / (D -
+        1): the sample variance over D where all shares are 1/D. It has D - 1 degrees of freedom.
 
-def variance_of_draws(
-    stein: Divisible,
-    quantity: Quantity,
-    a: Tensor,
-    share: Tensor,
-    draws: Sequence[Tensor],
-    v: Tensor | None,
-    pooled: Tensor | None = None,
-) -> Spread:
-    """Return the variance of value [B, P], gradient, hessian_diagonal or hvp [B, P, n] or hessian, in units of sigma.
+        A baseline that is the mean of the other draws makes the draws depend on each other. The variance is then by the
+        jackknife (Efron and Stein 1981), from the estimates Y_d without draw d, whose baselines leave it out as well:
+        sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 / (D - 1). It counts the variance of products of two draws, a baseline times
+        a kernel, 2 (D - 1) / (D - 2) times. Where such products matter (the Hessian, and the gradient without
+        antithetic pairs), the standard error is 35 to 50 % too large for three draws, 20 to 40 % for four, and 3 to 8 %
+        for sixteen.
 
-    With D independent draws y_d, each of share s_d of the sum Y, the variance is sum_d (y_d - s_d Y)^2 / s_d / (D - 1):
-    the sample variance over D where all shares are 1/D. It has D - 1 degrees of freedom.
+        Two draws leave no other draw for a baseline. Where they are scrambles of at least four single points, products
+        of a baseline and a kernel are small: both are means over evenly spread points. The draws then count as
+        independent. Scrambles of pairs do not: their intervals at 95 % cover 80 to 93 % of Hessians.
 
-    A baseline that is the mean of the other draws makes the draws depend on each other. The variance is then by the
-    jackknife (Efron and Stein 1981), from the estimates Y_d without draw d, whose baselines leave it out as well:
-    sum_d (1 - s_d)^2 / s_d (Y_d - Y)^2 / (D - 1). It counts the variance of products of two draws, a baseline times a
-    kernel, 2 (D - 1) / (D - 2) times. Where such products matter (the Hessian, and the gradient without antithetic
-    pairs), the standard error is 35 to 50 % too large for three draws, 20 to 40 % for four, and 3 to 8 % for sixteen.
+        Args:
+            quantity: which sum.
+            a: coefficients [B, P, K].
+            share: weight of each row in a mean [B, K], zero where the row was dropped.
+            draws: rows of the independent draws, int64 [D, r], draws of the same size together.
+            v: vector of the hvp, [B, P, n], the same for all P.
+            pooled: (f - mean of f) * share, [B, P, K], where the draws depend on each other by their baseline.
 
-    Two draws leave no other draw for a baseline. Where they are scrambles of at least four single points, products of a
-    baseline and a kernel are small: both are means over evenly spread points. The draws then count as independent.
-    Scrambles of pairs do not: their intervals at 95 % cover 80 to 93 % of Hessians.
-
-    Args:
-        stein: the family.
-        quantity: which sum.
-        a: coefficients [B, P, K].
-        share: weight of each row in a mean [B, K], zero where the row was dropped.
-        draws: rows of the independent draws, int64 [D, r], draws of the same size together.
-        v: vector of the hvp, [B, P, n], the same for all P.
-        pooled: (f - mean of f) * share, [B, P, K], where the draws depend on each other by their baseline.
-
-    Raises:
-        ValueError: fewer than two independent draws are left, or three where they depend on each other.
-    """
-    draws = [one.to(a.device) for one in draws]
-    shares = torch.cat([share[:, one].sum(2) for one in draws], 1)  # [B, D]
-    D = (shares > 0).sum(1).double()
-    two = pooled is not None and shares.shape[1] == 2 and _scrambles(draws[0])
-    fewest = 2 if pooled is None or two else 3
-    if int(D.min()) < fewest:
-        raise ValueError(
-            f"a standard error needs at least two independent draws, got {int(D.min())}: use at least 2 samples; "
-            "sampler 'sobol' needs an even number, with scrambles None or at least 2"
-            if pooled is None
-            else f"a standard error with baseline 'mean' needs at least three independent draws, got {int(D.min())}: "
-            "use baseline 'center', or at least 3 samples; sampler 'sobol' needs a multiple of 4, with scrambles=4 or, "
-            "from 32 samples on, scrambles=None; without antithetic pairs an even number from 8 on is enough"
-        )
-    whole = stein.sums(quantity, a, v)
-    divided = _Divided(stein, quantity, share, draws, v, whole[0].numel())
-    if pooled is None:
-        squares, cubes, fourth = _powers((y - s * whole[:, None]) / _positive(s).sqrt() for s, y in divided.sums(a))
-    elif two:
-        squares, cubes, fourth = _powers([_two(divided, a, pooled)])
-    else:
-        squares, cubes, fourth = _powers(_jackknife(divided, whole, shares, pooled))
-    D = D.reshape(-1, *(1,) * (whole.dim() - 1))
-    return Spread(squares / (D - 1), (D - 1).expand_as(whole), shape_of(squares, cubes, fourth, D))
+        Raises:
+            ValueError: fewer than two independent draws are left, or three where they depend on each other.
+        """
+        draws = [one.to(a.device) for one in draws]
+        shares = torch.cat([share[:, one].sum(2) for one in draws], 1)  # [B, D]
+        D = (shares > 0).sum(1).double()
+        two = pooled is not None and shares.shape[1] == 2 and _scrambles(draws[0])
+        fewest = 2 if pooled is None or two else 3
+        if int(D.min()) < fewest:
+            got = f"independent draws, got {int(D.min())}"
+            raise ValueError(
+                f"a standard error needs at least two {got}: use at least 2 samples; sampler 'sobol' needs an even "
+                "number, with scrambles None or at least 2"
+                if pooled is None
+                else f"a standard error with baseline 'mean' needs at least three {got}: use baseline 'center', or at "
+                "least 3 samples; sampler 'sobol' needs a multiple of 4, with scrambles=4 or, from 32 samples on, "
+                "scrambles=None; without antithetic pairs an even number from 8 on is enough"
+            )
+        whole = self.sums(quantity, a, v)
+        divided = _Divided(self, quantity, share, draws, v, whole[0].numel())
+        if pooled is None:
+            squares, cubes, fourth = _powers((y - s * whole[:, None]) / _positive(s).sqrt() for s, y in divided.sums(a))
+        elif two:
+            squares, cubes, fourth = _powers([_two(divided, a, pooled)])
+        else:
+            squares, cubes, fourth = _powers(_jackknife(divided, whole, shares, pooled))
+        D = D.reshape(-1, *(1,) * (whole.dim() - 1))
+        return Spread(squares / (D - 1), (D - 1).expand_as(whole), shape_of(squares, cubes, fourth, D))
 
 
 def _scrambles(draws: Tensor) -> bool:

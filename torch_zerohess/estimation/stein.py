@@ -158,7 +158,7 @@ class Stein(ABC):
         v: Tensor | None,
         pooled: Tensor | None = None,
     ) -> Spread:
-        """Return the variance of a sum in its shape: see `standard_error.variance_of_draws` for the arguments."""
+        """Return the variance of a sum in its shape: see `standard_error.Divisible.variance` for the arguments."""
 
     def sums(self, quantity: Quantity, a: Tensor, v: Tensor | None) -> Tensor:
         """Return the sums of one quantity; v is the vector of "hvp"."""

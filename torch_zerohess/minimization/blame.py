@@ -12,7 +12,7 @@ _CHECKS = tuple(
         "minimization.callback",
         "minimization.evaluating",
         "minimization.separate",
-        "search.local_progress",
+        "search.sparse_progress",
         "search.told",
     )
 )

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.trust_region import TrustRegion
-from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.noisy_derivatives import noisy_derivatives
 from torch_zerohess.surrogates.quadratic import LocalModel
+from torch_zerohess.surrogates.quadratic_around import quadratic_around
 
 _FITTED = 40
 """Parameters up to which a quadratic is fitted to all evaluations at the end."""

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool, checked_number
 from torch_zerohess.linalg.flat import widest_type
 from torch_zerohess.linalg.step import Step
 from torch_zerohess.linalg.subproblem import diagonal_step
@@ -67,16 +66,15 @@ class Newton(NewtonStep):
         lr: float = 1.0,
         distributed: bool = False,
     ) -> None:
-        check_bool(adapt=adapt)
         if modification not in MODIFICATIONS:
             raise ValueError(f"modification must be 'shift' or 'abs', got {modification!r}")
         defaults = {
             "lr": lr,
-            "radius": checked_number("radius", radius, above=0.0, below=math.inf),
+            "radius": radius,
             "curvature": curvature,
             "modification": modification,
-            "adapt": bool(adapt),
-            "max_radius": checked_number("max_radius", max_radius, above=0.0),
+            "adapt": adapt,
+            "max_radius": max_radius,
         }
         super().__init__(params, defaults, distributed=distributed)
         n = sum(one.numel() for one in self._parameters)

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool, checked_integer, checked_number
+from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.linalg.steihaug import steihaug
 from torch_zerohess.linalg.step import Step, clipped
 from torch_zerohess.optim.newton_step import NewtonStep
@@ -95,12 +95,9 @@ class NewtonCG(NewtonStep):
         lr: float = 1.0,
         distributed: bool = False,
     ) -> None:
-        radius = checked_number("radius", radius, above=0.0, below=math.inf)
         tolerance = checked_number("tolerance", tolerance, above=0.0)
-        max_radius = checked_number("max_radius", max_radius, above=0.0)
         damping = checked_number("damping", damping, 0.0, below=math.inf)
         noise = checked_number("noise", noise, 0.0, below=math.inf)
-        check_bool(adapt=adapt)
         if solver not in SOLVERS:
             raise ValueError(f"solver must be one of {', '.join(map(repr, SOLVERS))}, got {solver!r}")
         if modification not in (None, "abs"):
@@ -123,7 +120,7 @@ class NewtonCG(NewtonStep):
             "iterations": checked_integer("iterations", iterations, 1),
             "tolerance": tolerance,
             "damping": damping,
-            "adapt": bool(adapt),
+            "adapt": adapt,
             "max_radius": max_radius,
             "noise": noise,
             "output_radius": output_radius,

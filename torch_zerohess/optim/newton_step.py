@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import check_bool, checked_number
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.step import Step
 from torch_zerohess.optim import processes
@@ -54,7 +55,11 @@ class NewtonStep(SecondOrder):
     """Why the search for the last step ended; not part of the state."""
 
     def __init__(self, params: Iterable[Tensor], defaults: dict[str, Any], *, distributed: bool = False) -> None:
-        super().__init__(params, defaults | {"first_radius": defaults["radius"]}, distributed=distributed)
+        check_bool(adapt=defaults["adapt"])
+        radius = checked_number("radius", defaults["radius"], above=0.0, below=math.inf)
+        defaults |= {"radius": radius, "adapt": bool(defaults["adapt"]), "first_radius": radius}
+        defaults["max_radius"] = checked_number("max_radius", defaults["max_radius"], above=0.0)
+        super().__init__(params, defaults, distributed=distributed)
 
     @abstractmethod
     def _minimise(self, model: Model, radius: float, group: dict[str, Any]) -> Step:

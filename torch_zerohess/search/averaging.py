@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.local_progress import LocalProgress
-from torch_zerohess.search.local_settings import LocalSettings
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.noisy_step import alternating, constants, step_in_noise
+from torch_zerohess.search.noisy_step import constants, step_in_noise
+from torch_zerohess.search.sparse_progress import SparseProgress
+from torch_zerohess.search.sparse_search_settings import SparseSearchSettings
 from torch_zerohess.search.state import Best, Evaluated
-from torch_zerohess.surrogates.loss_curvature import loss_curvature
+from torch_zerohess.surrogates.loss_curvature import alternating, loss_curvature
 from torch_zerohess.surrogates.sparse_choices import kept
 from torch_zerohess.surrogates.sparse_evidence import Evidence
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES, fit_sparse
@@ -48,41 +48,41 @@ _INSIDE = 0.5
 
 @dataclass(frozen=True)
 class Averaging:
-    """The iterations of `NoisyLocalMethod` from where no single output is trusted, in units of its sigma."""
+    """The iterations of `NoisySparseMethod` from where no single output is trusted, in units of its sigma."""
 
     settings: Settings
-    own: LocalSettings
+    own: SparseSearchSettings
 
-    def points(self, known: LocalProgress, generator: torch.Generator) -> Tensor:
+    def points(self, known: SparseProgress, generator: torch.Generator) -> Tensor:
         """Return the center twice, and samples from N(center, sigma^2), mirrored into the bounds."""
         count = max(known.samples, len(known.points) // _GROWTH)
         points = self.settings.drawn(known.center, known.sigma, count, generator)
         return torch.cat([known.center.expand(2, -1), points])
 
-    def promise(self, known: LocalProgress) -> float:
+    def promise(self, known: SparseProgress) -> float:
         """Return the promise of the step to the center; it is infinite if the radius has shortened the step."""
         before = known.before
         if before is None or not known.predicts or self._length(known) > _INSIDE * known.radius:
             return math.inf
         return before.loss - known.loss
 
-    def width(self, known: LocalProgress) -> Tensor:
+    def width(self, known: SparseProgress) -> Tensor:
         """Return the length of the last step for every parameter; infinity where the Jacobian does not predict."""
         return torch.full_like(known.center, self._length(known) if known.predicts else math.inf)
 
-    def error(self, known: LocalProgress, variance: float) -> float:
+    def error(self, known: SparseProgress, variance: float) -> float:
         """Return the standard error of the loss at the center if the numbers of the output have a variance."""
-        slope = loss_curvature(self.settings.white_box, known.output.view(known.shape)).slope
+        slope = loss_curvature(self.settings.white_box, known.shaped_output).slope
         return math.sqrt(variance) * float(slope.norm())
 
-    def raised(self, known: LocalProgress, variance: float) -> float:
+    def raised(self, known: SparseProgress, variance: float) -> float:
         """Return by how much noise with a variance raises the loss of the output at the center, about."""
-        output = known.output.view(known.shape)
+        output = known.shaped_output
         noise = math.sqrt(variance) * alternating(output)
         around = [float(self.settings.white_box(one)) for one in (output + noise, output - noise)]
         return max(0.5 * sum(around) - known.loss, 0.0)
 
-    def begun(self, known: LocalProgress) -> LocalProgress:
+    def begun(self, known: SparseProgress) -> SparseProgress:
         """Begin with the largest sigma at which the kept evaluations show no curvature, or with the one so far."""
         sigma = 1.0
         while sigma > known.sigma:
@@ -92,7 +92,7 @@ class Averaging:
             sigma *= _NEARER
         return known
 
-    def averaged(self, known: LocalProgress, sound: Evaluated, centers: Tensor) -> LocalProgress:
+    def averaged(self, known: SparseProgress, sound: Evaluated, centers: Tensor) -> SparseProgress:
         """Fit the Jacobian and the output at the center; judge the last step, and take the next one.
 
         centers: outputs [k, m] of the center, up to two.
@@ -104,7 +104,7 @@ class Averaging:
         fitted, rest, count = self.regressed(known, len(sound))
         return self._went_on(known, fitted, rest, count, centers) if count else known
 
-    def regressed(self, known: LocalProgress, new: int) -> tuple[LocalProgress, float, float]:
+    def regressed(self, known: SparseProgress, new: int) -> tuple[SparseProgress, float, float]:
         """Return the progress with a regression, and the variance that it leaves.
 
         Also return of how many outputs the output at the center is as exact as the mean; 0 where there are too few.
@@ -131,8 +131,8 @@ class Averaging:
         return replace(known, output=known.output + known.sigma * constant), known.sigma**2 * rest, counted
 
     def _went_on(
-        self, known: LocalProgress, fitted: LocalProgress, rest: float, count: float, centers: Tensor
-    ) -> LocalProgress:
+        self, known: SparseProgress, fitted: SparseProgress, rest: float, count: float, centers: Tensor
+    ) -> SparseProgress:
         """Judge the last step by what `regressed` has returned, and take the next one; centers: see `averaged`."""
         output, variance = self.combined(fitted, count, centers)
         after = replace(fitted, output=output, loss=float(self.settings.white_box(output.view(known.shape))))
@@ -142,10 +142,10 @@ class Averaging:
         if not math.isfinite(after.loss):
             return known
         sigma, radius = self.distance(fitted, rest), self.radius(after, known.loss, error)
-        after = replace(after, radius=radius, best=Best(after.center, after.loss, after.sigma))
+        after = replace(after, radius=radius, best=after.here)
         return replace(self._stepped(after), sigma=sigma)
 
-    def combined(self, fitted: LocalProgress, count: float, centers: Tensor) -> tuple[Tensor, float]:
+    def combined(self, fitted: SparseProgress, count: float, centers: Tensor) -> tuple[Tensor, float]:
         """Return the output at the center and its variance, by the regression and by outputs of the center [k, m].
 
         Curvature moves the constant by b^2, mean square. The weights of both go with 1 / b^2 and 1 / (variance / k).
@@ -160,7 +160,7 @@ class Averaging:
         weight = moved / (moved + own)
         return known.output + weight * difference, weight * own
 
-    def _undone(self, known: LocalProgress, before: Best) -> LocalProgress:
+    def _undone(self, known: SparseProgress, before: Best) -> SparseProgress:
         """Return to where the last step began, and sample nearer."""
         assert known.jacobian is not None
         return replace(
@@ -174,7 +174,7 @@ class Averaging:
             sigma=max(self._least_sigma(known), _NEARER * known.sigma),
         )
 
-    def radius(self, known: LocalProgress, predicted: float, error: float) -> float:
+    def radius(self, known: SparseProgress, predicted: float, error: float) -> float:
         """Return the radius after what the last step has achieved.
 
         predicted: loss at its end by the model before it.
@@ -187,12 +187,12 @@ class Averaging:
         longer = min(_LONGER * known.radius, _WIDEST) if achieved > _GOOD else known.radius
         return _SHORTER * known.radius if achieved < _BAD else longer
 
-    def _least_sigma(self, known: LocalProgress) -> float:
+    def _least_sigma(self, known: SparseProgress) -> float:
         """Return the least sigma: below that of the caller only where the Jacobian predicts."""
         least = min(self.settings.tolerance, self.own.least_sigma) if known.predicts else self.own.least_sigma
         return min(least, known.sigma)
 
-    def distance(self, known: LocalProgress, rest: float) -> float:
+    def distance(self, known: SparseProgress, rest: float) -> float:
         """Return the sigma of the next samples. rest: variance of what the regression leaves."""
         assert known.jacobian is not None
         if not known.pairs:
@@ -204,7 +204,7 @@ class Averaging:
         wider = rest <= _STRAIGHT * known.variance or predicted < known.variance
         return min(1.0, known.sigma / _NEARER) if wider else known.sigma
 
-    def _stepped(self, known: LocalProgress) -> LocalProgress:
+    def _stepped(self, known: SparseProgress) -> SparseProgress:
         """Go to the end of a step."""
         assert known.jacobian is not None
         end = (known.center + step_in_noise(known, self.settings)).clamp(self.settings.lower, self.settings.upper)
@@ -212,7 +212,7 @@ class Averaging:
         loss, before = float(self.settings.white_box(output.view(known.shape))), known.best
         return replace(known, center=end, output=output, loss=loss, before=before, iterations=known.iterations + 1)
 
-    def _length(self, known: LocalProgress) -> float:
+    def _length(self, known: SparseProgress) -> float:
         """Return the length of the step to the center, root mean square over the parameters."""
         if known.before is None:
             return math.inf

@@ -184,7 +184,7 @@ def _is_sum(lines: AxisLines, losses: Tensor) -> bool:
 
 def _is_convex(lines: AxisLines, evaluated: Evaluated) -> bool:
     """Whether the losses on the chord are convex."""
-    evaluated = evaluated.those(evaluated.finite)
+    evaluated = evaluated.sound
     step = lines.other - lines.origin.point
     t = torch.cat([((evaluated.points - lines.origin.point) @ step) / (step @ step), step.new_tensor([0.0, 1.0])])
     losses = torch.cat([evaluated.losses, step.new_tensor([lines.origin.loss, lines.other_loss])])

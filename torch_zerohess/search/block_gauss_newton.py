@@ -27,16 +27,15 @@ from torch_zerohess.arguments import checked_number
 from torch_zerohess.linalg.krylov import are_free
 from torch_zerohess.linalg.subproblem import damped_steps
 from torch_zerohess.search.gauss_newton import LENGTHS, GaussNewton, JacobianProgress
-from torch_zerohess.search.local_progress import check_range
-from torch_zerohess.search.local_steps import LITTLE, LocalSteps, checked_steps, linear_outputs
+from torch_zerohess.search.kinked_steps import LITTLE, Steps, checked_steps, linear_outputs
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.noisy_step import alternating
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.random_points import orthonormal
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.state import Best, Evaluated
-from torch_zerohess.surrogates.loss_curvature import loss_curvature
-from torch_zerohess.surrogates.surrogate import scaled
+from torch_zerohess.search.told import check_range
+from torch_zerohess.surrogates.loss_curvature import alternating, loss_curvature
+from torch_zerohess.surrogates.surrogate import raised, scaled
 
 _RIDGE = 1e-6
 """Added to D D^T, in units of its mean diagonal: bounds can make the steps of a block dependent."""
@@ -92,7 +91,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
 
     def renewed(self, known: BlockProgress, evaluated: Evaluated) -> BlockProgress:
         """Correct the Jacobian along the samples; steps follow when no more are wanted."""
-        count, sound = len(evaluated), evaluated.those(evaluated.finite)
+        count, sound = len(evaluated), evaluated.sound
         assert sound.outputs is not None
         if not len(known.jacobian) and len(sound):
             check_range("BlockGaussNewton", (sound.outputs - known.output) / known.sigma)
@@ -108,7 +107,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         """Solve the model for the parameters that no bound holds, see `damped_steps` and `checked_steps`."""
         return self._solved(known, radii).steps
 
-    def _solved(self, known: BlockProgress, radii: Tensor) -> LocalSteps:
+    def _solved(self, known: BlockProgress, radii: Tensor) -> Steps:
         x, jacobian, (gradient, hessian) = known.center, known.jacobian, self._derivatives(known)
         lower, upper = self.settings.lower - x, self.settings.upper - x
         free = are_free(torch.zeros_like(x), gradient, lower, upper) > 0.0
@@ -118,7 +117,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
 
         outputs = linear_outputs(
             self.settings.white_box,
-            known.output.view(known.shape),
+            known.shaped_output,
             lambda s: (s.float() @ jacobian).double(),
             lambda w: (jacobian @ w.float()).double(),
         )
@@ -140,7 +139,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         longest = known.center.new_tensor([LENGTHS[-1] * self.radius * math.sqrt(self.settings.n)])
         promised = self._solved(known, longest).promised
         if bool(known.jacobian.any()) and (promised is None or promised <= LITTLE * abs(known.loss)):
-            known = known.arriving(Best(known.center, known.loss, known.sigma))
+            known = known.arriving(known.here)
         return super().arrived(replace(known, wanted=self.settings.n))
 
     def distance(self, radius: float) -> float:
@@ -155,7 +154,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
         size = _largest(known.jacobian)
         jacobian = known.jacobian / size  # squares of float32 do not overflow
         directions = jacobian.view(-1, *known.shape)
-        loss = loss_curvature(self.settings.white_box, known.output.view(known.shape))
+        loss = loss_curvature(self.settings.white_box, known.shaped_output)
         _, unit = scaled(loss.product(alternating(loss.slope)))  # a second derivative may be beyond float32
         slope, bend = loss.slope.flatten(), loss.products(directions, unit)
         steep, bent = _largest(slope), _largest(bend)
@@ -231,9 +230,8 @@ def broyden_update(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
     steps, changes = steps[long], changes[long]
     length = steps.norm(dim=1).mean().clamp_min(torch.finfo(torch.float64).tiny)
     d, c = (steps / length).float(), (changes / length).float()
-    square = d @ d.mT
-    square.diagonal().add_(_RIDGE * float(square.diagonal().mean()) or 1.0)
-    return torch.addmm(jacobian, d.mT, torch.cholesky_solve(c - d @ jacobian, torch.linalg.cholesky(square)))
+    factor = torch.linalg.cholesky(raised(d @ d.mT, _RIDGE))
+    return torch.addmm(jacobian, d.mT, torch.cholesky_solve(c - d @ jacobian, factor))
 
 
 def _largest(values: Tensor) -> float:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.method import Method
-from torch_zerohess.search.state import LOST, Evaluated, Progress
+from torch_zerohess.search.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
@@ -34,14 +34,24 @@ class JacobianProgress(Progress):
     """The output at the center, and the kind of points asked for next. A subclass adds the Jacobian."""
 
     phase: Literal["sample", "trial", "aside"] = "sample"
-    """What is asked for: samples, after the start itself at first; steps; or points where only the parameters move that
-    have stayed, see `LocalMethod`."""
+    """What is asked for: samples, the first ones after the start; the ends of steps; or points at which only the
+    parameters move that stayed so far, see `SparseMethod`."""
     radius: float
     """Root mean square over the parameters."""
     output: Tensor
     """At the center [m], float64; empty before the first values."""
     loss: float = math.inf
     """At the center. The best point may be a sample with a lower loss."""
+
+    @property
+    def shaped_output(self) -> Tensor:
+        """The output at the center [*out]."""
+        return self.output.view(self.shape)
+
+    @property
+    def here(self) -> Best:
+        """The center as a best point."""
+        return Best(self.center, self.loss, self.sigma)
 
     def counted(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with a batch counted; it is done after too many batches without a finite value."""
@@ -50,7 +60,7 @@ class JacobianProgress(Progress):
 
     def recorded(self: Q, evaluated: Evaluated) -> Q:
         """Return the progress with the lowest loss so far as the best one. Samples count as steps do."""
-        return replace(self, best=self.best.or_lower(evaluated.those(evaluated.finite), self.sigma))
+        return replace(self, best=self.best.or_lower(evaluated.sound, self.sigma))
 
 
 class GaussNewton(Method[Q]):
@@ -102,7 +112,7 @@ class GaussNewton(Method[Q]):
         if not known.done and known.phase == "sample":
             known = self.sampled(known, evaluated)
         elif not known.done:
-            known = self.taken(known, evaluated.those(evaluated.finite))
+            known = self.taken(known, evaluated.sound)
         if known.done:
             return known, known.center[None][:0]
         return self.asked(known, generator)

@@ -4,9 +4,9 @@ from typing import Any
 
 import torch
 
-from torch_zerohess.search.loss_process import LossProcess
+from torch_zerohess.search.gaussian_process_of_loss import LossProcess
+from torch_zerohess.search.gaussian_process_of_output import OutputProcess
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.output_process import OutputProcess
 from torch_zerohess.search.protocol import AskTell
 
 

@@ -1,6 +1,7 @@
 """Gauss-Newton for outputs whose elements depend on few parameters each: thousands of parameters, few evaluations.
 
-See `search.local_method` for how it goes on, and `search.noisy_local` and `search.averaging` in noise.
+Such outputs are local. Other modules name this search after its Jacobian, which is sparse: see `search.sparse_method`
+for how it goes on, and `search.noisy_sparse_method` and `search.averaging` in noise.
 """
 
 from collections.abc import Callable
@@ -8,17 +9,17 @@ from typing import Any
 
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LocalMethod
-from torch_zerohess.search.local_progress import LocalProgress
-from torch_zerohess.search.local_settings import LOCAL_TOLERANCE, LocalSettings
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.noisy_local import local_method
+from torch_zerohess.search.noisy_sparse_method import sparse_method
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
+from torch_zerohess.search.sparse_method import SparseMethod
+from torch_zerohess.search.sparse_progress import SparseProgress
+from torch_zerohess.search.sparse_search_settings import SPARSE_TOLERANCE, SparseSearchSettings
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 
-class LocalGaussNewton(AskTell[LocalProgress]):
+class LocalGaussNewton(AskTell[SparseProgress]):
     """Gauss-Newton for a black box [n] -> [*out] whose outputs depend on few of thousands of parameters each.
 
     Textures, height fields, vertices and voxels are such parameters, pixels such outputs. Which pixel depends on which
@@ -101,7 +102,7 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         share: float = 0.35,
         least_sigma: float = 0.03,
         restarts: int = 10,
-        tolerance: float = LOCAL_TOLERANCE,
+        tolerance: float = SPARSE_TOLERANCE,
         noise: float = 0.0,
         seed: int | None = None,
     ) -> None:
@@ -115,5 +116,5 @@ class LocalGaussNewton(AskTell[LocalProgress]):
         """The latest smoothed Jacobian, in units of the first sigma per parameter; None before the first one."""
         return self._state.progress.jacobian
 
-    def _make(self, settings: Settings) -> LocalMethod:
-        return local_method(settings, LocalSettings.checked(settings, **self._own))
+    def _make(self, settings: Settings) -> SparseMethod:
+        return sparse_method(settings, SparseSearchSettings.checked(settings, **self._own))

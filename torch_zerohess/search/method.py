@@ -73,8 +73,7 @@ class Method(ABC, Generic[P]):
     """A search as settings and a pure step.
 
     A method changes no `Progress` that it was given, and of itself at most a cache. All randomness is drawn from the
-    generator.
-    Both `first` and `next` return points [K, n] within the bounds, at least one unless the search is done.
+    generator. Both `first` and `next` return points [K, n] within the bounds, at least one unless the search is done.
     """
 
     engine: ClassVar[str]

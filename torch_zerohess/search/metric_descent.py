@@ -5,7 +5,7 @@ region (`RegionDescent`) moves towards |H|^(-1/2) (`learned`), so a narrow valle
 evaluation is spent on its walls.
 
 On a plateau, where the loss is exactly constant, isotropic quadratics of the smoothed loss take over, whose sigma
-grows (`LocalQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
+grows (`SmoothedQuadratics`). Short steps to the same value are an arrival: they are below the rounding of the loss.
 
 A round that has arrived keeps the quadratic at its minimum. A later round ends early where this quadratic predicts its
 losses: it would arrive at the same minimum.
@@ -18,16 +18,16 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.metric import learned, region_step
-from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.region_descent import RegionDescent
+from torch_zerohess.search.smoothed_descent import SmoothedQuadratics
 from torch_zerohess.search.state import Best, Evaluated, are_same
 from torch_zerohess.surrogates.least_change import least_change
-from torch_zerohess.surrogates.local_fit import quadratic_around
 from torch_zerohess.surrogates.plateau import is_plateau
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, fit_values
+from torch_zerohess.surrogates.quadratic_around import quadratic_around
 
 MOST = 200
 """Parameters up to which a metric is learned. A step costs O(n^3 + P^3) for n parameters and P evaluations."""
@@ -72,7 +72,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def __init__(self, settings: Settings) -> None:
         fitted = min(coefficients(settings.n) + settings.n, _FITTED)
         super().__init__(settings, fitted, settings.pool or max(_KEPT * fitted, _LEAST_KEPT))
-        self._wide = LocalQuadratics(settings)
+        self._wide = SmoothedQuadratics(settings)
 
     def go_on(self, points: Tensor, values: Tensor, best: Best, sigma: float) -> MetricProgress:
         """Return a round that begins at the best point of another search, with its evaluations [P, n] and [P]."""
@@ -206,7 +206,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _compared(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
         """Compare the lowest new loss, and all losses at the start of a round, with the quadratic that is kept."""
         bottom, holes = known.bottom, not bool(evaluated.finite.all())
-        evaluated = evaluated.those(evaluated.finite)
+        evaluated = evaluated.sound
         if bottom is None or known.slope is None or known.bend is None or not len(evaluated):
             return known
         steps, above = evaluated.points - bottom.point, evaluated.losses - bottom.loss

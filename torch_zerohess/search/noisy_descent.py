@@ -187,7 +187,7 @@ class NoisyQuadratics(Method[NoisyProgress]):
 
     def _remembered(self, known: NoisyProgress, evaluated: Evaluated) -> NoisyProgress:
         """Add the evaluations with finite values."""
-        new = evaluated.those(evaluated.finite)
+        new = evaluated.sound
         points = torch.cat([known.points, new.points])
         values = torch.cat([known.values, new.losses.clamp(-_LARGEST, _LARGEST)])
         which = latest(points, known.center, self._capacity)

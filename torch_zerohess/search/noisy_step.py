@@ -1,7 +1,7 @@
 """The output at the center by a sparse Jacobian in noise, and a step that minimises the expected loss.
 
 The expected loss has the variance of the predicted outputs in it: the sum of squares of (error of a slope times step).
-So the step is short along directions that noise hides. At a kink of the loss the step is that of `local_steps`.
+So the step is short along directions that noise hides. At a kink of the loss the step is that of `sparse_steps`.
 """
 
 import math
@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.linalg.krylov import are_free, krylov_steps
-from torch_zerohess.search.local_progress import LocalProgress
-from torch_zerohess.search.local_steps import derivatives, local_steps
 from torch_zerohess.search.method import Settings
-from torch_zerohess.surrogates.loss_curvature import LossCurvature, loss_curvature
+from torch_zerohess.search.sparse_progress import SparseProgress
+from torch_zerohess.search.sparse_steps import derivatives, sparse_steps
+from torch_zerohess.surrogates.loss_curvature import LossCurvature, alternating, loss_curvature
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 _CURVED = 3.0
@@ -22,13 +22,13 @@ _ITERATIONS = 100
 """Products of the Hessian for a step."""
 
 
-def step_in_noise(known: LocalProgress, settings: Settings) -> Tensor:
+def step_in_noise(known: SparseProgress, settings: Settings) -> Tensor:
     """Return the step from the center to the minimum of the model within the radius [n]."""
     jacobian, x, loss = known.jacobian, known.center, settings.white_box
     assert jacobian is not None
-    output, radii = known.output.view(known.shape), x.new_tensor([known.radius * math.sqrt(settings.n)])
+    output, radii = known.shaped_output, x.new_tensor([known.radius * math.sqrt(settings.n)])
     lower, upper = settings.lower - x, settings.upper - x
-    kinked = local_steps(loss, output, jacobian, radii, lower, upper)
+    kinked = sparse_steps(loss, output, jacobian, radii, lower, upper)
     if kinked.promised is not None:
         return kinked.steps[0]
     expanded = loss_curvature(loss, output)
@@ -40,13 +40,6 @@ def step_in_noise(known: LocalProgress, settings: Settings) -> Tensor:
         return free * (product(free * v) + own * v)
 
     return krylov_steps(bent, free * gradient, radii, iterations=_ITERATIONS)[0]
-
-
-def alternating(output: Tensor) -> Tensor:
-    """Return 1, -1, 1, ... in the shape of an output."""
-    signs = torch.ones_like(output).flatten()
-    signs[1::2] = -1.0
-    return signs.view(output.shape)
 
 
 def uncertain(expanded: LossCurvature, jacobian: SparseJacobian, output: Tensor) -> Tensor:
@@ -61,10 +54,10 @@ def uncertain(expanded: LossCurvature, jacobian: SparseJacobian, output: Tensor)
 
 
 def constants(predicted: Tensor, left: Tensor, entries: int) -> tuple[Tensor, float, float]:
-    """Return what is left at the center [m], the variance of the rest, and of how many values each is a mean.
+    """Return the constants [m] that the slopes leave, the variance of the rest, and as how many values they are exact.
 
-    Curvature counts as a multiple of the squared prediction, where all outputs together show it. It would otherwise
-    move the constants, which are at the center what the slopes leave.
+    The constants are means of what the slopes leave of the changes. Curvature would move them. So where all outputs
+    together show curvature, it is fitted, too: as a multiple of the squared prediction.
 
     Args:
         predicted: changes [K, m] by the slopes.

@@ -1,9 +1,9 @@
 """Descent on an output: it follows the smoothed output, and goes on by Gauss-Newton where the output is smooth.
 
-Following (`LocalQuadratics`) passes plateaus and small minima, but converges slowly near a minimum whose residuals are
-not zero. Interpolation (`OutputGaussNewton`) converges fast on smooth outputs and stops at their kinks. The evidence
-is a step that lowers the loss and whose output was predicted well. Where Gauss-Newton fails, the descent follows again
-from the best point, with the sigma that it had.
+Following (`SmoothedQuadratics`) passes plateaus and small minima, but converges slowly near a minimum whose residuals
+are not zero. Interpolation (`OutputGaussNewton`) converges fast on smooth outputs and stops at their kinks. The
+evidence is a step that lowers the loss and whose output was predicted well. Where Gauss-Newton fails, the descent
+follows again from the best point, with the sigma that it had.
 """
 
 from dataclasses import dataclass, replace
@@ -12,11 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton, OutputProgress
 from torch_zerohess.search.relay import Relay
+from torch_zerohess.search.smoothed_descent import SmoothedQuadratics
 from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -49,7 +49,7 @@ class OutputDescent(Relay[OutputDescentProgress]):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        self._follow = LocalQuadratics(settings)
+        self._follow = SmoothedQuadratics(settings)
         self._smooth = OutputGaussNewton(settings, self._follow.capacity)
         self._may = settings.noise == 0.0 and settings.n <= MOST
 

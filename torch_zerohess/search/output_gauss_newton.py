@@ -28,6 +28,7 @@ from torch import Tensor
 from torch_zerohess.linalg.nonsmooth import kinked_minimum, mirrored
 from torch_zerohess.search.descent_progress import DescentProgress
 from torch_zerohess.search.gaussian_process_progress import ProcessProgress
+from torch_zerohess.search.kinked_steps import NOTHING, holds, shortened
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.random_points import normal
 from torch_zerohess.search.region_descent import BAD, LONG, NEAR, RegionDescent
@@ -40,8 +41,6 @@ from torch_zerohess.surrogates.quadratic import coefficients
 
 _PATIENCE = 5
 """Rejected steps in a row after which the method has failed."""
-_EXPANDED, _ROUNDED = 0.5, 1e-12
-"""Error of the quadratic's promise, over the promise and over the loss, with which its step is taken."""
 _STEEP = 10.0
 """Slope of the penalty beyond the region, over the slope of the loss."""
 _ITERATIONS = 100
@@ -51,8 +50,6 @@ _LEAST_GAIN = 1e-3
 _AGAIN, _ASIDE = ((1000, 1e-6), (1000, 1e-6)), 0.01
 """Iterations and least gains of further tries where it finds next to nothing and the slope is known, and the distance
 of their starts from x, over the radius."""
-_NOTHING = 1e-8
-"""Promised decrease, over the loss, that is next to nothing."""
 _LEVEL = 1e-3
 """Distance from a bound, over the distance of the farthest evaluation near by, that tells nothing about the slope."""
 _HOLES = 3
@@ -80,7 +77,7 @@ class OutputProgress(RegionProgress):
 
     def remembered(self, evaluated: Evaluated, capacity: int) -> "OutputProgress":
         """Add evaluations whose values are finite."""
-        new = evaluated.those(evaluated.finite)
+        new = evaluated.sound
         known, outputs = super().remembered(new, capacity), self.outputs
         known = known.taking(self.told(evaluated, lost=evaluated.lacking), "evaluations", "lost", "shape")
         if new.outputs is not None and len(new):
@@ -142,7 +139,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         other = error + (-known.curved_part if known.curved else known.curved_part)
         known = replace(known, curved=known.curved != (abs(other) < abs(error)))
         kept = known.kept or ratio >= BAD
-        nothing = known.promised <= _NOTHING * abs(known.lowest.loss)
+        nothing = known.promised <= NOTHING * abs(known.lowest.loss)
         is_short = known.length < LONG and known.length * known.sigma < self.settings.tolerance and nothing
         short = known.short + is_short if known.rejected else 0
         known = replace(known, kept=kept, short=short)
@@ -194,7 +191,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         curvature = known.size * known.curvature if known.curved else torch.zeros_like(known.curvature)
         before, _ = self._of_linear(known, curvature, torch.zeros_like(s))
         after, _ = self._of_linear(known, curvature, s)
-        if abs(before - after - promised) <= _EXPANDED * promised + _ROUNDED * abs(before):
+        if holds(before, after, promised):
             return s, promised
         x, settings, radius = known.lowest.point, self.settings, known.sigma
         lower, upper = ((one - x).clamp(-2.0 * radius, 2.0 * radius) for one in (settings.lower, settings.upper))
@@ -210,14 +207,14 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
 
         def lowest(start: Tensor, iterations: int, least_gain: float) -> Tensor:
             t, _ = mirrored(kinked_minimum(penalised, start, iterations, radius, least_gain), lower, upper)
-            return t * min(1.0, radius / max(float(t.norm()), math.ulp(0.0)))
+            return shortened(t, radius)
 
         zero, generator = torch.zeros_like(s), torch.Generator().manual_seed(0)
         t = lowest(s if after < before else zero, _ITERATIONS, _LEAST_GAIN)
         # Where kinks meet, a slope may point to no decrease although there is one.
         again = _AGAIN if self._is_known(known) else ((_ITERATIONS, _LEAST_GAIN),)
         for iterations, least_gain in again:
-            if before - self._of_linear(known, curvature, t)[0] > _NOTHING * abs(before):
+            if before - self._of_linear(known, curvature, t)[0] > NOTHING * abs(before):
                 break
             beside = _ASIDE * radius * torch.nn.functional.normalize(normal(generator, s, self._n), dim=0)
             end = lowest(beside, iterations, least_gain)

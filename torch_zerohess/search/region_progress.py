@@ -39,16 +39,16 @@ class RegionProgress(Progress):
     lowest: Best
     """The best point of the round."""
     phase: Literal["start", "axes", "trial", "geometry", "slope", "aside", "lines"] = "start"
-    """What is asked for: the start and n points, n further ones, the end of a step, a point for the model, a slope at
-    a kink, two points beside a flat end, or points along the axes."""
+    """What is asked for: the start and n points, n further ones, the end of a step, a point that improves the model, a
+    slope at a kink, two points beside a flat end, or points along the axes."""
     promised: float = 0.0
     """Decrease that the model promises at the end of the step."""
     length: float = 0.0
     """Of the step, in units of the region."""
     expected: float = math.inf
-    """Loss that the model predicts at a point for the model."""
+    """Loss that the model predicts at the last point that was to improve it."""
     confirmed: bool = False
-    """Whether the last such point was as predicted."""
+    """Whether the loss there was as predicted."""
     good: bool = False
     """Whether the last step of this search was not rejected."""
     rejected: int = 0

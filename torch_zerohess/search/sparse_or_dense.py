@@ -18,11 +18,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.local_method import LocalMethod
-from torch_zerohess.search.local_progress import LocalProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
 from torch_zerohess.search.relay import Relay
+from torch_zerohess.search.sparse_method import SparseMethod
+from torch_zerohess.search.sparse_progress import SparseProgress
 from torch_zerohess.search.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
 
@@ -59,18 +59,18 @@ class SparseOrDenseProgress(Progress):
     outputs: Tensor
     """[K, m]"""
     descent: OutputDescentProgress | None
-    local: LocalProgress | None = None
+    sparse: SparseProgress | None = None
 
 
 class SparseOrDense(Relay[SparseOrDenseProgress]):
-    """`OutputDescent` or `LocalMethod`, for outputs with a loss."""
+    """`OutputDescent` or `SparseMethod`, for outputs with a loss."""
 
     engine = "descent or local"
     progress = SparseOrDenseProgress
 
-    def __init__(self, settings: Settings, local: LocalMethod) -> None:
+    def __init__(self, settings: Settings, sparse: SparseMethod) -> None:
         super().__init__(settings)
-        self.descent, self.local = OutputDescent(settings), local
+        self.descent, self.sparse = OutputDescent(settings), sparse
 
     def first(self, generator: torch.Generator) -> tuple[SparseOrDenseProgress, Tensor]:
         """Ask for the start and the first part of the samples."""
@@ -104,9 +104,9 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         self, known: SparseOrDenseProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[SparseOrDenseProgress, Tensor]:
         """Let the chosen search go on."""
-        if known.local is not None:
-            local, points = self.local.next(known.local, evaluated, generator)
-            return replace(known, local=local).taking(local), points
+        if known.sparse is not None:
+            sparse, points = self.sparse.next(known.sparse, evaluated, generator)
+            return replace(known, sparse=sparse).taking(sparse), points
         assert known.descent is not None
         descent, points = self.descent.next(known.descent, evaluated, generator)
         return replace(known, descent=descent).taking(descent), points
@@ -116,12 +116,12 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         every = Evaluated(known.points, known.losses, known.outputs, known.shape)
         k = int(torch.where(torch.isfinite(known.losses), known.losses, torch.inf).argmin())
         known = replace(known, evaluations=len(every), best=Best(known.points[k], float(known.losses[k])))
-        start = self.local.started(every)
+        start = self.sparse.started(every)
         sparse, dense, reason = _predicted(start)
         whole, early = len(every) + len(known.rest), len(known.rest) > 0
         most = _DETERMINED[0 if early else 1] if whole > self.settings.n else _MOST if early else 0.0
         if start is not None and sparse > dense + _MORE and sparse > most:
-            return self._to_local(known, start, reason, generator)
+            return self._to_sparse(known, start, reason, generator)
         if len(known.rest):
             return replace(known, rest=known.rest[:0]), known.rest
         assert known.descent is not None
@@ -135,23 +135,23 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         """Choose by all evaluations around the best of them."""
         every = Evaluated(known.points, known.losses, known.outputs, known.shape)
         every = every.those(torch.where(every.finite, known.losses, torch.inf).argsort(stable=True))
-        start = self.local.started(every) if bool(every.finite[0]) else None
+        start = self.sparse.started(every) if bool(every.finite[0]) else None
         sparse, dense, reason = _predicted(start)
-        if known.local is None and start is not None and sparse > max(dense + _MORE, _MOST):
-            return self._to_local(known, start, reason, generator)
-        jacobian = None if known.local is None else known.local.fitted
+        if known.sparse is None and start is not None and sparse > max(dense + _MORE, _MOST):
+            return self._to_sparse(known, start, reason, generator)
+        jacobian = None if known.sparse is None else known.sparse.fitted
         if jacobian is not None and dense > max(jacobian.explained, sparse) + _MORE:
             descent, points = self.descent.taking_over(known, every, generator)
-            known = replace(known, chosen="descent", reason=reason, descent=descent, local=None).taking(descent)
+            known = replace(known, chosen="descent", reason=reason, descent=descent, sparse=None).taking(descent)
         return self._decided(known), points
 
-    def _to_local(
-        self, known: SparseOrDenseProgress, start: LocalProgress, reason: str, generator: torch.Generator
+    def _to_sparse(
+        self, known: SparseOrDenseProgress, start: SparseProgress, reason: str, generator: torch.Generator
     ) -> tuple[SparseOrDenseProgress, Tensor]:
         """Go on by the sparse Jacobian."""
         begun = start.taking(known, "iterations").with_arrivals(rounds=known.rounds)
-        local, points = self.local.asked(begun, generator)
-        known = replace(known, chosen="local", reason=reason, descent=None, local=local).taking(local)
+        sparse, points = self.sparse.asked(begun, generator)
+        known = replace(known, chosen="local", reason=reason, descent=None, sparse=sparse).taking(sparse)
         assert start.fitted is not None
         return self._decided(known, final=start.fitted.explained > _MOST), points
 
@@ -166,10 +166,10 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         return super().more(known, points, count, generator) if known.chosen else points[:0]
 
     def turn(self, known: SparseOrDenseProgress) -> tuple[Method[Any], Any]:
-        return (self.descent, known.descent) if known.local is None else (self.local, known.local)
+        return (self.descent, known.descent) if known.sparse is None else (self.sparse, known.sparse)
 
 
-def _predicted(start: LocalProgress | None) -> tuple[float, float, str]:
+def _predicted(start: SparseProgress | None) -> tuple[float, float, str]:
     """Return the shares of the held-out change that a sparse and a dense Jacobian predict, and both in words."""
     if start is None or start.fitted is None:
         return 0.0, 0.0, "a sparse Jacobian predicts nothing: the output is one number, or too few outputs are finite"

@@ -69,8 +69,8 @@ class Progress:
     """Steps tried."""
     arrivals: Arrivals = Arrivals()
     lost: int = 0
-    """Batches in a row that were lost: with values that are not finite at points that the search needed; in noise, and
-    for Gauss-Newton, without any finite value."""
+    """Batches in a row that were lost. A batch is lost if a point that the search needed has no finite value; in noise,
+    and for Gauss-Newton, if no point has one."""
     done: bool = False
     message: str = ""
     """Why the search is done."""
@@ -194,6 +194,11 @@ class Evaluated:
         """Which of the points have finite values [K]."""
         finite = torch.isfinite(self.losses)
         return finite if self.outputs is None else finite & torch.isfinite(self.outputs).all(1)
+
+    @property
+    def sound(self) -> "Evaluated":
+        """The points with finite values."""
+        return self.those(self.finite)
 
     @property
     def lacking(self) -> bool:

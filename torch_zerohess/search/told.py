@@ -129,3 +129,18 @@ def check_start(start: Evaluated) -> None:
         f"{count} of {start.outputs.shape[1]} numbers of the output at the start x0 are not finite, or beyond "
         f"{_LARGEST_OUTPUT}: the search models every number, also those that the loss ignores; return moderate ones"
     )
+
+
+def check_range(search: str, changes: Tensor) -> None:
+    """Raise ValueError for changes of outputs over sigma that float32 cannot hold; `search` says who computes in it."""
+    if not in_range(changes):
+        raise ValueError(
+            f"{search} computes in float32, got outputs whose largest change over sigma is "
+            f"{float(changes.abs().max()):g}: return them in other units, so that it is near 1"
+        )
+
+
+def in_range(changes: Tensor) -> bool:
+    """Whether the largest of these numbers is a normal number in float32, or all are 0."""
+    largest, limits = float(changes.abs().max()), torch.finfo(torch.float32)
+    return largest == 0.0 or limits.tiny <= largest <= limits.max

@@ -6,15 +6,15 @@ from typing import Any, Literal, get_args
 
 from torch import Tensor
 
-from torch_zerohess.search.descent_and_process import DescentAndProcess, TurnsProgress
-from torch_zerohess.search.descent_search import descent_method
+from torch_zerohess.search.descent import descent_method
+from torch_zerohess.search.descent_and_gaussian_process import DescentAndProcess, TurnsProgress
 from torch_zerohess.search.gaussian_process_search import process_method
-from torch_zerohess.search.local_settings import LOCAL_TOLERANCE, LocalSettings
 from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.noisy_local import local_method
+from torch_zerohess.search.noisy_sparse_method import sparse_method
 from torch_zerohess.search.protocol import AskTell
 from torch_zerohess.search.space import Bounds
 from torch_zerohess.search.sparse_or_dense import FEWEST, SparseOrDense, SparseOrDenseProgress
+from torch_zerohess.search.sparse_search_settings import SPARSE_TOLERANCE, SparseSearchSettings
 
 _TOLERANCE = 1e-2
 """Length, in units of the first sigma, below which a search has arrived, if the caller says nothing."""
@@ -133,10 +133,10 @@ class TrustRegion(AskTell[Any]):
         if engine == "descent" and (settings.loss is None or settings.n < FEWEST):
             hands_over = settings.loss is not None and settings.bounded and settings.restarts and not settings.noise
             return DescentAndProcess(settings) if hands_over else descent_method(settings)
-        tolerance = LOCAL_TOLERANCE if self._tolerance is None else settings.tolerance
-        own = LocalSettings.checked(settings, grid=self._grid)
-        local = local_method(replace(settings, tolerance=tolerance), own)
-        return local if engine == "local" else SparseOrDense(settings, local)
+        tolerance = SPARSE_TOLERANCE if self._tolerance is None else settings.tolerance
+        own = SparseSearchSettings.checked(settings, grid=self._grid)
+        sparse = sparse_method(replace(settings, tolerance=tolerance), own)
+        return sparse if engine == "local" else SparseOrDense(settings, sparse)
 
 
 def _chosen(settings: Settings) -> tuple[str, str]:

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
+from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate, left_out_share
 from torch_zerohess.surrogates.low_rank import LowRank
-from torch_zerohess.surrogates.process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
 from torch_zerohess.surrogates.sparse_surrogate import SparseSurrogate
 from torch_zerohess.surrogates.surrogate import Surrogate, checked, fitted

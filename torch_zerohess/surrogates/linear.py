@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
-from torch_zerohess.surrogates.surrogate import checked, fitted, scaled
+from torch_zerohess.surrogates.surrogate import checked, fitted, raised, scaled
 
 _RIDGE = 1e-9
 """Added to the squares of the points, in units of their mean: enough to be solvable."""
@@ -78,7 +78,7 @@ def left_out_share(points: Tensor, outputs: Tensor) -> float:
     y = y if y.dtype == torch.float64 else y.float()
     middle, y = z.mean(0), scaled(y - y.mean(0))[0]
     z = (z - middle) / _units(z - middle, middle)
-    half = torch.linalg.solve_triangular(torch.linalg.cholesky(_raised(z.mT @ z)), z.mT, upper=False)
+    half = torch.linalg.solve_triangular(torch.linalg.cholesky(raised(z.mT @ z, _RIDGE)), z.mT, upper=False)
     fitting = half.mT @ half
     own = 1.0 - fitting.diagonal() - 1.0 / len(z)
     if not float(own.min()) > _ALONE:
@@ -99,10 +99,4 @@ def _units(z: Tensor, middle: Tensor) -> Tensor:
 
 
 def _solve(square: Tensor, right: Tensor) -> Tensor:
-    return torch.cholesky_solve(right, torch.linalg.cholesky(_raised(square)))
-
-
-def _raised(square: Tensor) -> Tensor:
-    """Add _RIDGE h to a positive matrix, h the mean of its diagonal."""
-    square.diagonal().add_(_RIDGE * float(square.diagonal().mean()) or 1.0)
-    return square
+    return torch.cholesky_solve(right, torch.linalg.cholesky(raised(square, _RIDGE)))

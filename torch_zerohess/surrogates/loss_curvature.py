@@ -74,6 +74,13 @@ def value_and_slope(loss: Callable[[Tensor], Tensor], output: Tensor) -> tuple[f
     return float(value.detach()), _finite(slope)
 
 
+def alternating(output: Tensor) -> Tensor:
+    """Return 1, -1, 1, ... in the shape of an output."""
+    signs = torch.ones_like(output).flatten()
+    signs[1::2] = -1.0
+    return signs.view(output.shape)
+
+
 def _finite(derivatives: Tensor) -> Tensor:
     """Replace derivatives that are not finite by zero: of a norm at zero, of a logarithm outside of its domain."""
     return torch.nan_to_num(derivatives, nan=0.0, posinf=0.0, neginf=0.0)

@@ -81,3 +81,9 @@ def scaled(numbers: Tensor) -> tuple[Tensor, float]:
         return numbers, 1.0
     size = 2.0 ** math.frexp(largest)[1]
     return numbers.to(torch.float64, copy=True).div_(size).to(numbers.dtype), size
+
+
+def raised(square: Tensor, ridge: float) -> Tensor:
+    """Add a part of the mean of its diagonal to the diagonal of a positive matrix; 1 if that is 0."""
+    square.diagonal().add_(ridge * float(square.diagonal().mean()) or 1.0)
+    return square

@@ -15,23 +15,19 @@ import torch
 from experiments.problems.rendered import Setting, load_scene, rendered
 from experiments.problems.scenes.bunny import OVER_WALL, as_mesh, over_wall
 from experiments.problems.task import Preset, Task, around
-from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 PRESETS = {"fast": Setting((48, 48), 8, 2), "paper": Setting((64, 64), 32, 6)}
 
 
 def task(preset: Preset = "fast", variant: str = "auto") -> Task:
-    def scene(setting: Setting, *, instances: bool = True) -> MitsubaScene:
-        pose = OVER_WALL if instances else as_mesh(OVER_WALL, (0.0, 0.0, 0.0))
-        return load_scene(partial(over_wall, instances=instances), pose, setting, variant)
-
+    moved = as_mesh(OVER_WALL, (0.0, 0.0, 0.0))
     return rendered(
         name="bunny",
         title="position and rotation of the Stanford bunny over a wall",
         parameters="x, z in scene lengths, rotation in units of 100 degrees, all -1 to 1; "
         "starts +-.25 +- .1, solution 0",
-        scene=scene,
-        moving=partial(scene, instances=False),
+        scene=partial(load_scene, over_wall, OVER_WALL, variant),
+        moving=partial(load_scene, partial(over_wall, instances=False), moved, variant),
         variant=variant,
         setting=PRESETS[preset],
         needs="direct light",

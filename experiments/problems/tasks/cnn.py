@@ -1,8 +1,14 @@
-"""CNN: a network predicts the rotation of a mug from an image, without labels, through a path tracer.
+"""CNN and CNN_WIDE: a network predicts the rotation of a mug from an image, without labels, through a path tracer.
 
 One black-box parameter, in units of 20 degrees, as in the source. Training angles are U(11.5, 15.5) x 20 degrees and
-the output is 4.5 + 18 sigmoid. The scene needs no more than direct light at a small film (see `mug_scene`); the `paper`
-preset has the source's film, samples and depth.
+the output is 4.5 + 18 sigmoid.
+
+CNN_WIDE has all angles at which the handle is seen, U(6.5, 19) x 20 degrees: from where the handle comes out behind the
+mug on one side to where it disappears on the other. From 40 to 120 degrees, between the ends, the image does not
+change. The output is 3.5 + 18.5 sigmoid, the whole circle, so that a network can collapse into this plateau.
+
+The scene needs no more than direct light at a small film (see `mug_scene`); the `paper` preset has the source's film,
+samples and depth.
 """
 
 from typing import ClassVar
@@ -15,10 +21,6 @@ from experiments.problems.scenes.mug import DEGREES, mug_scene
 from experiments.problems.task import Preset
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 
-ANGLES = (11.5, 15.5)
-"""Range of the training and held-out angles, in units of 20 degrees."""
-OUTPUT = (4.5, 22.5)
-"""Range of the predictions, in units of 20 degrees."""
 SIZES = {
     "fast": Size(64, 8, 2, evaluations=4000, images=1024, held_out=32),
     "paper": Size(256, 32, 6, evaluations=12000, images=4096, held_out=64, pools=(2, 4, 4)),
@@ -33,8 +35,10 @@ class Rotation(NetworkTask):
     n = 1
     sigma = (1.0, 0.1)
     measure = "rms error [degrees]"
-    angles: ClassVar[tuple[float, float]] = ANGLES
-    output: ClassVar[tuple[float, float]] = OUTPUT
+    angles: ClassVar[tuple[float, float]] = (11.5, 15.5)
+    """Range of the training and held-out angles, in units of 20 degrees."""
+    output: ClassVar[tuple[float, float]] = (4.5, 22.5)
+    """Range of the predictions, in units of 20 degrees."""
 
     def encoder(self) -> Encoder:
         return Encoder(self.size, self.output[:1], self.output[1:])
@@ -56,5 +60,18 @@ class Rotation(NetworkTask):
         return f"{DEGREES * float(x[0]):.1f}°"
 
 
+class WideRotation(Rotation):
+    """The same from all angles at which the handle is seen."""
+
+    name = "cnn_wide"
+    title = "the same from 250 degrees, with a plateau between the ends"
+    sigma = (3.0, 0.1)
+    angles, output = (6.5, 19.0), (3.5, 22.0)
+
+
 def task(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
     return Rotation(SIZES[preset], variant, threads)
+
+
+def cnn_wide(preset: Preset = "fast", variant: str = "auto", threads: int | None = None) -> NetworkTask:
+    return WideRotation(SIZES[preset], variant, threads)

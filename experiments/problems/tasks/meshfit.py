@@ -128,7 +128,23 @@ class MeshFit:
 _SIDES = {"fast": 64, "paper": 256}
 
 
-def fitted_to(name: str, preset: Preset) -> Task:
+def task(preset: Preset = "fast") -> Task:
+    return _fitted_to("meshfit", preset)
+
+
+def meshfit_color(preset: Preset = "fast") -> Task:
+    return _fitted_to("meshfit_color", preset)
+
+
+def suzanne(preset: Preset = "fast") -> Task:
+    return _fitted_to("suzanne", preset)
+
+
+def banana(preset: Preset = "fast") -> Task:
+    return _fitted_to("banana", preset)
+
+
+def _fitted_to(name: str, preset: Preset) -> Task:
     """Return the task of fitting an icosphere to one of `TARGETS`."""
     target = TARGETS[name]()
     colored = target.colors is not None
@@ -139,10 +155,6 @@ def fitted_to(name: str, preset: Preset) -> Task:
         f"x, y, z in {unit}{', red, green, blue in 0 to 1' if colored else ''} of 2562 vertices; "
         f"starts: {'grey ' if colored else ''}spheres of radius .4 to .5",
     )
-
-
-def task(preset: Preset = "fast") -> Task:
-    return fitted_to("meshfit", preset)
 
 
 def contact_sheet(images: Tensor) -> Tensor:

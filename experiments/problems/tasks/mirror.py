@@ -16,23 +16,19 @@ import torch
 from experiments.problems.rendered import Setting, load_scene, rendered
 from experiments.problems.scenes.bunny import IN_MIRRORS, SEEN_AT, as_mesh, in_mirrors
 from experiments.problems.task import Preset, Task, around
-from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 PRESETS = {"fast": Setting((48, 48), 8, 4), "paper": Setting((64, 64), 32, 6)}
 
 
 def task(preset: Preset = "fast", variant: str = "auto") -> Task:
-    def scene(setting: Setting, *, instances: bool = True) -> MitsubaScene:
-        pose = IN_MIRRORS if instances else as_mesh(IN_MIRRORS, SEEN_AT)
-        return load_scene(partial(in_mirrors, instances=instances), pose, setting, variant)
-
+    moved = as_mesh(IN_MIRRORS, SEEN_AT)
     return rendered(
         name="mirror",
         title="position and rotation of the Stanford bunny in two mirrors",
         parameters="x, y in scene lengths, rotation in units of 100 degrees, all -1 to 1; "
         "starts +-.25 +- .1, solution 0",
-        scene=scene,
-        moving=partial(scene, instances=False),
+        scene=partial(load_scene, in_mirrors, IN_MIRRORS, variant),
+        moving=partial(load_scene, partial(in_mirrors, instances=False), moved, variant),
         variant=variant,
         setting=PRESETS[preset],
         needs="two mirrors and direct light",

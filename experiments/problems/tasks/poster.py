@@ -9,21 +9,20 @@ One light and direct light are enough, since the poster reflects no light onto i
 that the texels at the far side are as wide as a pixel.
 """
 
+from functools import partial
+
 import torch
 from skimage import data
 
 from experiments.problems.rendered import Setting, load_scene, rendered
 from experiments.problems.scenes.poster import SIDE, TEXTURE, poster
 from experiments.problems.task import Preset, Task, uniform
-from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 PRESETS = {"fast": Setting((96, 96), 4, 2), "paper": Setting((192, 192), 32, 2)}
 
 
 def task(preset: Preset = "fast", variant: str = "auto") -> Task:
-    def scene(setting: Setting) -> MitsubaScene:
-        return load_scene(poster, TEXTURE, setting, variant)
-
+    scene = partial(load_scene, poster, TEXTURE, variant)
     photograph = torch.tensor(data.camera() / 255.0).unflatten(0, (SIDE, -1)).unflatten(2, (SIDE, -1)).mean((1, 3))
     lowest, highest = torch.zeros(SIDE**2).double(), torch.ones(SIDE**2).double()
     return rendered(

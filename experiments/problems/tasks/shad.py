@@ -16,23 +16,19 @@ import torch
 from experiments.problems.rendered import Setting, load_scene, rendered
 from experiments.problems.scenes.shadow import POSITION, shadow
 from experiments.problems.task import Preset, Task, uniform
-from torch_zerohess.adapters.mitsuba import MitsubaScene
 
 PRESETS = {"fast": Setting((64, 48), 8, 2), "paper": Setting((256, 192), 32, 6)}
 
 
 def task(preset: Preset = "fast", variant: str = "auto") -> Task:
-    def scene(setting: Setting, *, instances: bool = True) -> MitsubaScene:
-        return load_scene(partial(shadow, instances=instances), POSITION, setting, variant)
-
     start = torch.tensor([-0.5, 2.5]).double()
     return rendered(
         name="shad",
         title="the position of a sphere out of view, from its shadow",
         parameters="y, z of the sphere in scene lengths, (-3.25, 1) and (.25, 3.75); starts (-.5, 2.5) +- .1, "
         "solution (-1.5, 1)",
-        scene=scene,
-        moving=partial(scene, instances=False),
+        scene=partial(load_scene, shadow, POSITION, variant),
+        moving=partial(load_scene, partial(shadow, instances=False), POSITION, variant),
         variant=variant,
         setting=PRESETS[preset],
         needs="direct light",

@@ -5,6 +5,9 @@ blocks of 16x16 pixels. Starts: every pixel uniform in (0, 1). Loss: mean square
 image error and the parameter error are the same number. Sigma: 0.3, of the order of the difference of a pixel to its
 target.
 
+TEXTURE100 has the middle 500x500 pixels of the photograph, averaged over blocks of 5x5 pixels: 10 000 grey values.
+TEXTURE317 has the middle 317x317 pixels themselves: 100 489 grey values.
+
 The render is the texture itself, as nothing else in an image of it would depend on the parameters: no light, camera or
 film. Both presets are the same.
 """
@@ -15,17 +18,21 @@ from torch import Tensor
 
 from experiments.problems.task import Picture, Preset, Task, Truth, least_squares, uniform
 
-SIDE = 32
-BLOCK = 16
-"""Pixels of the photograph along the side of a pixel of the texture."""
-
 
 def task(preset: Preset = "fast") -> Task:
-    return texture("texture", SIDE, BLOCK)
+    return _texture("texture", 32, 16)
 
 
-def texture(name: str, side: int, block: int) -> Task:
-    """Return the task of finding the middle of the photograph, as side x side means over blocks."""
+def texture100(preset: Preset = "fast") -> Task:
+    return _texture("texture100", 100, 5)
+
+
+def texture317(preset: Preset = "fast") -> Task:
+    return _texture("texture317", 317, 1)
+
+
+def _texture(name: str, side: int, block: int) -> Task:
+    """Return the task of finding the middle of the photograph, as side x side means over block x block pixels."""
     photograph = torch.tensor(data.camera() / 255.0)
     margin = (len(photograph) - side * block) // 2
     middle = photograph[margin:, margin:][: side * block, : side * block]

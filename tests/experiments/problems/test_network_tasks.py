@@ -51,7 +51,7 @@ def test_parameters_can_be_predicted_and_change_the_image(name):
 def test_angles_are_those_of_the_source():
     task = made("cnn", Size(16, 1, 2, evaluations=1, images=64, held_out=64))
     for angles in (task.training(0)[1], task.held_out[1]):
-        low, high = cnn.ANGLES
+        low, high = cnn.Rotation.angles
         assert low <= float(angles.min()) < low + 0.1 * (high - low)
         assert high >= float(angles.max()) > high - 0.1 * (high - low)
 

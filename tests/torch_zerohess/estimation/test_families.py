@@ -13,7 +13,6 @@ from torch import Tensor
 
 import torch_zerohess as zh
 from torch_zerohess.estimation.perturbations import FAMILIES, draws, perturb, stored
-from torch_zerohess.estimation.standard_error import variance_of_draws
 from torch_zerohess.estimation.stein import (
     FIRST_ORDER_ERROR,
     Layout,
@@ -132,7 +131,7 @@ def test_the_variance_of_draws_is_the_textbook_formula(monkeypatch: pytest.Monke
     stein = perturb(X[:1], smoothing, 4, True).stein
     for chunk in (1 << 22, 1):  # all draws at a time, or one
         monkeypatch.setattr("torch_zerohess.estimation.standard_error._CHUNK", chunk)
-        got = variance_of_draws(stein, "value", f / 18, share, draws(smoothing, N), None)
+        got = stein.variance("value", f / 18, share, draws(smoothing, N), None)
         close(got.variance, expected.view(1, 1))
         close(got.degrees, torch.full((1, 1), 8.0, dtype=torch.float64))
 

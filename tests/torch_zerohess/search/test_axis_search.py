@@ -8,7 +8,7 @@ from torch import Tensor
 
 import torch_zerohess as zh
 from torch_zerohess.search.axis_search import AxisLines, AxisSearch
-from torch_zerohess.search.descent_search import Descent
+from torch_zerohess.search.descent import Descent
 from torch_zerohess.search.gaussian_process_search import GaussianProcessSearch
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.state import Best, Evaluated

@@ -9,8 +9,8 @@ from searches import TARGET, bowl, plateau, rays, rays_loss, rosenbrock, run, ze
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import pool_quadratic
-from torch_zerohess.search.descent import LocalQuadratics
 from torch_zerohess.search.method import Settings
+from torch_zerohess.search.smoothed_descent import SmoothedQuadratics
 from torch_zerohess.search.state import Best, Evaluated
 from truths import vector
 
@@ -187,7 +187,7 @@ def test_a_step_without_a_value_is_shortened(noise):
 def isotropic(n):
     """The method of isotropic samples, from zero and without bounds."""
     x0 = zeros(n)
-    return LocalQuadratics(Settings(x0, x0 - math.inf, x0 + math.inf, None, 10, 1e-2, 0.0, None))
+    return SmoothedQuadratics(Settings(x0, x0 - math.inf, x0 + math.inf, None, 10, 1e-2, 0.0, None))
 
 
 def test_an_isotropic_step_without_a_value_halves_sigma():
@@ -329,7 +329,7 @@ def test_a_further_round_begins_at_another_point():
 def test_a_search_that_has_taken_over_begins_further_rounds_around_the_start_of_the_caller():
     """Far away from where it has taken over: six standard deviations, of a false-alarm rate of 4e-9."""
     unbounded = torch.full((2,), math.inf, dtype=torch.float64)
-    method = LocalQuadratics(Settings(zeros(2), -unbounded, unbounded, None, 10, 1e-2, 0.0, None))
+    method = SmoothedQuadratics(Settings(zeros(2), -unbounded, unbounded, None, 10, 1e-2, 0.0, None))
     taken_over = method.begun(Best(vector(100.0, 100.0)))
     further = method.arrive(taken_over, "it ends", torch.Generator().manual_seed(0))
     assert float(further.center.abs().max()) < 6 * 2.0

@@ -8,6 +8,7 @@ import torch
 from searches import bar, bump, misfit, spiral, waves
 
 from torch_zerohess.optim import GaussianProcessSearch
+from torch_zerohess.search import gaussian_process_of_output
 from torch_zerohess.search.state import Best, Evaluated
 from truths import normal, vector
 
@@ -153,7 +154,7 @@ def test_so_many_evaluations_are_kept(n, pool, expected):
 @pytest.mark.parametrize(("pool", "first"), [(None, 20), (12, 12)])
 def test_noise_is_told_from_ten_outputs_per_coefficient_on(pool, first, monkeypatch):
     """Ten per coefficient of a line; a pool that is smaller tells when it is full."""
-    monkeypatch.setattr("torch_zerohess.search.output_process._WORTH_EARLY", math.inf)  # the process stays alone
+    monkeypatch.setattr(gaussian_process_of_output, "_WORTH_EARLY", math.inf)  # the process stays alone
     generator = torch.Generator().manual_seed(0)
     search = GaussianProcessSearch(
         vector(-3.0), sigma=1.5, bounds=(-5.0, 5.0), loss=misfit(bump, vector(1.3)), restarts=99, pool=pool, seed=0

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
-from torch_zerohess.search.descent_search import Descent
+from torch_zerohess.search.descent import Descent
 from torch_zerohess.search.loss_descent import LossQuadratics
 from torch_zerohess.search.state import Evaluated
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import torch_zerohess as zh
-from torch_zerohess.search.descent_search import Descent
+from torch_zerohess.search.descent import Descent
 from torch_zerohess.search.metric_progress import MetricProgress
 from torch_zerohess.search.state import Best, Evaluated
 from torch_zerohess.search.two_sided_descent import TwoSidedQuadratics, _in_use

@@ -3,8 +3,8 @@
 import torch
 
 from torch_zerohess.surrogates.automatic import AutomaticSurrogate
+from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
-from torch_zerohess.surrogates.process_surrogate import ProcessSurrogate
 from truths import normal
 
 

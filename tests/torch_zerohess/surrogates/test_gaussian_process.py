@@ -15,9 +15,9 @@ from torch_zerohess.surrogates.gaussian_process import (
     GaussianProcess,
     grid_evidence,
 )
+from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.kernels import KERNELS, gaussian, matern
 from torch_zerohess.surrogates.lengths import log_evidence, most_likely
-from torch_zerohess.surrogates.process_surrogate import ProcessSurrogate
 from truths import normal, vector
 
 

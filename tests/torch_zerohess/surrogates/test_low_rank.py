@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from torch_zerohess.surrogates.gaussian_process_surrogate import ProcessSurrogate
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.low_rank import LowRank, LowRankSurrogate
-from torch_zerohess.surrogates.process_surrogate import ProcessSurrogate
 from truths import normal
 
 

@@ -9,7 +9,7 @@ from searches import Linear, misfit, run, waves, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.optim import GaussianProcessSearch
-from torch_zerohess.search.output_process import OutputProcess
+from torch_zerohess.search.gaussian_process_of_output import OutputProcess
 from truths import normal, vector
 
 TIMES = torch.linspace(0.0, 6.0, 25, dtype=torch.float64)
@@ -59,7 +59,7 @@ def test_it_arrives_at_the_last_digit_of_a_smooth_output(seed):
 
 def test_the_process_alone_does_not(monkeypatch):
     for name in ("_WORTH", "_WORTH_EARLY"):
-        monkeypatch.setattr(f"torch_zerohess.search.output_process.{name}", float("inf"))
+        monkeypatch.setattr(f"torch_zerohess.search.gaussian_process_of_output.{name}", float("inf"))
     found = search()
     while not found.done and found.evaluations < 150:
         found.tell(swing(found.ask()))

@@ -31,8 +31,8 @@ _WORTH_EARLY = 0.3
 """`_WORTH` right after the first samples. Where outputs have nothing in common, as images of objects that do not
 overlap, an affine output promises to fade the object out: up to a quarter."""
 _ARRIVED, _STRAIGHT = 1e-8, 0.01
-"""`_WORTH` where the process has arrived, but the loss falls nearly straight along the step: its curvature takes less
-than this part of the promise."""
+"""`_WORTH` where the process has arrived, and the loss falls nearly straight along the step: its curvature takes away
+less than the second part of the promise."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""
 

@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass, field, replace
 
-import torch
 from torch import Tensor
 
 from torch_zerohess.search.gauss_newton import JacobianProgress
 from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.told import check_range
 from torch_zerohess.surrogates.determined_jacobian import better_determined
 from torch_zerohess.surrogates.sparse_choices import GridEvidence
 from torch_zerohess.surrogates.sparse_evidence import Evidence
@@ -27,7 +27,7 @@ _EQUAL = 1e-5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LocalProgress(JacobianProgress):
+class SparseProgress(JacobianProgress):
     """The output at the center, the sparse Jacobian there, and the samples asked for next."""
 
     jacobian: SparseJacobian | None = None
@@ -59,7 +59,7 @@ class LocalProgress(JacobianProgress):
     """Whether steps lead to the minimum of the loss of linear outputs that a thorough search finds."""
     doubted: float = math.inf
     """Loss where the search has last found that it has not arrived, because the thorough search found a lower one."""
-    home: "LocalProgress | None" = None
+    home: "SparseProgress | None" = None
     """The search before the hop that has led here."""
     hopped: float = math.inf
     """Loss at the start of this hop."""
@@ -124,12 +124,12 @@ class LocalProgress(JacobianProgress):
         """Return directions from the center and changes of the output along them, in units of sigma, float32."""
         return ((points - self.center) / self.sigma).float(), ((outputs - self.output) / self.sigma).float()
 
-    def telling_noise(self, one: Tensor, other: Tensor) -> "LocalProgress":
+    def telling_noise(self, one: Tensor, other: Tensor) -> "SparseProgress":
         """Take what two outputs [m] at one point tell about noise: a mean over all pairs, mostly the latest ones."""
         own, pairs = 0.5 * float((one - other).square().mean()), min(self.pairs + 1, _PAIRS)
         return replace(self, variance=own if pairs == 1 else self.variance + (own - self.variance) / pairs, pairs=pairs)
 
-    def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "LocalProgress":
+    def fitting(self, fitted: SparseJacobian, evidence: Evidence) -> "SparseProgress":
         """Return the progress with a new Jacobian.
 
         If it is the first one with which some parameters stay, the best point is the center again: samples move all
@@ -139,9 +139,9 @@ class LocalProgress(JacobianProgress):
         if self.some_stay or not after.some_stay:
             return after
         at = self.home if self.home is not None and self.failed else self
-        return replace(after, best=Best(at.center, at.loss, at.sigma))
+        return replace(after, best=at.here)
 
-    def with_dense(self, u: Tensor, changes: Tensor) -> "LocalProgress":
+    def with_dense(self, u: Tensor, changes: Tensor) -> "SparseProgress":
         """Take the dense Jacobian where the samples of the latest fit determine it, and it predicts better."""
         assert self.fitted is not None
         assert self.evidence is not None
@@ -151,7 +151,7 @@ class LocalProgress(JacobianProgress):
         evidence = self.evidence.with_batch(best, None, u, changes)
         return replace(self, jacobian=best.within(evidence.found), evidence=evidence)
 
-    def told_aside(self, evaluated: Evaluated, gain: float) -> "LocalProgress":
+    def told_aside(self, evaluated: Evaluated, gain: float) -> "SparseProgress":
         """Take what points tell at which only the parameters that stay have moved.
 
         Slopes may be zero although outputs change, as at the maximum of a parabola. Then no parameter stays any more,
@@ -166,7 +166,7 @@ class LocalProgress(JacobianProgress):
             return known
         return replace(known, center=evaluated.points[k].clone(), output=outputs[k].clone(), loss=float(losses[k]))
 
-    def recorded(self, evaluated: Evaluated) -> "LocalProgress":
+    def recorded(self, evaluated: Evaluated) -> "SparseProgress":
         """Return the progress with the lowest loss as the best one. Samples do not count where parameters stay."""
         if self.some_stay and self.phase == "sample":
             evaluated = evaluated.those(slice(int(self.hops)))
@@ -177,18 +177,3 @@ class LocalProgress(JacobianProgress):
         """Whether a hop has led to a loss that is lower by more than rounding."""
         added = self.hopped - before if self.hopped < math.inf else 0.0
         return loss < before - _ROUNDING * max(abs(before), added)
-
-
-def check_range(search: str, changes: Tensor) -> None:
-    """Raise ValueError for changes of outputs over sigma that float32 cannot hold; `search` says who computes in it."""
-    if not in_range(changes):
-        raise ValueError(
-            f"{search} computes in float32, got outputs whose largest change over sigma is "
-            f"{float(changes.abs().max()):g}: return them in other units, so that it is near 1"
-        )
-
-
-def in_range(changes: Tensor) -> bool:
-    """Whether the largest of these numbers is a normal number in float32, or all are 0."""
-    largest, limits = float(changes.abs().max()), torch.finfo(torch.float32)
-    return largest == 0.0 or limits.tiny <= largest <= limits.max

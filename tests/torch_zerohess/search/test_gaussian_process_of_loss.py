@@ -9,8 +9,8 @@ from searches import cosine_bowl, well
 
 from torch_zerohess import minimize
 from torch_zerohess.optim import GaussianProcessSearch
-from torch_zerohess.search import loss_process
-from torch_zerohess.search.loss_process import LossProcess
+from torch_zerohess.search import gaussian_process_of_loss
+from torch_zerohess.search.gaussian_process_of_loss import LossProcess
 from torch_zerohess.search.method import Settings
 from torch_zerohess.search.state import Evaluated
 from truths import normal, vector
@@ -252,7 +252,7 @@ def test_a_search_whose_arrivals_disagree_hops_every_other_time():
 
 def test_quadratics_that_begin_beside_the_best_point_confirm_nothing(monkeypatch):
     """They fall back into its basin, and hardly any others find it."""
-    monkeypatch.setattr(loss_process, "_HOPS", (1e-3, 2e-3))
+    monkeypatch.setattr(gaussian_process_of_loss, "_HOPS", (1e-3, 2e-3))
     ends = [after for before, after in turns_of_quadratics(300) if before.finishing and not after.finishing]
     agreed = [one.agreed for one in ends if one.beside]
     assert len(agreed) > 3

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.gaussian_process_of_output import OutputProcess, OutputProcessProgress
 from torch_zerohess.search.method import Method, Settings
 from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
-from torch_zerohess.search.output_process import OutputProcess, OutputProcessProgress
 from torch_zerohess.search.relay import Relay
 from torch_zerohess.search.state import Best, Evaluated, Progress
 
@@ -85,7 +85,7 @@ class DescentAndProcess(Relay[TurnsProgress]):
     def next(
         self, known: TurnsProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[TurnsProgress, Tensor]:
-        new = evaluated.those(evaluated.finite)
+        new = evaluated.sound
         record = known.record.or_lower(new, known.sigma)
         if record is not known.record:
             assert new.outputs is not None

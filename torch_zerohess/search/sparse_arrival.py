@@ -1,4 +1,4 @@
-"""Where the search by a sparse Jacobian has arrived, and how it hops: the part of `LocalMethod` that ends rounds.
+"""Where the search by a sparse Jacobian has arrived, and how it hops: the part of `SparseMethod` that ends rounds.
 
 Steps may become short although the search has not arrived: where bounds and kinks meet, or where the Jacobian lacks
 entries. So, before it arrives, a thorough search minimises the loss of linear outputs within the first radius. If the
@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.gauss_newton import LENGTHS, SHRINKING, GaussNewton
-from torch_zerohess.search.local_progress import LocalProgress
-from torch_zerohess.search.local_settings import LocalSettings
-from torch_zerohess.search.local_steps import LITTLE, LocalSteps, local_steps, thorough_step
+from torch_zerohess.search.kinked_steps import LITTLE, Steps
 from torch_zerohess.search.method import Settings
-from torch_zerohess.search.state import Best
+from torch_zerohess.search.sparse_progress import SparseProgress
+from torch_zerohess.search.sparse_search_settings import SparseSearchSettings
+from torch_zerohess.search.sparse_steps import sparse_steps, thorough_step
 
 MOST = 2
 """Samples of a batch, over the first number of samples, at most."""
@@ -34,40 +34,40 @@ _SHARED = (
 """What a search that returns from a hop keeps."""
 
 
-class LocalArrivals(GaussNewton[LocalProgress]):
-    """The steps of `LocalMethod`, and what follows where they are short."""
+class SparseArrivals(GaussNewton[SparseProgress]):
+    """The steps of `SparseMethod`, and what follows where they are short."""
 
-    def __init__(self, settings: Settings, own: LocalSettings) -> None:
+    def __init__(self, settings: Settings, own: SparseSearchSettings) -> None:
         super().__init__(settings)
         self.own, self.radius = own, own.radius
-        self._last: tuple[LocalProgress, Tensor, LocalSteps] | None = None  # progress, lengths and steps
+        self._last: tuple[SparseProgress, Tensor, Steps] | None = None  # progress, lengths and steps
 
-    def steps(self, known: LocalProgress, radii: Tensor) -> Tensor:
-        """Solve the model, see `local_steps`."""
+    def steps(self, known: SparseProgress, radii: Tensor) -> Tensor:
+        """Solve the model, see `sparse_steps`."""
         return self._solved(known, radii).steps
 
-    def _solved(self, known: LocalProgress, radii: Tensor) -> LocalSteps:
+    def _solved(self, known: SparseProgress, radii: Tensor) -> Steps:
         last, settings = self._last, self.settings
         if last is not None and last[0] is known and torch.equal(last[1], radii):
             return last[2]
         assert known.jacobian is not None
         box = settings.lower - known.center, settings.upper - known.center
-        found = local_steps(settings.white_box, known.output.view(known.shape), known.jacobian, radii, *box)
+        found = sparse_steps(settings.white_box, known.shaped_output, known.jacobian, radii, *box)
         if known.thorough:
             found = self._thorough(known, float(radii[-1]), found.steps[-1])
             found = replace(found, steps=radii[:, None] / radii[-1] * found.steps)
         self._last = known, radii, found
         return found
 
-    def _thorough(self, known: LocalProgress, longest: float, start: Tensor) -> LocalSteps:
+    def _thorough(self, known: SparseProgress, longest: float, start: Tensor) -> Steps:
         """Return the step of a thorough search, from the end of another step [n]."""
         assert known.jacobian is not None
-        settings, output = self.settings, known.output.view(known.shape)
+        settings, output = self.settings, known.shaped_output
         lower, upper = settings.lower - known.center, settings.upper - known.center
         start = start.clamp(lower, upper)
         return thorough_step(settings.white_box, output, known.jacobian, longest, lower, upper, start)
 
-    def at_kink(self, known: LocalProgress) -> LocalProgress:
+    def at_kink(self, known: SparseProgress) -> SparseProgress:
         """Sample as near as samples get, then arrive. Where the Jacobian does not predict, shrink the radius."""
         own, radius, near = self.own, SHRINKING * known.radius, known.sigma <= self.own.least_sigma
         if known.predicts and not near:
@@ -77,7 +77,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
             known = self.arrived(known)
         return replace(known, sigma=self.distance(known.radius))
 
-    def arrived(self, known: LocalProgress) -> LocalProgress:
+    def arrived(self, known: SparseProgress) -> SparseProgress:
         """End, hop, or begin again with the first radius where the Jacobian does not predict."""
         if known.failed:
             return self._returned(known)
@@ -91,8 +91,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         if known.some_stay and not (known.moved or self.settings.noise):
             return replace(known, phase="aside")
         if found is None:
-            end = Best(known.center, known.loss, known.sigma)
-            known = known.arriving(end).agreeing(end, self.settings.tolerance)
+            known = known.arriving(known.here).agreeing(known.here, self.settings.tolerance)
         known = super().arrived(replace(known, thorough=False))
         return known if known.done else self._hopping(replace(known, finished=True))
 
@@ -102,7 +101,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         enough = math.ceil(1.25 * self.settings.n) + 4
         return enough if enough <= MOST * self.own.samples else 0
 
-    def _lower_end(self, known: LocalProgress) -> Tensor | None:
+    def _lower_end(self, known: SparseProgress) -> Tensor | None:
         """Return a step [n] that lowers the loss of linear outputs by more than `LITTLE`, unless it is short."""
         root = math.sqrt(self.settings.n)
         found = self._thorough(known, self.radius * root, torch.zeros_like(known.center))
@@ -111,12 +110,12 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         short = float(found.steps.norm()) <= _INSIDE * LENGTHS[-1] * self.settings.tolerance * root
         return None if little or short else found.steps[0]
 
-    def _doubting(self, known: LocalProgress, step: Tensor) -> LocalProgress:
+    def _doubting(self, known: SparseProgress, step: Tensor) -> SparseProgress:
         """Go on along a step [n], and take the steps of a thorough search from here on."""
         radius = float(step.norm()) / math.sqrt(self.settings.n)
         return replace(known, thorough=True, doubted=known.loss, radius=radius, phase="trial", slow=0)
 
-    def rejected(self, known: LocalProgress) -> LocalProgress:
+    def rejected(self, known: SparseProgress) -> SparseProgress:
         """Shrink the radius; where a thorough search has misled, sample near first, and then try shorter steps."""
         if not known.thorough:
             return super().rejected(known)
@@ -124,7 +123,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
             return replace(super().rejected(known), phase="trial")
         return replace(known, radius=min(SHRINKING * known.radius, self.own.least_sigma / self.own.share))
 
-    def stalled(self, known: LocalProgress) -> LocalProgress:
+    def stalled(self, known: SparseProgress) -> SparseProgress:
         """Hop, or return from a hop; go on where neither may help."""
         if known.failed:
             return self._returned(known)
@@ -132,7 +131,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
             return known
         return self._hopping(known)
 
-    def _hopping(self, known: LocalProgress) -> LocalProgress:
+    def _hopping(self, known: SparseProgress) -> SparseProgress:
         """Ask for a point close by, and samples around it."""
         return replace(
             known,
@@ -148,7 +147,7 @@ class LocalArrivals(GaussNewton[LocalProgress]):
             patient=False,
         )
 
-    def _returned(self, known: LocalProgress) -> LocalProgress:
+    def _returned(self, known: SparseProgress) -> SparseProgress:
         """Return from a hop that has found nothing better; hop again if the search had arrived before."""
         home = known.home
         assert home is not None
@@ -156,15 +155,14 @@ class LocalArrivals(GaussNewton[LocalProgress]):
         known = replace(home.taking(known, *_SHARED), phase="sample", patient=True)
         if not home.finished:
             return known
-        end = Best(known.center, known.loss, known.sigma)
-        known = known.agreeing(end, self.settings.tolerance) if same else known.with_arrivals(agreed=0)
+        known = known.agreeing(known.here, self.settings.tolerance) if same else known.with_arrivals(agreed=0)
         known = super().arrived(known)
         return known if known.done else self._hopping(known)
 
     def distance(self, radius: float) -> float:
         return min(1.0, max(self.own.share * radius, self.own.least_sigma))
 
-    def promise(self, known: LocalProgress) -> float:
+    def promise(self, known: SparseProgress) -> float:
         """Return the promise of a step; it is infinite while a hop has led to nothing better."""
         if not known.predicts or known.failed or known.phase != "trial":
             return math.inf

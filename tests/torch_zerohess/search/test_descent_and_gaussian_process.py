@@ -6,7 +6,7 @@ from every_search import same, saved
 from searches import bent, points_of, run, square
 
 from torch_zerohess.optim import Descent, TrustRegion
-from torch_zerohess.search import descent_and_process
+from torch_zerohess.search import descent_and_gaussian_process
 from torch_zerohess.search.output_gauss_newton import OutputGaussNewton
 from torch_zerohess.surrogates import kernels
 from truths import normal
@@ -72,7 +72,7 @@ def test_a_descent_that_has_arrived_is_not_replaced(monkeypatch):
     search = run(TrustRegion(normal(1, 5, seed=3)[0], **settings), bent, 200, target=1 + 1e-9)
     while search.rounds == 0:
         search.tell(bent(search.ask()))
-    monkeypatch.setattr(descent_and_process, "_SLOW", 2.0)
+    monkeypatch.setattr(descent_and_gaussian_process, "_SLOW", 2.0)
     assert run(search, bent, search.evaluations + 100).engine == "descent"
 
 

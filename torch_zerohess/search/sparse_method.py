@@ -4,12 +4,12 @@ The start and a few dozen samples of all parameters at once tell a sparse Jacobi
 (`surrogates.sparse_fit`). It takes about s log n samples for s parameters per row, where a dense Jacobian takes n.
 
 An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths follow, see
-`local_steps` and `gauss_newton`. Steps and hops move only the parameters that some output was found to depend on, see
+`sparse_steps` and `gauss_newton`. Steps and hops move only the parameters that some output was found to depend on, see
 `surrogates.sparse_evidence`. If the output at the end of the step was predicted well, the next steps use the same J.
 Sigma is a share of the radius.
 
 At a kink of the loss, and at bounds, all steps may fail although the search has not arrived. What follows before it
-arrives is in `local_arrival`.
+arrives is in `sparse_arrival`.
 
 Where steps hardly lower the loss, the search hops: it goes on from a random point close by, with the J that it has. It
 stays with what the hop leads to if the loss is lower there. Otherwise it returns: to another hop if it had arrived,
@@ -24,11 +24,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.local_arrival import MOST, LocalArrivals
-from torch_zerohess.search.local_progress import LocalProgress, in_range
-from torch_zerohess.search.local_steps import derivatives
+from torch_zerohess.search.kinked_steps import NOTHING
 from torch_zerohess.search.random_points import normal
+from torch_zerohess.search.sparse_arrival import MOST, SparseArrivals
+from torch_zerohess.search.sparse_progress import SparseProgress
+from torch_zerohess.search.sparse_steps import derivatives
 from torch_zerohess.search.state import Best, Evaluated
+from torch_zerohess.search.told import in_range
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.sparse_choices import fit_chosen
@@ -48,23 +50,21 @@ _HOP = 0.3
 """Standard deviation of a hop, in units of the first sigma."""
 _FOUND = 0.3
 """Share of the entries that must be of parameters that were found, before steps follow, or else more samples."""
-_NOTHING = 1e-8
-"""Decrease that the loss of linear outputs promises, over the loss: so small that no step is tried."""
 _LEAST = 1e-300
 """Least number that is divided by."""
 _FULL = 1000
 """Parameters up to which `model_at_best` forms the Hessian."""
 
 
-class LocalMethod(LocalArrivals):
+class SparseMethod(SparseArrivals):
     """The search of `LocalGaussNewton`, in units of its sigma."""
 
     engine = "local"
-    progress = LocalProgress
+    progress = SparseProgress
 
-    def begun(self) -> LocalProgress:
+    def begun(self) -> SparseProgress:
         start = self.settings.start
-        return LocalProgress(
+        return SparseProgress(
             best=Best(start),
             center=start,
             radius=self.radius,
@@ -74,7 +74,7 @@ class LocalMethod(LocalArrivals):
             samples=self.own.samples,
         )
 
-    def started(self, evaluated: Evaluated) -> LocalProgress | None:
+    def started(self, evaluated: Evaluated) -> SparseProgress | None:
         """Return the progress after a center, the first one, and samples around it; None if they give no Jacobian."""
         if evaluated.outputs is None or evaluated.outputs.shape[1] == 1:
             return None
@@ -84,7 +84,7 @@ class LocalMethod(LocalArrivals):
         known = self.sampled(known.recorded(evaluated), evaluated)
         return None if known.jacobian is None else known
 
-    def samples(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
+    def samples(self, known: SparseProgress, generator: torch.Generator) -> tuple[SparseProgress, Tensor]:
         """Draw samples from N(center, sigma^2), mirrored into the bounds; after a hop, draw the center first."""
         hops = known.hops
         if hops:
@@ -94,7 +94,7 @@ class LocalMethod(LocalArrivals):
         points = self.settings.drawn(known.center, known.sigma, known.samples, generator)
         return known, torch.cat([known.center[None], points]) if hops else points
 
-    def sampled(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+    def sampled(self, known: SparseProgress, evaluated: Evaluated) -> SparseProgress:
         if known.first == math.inf and bool(evaluated.finite[0]):
             known = replace(known, first=float(evaluated.losses[0]))
         if not known.hops:
@@ -103,9 +103,9 @@ class LocalMethod(LocalArrivals):
             return self._returned(known)
         return super().sampled(replace(known, hopped=float(evaluated.losses[0])), evaluated)
 
-    def renewed(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+    def renewed(self, known: SparseProgress, evaluated: Evaluated) -> SparseProgress:
         """Fit the Jacobian to samples; too few of them are drawn again."""
-        first, sound = known.evaluations == len(evaluated) + 1, evaluated.those(evaluated.finite)
+        first, sound = known.evaluations == len(evaluated) + 1, evaluated.sound
         assert sound.outputs is not None
         if len(sound) < FEWEST_SAMPLES:
             return known
@@ -124,26 +124,26 @@ class LocalMethod(LocalArrivals):
         return replace(known, phase="trial")
 
     def next(
-        self, known: LocalProgress, evaluated: Evaluated, generator: torch.Generator
-    ) -> tuple[LocalProgress, Tensor]:
+        self, known: SparseProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[SparseProgress, Tensor]:
         if known.phase != "aside":
             return super().next(known, evaluated, generator)
         before = known.counted(evaluated).recorded(evaluated)
-        known = before.told_aside(evaluated.those(evaluated.finite), _SLOW)
+        known = before.told_aside(evaluated.sound, _SLOW)
         if known.center is not before.center:
             known = replace(known, radius=self.radius, sigma=self.distance(self.radius), phase="sample", slow=0)
         elif not known.done:
             known = self.arrived(known)
         return self.asked(known, generator)
 
-    def asked(self, known: LocalProgress, generator: torch.Generator) -> tuple[LocalProgress, Tensor]:
+    def asked(self, known: SparseProgress, generator: torch.Generator) -> tuple[SparseProgress, Tensor]:
         """Ask for what the phase says; for no steps where the loss of linear outputs promises nothing."""
         if known.phase == "trial" and known.fresh and known.radius < self.settings.tolerance and not known.done:
             known = self.arrived(known)
             known = replace(known, sigma=self.distance(known.radius))
         if known.phase == "trial" and not known.done:
             promised = self._solved(known, self.radii(known)).promised
-            if promised is not None and promised <= _NOTHING * abs(known.loss):
+            if promised is not None and promised <= NOTHING * abs(known.loss):
                 known = self.at_kink(known)
         if known.done:
             return known, known.center[None][:0]
@@ -153,7 +153,7 @@ class LocalMethod(LocalArrivals):
         step = ~known.evidence.found * normal(generator, known.center, self.settings.n)
         return known, self.settings.inside(known.center + torch.stack([step, -step]))
 
-    def taken(self, known: LocalProgress, evaluated: Evaluated) -> LocalProgress:
+    def taken(self, known: SparseProgress, evaluated: Evaluated) -> SparseProgress:
         """Take the best step; double the samples after a small gain, and halve them after a large one; or hop."""
         after = super().taken(known, evaluated)
         if after.home is not known.home or after.rounds > known.rounds or after.phase == "aside":  # it has arrived
@@ -164,10 +164,10 @@ class LocalMethod(LocalArrivals):
         after = replace(after, samples=count, slow=known.slow + 1 if gain < _SLOW * abs(before) else 0)
         return self.stalled(after) if after.slow >= _STALLED and not after.thorough else after
 
-    def gradient(self, known: LocalProgress) -> Tensor:
+    def gradient(self, known: SparseProgress) -> Tensor:
         return self._derivatives(known)[0]
 
-    def moved(self, known: LocalProgress, step: Tensor, change: Tensor) -> LocalProgress:
+    def moved(self, known: SparseProgress, step: Tensor, change: Tensor) -> SparseProgress:
         """Keep the Jacobian, without new samples, if it predicted the change of the output."""
         assert known.jacobian is not None
         miss = float((change - known.jacobian.matvec(step).flatten()).square().sum())
@@ -175,15 +175,15 @@ class LocalMethod(LocalArrivals):
         phase: Literal["trial", "sample"] = "trial" if share <= _FAITHFUL else "sample"
         return replace(known, phase=phase, fresh=False, missed=max(known.missed, share))
 
-    def untouched(self, known: LocalProgress) -> Tensor | None:
+    def untouched(self, known: SparseProgress) -> Tensor | None:
         """Return the parameters that no output was found to depend on, if some were found."""
         return ~known.evidence.found if known.some_stay and known.evidence is not None else None
 
-    def model_at_best(self, known: LocalProgress) -> tuple[LocalModel, float] | None:
+    def model_at_best(self, known: SparseProgress) -> tuple[LocalModel, float] | None:
         home = known.home
         return super().model_at_best(known if home is None or not known.failed else replace(home, best=known.best))
 
-    def derivatives_at_center(self, known: LocalProgress) -> tuple[Tensor, Tensor] | None:
+    def derivatives_at_center(self, known: SparseProgress) -> tuple[Tensor, Tensor] | None:
         """None before the first Jacobian, and for more than a thousand parameters."""
         n = self.settings.n
         if known.jacobian is None or n > _FULL:
@@ -192,7 +192,7 @@ class LocalMethod(LocalArrivals):
         eye = torch.eye(n, dtype=torch.float64, device=known.center.device)
         return gradient, torch.stack([product(one) for one in eye])
 
-    def _derivatives(self, known: LocalProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    def _derivatives(self, known: SparseProgress) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Gradient [n] of the loss at the center, and the product with its Gauss-Newton Hessian, float64."""
         assert known.jacobian is not None
-        return derivatives(loss_curvature(self.settings.white_box, known.output.view(known.shape)), known.jacobian)
+        return derivatives(loss_curvature(self.settings.white_box, known.shaped_output), known.jacobian)

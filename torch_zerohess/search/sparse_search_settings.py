@@ -8,12 +8,12 @@ from torch_zerohess.arguments import checked_integer, checked_number
 from torch_zerohess.search.method import Settings
 from torch_zerohess.surrogates.sparse_fit import SparseSettings, check_samples
 
-LOCAL_TOLERANCE = 5e-4
+SPARSE_TOLERANCE = 5e-4
 """Radius, in units of sigma, at which the search has arrived, if the caller says nothing."""
 
 
 @dataclass(frozen=True)
-class LocalSettings:
+class SparseSearchSettings:
     """Settings that only this search has; see `LocalGaussNewton`."""
 
     sparse: SparseSettings
@@ -31,7 +31,7 @@ class LocalSettings:
         rate: float = 0.1,
         grid: tuple[int, ...] | None = None,
         **own: Any,
-    ) -> "LocalSettings":
+    ) -> "SparseSearchSettings":
         """Check what a caller gave; ValueError for a setting out of range."""
         if not callable(settings.loss):
             raise ValueError(

@@ -257,10 +257,10 @@ def test_the_value_is_the_loss_of_the_output_that_the_regression_tells():
 
 
 def test_the_number_of_evaluations_that_are_kept_is_limited(monkeypatch):
-    monkeypatch.setattr("torch_zerohess.search.noisy_local._KEPT", 100)
+    monkeypatch.setattr("torch_zerohess.search.noisy_sparse_method._KEPT", 100)
     known = run(search_for(), noisy(), 300)._state.progress
     assert (len(known.points), len(known.outputs)) == (100, 100)
-    monkeypatch.setattr("torch_zerohess.search.noisy_local._HELD", 80 * 2 * N)
+    monkeypatch.setattr("torch_zerohess.search.noisy_sparse_method._HELD", 80 * 2 * N)
     assert len(run(search_for(), noisy(), 300)._state.progress.points) == 80
 
 

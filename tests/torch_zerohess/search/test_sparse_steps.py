@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torch_zerohess.linalg.krylov import krylov_steps
-from torch_zerohess.search.local_steps import local_steps
+from torch_zerohess.search.sparse_steps import sparse_steps
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from truths import normal, vector
 
@@ -23,7 +23,7 @@ def twice():
 
 
 def solved(loss, lower=-INF, upper=INF):
-    return local_steps(loss, OUTPUT, twice(), RADII, lower, upper)
+    return sparse_steps(loss, OUTPUT, twice(), RADII, lower, upper)
 
 
 def square(y):

@@ -139,7 +139,7 @@ class LossProcess(FinishedProcess[LossProgress]):
         """Let the search along the axes learn; when it has ended let quadratics begin where the loss is lowest."""
         before = known.best
         known = self.learned(known, evaluated)
-        known = replace(known, best=before.or_lower(evaluated.those(evaluated.finite), known.sigma))
+        known = replace(known, best=before.or_lower(evaluated.sound, known.sigma))
         known = replace(known, record=known.best, evaluations=known.evaluations + len(evaluated))
         lines, points = self._axes.next(lines, evaluated, several=known.several)
         known = replace(known, lines=lines)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torch_zerohess.surrogates.local_fit import quadratic_around
+from torch_zerohess.surrogates.quadratic_around import quadratic_around
 from truths import normal
 
 

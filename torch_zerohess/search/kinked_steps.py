@@ -17,6 +17,8 @@ from torch_zerohess.surrogates.loss_curvature import value_and_slope
 
 _EXPANDED, _ROUNDED = 0.5, 1e-12
 """Error of the quadratic's promise, over the promise and over the loss, with which its steps are taken."""
+_ROUNDED_UP = 1.0 + 4 * torch.finfo(torch.float64).eps
+"""Factor of outputs that changes them by their rounding."""
 LITTLE = 1e-5
 """Decrease that the loss of linear outputs promises, over the loss, with which a search has arrived."""
 NOTHING = 1e-8
@@ -81,10 +83,11 @@ def checked_steps(
         upper: at least 0.
     """
     before, down, longest = outputs.value(torch.zeros_like(gradient)), steps @ gradient, float(radii[-1])
+    rounding = abs(outputs.loss(outputs.output * _ROUNDED_UP)[0] - before)
 
     def is_wrong(s: Tensor, promised: float) -> bool:
         after = outputs.value(s)
-        return not (math.isnan(before - after - promised) or holds(before, after, promised))  # NaN tells nothing
+        return abs(before - after - promised) > rounding and not holds(before, after, promised)  # NaN tells nothing
 
     if not any(is_wrong(s, float(one)) for s, one in zip(steps, -(down + 0.5 * bent), strict=True)):
         straight = float(bent[-1]) <= -_ROUNDED * float(down[-1])

@@ -226,6 +226,7 @@ class SecondOrder(Optimizer):
         curvature = self.param_groups[0]["curvature"]
         if torch.is_inference_mode_enabled():
             raise RuntimeError("a step needs derivatives of the loss, which inference mode forbids: use torch.no_grad")
+        torch.clear_autocast_cache()  # torch 2.10 also keeps copies that the last step has made without a graph
         with torch.enable_grad():
             if not callable(closure):
                 raise TypeError(f"closure must be callable, a function that returns the loss, got {closure!r}")

@@ -21,7 +21,7 @@ from experiments.problems.task import Preset, Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
 from torch_zerohess.evaluators import Factory, ProcessPool
-from torch_zerohess.evaluators.lifetime import end_with_parent, ending, one_thread
+from torch_zerohess.evaluators.lifetime import end_with_parent, ending, starting_worker
 
 _PROGRESS = 0.2
 """Seconds between two messages about a running job."""
@@ -107,7 +107,7 @@ class _Process:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs,), daemon=daemon)  # which has no children
-        with one_thread():
+        with starting_worker():
             self.process.start()
         theirs.close()
         self.job: Job | None = None

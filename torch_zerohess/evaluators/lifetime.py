@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from pathlib import Path
 
@@ -14,13 +15,23 @@ _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Let processes that start inside have one thread each: libraries read these variables when they are loaded."""
+def starting_worker() -> Iterator[None]:
+    """Let a process that starts inside have one thread, and leave Ctrl-C to this process while it imports.
+
+    Libraries read these variables when they are loaded. A new process blocks the signals that its parent blocks;
+    `end_with_parent` ends that.
+    """
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
+    masks, blocked = hasattr(signal, "pthread_sigmask"), set[int]()
+    if masks:
+        resource_tracker.ensure_running()  # its start would end the blocking
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -35,6 +46,8 @@ def end_with_parent() -> None:
     parent holds the other end of a pipe, and SIGKILL is sent when that closes. Ctrl-C is left to the parent.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see `starting_worker`
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)  # a group for this process and the programs that it starts
     parent = multiprocessing.parent_process()

@@ -14,7 +14,7 @@ from torch_zerohess.evaluators.ahead import Job
 from torch_zerohess.evaluators.batch import Chunk
 from torch_zerohess.evaluators.default_dtype import default_dtype
 from torch_zerohess.evaluators.kept import make_room, used
-from torch_zerohess.evaluators.lifetime import end_group, ending, one_thread
+from torch_zerohess.evaluators.lifetime import end_group, ending, starting_worker
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
 
 _starting = threading.Lock()
@@ -32,7 +32,7 @@ class Process:
         context = multiprocessing.get_context("spawn")
         mine, theirs = context.Pipe()
         self.process = context.Process(target=worker.main, args=(theirs,), name="torch_zerohess worker", daemon=True)
-        with _starting, one_thread():
+        with _starting, starting_worker():
             self.process.start()
         theirs.close()
         self.messages = Messages(mine)

@@ -463,6 +463,26 @@ if __name__ == "__main__":
 """
 
 
+IMPORTING = """
+import multiprocessing, os, signal, threading, time
+import torch
+import black_boxes
+from torch_zerohess.evaluators import ProcessPool
+
+def interrupt():
+    while not multiprocessing.active_children():
+        time.sleep(0.001)
+    time.sleep(0.3)
+    os.kill(multiprocessing.active_children()[0].pid, signal.SIGINT)
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=interrupt).start()
+    with ProcessPool(1, retries=0) as pool:
+        print(len(pool(black_boxes.process, torch.ones(1, 2))))
+"""
+
+
 @pytest.mark.parametrize("end", ["return", "SIGINT", "SIGKILL"])
 def test_no_worker_outlives_its_parent(end, tmp_path):
     script = tmp_path / "script.py"
@@ -482,6 +502,14 @@ def test_no_worker_outlives_its_parent(end, tmp_path):
         while alive(worker) and time.monotonic() < until:
             time.sleep(0.02)
         assert not alive(worker)
+
+
+def test_ctrl_c_does_not_end_a_worker_that_imports(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(IMPORTING)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("1\n", "")
 
 
 def test_arguments_are_checked():

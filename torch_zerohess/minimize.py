@@ -21,7 +21,7 @@ from torch_zerohess.minimization.outcome import outcome
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.separate import separated
 from torch_zerohess.minimization.stopping import Stopping
-from torch_zerohess.search.space import Bounds, checked_start
+from torch_zerohess.search.protocol.space import Bounds, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 from torch_zerohess.smoothing import random_seed
 from torch_zerohess.surrogates.memory import Memory, check_memory

@@ -11,7 +11,7 @@ import torch
 from searches import CURVATURE, TARGET, tilted, zeros
 
 import torch_zerohess as zh
-from torch_zerohess.search.space import Space
+from torch_zerohess.search.protocol.space import Space
 from truths import vector
 
 

@@ -18,7 +18,7 @@ from torch_zerohess.evaluators.finished import finished_values, keep_finished
 from torch_zerohess.minimization import running
 from torch_zerohess.minimization.noise import reserved
 from torch_zerohess.minimization.running import Running
-from torch_zerohess.search.protocol import AskTell
+from torch_zerohess.search.protocol.ask_tell import AskTell
 from truths import vector
 
 SETTINGS = {"sigma": 2.0, "seed": 0, "vectorized": False, "max_evaluations": 16}

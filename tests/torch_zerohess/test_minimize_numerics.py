@@ -9,7 +9,7 @@ from searches import bowl, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.linalg.subproblem import ball_step
-from torch_zerohess.search import region_descent
+from torch_zerohess.search.region import method
 from truths import normal
 
 LARGEST = sys.float_info.max
@@ -88,13 +88,13 @@ def test_noise_of_the_largest_and_of_the_smallest_losses_is_measured(scale):
 
 
 def test_a_search_goes_on_after_a_numerical_failure(monkeypatch):
-    right, calls = region_descent.region_step, []
+    right, calls = method.region_step, []
 
     def step(*args):
         calls.append(args)
         return failing() if len(calls) in (2, 5) else right(*args)
 
-    monkeypatch.setattr(region_descent, "region_step", step)
+    monkeypatch.setattr(method, "region_step", step)
     fit = zh.minimize(bowl, zeros(2), sigma=2.0, seed=0, restarts=0)
     assert fit.success
     assert fit.value < 1e-8
@@ -103,7 +103,7 @@ def test_a_search_goes_on_after_a_numerical_failure(monkeypatch):
 @pytest.mark.parametrize("loss", [None, torch.sum])
 def test_a_numerical_failure_of_the_search_is_not_blamed_on_fn(loss, monkeypatch):
     """Here every step fails. With a loss, too, the models fail, and the loss is well."""
-    monkeypatch.setattr(region_descent, "region_step", lambda *args: failing())
+    monkeypatch.setattr(method, "region_step", lambda *args: failing())
     with pytest.raises(torch.linalg.LinAlgError) as caught:
         zh.minimize(lambda z: bowl(z) if loss is None else z.square(), zeros(2) + 1.0, sigma=2.0, seed=0, loss=loss)
     assert caught.value.minimum.message.startswith("the search raised _LinAlgError")

@@ -12,8 +12,8 @@ _CHECKS = tuple(
         "minimization.callback",
         "minimization.evaluating",
         "minimization.separate",
-        "search.sparse_progress",
-        "search.told",
+        "search.protocol.told",
+        "search.sparse.progress",
     )
 )
 """Modules that check what functions of a caller return."""

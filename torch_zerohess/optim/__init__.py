@@ -6,10 +6,10 @@ from torch_zerohess.optim.newton import Newton
 from torch_zerohess.optim.newton_cg import NewtonCG
 from torch_zerohess.optim.newton_targets import NewtonTargets
 from torch_zerohess.optim.nonlinear_cg import NonlinearCG
-from torch_zerohess.search.block_gauss_newton import BlockGaussNewton
-from torch_zerohess.search.descent import Descent
-from torch_zerohess.search.gaussian_process_search import GaussianProcessSearch
-from torch_zerohess.search.local_gauss_newton import LocalGaussNewton
+from torch_zerohess.search.descent.search import Descent
+from torch_zerohess.search.gauss_newton.block import BlockGaussNewton
+from torch_zerohess.search.gaussian_process.search import GaussianProcessSearch
+from torch_zerohess.search.sparse.search import LocalGaussNewton
 from torch_zerohess.search.trust_region import TrustRegion
 
 __all__ = [

@@ -18,11 +18,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.gaussian_process_of_output import OutputProcess, OutputProcessProgress
-from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
-from torch_zerohess.search.relay import Relay
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.descent.of_output import OutputDescent, OutputDescentProgress
+from torch_zerohess.search.gaussian_process.of_output import OutputProcess, OutputProcessProgress
+from torch_zerohess.search.protocol.method import Method, Settings
+from torch_zerohess.search.protocol.relay import Relay
+from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 
 _SLOW = 0.2
 """Part of the lowest loss that n + 1 evaluations of a descent that follows must take away."""

@@ -18,12 +18,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.output_descent import OutputDescent, OutputDescentProgress
-from torch_zerohess.search.relay import Relay
-from torch_zerohess.search.sparse_method import SparseMethod
-from torch_zerohess.search.sparse_progress import SparseProgress
-from torch_zerohess.search.state import Best, Evaluated, Progress
+from torch_zerohess.search.descent.of_output import OutputDescent, OutputDescentProgress
+from torch_zerohess.search.protocol.method import Method, Settings
+from torch_zerohess.search.protocol.relay import Relay
+from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
+from torch_zerohess.search.sparse.method import SparseMethod
+from torch_zerohess.search.sparse.progress import SparseProgress
 from torch_zerohess.surrogates.sparse_fit import FEWEST_SAMPLES
 
 FEWEST = 20

@@ -6,15 +6,15 @@ from typing import Any, Literal, get_args
 
 from torch import Tensor
 
-from torch_zerohess.search.descent import descent_method
+from torch_zerohess.search.descent.search import descent_method
 from torch_zerohess.search.descent_and_gaussian_process import DescentAndProcess, TurnsProgress
-from torch_zerohess.search.gaussian_process_search import process_method
-from torch_zerohess.search.method import Method, Settings
-from torch_zerohess.search.noisy_sparse_method import sparse_method
-from torch_zerohess.search.protocol import AskTell
-from torch_zerohess.search.space import Bounds
+from torch_zerohess.search.gaussian_process.search import process_method
+from torch_zerohess.search.protocol.ask_tell import AskTell
+from torch_zerohess.search.protocol.method import Method, Settings
+from torch_zerohess.search.protocol.space import Bounds
+from torch_zerohess.search.sparse.noisy_method import sparse_method
+from torch_zerohess.search.sparse.settings import SPARSE_TOLERANCE, SparseSearchSettings
 from torch_zerohess.search.sparse_or_dense import FEWEST, SparseOrDense, SparseOrDenseProgress
-from torch_zerohess.search.sparse_search_settings import SPARSE_TOLERANCE, SparseSearchSettings
 
 _TOLERANCE = 1e-2
 """Length, in units of the first sigma, below which a search has arrived, if the caller says nothing."""

@@ -9,7 +9,7 @@ from searches import bowl, misfit, rays, rays_loss, rosenbrock, spiral, waves, w
 
 import torch_zerohess as zh
 from torch_zerohess.optim import Descent, GaussianProcessSearch, LocalGaussNewton, TrustRegion
-from torch_zerohess.search import gaussian_process_of_output
+from torch_zerohess.search.gaussian_process import of_output
 from torch_zerohess.surrogates.gaussian_process import GaussianProcess
 from truths import vector
 
@@ -233,7 +233,7 @@ def test_a_pool_is_as_large_as_it_is_said_to_be(name):
 
 
 def test_a_pool_that_batches_have_widened_stays_so(monkeypatch):
-    monkeypatch.setattr(gaussian_process_of_output, "_WORTH_EARLY", math.inf)  # the process stays alone
+    monkeypatch.setattr(of_output, "_WORTH_EARLY", math.inf)  # the process stays alone
     search = make("process of the output")
     for _ in range(5):
         search.tell(waves(search.ask(16)))

@@ -7,7 +7,7 @@ from searches import bent, points_of, run, square
 
 from torch_zerohess.optim import Descent, TrustRegion
 from torch_zerohess.search import descent_and_gaussian_process
-from torch_zerohess.search.output_gauss_newton import OutputGaussNewton
+from torch_zerohess.search.gauss_newton.by_interpolation import OutputGaussNewton
 from torch_zerohess.surrogates import kernels
 from truths import normal
 

@@ -1,0 +1,78 @@
+"""Borders of regions in which a black box fails: where a plane between evaluations lies, and minima on borders."""
+
+import numpy as np
+import pytest
+import torch
+
+import torch_zerohess as zh
+from torch_zerohess.search.region.border import border_between
+
+
+def test_the_plane_lies_in_the_middle_between_evaluations_and_holes():
+    u = torch.tensor([[0.0, 0.0], [0.0, 1.0], [-1.0, 0.5], [0.4, 0.5], [0.4, -1.0]], dtype=torch.float64)
+    found = border_between(u, torch.tensor([False, False, False, True, True]))
+    assert found is not None
+    normal, offset, plane = found
+    torch.testing.assert_close(normal, torch.tensor([1.0, 0.0], dtype=torch.float64))
+    assert (offset, plane) == (pytest.approx(0.2), True)
+
+
+def test_where_the_border_is_curved_only_what_is_near_counts():
+    """Holes outside of a parabola and on its axis: no plane has all of them on one side, but one has those near by."""
+    inside = torch.tensor([[0.0, 0.0], [0.0, -0.5], [2.0, -2.0], [-2.0, -2.0]], dtype=torch.float64)
+    outside = torch.tensor([[0.0, 0.2], [1.0, 0.2], [0.0, -2.5]], dtype=torch.float64)
+    found = border_between(torch.cat([inside, outside]), torch.tensor(4 * [False] + 3 * [True]))
+    assert found is not None
+    normal, offset, plane = found
+    assert (outside[:2] @ normal).min() > offset > 0.0
+    assert not plane
+
+
+def test_without_holes_near_by_or_with_holes_all_around_there_is_no_border():
+    u = torch.tensor([[0.0, 0.0], [9.0, 0.0]], dtype=torch.float64)
+    assert border_between(u, torch.tensor([False, True])) is None
+    angles = torch.arange(7, dtype=torch.float64)
+    around = torch.cat([torch.zeros(1, 2, dtype=torch.float64), torch.stack([angles.cos(), angles.sin()], 1)])
+    assert border_between(around, torch.tensor([False] + 7 * [True])) is None
+
+
+def plane(n, generator):
+    """A quadratic above a plane that does not go through its minimum, and its minimum there in closed form."""
+    a, w = generator.uniform(0.8, 2.0, n), 10.0 ** generator.uniform(0.0, 1.0, n)
+    return (lambda x: x @ a >= 1.0), (lambda x: float((w * x * x).sum())), 1.0 / float((a * a / w).sum())
+
+
+def ball(n, generator):
+    """The squared distance from a point outside of the unit ball, and its minimum in the ball."""
+    c = generator.uniform(0.8, 2.0, n)
+    return (lambda x: x @ x <= 1.0), (lambda x: float((x - c) @ (x - c))), (float(np.sqrt(c @ c)) - 1.0) ** 2
+
+
+@pytest.mark.parametrize(
+    ("problem", "n", "bounds", "excess"),
+    [
+        (plane, 2, None, 1e-6),
+        (plane, 2, (-2.0, 2.0), 1e-6),
+        (plane, 4, None, 1e-4),
+        (ball, 2, None, 1e-3),
+        (ball, 4, None, 1e-2),
+    ],
+)
+def test_a_minimum_on_a_border_is_found(problem, n, bounds, excess):
+    """From most starts: where the border is learned slowly, the evaluations may be used up."""
+    found = 0
+    for seed in range(4):
+        generator = np.random.default_rng(seed)
+        allowed, f, least = problem(n, generator)
+        x0 = next(x for _ in range(1000) if allowed(x := generator.uniform(-1.5, 1.5, n)))
+
+        def fn(z, allowed=allowed, f=f):
+            return [f(x) if allowed(x) else float("nan") for x in z.numpy()]
+
+        near = least * (1.0 + excess)
+        settings = {"sigma": 0.7, "seed": seed, "max_evaluations": 60 * (n + 1), "engine": "descent", "target": near}
+        fit = zh.minimize(fn, x0, bounds=bounds, **settings)
+        assert allowed(fit.x.numpy())
+        assert fit.value >= least * (1.0 - 1e-9)
+        found += fit.value <= near
+    assert found >= 3

@@ -1,0 +1,1 @@
+"""`Descent`, and the models of a loss or an output that it follows downhill."""

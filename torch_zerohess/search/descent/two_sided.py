@@ -1,0 +1,105 @@
+"""Descent on quadratics, and on the larger of two quadratics beside a kink.
+
+No quadratic predicts a loss on both sides of a kink, as of c + w max(0, d) or max(c, d). So after a rejected step the
+larger of two quadratics is fitted, too (`fit_two_sides`). Where it has predicted the latest losses better, the steps
+lead to its minimum.
+
+The metric of the region is learned from the Hessian of the quadratics mixed as their gradients balance: the Hessian
+along the kink.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torch_zerohess.linalg.larger_of_two import least_of_larger, share_of_shortest
+from torch_zerohess.linalg.metric import learned, region_step
+from torch_zerohess.search.descent.metric import CURVED, RATE, MetricQuadratics
+from torch_zerohess.search.descent.metric_progress import MetricProgress, TwoSides
+from torch_zerohess.search.protocol.state import Evaluated
+from torch_zerohess.surrogates.two_sides import fit_two_sides
+
+_MOST = 10
+"""Parameters up to which two quadratics are fitted."""
+_FADING, _LARGEST = 0.8, 2.0
+"""The evidence is a sum over evaluations of log(error of one quadratic / error of two). Each term is at most the second
+number in magnitude. Each new term multiplies the sum so far by the first number."""
+_ENOUGH = 2.0
+"""Evidence from which steps follow two quadratics."""
+_ROUNDING, _SMALLEST = 1e-14, 1e-300
+"""Error of a prediction that is rounding, relative to the loss, and at a loss of 0."""
+_FEWEST = 2
+"""Evaluations, beyond the coefficients of one quadratic, that two are fitted to at least."""
+_FAR, _RELATIVELY = 8.0, 2.0
+"""Evaluations farther than this, and than this times the distance of the n + 3 nearest ones, are left out."""
+_SHARP = 3.0
+"""The gradient changes across a kink by at least so many times its change along the kink within the region. Two
+quadratics of a smooth loss differ by less."""
+
+
+class TwoSidedQuadratics(MetricQuadratics):
+    """Descent on quadratics of a loss alone, and on the larger of two beside a kink."""
+
+    def next(
+        self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[MetricProgress, Tensor]:
+        return super().next(self._weighed(known, evaluated), evaluated, generator)
+
+    def _weighed(self, known: MetricProgress, evaluated: Evaluated) -> MetricProgress:
+        """Compare the loss at the point that was needed with what one quadratic and two have predicted."""
+        if known.sides is None or known.wide is not None or known.phase not in ("trial", "geometry"):
+            return known
+        if not bool(evaluated.finite[0]):
+            return known
+        s, change = evaluated.points[0] - known.lowest.point, float(evaluated.losses[0]) - known.lowest.loss
+        rounding = _ROUNDING * abs(known.lowest.loss) + _SMALLEST
+        errors = [
+            abs(change - predicted) + rounding for predicted in (super()._change(known, s), known.sides.change(s))
+        ]
+        gain = math.log(errors[0]) - math.log(errors[1])
+        return replace(known, evidence=_FADING * known.evidence + min(max(gain, -_LARGEST), _LARGEST))
+
+    def _modelled(self, known: MetricProgress) -> tuple[MetricProgress, int]:
+        known, count = super()._modelled(replace(known, sides=None))
+        wanted = known.rejected > 0 or known.evidence > 0.0
+        return (replace(known, sides=self._sides(known)) if wanted and self._n <= _MOST else known), count
+
+    def _sides(self, known: MetricProgress) -> TwoSides | None:
+        """Fit two quadratics to the nearest evaluations; None if these tell none, or no kink between them."""
+        n, u = self._n, known.scaled
+        distance = u.norm(dim=1)
+        order = distance.argsort()
+        order = order[~known.holes[order]][: 2 * (self._coefficients + n)]
+        if len(order) < self._coefficients + _FEWEST:
+            return None
+        order = order[distance[order] <= max(_FAR, _RELATIVELY * float(distance[order[n + 2]]))]
+        found = fit_two_sides(u[order], known.values[order] - known.lowest.loss)
+        if found is None:
+            return None
+        in_u = TwoSides(found, share_of_shortest(found[0, 1:, 0], found[1, 1:, 0]))
+        if float(in_u.jump.norm()) < _SHARP * float(in_u.mixed[1:, 1:].norm()):
+            return None
+        to_u = torch.block_diag(torch.ones_like(known.root[:1, :1]), torch.linalg.inv(known.sigma * known.root))
+        return replace(in_u, matrices=to_u.mT @ found @ to_u)
+
+    def _learned(self, known: MetricProgress, count: int) -> Tensor:
+        if (sides := _in_use(known)) is None:
+            return super()._learned(known, count)
+        floor = CURVED * float(sides.jump.norm()) / known.sigma
+        return learned(known.root, sides.mixed[1:, 1:], RATE * min(1.0, count / self._coefficients), floor)
+
+    def _minimum(self, known: MetricProgress, factor: float = 1.0) -> Tensor:
+        if (sides := _in_use(known)) is None:
+            return super()._minimum(known, factor)
+        x, settings = known.lowest.point, self.settings
+        region = factor * known.sigma * known.root, settings.lower - x, settings.upper - x, self._singular, known.border
+        return least_of_larger(sides.matrices, lambda gradient, hessian: region_step(gradient, hessian, *region))
+
+    def _change(self, known: MetricProgress, s: Tensor) -> float:
+        return super()._change(known, s) if (sides := _in_use(known)) is None else sides.change(s)
+
+
+def _in_use(known: MetricProgress) -> TwoSides | None:
+    return known.sides if known.evidence >= _ENOUGH else None

@@ -1,0 +1,1 @@
+"""Quadratics in a trust region, for a loss or an output."""

@@ -1,0 +1,1 @@
+"""`LocalGaussNewton`: Gauss-Newton on a sparse Jacobian, with and without noise."""

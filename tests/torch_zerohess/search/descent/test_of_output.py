@@ -68,7 +68,7 @@ def test_a_loss_may_have_kinks(name, bounds, monkeypatch):
 
     assert max(evaluations(search(seed), decays, least + 1e-6) for seed in range(3)) < 100
     if bounds is None:
-        monkeypatch.setattr(by_interpolation, "_EXPANDED", float("inf"))
+        monkeypatch.setattr(by_interpolation, "holds", lambda *_: True)
         assert evaluations(search(0), decays, least + 1e-6, 301) > 300
 
 
@@ -120,7 +120,7 @@ def test_rounded_outputs_do_not_keep_it_from_arriving(monkeypatch):
     searches = [found(seed) for seed in range(50, 60)]
     assert all(one.value == pytest.approx(1.0, abs=1e-8) for one in searches)
     assert sum(one.done and one.evaluations < 100 for one in searches) >= 4
-    monkeypatch.setattr(by_interpolation, "_NOTHING", 0.0)
+    monkeypatch.setattr(by_interpolation, "NOTHING", 0.0)
     taken = sum(one.evaluations for one in searches[:5])
     assert sum(found(seed).evaluations for seed in range(50, 55)) > 1.5 * taken
 

@@ -11,8 +11,8 @@ of these runs.
 
 Newton steps are on the weights ("newton"), or on the outputs of the network alone (`zh.optim.NewtonTargets`), to whose
 ends the network is fitted ("targets"): by damped least squares, or by Adam if the outputs are many. Steps on the
-weights need fewest renders where the surrogate is good, as of CNN. Steps on the outputs also suit black boxes that
-jump, as of CNN-THROW, and many outputs, as of CNN-TEXTURE.
+weights need fewest renders where the surrogate is good, as of CNN. Steps on the outputs suit many outputs, as of
+CNN-TEXTURE. Where the black box jumps, as of CNN-THROW, they do better than steps on the weights, and Adam does best.
 """
 
 from collections.abc import Callable

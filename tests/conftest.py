@@ -1,9 +1,13 @@
 """What every run of the tests does, and what several folders share."""
 
 import gc
+import os
 from collections.abc import Iterator
 
 import pytest
+
+# Libraries read it when they are loaded. Tests run side by side, and two threads each would wait for one another.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 @pytest.hookimpl(trylast=True)

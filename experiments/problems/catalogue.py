@@ -22,7 +22,7 @@ _SHARED = {
     "cnn_wide": "cnn",
     **dict.fromkeys(("meshfit_color", "suzanne", "banana"), "meshfit"),
 }
-"""Modules of tasks that are the function of their name in the module of another one."""
+"""Tasks without a module of their own: the module that has the function of their name."""
 
 
 def _targets(*names: str) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import subprocess
+import os
 import sys
 
 import numpy as np
@@ -216,3 +217,7 @@ def test_adapters_are_there_without_an_import_of_their_own():
     assert done.stdout.split() == ["Program", "True"]
     with pytest.raises(AttributeError, match="no attribute 'blender'"):
         zh.adapters.blender  # noqa: B018
+
+
+def test_a_process_of_the_tests_has_one_thread_unless_the_caller_says_more():
+    assert torch.get_num_threads() == int(os.environ["OMP_NUM_THREADS"])

@@ -32,8 +32,9 @@ class Divisible(Stein):
     ) -> Spread:
         """Return the variance in units of sigma: of value [B, P], gradient, hessian_diagonal, hvp [B, P, n] or hessian.
 
-        With D independent draws y_d, each of share s_d of the sum Y, the variance is sum_d (y_d - s_d Y)^2 / s_d / (D -
-        1): the sample variance over D where all shares are 1/D. It has D - 1 degrees of freedom.
+        With D independent draws y_d, each of share s_d of the sum Y, the variance is
+        sum_d (y_d - s_d Y)^2 / s_d / (D - 1): the sample variance over D where all shares are 1/D. It has D - 1 degrees
+        of freedom.
 
         A baseline that is the mean of the other draws makes the draws depend on each other. The variance is then by the
         jackknife (Efron and Stein 1981), from the estimates Y_d without draw d, whose baselines leave it out as well:

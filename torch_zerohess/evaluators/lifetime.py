@@ -16,10 +16,10 @@ _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 @contextlib.contextmanager
 def starting_worker() -> Iterator[None]:
-    """Let a process that starts inside have one thread, and leave Ctrl-C to this process while it imports.
+    """Let a process that starts inside have one thread, and let Ctrl-C not reach it while it imports.
 
-    Libraries read these variables when they are loaded. A new process blocks the signals that its parent blocks;
-    `end_with_parent` ends that.
+    Libraries read the variables when they are loaded. A new process blocks the signals that its parent blocks, until it
+    calls `end_with_parent`.
     """
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))

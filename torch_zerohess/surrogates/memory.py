@@ -256,7 +256,7 @@ class Memory:
         """Take the evaluations of `state_dict`; a surrogate that is no module is fitted to what it knew.
 
         It is fitted to all evaluations if the memory has dropped some that it knew. The coefficient is learned anew if
-        one of both surrogates is a module and the other is none.
+        only one of the two surrogates is a module.
         """
         check_state(state, self.state_dict(), "a memory")
         with outside_inference():  # the state may have been read in inference mode

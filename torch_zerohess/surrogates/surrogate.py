@@ -84,6 +84,6 @@ def scaled(numbers: Tensor) -> tuple[Tensor, float]:
 
 
 def raised(square: Tensor, ridge: float) -> Tensor:
-    """Add a part of the mean of its diagonal to the diagonal of a positive matrix; 1 if that is 0."""
+    """Add `ridge` times the mean of the diagonal to the diagonal of a matrix, in place; 1 if this product is 0."""
     square.diagonal().add_(ridge * float(square.diagonal().mean()) or 1.0)
     return square

@@ -39,7 +39,7 @@ class Steps:
 
 
 def holds(before: float, after: float, promised: float, part: float = _EXPANDED) -> bool:
-    """Whether a quadratic promises about the decrease of the loss of linear outputs, but for a part of the promise."""
+    """Whether the loss of linear outputs falls as a quadratic promises, up to a part of the promise."""
     return abs(before - after - promised) <= part * promised + _ROUNDED * abs(before)
 
 
@@ -83,11 +83,13 @@ def checked_steps(
         upper: at least 0.
     """
     before, down, longest = outputs.value(torch.zeros_like(gradient)), steps @ gradient, float(radii[-1])
-    rounding = abs(outputs.loss(outputs.output * _ROUNDED_UP)[0] - before)
 
     def is_wrong(s: Tensor, promised: float) -> bool:
         after = outputs.value(s)
-        return abs(before - after - promised) > rounding and not holds(before, after, promised)  # NaN tells nothing
+        if holds(before, after, promised):
+            return False
+        rounding = abs(outputs.loss(outputs.output * _ROUNDED_UP)[0] - before)
+        return abs(before - after - promised) > rounding  # NaN tells nothing
 
     if not any(is_wrong(s, float(one)) for s, one in zip(steps, -(down + 0.5 * bent), strict=True)):
         straight = float(bent[-1]) <= -_ROUNDED * float(down[-1])

@@ -1,8 +1,8 @@
 """What surroundings may do to a layer, and what a layer may not do to them."""
 
 import contextlib
-import subprocess
 import os
+import subprocess
 import sys
 
 import numpy as np

@@ -355,5 +355,5 @@ def test_every_engine_says_that_a_minimum_may_not_be_unique(loss):
 
     box = {"bounds": ([0.1] * 3, [8, 8, 3]), "restarts": 0}
     maybe = "along some direction the loss hardly changes: the minimum may not be unique"
-    assert sum(said(seed, **box).endswith(maybe) for seed in range(3)) >= 2  # the others have evaluated too little
+    assert sum(said(seed, **box).endswith(maybe) for seed in range(8)) >= 4  # the others have evaluated too little
     assert said(0).endswith("the minimum is not unique")

@@ -3,8 +3,13 @@
 A full quadratic in n parameters has (n + 1)(n + 2)/2 coefficients, more than a search has evaluations. Many quadratics
 interpolate the values. We take the quadratic with the Hessian nearest to an earlier Hessian in the Frobenius norm. It
 is unique once the points span the space (Powell 2004, "Least Frobenius norm updating of quadratic models").
+
+It is also the mean of a Gaussian process: the entries of the change of the Hessian are independent normal numbers, and
+a value at u differs from the quadratic by a normal number whose variance grows as |u|^6. How fast it grows depends on
+the function. So the values choose between two rates by their likelihoods (Rasmussen and Williams 2006, section 5.4).
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -12,12 +17,15 @@ from torch import Tensor
 
 _EXACT = 1e-10
 """Variance of a value that is no quadratic, in units of the mean variance of the quadratics at the points."""
-_CUBIC = 1e-8
-"""The same per sixth power of the distance: a smooth function leaves a quadratic by third powers."""
+_CUBIC, _ROUGH = 1e-8, 1e-3
+"""The same per sixth power of the distance, of nearly quadratic functions and of others: a smooth function leaves a
+quadratic by third powers."""
+_TIMES = 20.0
+"""A function is no longer nearly quadratic where its values are so many times as likely."""
 _FREE = 1e-12
 """Prior precision of value and slope, in units of the values' own precision."""
 _CUBIC_OUTPUT = 1e-3
-"""Like `_CUBIC`, for the quadratics of outputs: their slopes are trusted, and not their curvatures."""
+"""Like `_ROUGH`, for the quadratics of outputs: their slopes are trusted, and not their curvatures."""
 
 
 def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Tensor, Tensor]:
@@ -31,20 +39,44 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
     With fewer than n + 1 points the gradient has the least norm. With more points than a quadratic has coefficients the
     result is a regression, in which near points count more than far ones.
     """
-    P, n = u.shape
     rest = values - 0.5 * ((u @ hessian) * u).sum(1)
-    factor = _factor(u, _CUBIC)
-    linear = torch.cat([u.new_ones(P, 1), u, rest[:, None]], 1)
-    white = torch.linalg.solve_triangular(factor, linear, upper=False)
-    design, target = white[:, :-1], white[:, -1]
-    scale = float(design.square().sum(0).amax())
-    padded = torch.cat([design, (_FREE * scale) ** 0.5 * torch.eye(n + 1, dtype=u.dtype, device=u.device)])
-    q, r = torch.linalg.qr(padded)
-    slope = torch.linalg.solve_triangular(r, (q.mT @ torch.cat([target, target.new_zeros(n + 1)]))[:, None], upper=True)
-    left = (target - design @ slope[:, 0])[:, None]
-    alpha = torch.linalg.solve_triangular(factor.mT, left, upper=True)[:, 0]
+    fit = _Affine.through(u, values, rest, _CUBIC)
+    if len(u) > u.shape[1] + 1:
+        rough = _Affine.through(u, values, rest, _ROUGH)
+        fit = rough if rough.likelihood > fit.likelihood + math.log(_TIMES) else fit
+    alpha = torch.linalg.solve_triangular(fit.factor.mT, fit.left[:, None], upper=True)[:, 0]
     change = (u.mT * alpha) @ u
-    return float(slope[0, 0]), slope[1:, 0], hessian + 0.5 * (change + change.mT)
+    return float(fit.coefficients[0]), fit.coefficients[1:], hessian + 0.5 * (change + change.mT)
+
+
+@dataclass(frozen=True)
+class _Affine:
+    """The affine part of a quadratic, where the rest of the values is a Gaussian process."""
+
+    factor: Tensor
+    """Cholesky factor of the covariance of that rest [P, P]."""
+    coefficients: Tensor
+    """[n + 1]"""
+    left: Tensor
+    """What the affine part leaves of the values less the earlier Hessian, divided by the factor [P]."""
+    likelihood: float
+    """Logarithm of the restricted likelihood of the values, without an earlier Hessian, at the likeliest scale."""
+
+    @classmethod
+    def through(cls, u: Tensor, values: Tensor, rest: Tensor, cubic: float) -> "_Affine":
+        """Fit the values [P] at u [P, n], and their `rest` less the earlier Hessian."""
+        P, n = u.shape
+        factor = _factor(u, cubic)
+        columns = torch.cat([u.new_ones(P, 1), u, rest[:, None], values[:, None]], 1)
+        design, targets = torch.linalg.solve_triangular(factor, columns, upper=False).split([n + 1, 2], 1)
+        free = (_FREE * float(design.square().sum(0).amax())) ** 0.5
+        q, r = torch.linalg.qr(torch.cat([design, free * torch.eye(n + 1, dtype=u.dtype, device=u.device)]))
+        found = torch.linalg.solve_triangular(r, q[:P].mT @ targets, upper=True)
+        left, own = (targets - design @ found).unbind(1)
+        degrees = max(P - n - 1, 1)
+        variance = max(float(own.square().sum()) / degrees, torch.finfo(u.dtype).tiny)
+        volume = float(factor.diagonal().log().sum() + r.diagonal().abs().log().sum())
+        return cls(factor, found[:, 0], left, -0.5 * degrees * math.log(variance) - volume)
 
 
 @dataclass(frozen=True)

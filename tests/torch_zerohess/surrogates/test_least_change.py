@@ -65,6 +65,25 @@ def test_near_points_count_more():
     assert abs(float(gradient)) < 0.01
 
 
+@pytest.mark.parametrize("seed", [1, 5])
+def test_values_tell_a_quadratic_from_a_rougher_function(seed):
+    """The slope at 0 is (1, ..., 1). Quadratics through all values of the rougher function miss it by 3 to 4."""
+    n = 6
+    generator = torch.Generator().manual_seed(seed)
+    A = torch.randn(n, n, generator=generator, dtype=torch.float64)
+    u = torch.randn(30, n, generator=generator, dtype=torch.float64)
+    u[22:] *= 0.1
+    u = torch.cat([u.new_zeros(1, n), u])
+    nothing = u.new_zeros(n, n)
+    for values, most in (
+        (u.sum(1) + 0.5 * (u @ A).square().sum(1), 1e-3),
+        (u.sum(1) + 0.5 * u.square().sum(1) + 0.3 * u.sum(1) ** 3, 2.5),
+    ):
+        size = float(values.abs().max())
+        _, gradient, _ = least_change(u, values / size, nothing)
+        assert float((size * gradient - 1).norm()) < most
+
+
 @pytest.mark.parametrize("P", [3, 5, 10, 14])
 def test_the_jacobian_against_a_direct_minimisation(P):
     """Least |H|^2 / 2 + sum of squared misfits / (10^-3 |u|^6), over all slopes and Hessians of each output."""

@@ -37,8 +37,10 @@ _KEPT, _LEAST_KEPT = 3, 200
 """Evaluations kept, over those that are fitted, and at least."""
 _FEW = 2
 """Parameters up to which a step is tried before there are two points along every axis."""
-RATE, _FIRST_RATE = 0.3, 0.7
+_RATE, _FIRST_RATE = 0.3, 0.7
 """Rate at which the metric is learned from a full quadratic, and from the first one."""
+_FALLING = 1.5
+"""For fewer points the rate is multiplied by (points / coefficients) to this power: much of the Hessian is guessed."""
 CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
 _LATEST = 2
@@ -264,5 +266,9 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
     def _learned(self, known: MetricProgress, count: int) -> Tensor:
         if len(known.values) <= 2 * self._n:
             return known.root
-        rate = _FIRST_RATE if known.phase == "axes" else RATE * min(1.0, count / self._coefficients)
+        rate = _FIRST_RATE if known.phase == "axes" else self._rate(count)
         return learned(known.root, known.hessian, rate, CURVED * float(known.gradient.norm()) / known.sigma)
+
+    def _rate(self, count: int) -> float:
+        """Return the rate at which the metric is learned from a quadratic of so many points."""
+        return _RATE * min(1.0, count / self._coefficients) ** _FALLING

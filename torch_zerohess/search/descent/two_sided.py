@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torch_zerohess.linalg.larger_of_two import least_of_larger, share_of_shortest
 from torch_zerohess.linalg.metric import learned, region_step
-from torch_zerohess.search.descent.metric import CURVED, RATE, MetricQuadratics
+from torch_zerohess.search.descent.metric import CURVED, MetricQuadratics
 from torch_zerohess.search.descent.metric_progress import MetricProgress, TwoSides
 from torch_zerohess.search.protocol.state import Evaluated
 from torch_zerohess.surrogates.two_sides import fit_two_sides
@@ -88,7 +88,7 @@ class TwoSidedQuadratics(MetricQuadratics):
         if (sides := _in_use(known)) is None:
             return super()._learned(known, count)
         floor = CURVED * float(sides.jump.norm()) / known.sigma
-        return learned(known.root, sides.mixed[1:, 1:], RATE * min(1.0, count / self._coefficients), floor)
+        return learned(known.root, sides.mixed[1:, 1:], self._rate(count), floor)
 
     def _minimum(self, known: MetricProgress, factor: float = 1.0) -> Tensor:
         if (sides := _in_use(known)) is None:

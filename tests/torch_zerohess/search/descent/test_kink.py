@@ -112,7 +112,7 @@ def test_differences_across_a_kink_tell_no_slope() -> None:
     def penalised(z: Tensor) -> Tensor:
         return (z - 1).square().sum(1) + 1e4 * (z @ normal - 1).clamp(min=0)
 
-    search = Descent(torch.zeros(3).double(), sigma=1.0, seed=1, restarts=0)
+    search = Descent(torch.zeros(3).double(), sigma=1.0, seed=0, restarts=0)
     while search._state.progress.slopes is None:
         search.tell(penalised(search.ask()))
     method, known = search._method, search._state.progress
@@ -163,7 +163,7 @@ def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
 def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
     """The evaluations end while slopes are measured."""
     start = torch.zeros(3).double()
-    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=6, restarts=0)
+    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=2, restarts=0)
     while (local := search._state.progress.local) is None or local.slopes is None:
         search.tell(half_space(search.ask(), 1e4))
     search.tell(half_space(search.ask(limit=2), 1e4))
@@ -173,7 +173,7 @@ def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
 def test_a_process_waits_until_slopes_are_measured() -> None:
     """It has no patience left, and the slopes that are measured lower nothing."""
     start = torch.zeros(3).double()
-    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=6, restarts=0)
+    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=2, restarts=0)
     while (local := search._state.progress.local) is None or local.slopes is None:
         search.tell(half_space(search.ask(), 1e4))
     search._state = replace(search._state, progress=replace(search._state.progress, waited=10**6))
@@ -203,7 +203,7 @@ def step(z: Tensor) -> Tensor:
     return z.square().sum(1) + (z[:, 0] > -0.2)
 
 
-@pytest.mark.parametrize(("f", "seeds"), [(valley, 4), (step, 2)])
+@pytest.mark.parametrize(("f", "seeds"), [(valley, 4), (step, 3)])
 def test_one_slope_tells_a_narrow_valley_and_a_jump_from_a_kink(f, seeds) -> None:
     measured = 0
     for seed in range(seeds):

@@ -46,12 +46,12 @@ def until_in_use(f, start: Tensor, seed: int = 0, **settings) -> Descent:
     ],
 )
 def test_evaluations_until_a_minimum_on_a_kink_is_exact(f, weight, start, least, most) -> None:
-    """At most so many in the median of three seeds until the loss is a millionth above the minimum."""
+    """At most so many in the median of five seeds until the loss is a millionth above the minimum."""
     counts = []
-    for seed in range(3):
+    for seed in range(5):
         settings = {"sigma": 0.5, "seed": seed, "restarts": 0, "max_evaluations": 600, "target": least * (1 + 1e-6)}
         counts.append(zh.minimize(lambda z: f(z, weight), torch.tensor(start).double(), **settings).evaluations)
-    assert sorted(counts)[1] <= most
+    assert sorted(counts)[2] <= most
 
 
 def test_a_minimum_on_a_penalty_is_called_solved() -> None:

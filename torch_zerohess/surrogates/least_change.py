@@ -18,10 +18,10 @@ from torch import Tensor
 _EXACT = 1e-10
 """Variance of a value that is no quadratic, in units of the mean variance of the quadratics at the points."""
 _CUBIC, _ROUGH = 1e-8, 1e-3
-"""The same per sixth power of the distance, of nearly quadratic functions and of others: a smooth function leaves a
-quadratic by third powers."""
-_TIMES = 20.0
-"""A function is no longer nearly quadratic where its values are so many times as likely."""
+"""The same per sixth power of the distance: of a function that is nearly quadratic, and of another one. A smooth
+function leaves a quadratic by third powers."""
+_LIKELIER = 20.0
+"""`_ROUGH` is taken where it makes the values more than so many times as likely as `_CUBIC` does."""
 _FREE = 1e-12
 """Prior precision of value and slope, in units of the values' own precision."""
 _CUBIC_OUTPUT = 1e-3
@@ -37,13 +37,14 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
         hessian: the earlier one [n, n].
 
     With fewer than n + 1 points the gradient has the least norm. With more points than a quadratic has coefficients the
-    result is a regression, in which near points count more than far ones.
+    result is a regression, in which near points count more than far ones. With more than n + 1 points the likelihood of
+    the values says how much more.
     """
     rest = values - 0.5 * ((u @ hessian) * u).sum(1)
     fit = _Affine.through(u, values, rest, _CUBIC)
     if len(u) > u.shape[1] + 1:
         rough = _Affine.through(u, values, rest, _ROUGH)
-        fit = rough if rough.likelihood > fit.likelihood + math.log(_TIMES) else fit
+        fit = rough if rough.likelihood > fit.likelihood + math.log(_LIKELIER) else fit
     alpha = torch.linalg.solve_triangular(fit.factor.mT, fit.left[:, None], upper=True)[:, 0]
     change = (u.mT * alpha) @ u
     return float(fit.coefficients[0]), fit.coefficients[1:], hessian + 0.5 * (change + change.mT)
@@ -51,20 +52,20 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
 
 @dataclass(frozen=True)
 class _Affine:
-    """The affine part of a quadratic, where the rest of the values is a Gaussian process."""
+    """An affine function fitted to values. Their deviations from it are a Gaussian process."""
 
     factor: Tensor
-    """Cholesky factor of the covariance of that rest [P, P]."""
+    """Cholesky factor of the covariance of the deviations [P, P]."""
     coefficients: Tensor
     """[n + 1]"""
     left: Tensor
-    """What the affine part leaves of the values less the earlier Hessian, divided by the factor [P]."""
+    """Deviations of the values less the earlier Hessian, divided by the factor [P]."""
     likelihood: float
     """Logarithm of the restricted likelihood of the values, without an earlier Hessian, at the likeliest scale."""
 
     @classmethod
     def through(cls, u: Tensor, values: Tensor, rest: Tensor, cubic: float) -> "_Affine":
-        """Fit the values [P] at u [P, n], and their `rest` less the earlier Hessian."""
+        """Fit values [P] at u [P, n], for the likelihood, and the `rest` of them less the earlier Hessian [P]."""
         P, n = u.shape
         factor = _factor(u, cubic)
         columns = torch.cat([u.new_ones(P, 1), u, rest[:, None], values[:, None]], 1)

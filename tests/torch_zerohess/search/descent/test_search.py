@@ -305,7 +305,7 @@ def test_at_most_64_samples_at_a_time():
 
 
 def test_twenty_parameters_of_a_loss_that_is_no_quadratic():
-    """Sums of 60 pseudo-Huber losses: evaluations until a hundredth of the first one, over three of them."""
+    """The loss is a sum of 60 pseudo-Huber losses. Three searches divide it by 100 in fewer than 580 evaluations."""
     count = 0
     for seed in range(1, 4):
         rows = torch.randn(60, 20, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

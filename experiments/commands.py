@@ -53,7 +53,9 @@ COMMANDS = {
     "least_squares": Command(
         "studies.least_squares:least_squares", "our search and others on least squares of More and Wild", long=True
     ),
-    "optimizers": Command("studies.optimizers:optimizers", "our search and others on functions of BBOB", long=True),
+    "optimizers": Command(
+        "studies.optimizers:optimizers", "our search and others on BBOB, or smooth losses", long=True
+    ),
     "noise": Command("studies.noise:noise", "our search and others on noisy functions of BBOB", long=True),
     "minima": Command("studies.minima:minima", "what is said at the end of noisy searches", long=True),
     "endings": Command("studies.endings:endings", "when searches of convex functions end", long=True),

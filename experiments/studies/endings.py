@@ -6,7 +6,6 @@ at random points until three rounds have arrived at the same minimum. All begin 
 
 import math
 import statistics
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,21 +15,27 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 import torch_zerohess as zh
+from experiments.problems.smooth_losses import Function, functions, lowest
 from experiments.reports import result_files
 from experiments.reports.progress import progress
 
+CONVEX = (
+    "sphere",
+    "quadratic, condition 100",
+    "log cosh, condition 100",
+    "logistic regression",
+    "exponentials",
+    "pseudo-Huber",
+)
+"""Losses of `smooth_losses` on which searches end."""
 METHODS = ("restarts=0", "default", "cobyqa", "py_bobyqa")
 HEADERS = ("function", "parameters", "box", *METHODS, "ratio", "worst ratio", "error left", "error of cobyqa", "runs")
 _SIGMA = 2.0
 """Size of the first region: sigma of ours, the radius of the rivals."""
 _BOX = 5.0
 """Half the width of the box around 0."""
-_EXAMPLES = 20
-"""Of the logistic regression, per parameter."""
 _MOST = 5_000
 """Evaluations of a search, at most."""
-
-Function = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -40,48 +45,6 @@ class End:
     evaluations: int
     error: float
     """Loss above the minimum at the point that is returned, over the one at the start."""
-
-
-def functions(n: int, run: int) -> dict[str, Function]:
-    """Return convex functions [K, n] -> [K] by name, rotated at random, with their minima within a unit of 0."""
-    generator = torch.Generator().manual_seed(run)
-    settings: dict[str, Any] = {"generator": generator, "dtype": torch.float64}
-    axes = torch.linalg.qr(torch.randn(n, n, **settings))[0]
-    place = 2 * torch.rand(n, **settings) - 1
-    scale = torch.logspace(0, 2, n, dtype=torch.float64)
-    examples = torch.randn(_EXAMPLES * n, n, **settings)
-    classes = torch.where(torch.rand(_EXAMPLES * n, **settings) < torch.sigmoid(3 * examples @ place), 1.0, -1.0)
-
-    def u(z: Tensor) -> Tensor:
-        return (z - place) @ axes
-
-    return {
-        "sphere": lambda z: u(z).square().sum(1),
-        "quadratic, condition 100": lambda z: (u(z).square() * scale).sum(1),
-        "log cosh, condition 100": lambda z: torch.cosh(u(z) * scale.sqrt()).log().sum(1),
-        "logistic regression": lambda z: (
-            torch.nn.functional.softplus(-(z @ examples.mT) * classes).mean(1) + 0.01 * z.square().sum(1)
-        ),
-        "exponentials": lambda z: (u(z).exp() + (-2 * u(z)).exp()).sum(1),
-        "pseudo-Huber": lambda z: (1 + 10 * u(z).square()).sqrt().sum(1),
-    }
-
-
-def lowest(function: Function, n: int) -> float:
-    """Return the minimum of a convex function, by Newton's method on its own derivatives."""
-
-    def loss(z: Tensor) -> Tensor:
-        return function(z[None])[0]
-
-    x = torch.zeros(n, dtype=torch.float64)
-    for _ in range(200):
-        step = torch.linalg.solve(torch.func.hessian(loss)(x), torch.func.grad(loss)(x))
-        while float(loss(x - step)) > float(loss(x)) and float(step.norm()) > 1e-12:
-            step = 0.5 * step
-        if torch.equal(x - step, x):  # all further steps are the same
-            break
-        x = x - step
-    return float(loss(x))
 
 
 def ended(method: str, function: Function, start: Tensor, minimum: float, *, box: bool, seed: int) -> End:
@@ -134,7 +97,7 @@ def endings(
         raise SystemExit(f"n must be 2 or more and runs at least 1, got {n} and {runs}")
     result_files.may_keep(store)
     torch.set_num_threads(1)
-    cases = [(name, size, box) for size in n for box in (False, True) for name in functions(size, 0)]
+    cases = [(name, size, box) for size in n for box in (False, True) for name in CONVEX]
     rows = [row(name, size, runs, seed, box=box) for name, size, box in progress(cases, "cases")]
     result_files.show(HEADERS, rows, store)
     return rows

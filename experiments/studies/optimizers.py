@@ -1,9 +1,9 @@
-"""`python -m experiments optimizers`: our search and other optimizers on functions that others wrote (BBOB).
+"""`python -m experiments optimizers`: our search and other optimizers on BBOB, or on smooth losses of users' kinds.
 
-A pair is a function instance and one of 51 precisions, 1e2 to 1e-8. A method reaches a pair once it has evaluated a
-point whose value is within the precision of the minimum. The table has the share of pairs reached after 10 n, 30 n and
-100 n evaluations, and after 500 n if runs may use so many. Every method gets the same starts, the same box and the same
-size of the first step. A method that ends by itself starts again from a random point of the box.
+A pair is a function instance and a precision, of the targets of its family. A method reaches a pair once it has
+evaluated a point whose value is within the precision of the minimum. The table has the share of pairs reached after
+10 n, 30 n and 100 n evaluations, and after 500 n if runs may use so many. Every method gets the same starts, the same
+box and the same size of the first step. A method that ends by itself starts again from a random point of the box.
 
 Instances 11 to 15 are for tuning, 1 to 5 for tables. `--over` compares settings of a method; rivals have those of
 `experiments.methods.settings.rivals`.
@@ -11,11 +11,11 @@ Instances 11 to 15 are for tuning, 1 to 5 for tables. `--over` compares settings
 
 import itertools
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from experiments.methods.keywords import with_settings
 from experiments.methods.method import Method
 from experiments.methods.ours import search
 from experiments.methods.settings.rivals import ON_BBOB
-from experiments.problems import bbob
+from experiments.problems import bbob, smooth_losses
 from experiments.problems.task import Task
 from experiments.reports import data_profiles
 from experiments.reports.progress import progress
@@ -57,9 +57,29 @@ SUITE = suite(BUDGETS[-1])
 
 
 @dataclass(frozen=True)
+class Family:
+    """Functions by their numbers."""
+
+    numbers: tuple[int, ...]
+    targets: tuple[float, ...]
+    """Precisions, the coarsest first."""
+    check: Callable[[Sequence[int], Sequence[int], Sequence[int]], None]
+    """SystemExit for n, functions or instances that the family does not have."""
+    task: Callable[[int, int, int, int], Task]
+    """Function, instance, n and evaluations to the task."""
+
+
+FAMILIES = {
+    "bbob": Family(bbob.FUNCTIONS, bbob.TARGETS, bbob.check, bbob.task),
+    "smooth": Family(smooth_losses.FUNCTIONS, smooth_losses.TARGETS, smooth_losses.check, smooth_losses.task),
+}
+
+
+@dataclass(frozen=True)
 class Job:
     """One method on one function from one start."""
 
+    family: str
     n: int
     function: int
     instance: int
@@ -69,23 +89,25 @@ class Job:
     """Evaluations over n."""
     settings: Settings = ()
 
+    @property
+    def targets(self) -> tuple[float, ...]:
+        """Precisions, the coarsest first."""
+        return FAMILIES[self.family].targets
+
 
 @dataclass(frozen=True)
 class Reached:
-    """Evaluations until each target of `bbob.TARGETS` that was reached, and seconds of the processor."""
+    """Evaluations until each target that was reached, the coarsest first, and seconds of the processor."""
 
     evaluations: Sequence[int]
     seconds: float
 
-    def share(self, most: int) -> float:
-        """Share of the targets that were reached within so many evaluations."""
-        return sum(one <= most for one in self.evaluations) / len(bbob.TARGETS)
-
 
 def optimizers(
     *,
+    family: Literal["bbob", "smooth"] = "bbob",
     n: tuple[int, ...] = (2, 3, 5, 10),
-    functions: tuple[int, ...] = bbob.FUNCTIONS,
+    functions: tuple[int, ...] | None = None,
     instances: tuple[int, ...] = (11, 12),
     methods: str = "all",
     runs: int = 1,
@@ -98,8 +120,9 @@ def optimizers(
     """Print and draw shares of (function, precision) pairs reached; called again it goes on where it was.
 
     Args:
-        n: numbers of parameters, among 2, 3, 5, 10, 20 and 40.
-        functions: of BBOB, 1 to 24.
+        family: the functions of BBOB, or smooth losses of users' kinds.
+        n: numbers of parameters; of BBOB among 2, 3, 5, 10, 20 and 40.
+        functions: their numbers in the family, by default all.
         instances: of every function, from 1 on; 11 to 15 are for tuning.
         methods: names separated by commas, or all: ours, cobyqa, py_bobyqa, lbfgs_fd, cma_es_bounded; or any that
             needs the loss alone, see `list`.
@@ -112,12 +135,14 @@ def optimizers(
     """
     if runs < 1 or budget < 1 or not limit > 0:
         raise SystemExit(f"runs and budget must be at least 1, limit positive, got {runs}, {budget} and {limit:g}")
-    bbob.check(n, functions, instances)
+    members = FAMILIES[family]
+    functions = members.numbers if functions is None else functions
+    members.check(n, functions, instances)
     may_keep(store)
     torch.set_num_threads(1)
     wanted = SUITE.wanted(methods, over)
     jobs = [
-        Job(count, function, instance, run, name, budget, settings)
+        Job(family, count, function, instance, run, name, budget, settings)
         for count, function, instance, run, (name, settings) in itertools.product(
             n, functions, instances, range(runs), wanted
         )
@@ -129,12 +154,17 @@ def optimizers(
 
 
 def _run(job: Job, limit: float) -> list[Reached]:
-    task = bbob.task(job.function, job.instance, job.n, job.budget * job.n)
-    return [reached(task, SUITE.method(job.method), job.run, limit, dict(job.settings))]
+    task = FAMILIES[job.family].task(job.function, job.instance, job.n, job.budget * job.n)
+    return [reached(task, job.targets, SUITE.method(job.method), job.run, limit, dict(job.settings))]
 
 
 def reached(
-    task: Task, method: Method, run: int, limit: float = 600.0, settings: Mapping[str, Any] | None = None
+    task: Task,
+    targets: Sequence[float],
+    method: Method,
+    run: int,
+    limit: float = 600.0,
+    settings: Mapping[str, Any] | None = None,
 ) -> Reached:
     """Run a method until the evaluations of the task are used up or the finest target is reached."""
     hits: list[int] = []
@@ -145,7 +175,7 @@ def reached(
         values = task.loss(x)
         for value in values.tolist():
             count += 1
-            while len(hits) < len(bbob.TARGETS) and value <= bbob.TARGETS[len(hits)]:
+            while len(hits) < len(targets) and value <= targets[len(hits)]:
                 hits.append(count)
         return values
 
@@ -163,7 +193,7 @@ def profiles(done: Mapping[Job, Reached]) -> dict[str, dict[str, data_profiles.P
     found: dict[str, dict[str, data_profiles.Profile]] = defaultdict(dict)
     for (n, name), group in grouped(done.items(), _row).items():
         counts = [count / n for _, one in group for count in one.evaluations]
-        found[f"n = {n}"][name] = counts, len(group) * len(bbob.TARGETS)
+        found[f"n = {n}"][name] = counts, sum(len(job.targets) for job, _ in group)
     return found
 
 
@@ -179,11 +209,16 @@ def _rows(groups: Mapping[tuple[int, str], Sequence[tuple[Job, Reached]]]) -> It
     for (n, name), group in groups.items():
         most = group[0][0].budget
         shares = [
-            sum(one.share(budget * n) for _, one in group) / len(group) if budget <= most else None
+            sum(_share(job, one, budget * n) for job, one in group) / len(group) if budget <= most else None
             for budget in budgets(most)
         ]
         # A run that has reached the finest target has ended there.
         used = sum(
-            one.evaluations[-1] if len(one.evaluations) == len(bbob.TARGETS) else job.budget * n for job, one in group
+            one.evaluations[-1] if len(one.evaluations) == len(job.targets) else job.budget * n for job, one in group
         )
         yield [n, name, *shares, 1e3 * sum(one.seconds for _, one in group) / used, len(group)]
+
+
+def _share(job: Job, found: Reached, most: int) -> float:
+    """Share of the targets that were reached within so many evaluations."""
+    return sum(one <= most for one in found.evaluations) / len(job.targets)

@@ -1,28 +1,13 @@
-"""The study of how searches of convex functions end: against closed forms, and its table against made-up ends."""
+"""The study of how searches of convex functions end: every method, and the table against made-up ends."""
 
 import math
 
 import pytest
 import torch
 
+from experiments.problems.smooth_losses import functions, lowest
 from experiments.studies import endings as module
-from experiments.studies.endings import HEADERS, METHODS, End, ended, endings, functions, lowest, row
-
-
-@pytest.mark.parametrize("name", functions(3, 0))
-def test_functions_are_convex(name):
-    function = functions(3, 1)[name]
-    a, b = 5 * torch.randn(2, 200, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    assert bool((function(0.5 * (a + b)) < 0.5 * (function(a) + function(b))).all())
-
-
-def test_minima_are_those_of_closed_forms():
-    minima = {name: lowest(function, 4) for name, function in functions(4, 5).items()}
-    exponentials = 4 * (2 ** (1 / 3) + 2 ** (-2 / 3))
-    assert minima["sphere"] == pytest.approx(0.0, abs=1e-20)
-    assert minima["log cosh, condition 100"] == pytest.approx(0.0, abs=1e-14)
-    assert minima["exponentials"] == pytest.approx(exponentials, rel=1e-14)
-    assert minima["pseudo-Huber"] == pytest.approx(4.0, rel=1e-14)
+from experiments.studies.endings import CONVEX, HEADERS, METHODS, End, ended, endings, row
 
 
 @pytest.mark.parametrize("box", [False, True])
@@ -59,7 +44,7 @@ def test_a_row_has_medians_and_ratios(monkeypatch):
 def test_the_table_is_printed_and_bad_input_refused(monkeypatch, capsys):
     monkeypatch.setattr(module, "ended", lambda *job, **options: End(7, 0.0))
     rows = endings(n=(2,), runs=1)
-    assert len(rows) == 2 * len(functions(2, 0))
+    assert len(rows) == 2 * len(CONVEX)
     assert "worst ratio" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="n must be 2 or more"):
         endings(n=(1,))

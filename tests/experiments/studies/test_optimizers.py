@@ -1,4 +1,4 @@
-"""The study on BBOB: its minima, its count of targets, and the command from a file that has half of the rows."""
+"""The study of optimizers: minima of BBOB, counts of targets, and the command from a file with half of the rows."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from experiments.methods import METHODS
-from experiments.problems import bbob
+from experiments.problems import bbob, smooth_losses
 from experiments.studies.noise import noise
 from experiments.studies.optimizers import OURS, Job, Reached, optimizers, profiles, reached, rows, suite
 
@@ -26,11 +26,21 @@ def test_no_point_is_below_the_minimum_and_the_sphere_is_a_sphere(function):
 
 
 def test_targets_are_counted_as_they_are_reached():
-    found = reached(bbob.task(1, 11, 2, 60), OURS, 0)
+    found = reached(bbob.task(1, 11, 2, 60), bbob.TARGETS, OURS, 0)
     assert len(found.evaluations) == len(bbob.TARGETS) == 51
     assert list(found.evaluations) == sorted(found.evaluations)
-    assert found.share(found.evaluations[-1]) == 1.0
-    assert found.share(0) == 0.0
+
+
+def test_every_target_is_counted_at_its_first_value():
+    """The values are 0.3, 0.05, 0.05 and 0 in turn; a share of the first gap at 0.1 is reached by the second."""
+    task = smooth_losses.task(1, 11, 2, 4)
+    values = iter([0.3, 0.05, 0.05, 0.0])
+
+    def loss(x):
+        return torch.tensor([next(values) for _ in x], dtype=torch.float64)
+
+    found = reached(replace(task, loss=loss), (0.5, 0.1, 1e-3), METHODS["lbfgs_fd"], 0)
+    assert list(found.evaluations) == [1, 2, 4]
 
 
 def test_a_method_that_ends_starts_again():
@@ -42,7 +52,7 @@ def test_a_method_that_ends_starts_again():
         calls.append(len(x))
         return task.loss(x)
 
-    reached(replace(task, loss=loss), METHODS["cobyqa"], 0)
+    reached(replace(task, loss=loss), bbob.TARGETS, METHODS["cobyqa"], 0)
     # The errors of what is reported are measured with the error of the task, not with its loss.
     assert sum(calls) == 300
 
@@ -79,7 +89,7 @@ def test_rivals_have_their_settings_of_bbob(tmp_path):
 
 
 def test_the_table_has_shares():
-    jobs = {Job(2, f, 11, 0, "ours", 100): Reached((5,) * count, 1.0) for f, count in ((1, 51), (2, 0))}
+    jobs = {Job("bbob", 2, f, 11, 0, "ours", 100): Reached((5,) * count, 1.0) for f, count in ((1, 51), (2, 0))}
     assert rows(jobs) == [[2, "ours: gaussian_process", 0.5, 0.5, 0.5, pytest.approx(1e3 * 2 / 205), 2]]
     assert profiles(jobs) == {"n = 2": {"ours: gaussian_process": ([2.5] * 51, 102)}}
     (short,) = rows({replace(job, budget=20): found for job, found in jobs.items()})
@@ -89,6 +99,19 @@ def test_the_table_has_shares():
     assert suite(500).headers[2:6] == ("10 n", "30 n", "100 n", "500 n")
     assert suite(499).headers[2:5] == ("10 n", "30 n", "100 n")
     assert len(suite(499).headers) == len(short)
+
+
+def test_smooth_losses_are_another_family(tmp_path, capsys):
+    settings = {"family": "smooth", "n": (4,), "functions": (1,), "instances": (11,), "budget": 30, "out": tmp_path}
+    optimizers(methods="ours", **settings)
+    shares = next(line.split() for line in capsys.readouterr().out.splitlines() if "gaussian_process" in line)[3:5]
+    assert [float(share) for share in shares] == [1.0, 1.0]  # a sphere
+    with pytest.raises(SystemExit, match="functions must be from 1 to 10, got 11"):
+        optimizers(**settings | {"functions": (11,)})
+    with pytest.raises(SystemExit, match="n must be at least 2, got 1"):
+        optimizers(**settings | {"n": (1,)})
+    with pytest.raises(SystemExit, match="instances must be at least 1, got 0"):
+        optimizers(**settings | {"instances": (0,)})
 
 
 def test_numbers_that_cannot_be(tmp_path):

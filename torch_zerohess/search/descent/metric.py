@@ -41,6 +41,9 @@ _RATE, _FIRST_RATE = 0.3, 0.7
 """Rate at which the metric is learned from a full quadratic, and from the first one."""
 _FALLING = 1.5
 """For fewer points the rate is multiplied by (points / coefficients) to this power: much of the Hessian is guessed."""
+_DOUBTED = 100.0
+"""Curvatures below so many times (most negative curvature)^2 / (largest one) may be errors of a Hessian, see
+`_guessed`."""
 CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
 _LATEST = 2
@@ -267,7 +270,21 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         if len(known.values) <= 2 * self._n:
             return known.root
         rate = _FIRST_RATE if known.phase == "axes" else self._rate(count)
-        return learned(known.root, known.hessian, rate, CURVED * float(known.gradient.norm()) / known.sigma)
+        floor = max(CURVED * float(known.gradient.norm()) / known.sigma, self._guessed(known.hessian, count))
+        return learned(known.root, known.hessian, rate, floor)
+
+    def _guessed(self, hessian: Tensor, count: int) -> float:
+        """Return the curvature below which a Hessian [n, n] from so many points says nothing about the metric.
+
+        Near a minimum no curvature is negative. A negative curvature is an error there, and the other curvatures have
+        errors of its size: as valleys of the metric they would be wrong. The bound is the square of the most negative
+        curvature, because a negative curvature that is small beside the largest one may be true. The bound falls to
+        zero as the points determine the Hessian.
+        """
+        curvatures = torch.linalg.eigvalsh(hessian)
+        negative, largest = max(0.0, -float(curvatures[0])), float(curvatures.abs().max())
+        unknown = max(0.0, 1.0 - count / self._coefficients) ** 2
+        return min(unknown * _DOUBTED * negative**2 / largest, largest) if negative else 0.0
 
     def _rate(self, count: int) -> float:
         """Return the rate at which the metric is learned from a quadratic of so many points."""

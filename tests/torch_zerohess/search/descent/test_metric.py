@@ -36,6 +36,27 @@ def test_a_narrow_valley(n, most, seed):
     assert evaluations_to(Descent(zeros(n), sigma=2.0, seed=seed, restarts=0), f, 1e-8) < most
 
 
+def test_errors_of_a_hessian_make_no_valley():
+    """The loss is round at its minimum. Four searches divide it by more than 500 in fewer than 560 evaluations."""
+    count = 0
+    for seed in range(4):
+        start = 1.0 + 4.0 * torch.rand(10, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        search = Descent(start, sigma=2.0, seed=seed, restarts=0)
+        count += evaluations_to(search, lambda z: (1.0 + 10.0 * z.square()).sqrt().sum(1) - 10.0, 0.03)
+    assert count < 560
+
+
+def test_curvatures_that_may_be_errors():
+    """With 4 parameters a quadratic has 15 coefficients."""
+    method = method_of(4)
+    hessian = torch.diag(vector(10.0, 4.0, 1.0, -0.1))
+    assert method._guessed(hessian, 0) == pytest.approx(100.0 * 0.1**2 / 10.0)
+    assert method._guessed(hessian, 12) == pytest.approx(0.2**2 * 100.0 * 0.1**2 / 10.0)
+    assert method._guessed(hessian, 15) == 0.0
+    assert method._guessed(hessian.abs(), 0) == 0.0
+    assert method._guessed(-hessian, 0) == 10.0  # at most the largest
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_a_narrow_valley_that_is_no_quadratic(seed):
     """The root of one: its curvature changes from point to point, and the ratio of its axes does not."""
@@ -135,10 +156,14 @@ def test_the_quadratic_of_a_round_is_made_of_more_than_rounding():
     assert sum(one.evaluations for one in searches) < 570  # 657 with that Hessian
 
 
+def method_of(n):
+    box = zeros(n) - 9, zeros(n) + 9
+    return metric.MetricQuadratics(Settings(zeros(n), *box, None, restarts=9, tolerance=1e-3, noise=0.0, pool=None))
+
+
 def arrived_at_zero():
     """A search, and its progress in a round after one that has arrived at 0, where the loss is |z|^2."""
-    settings = Settings(zeros(2), zeros(2) - 9, zeros(2) + 9, None, restarts=9, tolerance=1e-3, noise=0.0, pool=None)
-    method = metric.MetricQuadratics(settings)
+    method = method_of(2)
     bottom = Best(zeros(2), 0.0)
     known = replace(method._begun(bottom), bottom=bottom, slope=zeros(2), bend=2 * torch.eye(2, dtype=torch.float64))
     return method, replace(known, lowest=Best(zeros(2) + 9, 162.0), phase="trial")

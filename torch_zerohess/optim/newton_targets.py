@@ -11,12 +11,13 @@ from torch_zerohess.arguments import check_state, check_tensors, checked_integer
 from torch_zerohess.autograd.graph import check_twice
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.magnitudes import magnitudes
+from torch_zerohess.linalg.saddle_free import saddle_free_steps
 from torch_zerohess.version import VERSION
 
 _DENSE = 16
 """Outputs up to which the Hessian of every element is formed and solved."""
 _TOLERANCE = 1e-2
-"""Residual of conjugate gradients, relative to the gradient."""
+"""Residual of the system, relative to the gradient."""
 _COUPLED = 1e-3
 """Relative error of a derivative at which losses depend on other elements."""
 _REPEATED = 8.0
@@ -36,12 +37,18 @@ class NewtonTargets:
     optimizer of the weights then trains as if the loss were well-conditioned in y. Convergence no longer depends on the
     condition of the black box. For a batch much smaller than the weights this needs no curvature of the network.
 
-    Up to 16 outputs H is formed. |H|, with the magnitudes of its eigenvalues, takes its place in t and in h. For more
-    outputs the system is solved by conjugate gradients on Hessian-vector products, and h is |v^T H v| / n with random
-    signs v (Hutchinson 1989). The preconditioner is one matrix: column i is from the Hessian over h of element i modulo
-    B. Later calls keep it. Where `iterations` do not reach a residual of 1 %, the call makes another one. If the
-    residual stays above 1 % with that one, too, the step is taken as it is, and the next 100 calls make none. An affine
-    black box with a quadratic loss takes one iteration.
+    |H|, with the magnitudes of the eigenvalues of H, takes the place of H in t and in h (Dauphin et al. 2014): negative
+    curvature makes a step as long as positive curvature does. Up to 16 outputs |H| is formed. For more outputs the
+    system is solved in a Krylov space of Hessian-vector products. If H has no negative curvature there, this is the
+    method of conjugate gradients. If it has, the step is (|H| + relative_damping * h I)^-1 g where all elements have
+    one H, and of about this length where their Hessians differ. Negative curvature that `iterations` do not find can
+    make a step longer: `output_radius` is its bound. h is v^T |H| v / n with random signs v (Hutchinson 1989), where
+    |H| is taken in the space of v and H v.
+
+    The preconditioner is one matrix: column i is from the Hessian over h of element i modulo B. Later calls keep it.
+    Where `iterations` do not reach a residual of 1 %, the call makes another one. If the residual stays above 1 % with
+    that one, too, the step is taken as it is, and the next 100 calls make none. An affine black box with a quadratic
+    loss takes one iteration.
 
     Every call checks by two more backward passes, of first and of second order, that no loss depends on the outputs of
     another element.
@@ -51,7 +58,7 @@ class NewtonTargets:
 
     Args:
         relative_damping: of the Hessian, in units of h; positive.
-        iterations: of conjugate gradients at most.
+        iterations: dimension of the Krylov space at most.
         output_radius: longest step |t - y| of an element, in units of y.
 
     Example:
@@ -182,8 +189,8 @@ class NewtonTargets:
         coins = torch.rand(n, generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu")
         signs = torch.where(coins < 0.5, -1.0, 1.0).to(gradient)
         image = product(signs.expand_as(gradient))
-        size = (image @ signs)[:, None].abs() / n
-        _check(size)
+        _check(image)
+        size = _size(product, signs, image)
         _check_elements(lambda c: product(c[:, None] * signs), image)
         if self._factor is not None and self._factor.shape[0] == n:
             self._factor = self._factor.to(gradient.device)  # a loaded one may be elsewhere
@@ -210,37 +217,39 @@ class NewtonTargets:
         self._factor = torch.linalg.cholesky(h + shift * torch.eye(n, dtype=h.dtype, device=h.device))
 
     def _solve(self, product: Callable[[Tensor], Tensor], gradient: Tensor, size: Tensor) -> tuple[Tensor, bool]:
-        """Solve (H + relative_damping h I) s = g for all elements.
+        """Solve (|H| + relative_damping h I) s = g for all elements. size: h, [B, 1]."""
+        assert self._factor is not None
 
-        An element ends at its tolerance or at negative curvature. size: h, [B, 1].
-        """
-        factor, shift, unit = self._factor, self._shift(size), torch.where(size > 0, size, 1.0)
-        assert factor is not None
-        shift, unit, g = shift.double(), unit.double(), gradient.double()  # squares neither over- nor underflow
+        def image(v: Tensor) -> Tensor:
+            hv = product(v.to(gradient.dtype)).double()
+            _check(hv)
+            return hv
 
-        def precondition(r: Tensor) -> Tensor:
-            return torch.cholesky_solve(r.mT, factor).mT / unit
+        s, converged = saddle_free_steps(
+            image,
+            gradient.double(),
+            self._shift(size).double(),
+            self._factor,
+            iterations=self.iterations,
+            tolerance=_TOLERANCE,
+        )
+        return s.to(gradient.dtype), converged
 
-        s, r = torch.zeros_like(g), g
-        z = precondition(r)
-        p, rz = z, (r * z).sum(1, keepdim=True)
-        least = _TOLERANCE * g.norm(dim=1, keepdim=True)
-        going = least > 0
-        for iteration in range(self.iterations):
-            hp = product(p.to(gradient.dtype)).double() + shift * p
-            bend = (p * hp).sum(1, keepdim=True)
-            if not iteration:
-                s = torch.where(going & (bend <= 0), p, s)  # the gradient, in the metric of the preconditioner
-            going = going & (bend > 0)
-            length = torch.where(going, rz / bend.clamp_min(torch.finfo(bend.dtype).tiny), 0.0)
-            s, r = s + length * p, r - length * hp
-            going = going & (r.norm(dim=1, keepdim=True) > least)
-            if not bool(going.any()):
-                return s.to(gradient.dtype), True
-            z = precondition(r)
-            before, rz = rz, (r * z).sum(1, keepdim=True)
-            p = z + torch.where(before == 0, 0.0, rz / before) * p  # an element that has ended may have nothing left
-        return s.to(gradient.dtype), False
+
+def _size(product: Callable[[Tensor], Tensor], signs: Tensor, image: Tensor) -> Tensor:
+    """Return v^T |H| v / n of every element, [B, 1], for v = signs [n] and image = H v [B, n].
+
+    |H| is taken in the space of v and H v. If H has no negative curvature there, this is v^T H v / n.
+    """
+    scale = math.sqrt(len(signs))
+    v, hv = signs.double() / scale, image.double() / scale
+    first = (hv @ v)[:, None]
+    rest = hv - first * v
+    beside = rest.norm(dim=1, keepdim=True)
+    w = torch.where(beside > 0, rest / beside, 0.0)
+    second = (product(w.to(image.dtype)).double() * w).sum(1, keepdim=True)
+    h = torch.cat([first, beside, beside, second], 1).view(-1, 2, 2)
+    return _magnitudes(h)[:, :1, 0].to(image.dtype)
 
 
 def _magnitudes(h: Tensor) -> Tensor:

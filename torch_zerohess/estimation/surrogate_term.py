@@ -27,6 +27,9 @@ MOST_STEIN = 8
 """Parameters up to which Stein's sums are tried."""
 _TRIED = 4
 """Elements of a batch on which both derivatives are compared."""
+_SUMS = 4
+"""Sums of all outputs with random signs, on which both derivatives are compared. The variance of such a sum has the sum
+of the variances of the outputs as its mean."""
 _REPEATS = 8
 """Means over other points, which tell the variance of one."""
 _SHORTER = 4
@@ -54,6 +57,8 @@ class SurrogateTerm:
     """Orders of derivatives along the points."""
     seed: int
     """Of the points of other means, see `variance`."""
+    sums: int | None = None
+    """How many sums of all outputs with random signs take the place of more outputs than these; None: none."""
     _predicted: Prediction = field(init=False)
 
     def __post_init__(self) -> None:
@@ -123,8 +128,18 @@ class SurrogateTerm:
     def _each(self, x: Tensor) -> Tensor:
         """Return c h(g(x + sigma u), r) at every point, [B, Q, P]."""
         z = (x[:, None] + self.sigma * self.u).to(self.x.dtype)
-        values = self.control.coefficient * self._predicted(z)
-        return values.reshape(*values.shape[:2], -1).double()
+        return self._numbers(self.control.coefficient * self._predicted(z)).double()
+
+    def _numbers(self, values: Tensor) -> Tensor:
+        """Return values [B, Q, *out] as [B, Q, P], or their `sums`."""
+        values = values.reshape(*values.shape[:2], -1)
+        if self.sums is None or values.shape[2] <= self.sums:
+            return values
+        generator = torch.Generator().manual_seed(self.seed)
+        seed = int(torch.randint(2**62, (), generator=generator, device="cpu"))
+        generator.manual_seed(seed)  # not the seed of the points
+        coins = torch.randint(2, (values.shape[2], self.sums), generator=generator, device="cpu")
+        return values @ (2 * coins - 1).to(values)
 
     def _pairs(self, quantity: Quantity, v: Tensor | None) -> Tensor:
         """Return a quantity for every pair of mirrored points: [B, Q / 2, P], or [B, Q / 2, P, n]."""
@@ -135,8 +150,8 @@ class SurrogateTerm:
             each = self._from_slopes(quantity, v)
         else:
             ways = [self._along_points, self._in_reverse]
-            if self.control.outer.head is not None or self.control.memory.output_shape == ():
-                ways.reverse()  # one number per point: all parameters in one pass
+            if self.control.outer.head is not None or self.control.memory.output_shape == () or self.sums is not None:
+                ways.reverse()  # few numbers per point: all parameters in one pass
             try:
                 each = ways[0](quantity, v)
             except RuntimeError:  # an operation without a forward mode, or without a second derivative
@@ -148,8 +163,8 @@ class SurrogateTerm:
         values, u = self._each(self.x.double()), self.u[:, :, None]
         if quantity == "value":
             return values
-        center = self._predicted(self.x[:, None]).double()
-        change = (values - self.control.coefficient * center.reshape(len(values), 1, -1))[..., None]
+        center = self._numbers(self.control.coefficient * self._predicted(self.x[:, None])).double()
+        change = (values - center)[..., None]
         if quantity == "gradient":
             return change * u / self.sigma
         if quantity == "hessian_diagonal":
@@ -184,7 +199,7 @@ class SurrogateTerm:
         with torch.inference_mode(False), torch.enable_grad(), without_autocast(self.x.device):
             z = (self.x.double()[:, None] + self.sigma * self.u).to(self.x.dtype).requires_grad_()
             values = self.control.coefficient * self._predicted(z)
-            outputs = values.reshape(*z.shape[:2], -1).unbind(2)
+            outputs = self._numbers(values).unbind(2)
 
             def gradient(of: Tensor, *, graph: bool = False) -> Tensor:
                 """[B, Q, n]"""
@@ -241,7 +256,7 @@ def measure(control: Control, x: Tensor, aux: Sequence[Tensor], sigma: Tensor, o
             return
         if orders and len(sigma) <= MOST_STEIN:
             few = [one[:_TRIED].clone() for one in (x, *aux)]
-            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u[:_TRIED], orders, seed)
+            term = SurrogateTerm(memory.surrogate, control, few[0], few[1:], sigma, u[:_TRIED], orders, seed, _SUMS)
             quantity: Quantity = "gradient" if order == 1 else "hessian_diagonal"
             own, others = (float(one.variance_of_pairs(quantity).sum()) for one in (term, replace(term, pathwise=0)))
             orders = orders if own < others else 0

@@ -6,6 +6,7 @@ so that F has a closed form.
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 
 from torch_zerohess import BlackBox, Memory, Smoothing, estimate
 from torch_zerohess.estimation.control import _negligible
+from torch_zerohess.estimation.surrogate_term import SurrogateTerm
 from torch_zerohess.heads import LocalEntropy, SquaredError
 from truths import deviation, vector
 
@@ -184,6 +186,41 @@ def test_derivatives_of_one_number_take_one_pass_for_all_parameters(head: Square
             for way in (got._term._along_points, got._term._in_reverse)
         )
         torch.testing.assert_close(along, reverse)
+
+
+def waves(z: Tensor) -> Tensor:
+    """Fifty outputs, each with its negative: the sum of all is zero."""
+    phases = z @ K[:, None] + torch.linspace(0.0, 3.0, 50, dtype=torch.float64)
+    return torch.cat([torch.sin(phases), -torch.sin(phases)], 1)
+
+
+@pytest.mark.parametrize("quantity", ["gradient", "hessian_diagonal"])
+@pytest.mark.parametrize("pathwise", [0, 1, 2])
+def test_sums_of_random_signs_tell_the_variance_of_many_outputs(quantity, pathwise: int) -> None:
+    """The mean of their variances is the sum of the variances of all outputs."""
+    memory = Whole(Model(waves), draws=32)
+    got = estimate(waves, X[None], SMOOTHING, memory=memory, value="smoothed")
+    term = replace(got._term, pathwise=pathwise)
+    expected = float(term.variance_of_pairs(quantity).sum())
+    found = torch.stack([replace(term, sums=4, seed=seed).variance_of_pairs(quantity) for seed in range(200)])
+    assert found.shape[2] == 4
+    one = found.flatten(1).sum(1) / 4
+    assert abs(float(one.mean()) - expected) < 5.0 * float(one.std()) / math.sqrt(len(one)) < 0.5 * expected
+
+
+def test_derivatives_are_compared_on_few_numbers(monkeypatch) -> None:
+    compared, pairs = [], SurrogateTerm._pairs
+
+    def recorded(self, *arguments):
+        each = pairs(self, *arguments)
+        compared.append(each.shape[2])
+        return each
+
+    monkeypatch.setattr(SurrogateTerm, "_pairs", recorded)
+    memory = Whole(Model(waves), draws=32)
+    estimate(waves, X[None], SMOOTHING, memory=memory, value="smoothed")
+    assert memory.pathwise == 2
+    assert compared == [4, 4]
 
 
 def test_the_value_at_the_center_is_the_head_of_the_output_there() -> None:

@@ -46,15 +46,14 @@ class _Fresh:
 
 def _pathwise(control: Control, center: Tensor, aux: Sequence[Tensor], sigma: Tensor, order: int, seed: int) -> int:
     """Return how many derivatives of the surrogate's term around center [B, n] to take along its points."""
-    memory, few = control.memory, center.shape[1] <= MOST_STEIN
-    hidden = transforms.watched(center) or transforms.forward_mode_active()
-    if not (hidden and few and memory.pathwise is None):  # the variances cannot be compared in a transform
-        with transforms.outside(), transforms.random_numbers_allowed():
-            shown = [one for one in map(transforms.shown, (center, *aux)) if one is not None]
-            if len(shown) == 1 + len(aux):
-                measure(control, shown[0], shown[1:], sigma, order, seed)
-            elif memory.pathwise is None:
-                return 2 if known_smooth(control) else 0
+    memory = control.memory
+    with transforms.outside(), transforms.random_numbers_allowed():
+        shown = [one for one in map(transforms.shown, (center, *aux)) if one is not None]
+        if len(shown) == 1 + len(aux):
+            measure(control, shown[0], shown[1:], sigma, order, seed)
+        elif memory.pathwise is None:
+            return 2 if known_smooth(control) else 0
+    few = center.shape[1] <= MOST_STEIN
     return (0 if few else 2) if memory.pathwise is None else memory.pathwise
 
 

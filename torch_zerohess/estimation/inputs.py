@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.fx import Proxy
 
 _FEW = 64  # numbers up to which Python is faster than an operation of torch
 _SHOWN = 8  # numbers of a tensor that a text shows
@@ -18,15 +19,22 @@ def checked_input(x: Any, *, empty: bool = False) -> Tensor:
     empty: a batch may have no points.
     """
     if not isinstance(x, Tensor):
-        raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}")
+        hint = ": torch.fx cannot trace a black box, make its layer a leaf module" if isinstance(x, Proxy) else ""
+        raise TypeError(f"x must be a torch tensor [*batch, n], got {type(x).__name__}{hint}")
     if x.dtype not in (torch.float32, torch.float64, *_HALF):
         raise TypeError(f"x must be float32 or float64, got {x.dtype}: convert, e.g. x.float()")
+    _check_not_nested("x", x)
     if x.layout != torch.strided:
         raise TypeError(f"x must be dense, got {x.layout}: convert by x.to_dense()")
     if x.dim() == 0 or x.shape[-1] == 0 or (x.numel() == 0 and not empty):
         wanted = "n > 0" if empty else "n and every batch dimension > 0"
         raise ValueError(f"x must have shape [*batch, n] with {wanted}, got {list(x.shape)}")
     return x
+
+
+def _check_not_nested(name: str, x: Tensor) -> None:
+    if x.is_nested:
+        raise TypeError(f"{name} must be one dense tensor, got a nested tensor: pass its parts one by one")
 
 
 def working(x: Tensor) -> Tensor:
@@ -42,6 +50,7 @@ def folded_aux(aux: tuple[Tensor, ...], batch: torch.Size) -> list[Tensor]:
     for number, one in enumerate(aux):
         if not isinstance(one, Tensor):
             raise TypeError(f"aux[{number}] must be a tensor [*batch, ...], got {type(one).__name__}")
+        _check_not_nested(f"aux[{number}]", one)
         if one.shape[: len(batch)] != batch:
             raise ValueError(
                 f"aux[{number}] must have the batch dimensions {list(batch)} of x first, got {list(one.shape)}"

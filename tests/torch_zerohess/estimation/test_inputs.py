@@ -465,6 +465,21 @@ def test_a_sparse_x_is_refused() -> None:
         estimate(f, torch.ones(2).to_sparse(), S)
 
 
+@pytest.mark.parametrize("layout", [torch.strided, torch.jagged])
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors is in prototype stage")
+def test_nested_tensors_are_refused_by_name(layout: torch.layout) -> None:
+    nested = torch.nested.nested_tensor([torch.ones(2, 3), torch.ones(1, 3)], layout=layout)
+    with pytest.raises(TypeError, match="x must be one dense tensor, got a nested tensor: pass its parts one by one"):
+        estimate(f, nested, S)
+    with pytest.raises(TypeError, match=r"aux\[0\] must be one dense tensor, got a nested tensor"):
+        BlackBox(lambda z, _: f(z), S)(torch.ones(2, 3), nested)
+
+
+def test_a_symbolic_trace_says_what_to_do() -> None:
+    with pytest.raises(TypeError, match=r"got Proxy: torch\.fx cannot trace a black box, make its layer a leaf module"):
+        torch.fx.symbolic_trace(BlackBox(f, S))
+
+
 def test_an_executor_is_no_evaluator() -> None:
     with (
         concurrent.futures.ThreadPoolExecutor(1) as threads,

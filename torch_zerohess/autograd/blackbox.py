@@ -46,8 +46,8 @@ class BlackBox(Layer):
             Second derivatives of a nonlinear loss there are biased by the variance of the sampled Jacobian.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
-            are. Under `torch.no_grad` f(x) alone is evaluated, and not kept, unless value="smoothed". Calls of several
-            threads that share a memory follow one another.
+            are, and so does the coefficient: 0 until a call has learned it. Under `torch.no_grad` f(x) alone is
+            evaluated, and not kept, unless value="smoothed". Calls of several threads with one memory take turns.
         smoothing: how to sample. This and `value` may be set between calls: `layer.smoothing = Smoothing(...)`.
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
@@ -160,8 +160,8 @@ class BlackBox(Layer):
         """Evaluate around x [*batch, n] once and return the estimate as a function of x alone.
 
         The function re-weights the same evaluations to the density around its argument. Near x it estimates the
-        smoothed black box and has derivatives of every order. With proposal "optimal" and order=2 it has two
-        derivatives, with "fr22" one. Higher ones raise ValueError. The function makes no further evaluation.
+        smoothed black box and has derivatives of every order. With proposal "optimal" it is an expansion about x:
+        quadratic, affine with order=1 or "fr22". Higher derivatives raise ValueError. Nothing more is evaluated.
         """
         tracing.check_traceable()
         batch, n = checked_input(x).shape[:-1], x.shape[-1]
@@ -268,7 +268,7 @@ def smooth(
     value: ValueMode = "center",
     on_nonfinite: str | float = "raise",
 ) -> Callable[..., Tensor]:
-    """Return fn, convolved with a Gaussian, as a differentiable function of a tensor: `BlackBox` without the module.
+    """Return fn, convolved with a Gaussian, as a differentiable function of a tensor: a `BlackBox` of fn.
 
     Arguments, shapes and errors: see `BlackBox`.
 

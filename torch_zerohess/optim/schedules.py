@@ -20,6 +20,7 @@ class LinearSigma:
         module_or_modules: a `BlackBox` or `SparseBlackBox`, a module that contains some, or several of either.
         start, end: sigma in units of the black box's input, positive: numbers, or tensors [n], one sigma per parameter.
             Each parameter goes from its own start to its own end; a number beside a tensor is that of all parameters.
+            A layer whose sigma is a tensor needs a tensor.
         steps: number of `step()` calls from start to end, at least 1.
         hold: number of `step()` calls before that.
 

@@ -193,7 +193,8 @@ class Memory:
     def fit(self) -> None:
         """Fit the surrogate to all evaluations that are kept; a module without `fit` is left as it is.
 
-        Raises ValueError if there are fewer than two.
+        A layer uses it after a later call in training mode, or of `estimate`, which learns the coefficient. Raises
+        ValueError if there are fewer than two evaluations.
         """
         if self._size < 2:
             raise ValueError(f"a surrogate is fitted to at least 2 evaluations, the memory has {self._size}: add some")

@@ -106,6 +106,19 @@ def test_hessians_by_transforms_are_as_accurate_as_by_backward(name: str) -> Non
     assert float((torch.stack(found) - expected).abs().max()) < 4e-3
 
 
+def test_a_filled_memory_is_used_after_a_call_in_training_mode() -> None:
+    """Until then its coefficient is 0, also in evaluation mode, which learns nothing."""
+    torch.manual_seed(0)
+    memory, z = zh.Memory(), torch.randn(40, 2)
+    memory.add(z, z.sin().sum(1))
+    memory.fit()
+    box = zh.BlackBox(lambda z: z.sin().sum(1), zh.Smoothing(sigma=0.3, samples=8), memory=memory).eval()
+    box(z[:4].clone().requires_grad_())
+    assert memory.coefficient == 0.0
+    box.train()(z[:4].clone().requires_grad_())
+    assert memory.coefficient > 0.9
+
+
 @pytest.mark.parametrize(
     ("head", "memory"),
     [(None, True), (zh.heads.LocalEntropy(lambda y: y), True), (zh.heads.LocalEntropy(lambda y: y), False)],

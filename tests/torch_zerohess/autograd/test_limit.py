@@ -60,6 +60,19 @@ def test_third_derivatives_of_optimal_samples_raise(way: str) -> None:
                 outer(second)(X)
 
 
+def test_a_frozen_function_of_optimal_samples_is_an_expansion() -> None:
+    """Quadratic about the point that was frozen, with the derivatives of the estimate there; or affine."""
+    moved = X + 0.4 * V
+    for smoothing in (OPTIMAL, *FIRST.values()):
+        e, f = estimate(F, X, smoothing), BlackBox(F, smoothing).freeze(X)
+        slope = e.gradient
+        if smoothing is OPTIMAL:
+            hessian = e.hessian()
+            torch.testing.assert_close(func.hessian(f)(moved), hessian)
+            slope = slope + hessian @ (moved - X)
+        torch.testing.assert_close(func.grad(f)(moved), slope)
+
+
 @in_graphs
 def test_third_derivatives_of_optimal_samples_raise_in_plain_and_compiled_code() -> None:
     layer, x = BlackBox(F, OPTIMAL), X.clone().requires_grad_()

@@ -80,6 +80,23 @@ def test_a_minimum_that_is_not_unique_is_found_once_and_said(fn, n, settings):
     assert fit.value < 1e-16
 
 
+@pytest.mark.parametrize(("unused", "n", "bounds"), [(1, 2, None), (1, 6, None), (3, 6, None), (1, 2, (-5.0, 5.0))])
+@pytest.mark.parametrize("restarts", [None, 0])
+def test_a_minimum_is_one_where_parameters_have_no_effect(unused, n, bounds, restarts):
+    """All values along these parameters are equal, and the loss at the minimum is 1."""
+    scale = torch.linspace(1.0, 3.0, n - unused, dtype=torch.float64)
+
+    def fn(z):
+        return 1.0 + ((z[:, unused:] - 3.0).square() * scale).sum(1)
+
+    fits = [zh.minimize(fn, zeros(n), sigma=1.0, bounds=bounds, restarts=restarts, seed=seed) for seed in range(3)]
+    assert sum(fit.status == "solved" and fit.evaluations < 600 for fit in fits) >= (3 if restarts == 0 else 2)
+    for fit in fits:  # steps that arrive at the minimum exactly evaluate nothing else next to it: a round may not count
+        assert fit.success
+        assert float((fit.x[unused:] - 3.0).abs().max()) < 1e-6
+        assert "constant" not in fit.message
+
+
 @pytest.mark.parametrize(("n", "bounds"), [(2, None), (6, None), (2, (-5.0, 5.0))])
 def test_a_floor_is_no_agreement(n, bounds):
     """All points of a ball have the lowest loss, exactly: a plateau may lie beside something lower."""

@@ -44,10 +44,10 @@ def is_unbounded(losses: Tensor) -> bool:
 
 def is_constant(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:
     """Whether evaluations near x, but not next to it, have exactly the value at x; arguments as of `jumps`."""
-    distance = ((points - x) / unit).square().mean(1).sqrt()
+    steps = (points - x) / unit
     nearest, farthest = _PLATEAU
-    near = distance <= farthest
-    return is_plateau(distance[near], losses[near], value, beyond=nearest)
+    near = steps.square().mean(1).sqrt() <= farthest
+    return is_plateau(steps[near], losses[near], value, beyond=nearest)
 
 
 def jumps(points: Tensor, losses: Tensor, x: Tensor, value: float, unit: Tensor) -> bool:

@@ -83,7 +83,7 @@ class Pool:
 
     def ties(self, x: Tensor, value: float, distance: float) -> bool:
         """Whether x [n] lies on a plateau, by evaluations farther away than this, root mean square."""
-        return is_plateau((self.points - x).square().mean(1).sqrt(), self.values, value, beyond=distance)
+        return is_plateau(self.points - x, self.values, value, beyond=distance)
 
     def reach(self, x: Tensor) -> float:
         """Return the distance from x [n] to the (n + 1)-th nearest evaluation."""

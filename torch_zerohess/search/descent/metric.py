@@ -182,8 +182,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Count a round that has arrived at a point, or nowhere; end, or start another one."""
         settings = self.settings
         if end is not None:
-            distance = (known.points - end.point).square().mean(1).sqrt()
-            plateau = is_plateau(distance, known.values, end.loss, beyond=settings.tolerance)
+            plateau = is_plateau(known.points - end.point, known.values, end.loss, beyond=settings.tolerance)
             known = known.agreeing(end, settings.tolerance, None if plateau else known.values)
             known = known.arriving(end)
         known = known.ended_round(reason, 0 if last else settings.restarts)

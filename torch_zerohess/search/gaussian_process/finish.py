@@ -18,6 +18,7 @@ from torch_zerohess.search.gaussian_process.progress import ProcessProgress
 from torch_zerohess.search.protocol.state import Evaluated
 from torch_zerohess.search.region.method import RegionDescent
 from torch_zerohess.search.region.progress import RegionProgress
+from torch_zerohess.surrogates.plateau import is_plateau
 
 PATIENCE = 3
 """Evaluations over n + 1 in which the process must find something better."""
@@ -40,6 +41,13 @@ class FinishedProgress(ProcessProgress):
     def handed_over(self) -> bool:
         """Whether it is the turn of another search than the process."""
         return self.finishing
+
+    def is_on_plateau(self, tolerance: float) -> bool:
+        """Judge by the evaluations of the local search where it has found the best point: it has nearer ones."""
+        local, best = self.local, self.best
+        if local is None or not torch.equal(local.best.point, best.point):
+            return super().is_on_plateau(tolerance)
+        return is_plateau(local.points - best.point, local.values, best.loss, beyond=tolerance)
 
 
 F = TypeVar("F", bound=FinishedProgress)

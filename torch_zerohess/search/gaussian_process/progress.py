@@ -56,7 +56,7 @@ class ProcessProgress(Progress):
         then: beside a minimum that was hard to find there may be a lower one that is as hard to find.
         """
         found = self.is_minimum(tolerance)
-        if found or (self.noisy and not self.pool.ties(self.best.point, self.best.loss, tolerance)):
+        if found or (self.noisy and not self.is_on_plateau(tolerance)):
             self = self.arriving(self.best)
         if not found:  # a plateau, or no minimum of the quadratics
             return self
@@ -77,4 +77,8 @@ class ProcessProgress(Progress):
 
     def is_minimum(self, tolerance: float) -> bool:
         """Whether neither noise nor a plateau has chosen the best point."""
-        return not self.noisy and not self.pool.ties(self.best.point, self.best.loss, tolerance)
+        return not self.noisy and not self.is_on_plateau(tolerance)
+
+    def is_on_plateau(self, tolerance: float) -> bool:
+        """Whether evaluations around the best point have exactly its value."""
+        return self.pool.ties(self.best.point, self.best.loss, tolerance)

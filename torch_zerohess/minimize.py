@@ -81,8 +81,8 @@ def minimize(
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
             there is one, give it: each evaluation then tells as many equations as the output has numbers. It may have
             kinks, as a sum of magnitudes or a norm. A point with a number that is not finite in its output has failed,
-            also where the loss ignores that number. Leave constants out: "gaussian_process" ends where little of the
-            loss is left to gain.
+            also where the loss ignores that number. Leave constants out: "gaussian_process" takes fewer evaluations
+            where the loss falls to 0.
         bounds: (lower, upper), numbers or [n] or None; n pairs (lower, upper), a list of tuples or an array [n, 2]; or
             `scipy.optimize.Bounds`. ValueError for two rows of two numbers that can be read either way.
         max_evaluations: points that fn may be called with.

@@ -31,8 +31,8 @@ _WORTH_EARLY = 0.3
 """`_WORTH` right after the first samples. Where outputs have nothing in common, as images of objects that do not
 overlap, an affine output promises to fade the object out: up to a quarter."""
 _ARRIVED, _STRAIGHT = 1e-8, 0.01
-"""`_WORTH` where the process has arrived, and the loss falls nearly straight along the step: its curvature takes away
-less than the second part of the promise."""
+"""`_WORTH` where the process has arrived, and the search would end; or where the loss falls nearly straight along the
+step: its curvature takes away less than the second part of the promise."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""
 
@@ -166,7 +166,8 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         newton, points = self.local.plan(begun, generator)
         if known.due and len(points):
             step = points[0] - newton.lowest.point
-            if 0.5 * newton.size * float(step @ newton.hessian @ step) < _STRAIGHT * newton.promised:
+            bent = 0.5 * newton.size * float(step @ newton.hessian @ step)
+            if known.rounds >= self.settings.restarts or bent < _STRAIGHT * newton.promised:
                 least = min(least, _ARRIVED * abs(best.loss))
         if len(points) and newton.promised > least:
             return replace(known, local=newton, finishing=True, waited=0), points

@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 import torch
-from searches import Linear, misfit, run, waves, zeros
+from searches import Linear, misfit, waves, zeros
 
 import torch_zerohess as zh
 from torch_zerohess.optim import GaussianProcessSearch
@@ -36,13 +36,14 @@ def finishing(found):
     ("n", "seed", "kind"), [(4, 4, "largest"), (4, 1, "curved"), (2, 1, "largest"), (2, 1, "mean"), (2, 5, "curved")]
 )
 def test_at_kinks_gauss_newton_goes_on_from_where_the_process_arrives(n, seed, kind):
-    """By itself the process ends 1e-3 or more of the loss at the start above the minimum.
+    """By itself the process arrives 1e-3 or more of the loss at the start above the minimum, in the first round.
 
     With two parameters its last evaluations are all on a side of the box, and tell no slope across it.
     """
     fn = Linear(n, seed, kind)
-    found = GaussianProcessSearch(zeros(n), sigma=1.0, bounds=(-1, 1), loss=fn.loss, seed=seed, restarts=0)
-    run(found, fn, 200)
+    found = GaussianProcessSearch(zeros(n), sigma=1.0, bounds=(-1, 1), loss=fn.loss, seed=seed, restarts=99)
+    while found.rounds == 0 and found.evaluations < 200:
+        found.tell(fn(found.ask()))
     assert found.solved
     assert fn.excess(found.value) < 1e-6
 
@@ -58,7 +59,7 @@ def test_it_arrives_at_the_last_digit_of_a_smooth_output(seed):
 
 
 def test_the_process_alone_does_not(monkeypatch):
-    for name in ("_WORTH", "_WORTH_EARLY"):
+    for name in ("_WORTH", "_WORTH_EARLY", "_ARRIVED"):
         monkeypatch.setattr(f"torch_zerohess.search.gaussian_process.of_output.{name}", float("inf"))
     found = search()
     while not found.done and found.evaluations < 150:
@@ -113,11 +114,40 @@ def test_it_promises_what_gauss_newton_promises_in_its_turn_and_nothing_before()
 
 
 def test_it_does_not_begin_where_little_is_left_to_gain():
-    found, seen = search(shift=1.0), []
-    while not found.done and found.evaluations < 100:
+    found, seen = search(shift=1.0, restarts=99), []
+    while found.rounds == 0 and found.evaluations < 100:
         found.tell(swing(found.ask()))
         seen.append(finishing(found))
     assert not any(seen)
+
+
+def test_before_the_search_ends_it_begins_where_little_is_left_to_gain():
+    for seed in range(3):
+        found = search(shift=1.0, seed=seed)
+        while not found.done and found.evaluations < 100:
+            found.tell(swing(found.ask()))
+        assert found.solved
+        assert found.value - 1.0 < 1e-14
+
+
+def test_it_finishes_where_a_bound_is_active():
+    """A bump and a line, where the height of the bump is at its bound and the residual is not zero."""
+    places = torch.linspace(0.0, 1.0, 64, dtype=torch.float64)
+
+    def image(x):
+        return x[:, 1:2] * torch.exp(-0.5 * ((places - x[:, :1]) / 0.08).square()) + x[:, 2:] * places
+
+    away = misfit(image, vector(0.62, 1.3, 0.4))
+    for seed in range(4):
+        settings = {"sigma": 0.3, "bounds": (0.0, 1.0), "restarts": 0, "seed": seed}
+        found = GaussianProcessSearch(vector(0.2, 0.8, 0.0), loss=away, **settings)
+        while not found.done and found.evaluations < 100:
+            found.tell(image(found.ask()))
+        slope = torch.func.grad(lambda x: away(image(x[None])[0]))(found.x)
+        assert found.solved
+        assert found.x[1] == 1.0
+        assert slope[1] < 0.0
+        assert float(slope[::2].abs().max()) < 1e-6
 
 
 def test_gauss_newton_finishes_where_the_loss_has_a_constant_that_is_not_left_out():

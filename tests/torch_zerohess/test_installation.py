@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -67,6 +68,14 @@ def test_extension_is_built_and_doctor_says_so():
     assert report.devices[0] == "cpu"
     assert "scalar_rgb" in report.mitsuba
     assert "C++ extension  used" in str(report)
+
+
+def test_the_module_doctor_prints_its_report(capsys, monkeypatch):
+    monkeypatch.setattr(
+        "torch_zerohess.adapters.mitsuba_variants.probe", lambda *_: mitsuba_variants.Probe(False, "no")
+    )
+    runpy.run_path(str(ROOT / "torch_zerohess" / "doctor.py"), run_name="__main__")
+    assert capsys.readouterr().out == f"{zh.doctor()}\n"
 
 
 def test_doctor_says_what_to_install_for_what_is_missing(monkeypatch):

@@ -90,7 +90,8 @@ def minimize(
             and, with `loss` and at least 20 parameters, by the evaluations.
         batch: points that fn gets at once, where the search can use so many: fewer batches, more evaluations. Give the
             number of `workers`, or how many points fn takes at once. See `TrustRegion.ask`.
-        vectorized: False for an fn of one point, [n] -> scalar or [*out].
+        vectorized: False for an fn of one point, [n] -> scalar or [*out]. The point is a tensor, too: NumPy code begins
+            with `x = np.asarray(x)`.
         evaluator: where evaluations run; in this process if None.
         workers: processes in which evaluations run: `evaluator=ProcessPool(workers)`, made and closed here. The result
             does not depend on their number. Most steps are single points: give a `batch`, too, so that all workers
@@ -144,9 +145,9 @@ def minimize(
 
     Ctrl-C ends the search and returns the best point so far; so does the last of `max_evaluations`. Ctrl-C while the
     last checkpoint is written, or while workers end, returns it, too. An exception of fn, loss or callback passes, with
-    the `Minimum` so far as its attribute `minimum`. Ctrl-C and exceptions keep, also in the checkpoint, the points of
-    an interrupted batch whose values are known: with `vectorized=False`, or from an evaluator. Where all values are
-    equal the message says so.
+    the `Minimum` so far as its attribute `minimum`. From Python 3.11 on a note says at which points fn was. Ctrl-C and
+    exceptions keep, also in the checkpoint, the points of an interrupted batch whose values are known: with
+    `vectorized=False`, or from an evaluator. Where all values are equal the message says so.
 
     Example:
         >>> import torch

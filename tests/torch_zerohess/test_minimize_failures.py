@@ -1,6 +1,7 @@
 """Functions that fail at some points, or are rough: the result is the lowest loss that was evaluated, and says so."""
 
 import math
+import sys
 
 import pytest
 import torch
@@ -82,3 +83,40 @@ def test_outputs_that_are_not_finite_have_no_loss(restarts: int | None) -> None:
     assert torch.equal(fit.values.isnan(), fit.points[:, 0] < 0.5)
     assert fit.value == float(fit.values.nan_to_num(math.inf).min())
     assert f"; values or outputs that are not finite, and were left out: {int(fit.values.isnan().sum())}" in fit.message
+
+
+def breaks(z: Tensor) -> Tensor:
+    """At the second point of a batch, or at each point of its own but x0."""
+    if float(z.flatten()[-1]) != 0.0:
+        raise ValueError("lost the scene")
+    return z.square().sum(-1)
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+@pytest.mark.parametrize("workers", [None, 1])
+def test_an_error_says_at_which_point_fn_was(workers) -> None:
+    settings = {"sigma": 1.0, "seed": 0, "noise": 0.0, "engine": "descent"}
+    with pytest.raises(ValueError, match="lost the scene") as raised:
+        zh.minimize(breaks, [0.0], vectorized=False, workers=workers, **settings)
+    note = raised.value.__notes__[-1]
+    assert note.startswith("fn was called at the point [")
+    with pytest.raises(ValueError, match="lost the scene") as raised:
+        zh.minimize(breaks, [0.0], **settings)
+    assert raised.value.__notes__[-1].startswith("fn was called at the points [0], [")
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+def test_an_error_names_the_first_point_without_a_value() -> None:
+    """The first batch has three points, and the second one fails."""
+    calls: list[Tensor] = []
+
+    def fn(x: Tensor) -> float:
+        calls.append(x.clone())
+        if len(calls) == 2:
+            raise ValueError("lost the scene")
+        return float(x.square().sum())
+
+    with pytest.raises(ValueError, match="lost the scene") as raised:
+        zh.minimize(fn, [0.0, 0.0], sigma=1.0, seed=0, noise=0.0, vectorized=False)
+    x, y = calls[-1].tolist()
+    assert raised.value.__notes__ == [f"fn was called at the point [{x:.6g}, {y:.6g}]"]

@@ -169,9 +169,12 @@ class MitsubaScene:
         """Render points [K, n].
 
         Raises:
+            TypeError: x is no tensor.
             ValueError: x has another shape, or is not finite.
             FloatingPointError: a pixel is not finite.
         """
+        if not isinstance(x, Tensor):
+            raise TypeError(f"x must be a tensor [K, {self.n}], got {type(x).__name__}")
         if x.ndim != 2 or x.shape[1] != self.n:
             columns = ", ".join(self.labels)
             raise ValueError(f"x must have shape [K, {self.n}] for {columns}, got {list(x.shape)}")

@@ -7,15 +7,22 @@ from typing import Any
 from torch import Tensor
 
 
-def add_advice(error: Exception, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> None:
+def add_advice(
+    error: Exception, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor], *, vectorized: bool
+) -> None:
     """Add a note to an error that fn raised when it was called for a batch of points [K, n]; before Python 3.11 none.
 
-    A class of black boxes with the attribute `takes_batches` gets none: its errors are no sign of a function of one
-    point. Neither does an error that says what fn must return.
+    A function of one point gets a note only where it mixes arrays and tensors. A class of black boxes with the
+    attribute `takes_batches` gets none: its errors are no sign of a function of one point. Neither does an error that
+    says what fn must return.
     """
     text = str(error)
     by_construction = getattr(getattr(fn, "__self__", fn), "takes_batches", False)
     if by_construction or text.startswith("fn must return") or not hasattr(error, "add_note"):
+        return
+    if "numpy.ndarray" in text and "Tensor" in text:
+        error.add_note(f"fn gets {'points' if vectorized else 'a point'} as a torch.Tensor: np.asarray(x) is the array")
+    if not vectorized:
         return
     if "does not require grad" in text:
         error.add_note(

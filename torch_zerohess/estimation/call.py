@@ -71,8 +71,8 @@ class BlackBoxCall:
                 result = self.evaluator(fn, points, *aux)
         except (IndexError, RuntimeError, TypeError, ValueError) as error:
             raised = isinstance(self.evaluator, Inline) or isinstance(error.__cause__, RemoteTraceback)
-            if raised and self.vectorized and not self.answered:
-                add_advice(error, self.fn, points, aux)
+            if raised and not self.answered:
+                add_advice(error, self.fn, points, aux, vectorized=self.vectorized)
             raise
         values = checked_values(result, points, self.vectorized)
         object.__setattr__(self, "answered", True)

@@ -650,6 +650,8 @@ def test_wrong_points() -> None:
     for wrong in (torch.zeros(3), torch.zeros(2, 4)):
         with pytest.raises(ValueError, match=r"x must have shape \[K, 3\]"):
             scene(wrong)
+    with pytest.raises(TypeError, match=r"x must be a tensor \[K, 3\], got ndarray"):
+        scene(np.zeros((1, 3)))
     with pytest.raises(ValueError, match=r"x must have shape \[3\]"):
         scene.set(torch.zeros(2))
     with pytest.raises(ValueError, match=r"loss must return a tensor with one number per image, got 1.0"):

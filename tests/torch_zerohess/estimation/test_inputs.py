@@ -198,6 +198,15 @@ def test_an_error_of_the_first_batch_says_that_it_was_one(of_one_point, error: t
     assert not hasattr(raised.value, "__notes__")
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+@pytest.mark.parametrize("vectorized", [True, False])
+def test_an_error_of_arrays_and_tensors_says_how_to_make_an_array(vectorized: bool) -> None:
+    with pytest.raises(TypeError, match="numpy") as raised:
+        estimate(lambda z: (np.ones(2) - z[..., 0]).sum(), X, S, vectorized=vectorized)
+    points = "points" if vectorized else "a point"
+    assert raised.value.__notes__[0] == f"fn gets {points} as a torch.Tensor: np.asarray(x) is the array"
+
+
 CALLED = "fn was called as fn(points [7, 2]"
 
 

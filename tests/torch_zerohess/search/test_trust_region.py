@@ -6,6 +6,7 @@ import pytest
 import torch
 from searches import points_of, rays, rays_loss, rosenbrock, zeros
 
+import torch_zerohess as zh
 from torch_zerohess.optim import Descent, GaussianProcessSearch, TrustRegion
 from truths import vector
 
@@ -21,12 +22,25 @@ INFINITE = float("inf")
         (5, (-1.0, 1.0), "descent", "a box of up to 4 parameters, and there are 5$"),
         (1, None, "descent", "not every parameter has finite bounds"),
         (2, (-1.0, vector(1.0, INFINITE)), "descent", "not every parameter has finite bounds"),
+        (2, (-1.0, vector(1.0, 1e200)), "descent", "not every parameter has finite bounds"),
+        (2, (-1.0, vector(1.0, 1e90)), "gaussian_process", "a finite box"),
     ],
 )
 def test_it_chooses_by_the_number_of_parameters_and_the_bounds(n, bounds, engine, reason, loss):
     search = TrustRegion(zeros(n), sigma=1.0, bounds=bounds, loss=loss)
     assert search.engine == engine
     assert re.search(reason, search.reason)
+
+
+@pytest.mark.parametrize("loss", [None, lambda output: output.square().sum()])
+def test_squares_of_distances_in_a_very_wide_box_do_not_overflow(loss):
+    found = zh.minimize(
+        lambda z: z - 3.0 if loss else (z - 3.0).square().sum(1), [0.0], sigma=1.0, loss=loss, bounds=(-1e200, 1e200)
+    )
+    assert found.success
+    assert float(found.x) == pytest.approx(3.0, abs=1e-6)
+    with pytest.raises(ValueError, match=r"must be finite for a Gaussian process.* got bounds 2e\+200 sigma apart for"):
+        TrustRegion(zeros(1), sigma=1.0, bounds=(-1e200, 1e200), loss=loss, engine="gaussian_process")
 
 
 @pytest.mark.parametrize("with_loss", [False, True])

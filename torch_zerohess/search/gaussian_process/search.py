@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import torch
-
 from torch_zerohess.search.gaussian_process.of_loss import LossProcess
 from torch_zerohess.search.gaussian_process.of_output import OutputProcess
 from torch_zerohess.search.protocol.ask_tell import AskTell
@@ -47,6 +45,7 @@ class GaussianProcessSearch(AskTell[Any]):
     Duvenaud, Nickisch and Rasmussen (2011) for additive kernels.
 
     Example:
+        >>> import torch
         >>> target = torch.tensor([0.3, 0.7]).sin()
         >>> search = GaussianProcessSearch(
         ...     torch.zeros(2), sigma=0.5, bounds=(-1.0, 1.0), loss=lambda y: (y - target).square().sum(), seed=0
@@ -64,9 +63,14 @@ class GaussianProcessSearch(AskTell[Any]):
 def process_method(settings: Settings) -> OutputProcess | LossProcess:
     """Return the process of the output if there is a loss, otherwise of the loss. ValueError without a finite box."""
     if not settings.bounded:
-        finite = torch.isfinite(settings.lower) & torch.isfinite(settings.upper)
+        widths = settings.upper - settings.lower
+        far = (
+            f"bounds {float(widths.max()):g} sigma apart"
+            if bool(widths.isfinite().all())
+            else "none or an infinite one"
+        )
         raise ValueError(
-            "bounds must be finite for a Gaussian process, which predicts all over a box, got none or an infinite one "
-            f"for parameter {int((~finite).nonzero()[0])}; Descent needs no bounds"
+            f"bounds must be finite for a Gaussian process, which predicts all over a box, got {far} for parameter "
+            f"{int(widths.argmax())}; Descent needs no bounds"
         )
     return LossProcess(settings) if settings.loss is None else OutputProcess(settings)

@@ -20,6 +20,9 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 
 _AWAY = 2.0
 """Standard deviation of a further start from the first one, where there is no box to draw it from."""
+_WIDEST_BOX = 1e100
+"""Distance between two bounds, in units of the first sigma, from which they count as none: models of the whole box take
+squares of distances in it, which must not overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +54,8 @@ class Settings:
 
     @property
     def bounded(self) -> bool:
-        """Whether every bound is finite."""
-        return bool(torch.isfinite(self.lower).all() and torch.isfinite(self.upper).all())
+        """Whether the bounds are those of a box that a search can look all over: finite, and not too far apart."""
+        return bool((self.upper - self.lower < _WIDEST_BOX).all())
 
     def inside(self, points: Tensor) -> Tensor:
         """Mirror points [K, n] into the bounds."""

@@ -7,6 +7,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -41,7 +42,7 @@ def source(folder: Path) -> Path:
     """A copy of what an installation is built from, without anything built."""
     copy = folder / "source"
     copy.mkdir()
-    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
+    for name in ("setup.py", "pyproject.toml", "MANIFEST.in", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
     for name in ("torch_zerohess", "csrc"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("_C*", "__pycache__"))
@@ -168,3 +169,18 @@ def test_missing_torch_names_the_command(tmp_path):
     )
     assert done.returncode != 0
     assert "pip install 'torch>=2.10'" in done.stderr
+
+
+def test_a_source_distribution_has_the_extension_and_no_tests(tmp_path):
+    """Without `MANIFEST.in` it has those tests alone that lie in no folder."""
+    folder = source(tmp_path)
+    (folder / "tests").mkdir()
+    shutil.copy(ROOT / "tests" / "test_architecture.py", folder / "tests")
+    subprocess.run([sys.executable, "setup.py", "-q", "sdist"], cwd=folder, check=True, capture_output=True)
+    (archive,) = (folder / "dist").iterdir()
+    with tarfile.open(archive) as file:
+        names = {name.partition("/")[2] for name in file.getnames()}
+    needed = {str(path.relative_to(ROOT)) for path in (ROOT / "csrc").iterdir()}
+    needed |= {"setup.py", "pyproject.toml", "README.md", "LICENSE", "torch_zerohess/py.typed"}
+    assert needed <= names
+    assert not any(name.startswith("tests") for name in names)

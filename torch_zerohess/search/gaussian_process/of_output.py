@@ -3,8 +3,8 @@
 Gauss-Newton interpolates outputs next to the minimum (`OutputGaussNewton`). Where it promises much after the first
 samples, as for smooth outputs, it begins at once. If its steps do not keep their promise, as where outputs jump, the
 process goes on alone. Gauss-Newton begins again once its first step promises more than an evaluation of the process has
-gained in the meantime. On a plateau with ripples each step of the process finds something a little better. Where
-nothing much better comes, the process looks where it knows least.
+gained in the meantime, or once the search would end. On a plateau with ripples each step of the process finds something
+a little better. Where nothing much better comes, the process looks where it knows least.
 """
 
 import math

@@ -162,18 +162,21 @@ def test_a_plateau_beside_a_jump_is_not_solved(settings):
 def test_the_hessian_in_a_curved_valley_is_that_of_the_nearest_evaluations_that_tell_it(settings):
     """Steps along the valley say nothing about its walls.
 
-    The standard errors do not contain how curvatures change within the evaluations that are fitted: some percents.
+    The standard errors do not contain how curvatures change within the evaluations that are fitted: some percents. One
+    of ten runs may miss more.
     """
 
     def banana(z):
         return 100.0 * (z[:, 1] - z[:, 0].square()).square() + (1.0 - z[:, 0]).square()
 
-    for seed in range(3):
+    within = 0
+    for seed in range(10):
         fit = zh.minimize(banana, [-1.0, -1.0], sigma=0.5, seed=seed, **settings)
         expected = torch.func.hessian(lambda x: banana(x[None])[0])(fit.x)
         off, errors = (fit.hessian - expected).diagonal().abs(), fit.standard_errors["hessian_diagonal"]
-        assert bool((off < torch.maximum(5 * errors, 0.03 * expected.diagonal())).all())
+        within += bool((off < torch.maximum(5 * errors, 0.03 * expected.diagonal())).all())
         assert bool((errors < 0.2 * expected.diagonal()).all())
+    assert within >= 9
 
 
 def test_a_region_that_shrank_by_mistake_is_no_evidence():

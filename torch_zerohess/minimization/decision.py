@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.minimization.noise import distinct, lowest_mean
+from torch_zerohess.minimization.regression import modelled_minimum
 
 _OTHERS = 2
 """Points with low values, besides the best one and where the search is, that may be best in noise."""
@@ -28,6 +29,7 @@ def decide(
     points: Tensor,
     losses: Tensor,
     likely: list[Tensor],
+    bounds: tuple[Tensor, Tensor],
     before: int,
     most: int,
     noise: float,
@@ -40,7 +42,9 @@ def decide(
         evaluate: points [K, n] -> losses [K].
         points: all evaluations [P, n], in order.
         losses: [P].
-        likely: points [n] that may be best.
+        likely: points [n] that may be best. The minimum of a regression on all evaluations, near the first of them,
+            comes before them, and is trusted.
+        bounds: lower and upper [n].
         before: number of evaluations before the decision. Later evaluations belong to an interrupted decision, and are
             used again if they are of the same points.
         most: evaluations that the decision gets.
@@ -48,6 +52,9 @@ def decide(
         trusted: whether a model of many evaluations has chosen the first of the likely points, see `lowest_mean`.
     """
     lowest = torch.where(torch.isfinite(losses), losses, torch.inf)[:before].argsort()[:_OTHERS]
+    minimum = modelled_minimum(likely[0], points[:before], losses[:before], noise, bounds)
+    if minimum is not None:
+        likely, trusted = [minimum, *likely], True
     candidates = distinct([*likely, *points[lowest]])
     unused = list(range(before, len(points)))
 

@@ -5,13 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_zerohess.minimization.regression import FITTED
 from torch_zerohess.search.trust_region import TrustRegion
 from torch_zerohess.surrogates.noisy_derivatives import noisy_derivatives
 from torch_zerohess.surrogates.quadratic import LocalModel
 from torch_zerohess.surrogates.quadratic_around import quadratic_around
 
-_FITTED = 40
-"""Parameters up to which a quadratic is fitted to all evaluations at the end."""
 _RELIABLE, _MORE_RELIABLE = 0.1, 1e-3
 """Largest relative standard error of its Hessian with which it replaces a model of the loss, and one of the output."""
 _FLAT, _LEVEL = 1e-6, 1e-3
@@ -49,7 +48,7 @@ def is_flat(found: Derivatives, unit: Tensor) -> bool:
         unit: sigma of every parameter [n].
     """
     gradient, hessian, errors = found.gradient, found.hessian, found.standard_errors
-    if gradient is None or hessian is None or errors is None or not 1 < len(unit) <= _FITTED:
+    if gradient is None or hessian is None or errors is None or not 1 < len(unit) <= FITTED:
         return False
     bent, slope = hessian.to(unit) * unit[:, None] * unit, gradient.to(unit) * unit
     if not bool(torch.isfinite(errors["hessian_diagonal"]).all() and torch.isfinite(bent).all()):
@@ -68,7 +67,7 @@ def _model(
     In noise it is better if there are enough of them: its standard errors contain what is not quadratic.
     """
     found, unit = search.model_at_best(x), search.unit
-    if len(x) > _FITTED:
+    if len(x) > FITTED:
         return found
     x, points, losses = x.to(unit) / unit, points.to(unit) / unit, losses.to(unit)
     if noise:

@@ -20,7 +20,9 @@ _BATCHED = 1e-3
 _SHARE, _MOST, _LEAST = 8, 48, 4
 """The part of all evaluations that the decision at the end gets: one in so many, at most and at least so many."""
 _SIGNIFICANT = 2.0
-"""Standard errors by which a mean must be below the mean of a point that is trusted, and a deviation below noise."""
+"""Standard errors by which a deviation must be below noise."""
+_CONTRADICTION = 3.0
+"""Standard errors by which a mean must be below the mean of a point that is trusted: several points are compared."""
 
 
 def differs(one: Tensor, other: Tensor, rounding: float = _ROUNDING) -> bool:
@@ -137,7 +139,7 @@ def lowest_mean(
         noise: standard deviation of a loss. What is measured at the chosen point takes its place if that is larger, or
             significantly smaller: a loss of noisy outputs has less noise where it is lower.
         trusted: whether a model of many evaluations has chosen the first point. Another point then takes its place only
-            if the mean is lower by two standard errors of the difference.
+            if the mean is lower by three standard errors of the difference.
     """
     left, choosing = torch.arange(len(points), device="cpu"), evaluations // 2
     losses = torch.zeros(len(points), 0, dtype=torch.float64, device="cpu")  # of those that are left
@@ -150,7 +152,7 @@ def lowest_mean(
             losses = torch.cat([losses, torch.where(torch.isfinite(told), told, torch.inf)], 1)
             means = losses.mean(1)
             if trusted:
-                means[left == 0] -= _SIGNIFICANT * noise * math.sqrt(2.0 / losses.shape[1])
+                means[left == 0] -= _CONTRADICTION * noise * math.sqrt(2.0 / losses.shape[1])
             better = means.argsort()[: math.ceil(len(left) / 2)]
             left, losses = left[better], losses[better]
     told = evaluate(points[left[:1]].repeat(evaluations, 1))

@@ -220,9 +220,9 @@ class Running:
             return
         self._deciding = before, allowed
         search, believed = self.search, self._believed(before).x
-        points, losses = self.record.keeping(search.untouched, search.x)
+        told, bounds = self.record.keeping(search.untouched, search.x), search.bounds
         likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
-        found = decide(self._evaluated, points, losses, likely, before, allowed, self.noise, trusted=search.averages)
+        found = decide(self._evaluated, *told, likely, bounds, before, allowed, self.noise, trusted=search.averages)
         if found is not None:
             self._decided = Decision(*found, self.evaluations)
         self._deciding = None

@@ -66,7 +66,7 @@ _KERNELS = (
 
 
 class _Choices(NamedTuple):
-    """What C choices of kernel, length and size tell of value, gradient and upper triangle of the Hessian [q]."""
+    """What C choices of kernel, length and size tell of value, gradient, upper triangle of the Hessian, changes [q]."""
 
     evidence: Tensor
     """Log probability [C], up to a constant."""
@@ -74,6 +74,19 @@ class _Choices(NamedTuple):
     """[C, q]"""
     variances: Tensor
     """[C, q]"""
+
+
+class _Told(NamedTuple):
+    """What values around x tell."""
+
+    model: LocalModel
+    """In units of the width."""
+    width: Tensor
+    """[n]"""
+    changes: Tensor
+    """Values at other points less the value at x [C]."""
+    errors: Tensor
+    """Of the changes [C]."""
 
 
 def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -> tuple[LocalModel, Tensor] | None:
@@ -92,6 +105,23 @@ def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -
         The quadratic around x in units of the width, and the width [n], the mean distance along every parameter; None
         if the points do not determine a quadratic.
     """
+    told = _told(x, points, values, noise, x[None][:0])
+    return None if told is None else told[:2]
+
+
+def noisy_changes(
+    x: Tensor, others: Tensor, points: Tensor, values: Tensor, noise: float
+) -> tuple[Tensor, Tensor] | None:
+    """Return the values at other points [C, n] less the value at x, [C], and the standard errors [C]; or None.
+
+    The arguments are those of `noisy_derivatives`, and so are the evaluations that tell.
+    """
+    told = _told(x, points, values, noise, others)
+    return None if told is None else told[2:]
+
+
+def _told(x: Tensor, points: Tensor, values: Tensor, noise: float, others: Tensor) -> _Told | None:
+    """Return what values tell around x [n], by the part of them that has the least error of the Hessian."""
     finite = torch.isfinite(values)
     steps, values, least = points[finite] - x, values[finite], coefficients(len(x)) + _SPARE
     unit = _width(steps)
@@ -100,12 +130,13 @@ def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -
     while count >= least:
         near = order[:count][:: math.ceil(count / most)]
         width = _width(steps[near])
-        model = _model(steps[near] / width, values[near], noise)
-        if model is not None:
-            found.append((float((model.curvature_error * (unit / width).square()).norm()), model, width))
+        told = _model(steps[near] / width, values[near], noise, (others - x) / width)
+        if told is not None:
+            error = float((told[0].curvature_error * (unit / width).square()).norm())
+            found.append((error, _Told(told[0], width, *told[1:])))
         count //= 2
     best = min((one for one in found if math.isfinite(one[0])), key=lambda one: one[0], default=None)
-    return None if best is None else best[1:]
+    return None if best is None else best[1]
 
 
 def _width(steps: Tensor) -> Tensor:
@@ -114,27 +145,34 @@ def _width(steps: Tensor) -> Tensor:
     return torch.where(mean > 0.0, mean, torch.ones_like(mean))
 
 
-def _model(u: Tensor, values: Tensor, noise: float) -> LocalModel | None:
-    """Return the quadratic around 0 given values [P] at u [P, n]; None if they do not determine one."""
+def _model(u: Tensor, values: Tensor, noise: float, others: Tensor) -> tuple[LocalModel, Tensor, Tensor] | None:
+    """Return the quadratic around 0 given values [P] at u [P, n]; None if they do not determine one.
+
+    And the changes of the value from 0 to others [C, n] with their standard errors.
+    """
     largest, n = float(values.abs().max()) or 1.0, u.shape[1]
     values, noise = values / largest, noise / largest  # differences of the largest numbers overflow
     base = values.median()
     spread = float((values - base).abs().max())
     size = max(spread, noise)  # neither the square of a change nor that of the noise overflows
-    choices = _choices(u, (values - base) / size, noise / size) if spread > 0.0 else None
+    choices = _choices(u, (values - base) / size, noise / size, others) if spread > 0.0 else None
     if choices is None:
         return None
     weights = choices.evidence.softmax(0)
     mean = weights @ choices.means
     error = (weights @ (choices.variances + (choices.means - mean).square())).sqrt()
     mean, error = largest * (size * mean), largest * (size * error)
-    slope, bend = error[1 : n + 1], symmetric(error[n + 1 :], n).diagonal()
+    q = coefficients(n)
+    slope, bend = error[1 : n + 1], symmetric(error[n + 1 : q], n).diagonal()
     value = largest * float(base) + float(mean[0])
-    return LocalModel(value, mean[1 : n + 1], symmetric(mean[n + 1 :], n), None, slope, bend)
+    model = LocalModel(value, mean[1 : n + 1], symmetric(mean[n + 1 : q], n), None, slope, bend)
+    return model, mean[q:], error[q:]
 
 
-def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
+def _choices(u: Tensor, change: Tensor, noise: float, others: Tensor) -> _Choices | None:
     """Return what all choices tell at u = 0, given change [P] at u [P, n]; None if u does not determine a quadratic.
+
+    And of the changes from there to others [C, n].
 
     For each kernel and length the process is a sum of features with independent normal weights. The flat prior of the
     quadratic takes its part out of features and values (restricted likelihood). The eigenvectors of what is left serve
@@ -144,15 +182,18 @@ def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
     if factors is None:
         return None
     orthonormal, inverse = factors
-    quadratic = inverse @ (orthonormal.mT @ change)
+    steps = quadratic_terms(others)
+    steps[:, 0] = 0.0
+    sought = torch.cat([inverse, steps @ inverse])
+    quadratic = sought @ (orthonormal.mT @ change)
     rest = change - orthonormal @ (orthonormal.mT @ change)
     known = DEVIATION_DEGREES * noise**2
     degrees = len(u) - len(inverse) + DEVIATION_DEGREES
     ratios = u.new_tensor(_RATIOS)[:, None]
     found = []
     for kernel, length in itertools.product(_KERNELS, _LENGTHS):
-        features, derivatives, missed = _features(u, kernel, length)
-        part = inverse @ (orthonormal.mT @ features)
+        features, derivatives, missed = _features(u, kernel, length, others)
+        part = sought @ (orthonormal.mT @ features)
         spread, axes = torch.linalg.eigh((features - orthonormal @ (orthonormal.mT @ features)).mT @ features)
         pulled = axes.mT @ (features.mT @ rest)
         widened = 1.0 + ratios * spread.clamp_min(0.0)  # [ratios, M]
@@ -163,17 +204,17 @@ def _choices(u: Tensor, change: Tensor, noise: float) -> _Choices | None:
         evidence += _SHORT * math.log(min(length, 1.0)) - _LARGE * ratios[:, 0].log()
         tilt = (derivatives - part) @ axes  # [q, M]
         means = quadratic + (shrunk * pulled) @ tilt.mT
-        certain = inverse.square().sum(1) + shrunk @ tilt.square().mT + ratios * missed
+        certain = sought.square().sum(1) + shrunk @ tilt.square().mT + ratios * missed
         found.append(_Choices(evidence, means, variances[:, None] * certain))
     return _Choices(*(torch.cat(one) for one in zip(*found, strict=True)))
 
 
-def _features(u: Tensor, kernel: _Kernel, length: float) -> tuple[Tensor, Tensor, Tensor]:
+def _features(u: Tensor, kernel: _Kernel, length: float, others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Decompose a process of variance 1 (plus a constant) into features, at most as many as there are points.
 
     Returns:
-        The features at u [P, M]; their value, gradient and upper triangle of the Hessian at 0 [q, M]; and the variances
-        of these [q] that the features miss.
+        The features at u [P, M]; their value, gradient and upper triangle of the Hessian at 0, and their changes from
+        there to others [C, n], [q, M]; and the variances of these [q] that the features miss.
     """
     n = u.shape[1]
     features, chosen = decomposed(u / length, lambda d: kernel.value(d.square()), _UNEXPLAINED, _FEATURES)
@@ -183,10 +224,14 @@ def _features(u: Tensor, kernel: _Kernel, length: float) -> tuple[Tensor, Tensor
     row, column = torch.triu_indices(n, n, device=u.device)
     same = (row == column).to(u)
     bends = 4.0 * second * (to[:, row] * to[:, column]).mT + 2.0 * first * same[:, None]
-    covariance = torch.cat([CONSTANT + kernel.value(square)[None], -2.0 * first * to.mT, bends])
+    moves = others / length
+    between = kernel.value((moves[:, None] - to).square().sum(2)) - kernel.value(square)
+    covariance = torch.cat([CONSTANT + kernel.value(square)[None], -2.0 * first * to.mT, bends, between])
     slope, bend = kernel.first(u.new_zeros(1)), kernel.second(u.new_zeros(1))
-    prior = torch.cat([u.new_full((1,), CONSTANT + 1.0), -2.0 * slope.expand(n), 4.0 * bend * (1.0 + 2.0 * same)])
-    units = length ** torch.cat([u.new_zeros(1), u.new_ones(n), torch.full_like(same, 2.0)])
+    apart = 2.0 - 2.0 * kernel.value(moves.square().sum(1))
+    curved = 4.0 * bend * (1.0 + 2.0 * same)
+    prior = torch.cat([u.new_full((1,), CONSTANT + 1.0), -2.0 * slope.expand(n), curved, apart])
+    units = length ** torch.cat([u.new_zeros(1), u.new_ones(n), torch.full_like(same, 2.0), torch.zeros_like(apart)])
     derivatives = torch.linalg.solve_triangular(features[chosen].tril(), covariance.mT, upper=False).mT
     missed = (prior - derivatives.square().sum(1)).clamp_min(0.0)
     return features, derivatives / units[:, None], missed / units.square()

@@ -455,7 +455,10 @@ def test_two_points_with_low_values_may_be_best_besides_the_likely_ones():
     """The values of a decision are 1 at the lowest point, 0 at the second lowest, -1 at the third and 2 elsewhere."""
     points, losses = torch.arange(5.0).double()[:, None], vector(0.1, 0.2, 0.3, 0.4, 0.5)
     truth = vector(1.0, 0.0, -1.0, 2.0, 2.0)
-    x, value, _ = decide(lambda z: truth[z[:, 0].long()], points, losses, [points[4]], 5, 12, 0.1, trusted=False)
+    bounds = vector(-math.inf), vector(math.inf)
+    x, value, _ = decide(
+        lambda z: truth[z[:, 0].long()], points, losses, [points[4]], bounds, 5, 12, 0.1, trusted=False
+    )
     assert (float(x), value) == (1.0, 0.0)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torch_zerohess.surrogates import noisy_derivatives as module
-from torch_zerohess.surrogates.noisy_derivatives import noisy_derivatives
+from torch_zerohess.surrogates.noisy_derivatives import noisy_changes, noisy_derivatives
 from torch_zerohess.surrogates.quadratic import quadratic_terms
 from truths import normal
 
@@ -73,7 +73,7 @@ def test_one_choice_is_universal_kriging(monkeypatch, kernel, n, length, ratio):
     choose(monkeypatch, kernel, length, ratio)
     u = normal(30, n)
     change = torch.sin(2 * u).sum(1) + 0.05 * normal(30, seed=1)
-    choices = module._choices(u, change, NOISE)
+    choices = module._choices(u, change, NOISE, u[:0])
     _, means, variances = dense(u, change, kernel, length, ratio, NOISE)
     torch.testing.assert_close(choices.means[0], means, rtol=0, atol=1e-4 * float(means.abs().max()))
     torch.testing.assert_close(choices.variances[0].sqrt(), variances.sqrt(), rtol=1e-3, atol=0)
@@ -87,7 +87,7 @@ def test_choices_have_the_evidence_of_universal_kriging(monkeypatch):
         with monkeypatch.context() as patch:
             choose(patch, kernel, length, ratio)
             prior = 6 * math.log(min(length, 1.0)) - 0.1 * math.log(ratio)
-            found.append(float(module._choices(u, change, NOISE).evidence) - prior)
+            found.append(float(module._choices(u, change, NOISE, u[:0]).evidence) - prior)
         truth.append(dense(u, change, kernel, length, ratio, NOISE)[0])
     assert [one - found[0] for one in found] == pytest.approx([one - truth[0] for one in truth], abs=1e-3)
 
@@ -97,7 +97,7 @@ def test_the_choices_are_averaged(monkeypatch):
     means, variances = normal(2, 6), normal(2, 6, seed=1).square()
     weights = torch.tensor([0.25, 0.75], dtype=torch.float64)
     two = module._Choices(weights.log() + 5.0, means, variances)
-    monkeypatch.setattr(module, "_choices", lambda u, change, noise: two)
+    monkeypatch.setattr(module, "_choices", lambda u, change, noise, others: two)
     points = normal(12, 2)
     model, _ = noisy_derivatives(points.new_zeros(2), points, 2.0 * torch.eye(12, dtype=torch.float64)[0], NOISE)
     size = 2.0  # the largest distance of a value from their median
@@ -200,9 +200,9 @@ def test_what_few_features_miss_is_in_the_errors(monkeypatch):
     u = normal(60, 2)
     change = torch.sin(3 * u).sum(1)
     choose(monkeypatch, 1, 0.5, 100.0)
-    exact = module._choices(u, change, NOISE).variances
+    exact = module._choices(u, change, NOISE, u[:0]).variances
     monkeypatch.setattr(module, "_FEATURES", 10)
-    few = module._choices(u, change, NOISE).variances
+    few = module._choices(u, change, NOISE, u[:0]).variances
     assert bool((few[0, 1:] > 0.9 * exact[0, 1:]).all())
 
 
@@ -248,3 +248,35 @@ def test_the_largest_losses_do_not_overflow():
     error = model.full_hessian().diagonal() / width**2 - 2.0
     assert bool((error.abs() < 4 * model.full_errors()[1] / width**2).all())
     assert bool((model.full_errors()[1] / width**2 < 2.0).all())
+
+
+@pytest.mark.parametrize("kernel", [0, 1])
+def test_a_change_is_that_of_universal_kriging(monkeypatch, kernel):
+    """At both of its points, which are known exactly but for noise that is far smaller than the process."""
+    choose(monkeypatch, kernel, 1.0, 1e6)
+    u = normal(40, 2)
+    change = torch.sin(2 * u).sum(1)
+    choices = module._choices(torch.cat([u, u.new_zeros(1, 2)]), torch.cat([change, change.new_zeros(1)]), 1e-6, u[:5])
+    torch.testing.assert_close(choices.means[0, -5:], change[:5], rtol=0, atol=1e-3)
+    assert float(choices.variances[0, -5:].max()) < 1e-4
+
+
+def test_changes_between_points_and_their_errors():
+    """Over 40 sets of values of cosh, (change - truth) / error has size 1; nearer points are known better."""
+    generator, scores, errors = torch.Generator().manual_seed(0), [], []
+    others = torch.tensor([[0.1, 0.0], [0.5, -0.3], [-1.0, 0.4]], dtype=torch.float64)
+    for _ in range(40):
+        points = torch.randn(60, 2, generator=generator, dtype=torch.float64)
+        values = points.cosh().sum(1) + NOISE * torch.randn(60, generator=generator, dtype=torch.float64)
+        change, error = noisy_changes(points.new_zeros(2), others, points, values, NOISE)
+        scores.append((change - (others.cosh().sum(1) - 2.0)) / error)
+        errors.append(error)
+    rms = torch.stack(scores).square().mean(0).sqrt()
+    assert bool((rms < 1.0 + 5 / math.sqrt(2 * 40)).all())
+    assert bool((rms > 0.3).all())
+    assert torch.stack(errors).median(0).values.argsort().tolist() == [0, 1, 2]
+
+
+def test_few_values_tell_no_changes():
+    points = normal(8, 2)
+    assert noisy_changes(points[0], points, points, points.square().sum(1), NOISE) is None

@@ -63,6 +63,11 @@ class Standing(ABC, Generic[P]):
         return self._space.unit.clone()
 
     @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds [n], infinite where there are none."""
+        return self._space.lower, self._space.upper
+
+    @property
     def evaluations(self) -> int:
         """Values told so far."""
         return self._state.progress.evaluations

@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.minimization.noise import distinct, lowest_mean
-from torch_zerohess.minimization.regression import modelled_minimum
+from torch_zerohess.minimization.record import Record
+from torch_zerohess.minimization.regression import modelled_minimum, regression
+from torch_zerohess.search.trust_region import TrustRegion
 
 _OTHERS = 2
 """Points with low values, besides the best one and where the search is, that may be best in noise."""
@@ -26,33 +28,32 @@ class Decision:
 
 def decide(
     evaluate: Callable[[Tensor], Tensor],
-    points: Tensor,
-    losses: Tensor,
+    record: Record,
+    search: TrustRegion,
     likely: list[Tensor],
-    bounds: tuple[Tensor, Tensor],
     before: int,
     most: int,
     noise: float,
-    *,
-    trusted: bool,
 ) -> tuple[Tensor, float, float] | None:
     """Evaluate the best points again; return the point with the lowest mean, the mean, and its standard error.
 
+    The minimum of a regression on all evaluations is the first of these points, and is trusted, see `lowest_mean`.
+    Without one, the first of the likely points is trusted if a model of many evaluations has chosen it.
+
     Args:
         evaluate: points [K, n] -> losses [K].
-        points: all evaluations [P, n], in order.
-        losses: [P].
-        likely: points [n] that may be best. The minimum of a regression on all evaluations, near the first of them,
-            comes before them, and is trusted.
-        bounds: lower and upper [n].
+        record: all evaluations.
+        search: whose evaluations they are.
+        likely: points [n] that may be best.
         before: number of evaluations before the decision. Later evaluations belong to an interrupted decision, and are
             used again if they are of the same points.
         most: evaluations that the decision gets.
         noise: standard deviation of a loss.
-        trusted: whether a model of many evaluations has chosen the first of the likely points, see `lowest_mean`.
     """
+    points, losses = record.keeping(search.untouched, search.x)
     lowest = torch.where(torch.isfinite(losses), losses, torch.inf)[:before].argsort()[:_OTHERS]
-    minimum = modelled_minimum(likely[0], points[:before], losses[:before], noise, bounds)
+    told, trusted = regression(record, search, before, noise), search.averages
+    minimum = None if told is None else modelled_minimum(likely[0], told, search.bounds)
     if minimum is not None:
         likely, trusted = [minimum, *likely], True
     candidates = distinct([*likely, *points[lowest]])

@@ -10,6 +10,9 @@ from torch import Tensor
 from torch_zerohess.estimation.inputs import short
 from torch_zerohess.minimization.doubt import DEEP, is_unbounded
 
+_HELD = 1 << 22
+"""Numbers of outputs that are kept, at most."""
+
 Call = Callable[[Tensor], tuple[list[int], Tensor, BaseException | None]]
 """Evaluate points [K, n]: the numbers of those that have a value, these values [k, *out], and what was raised."""
 
@@ -34,6 +37,10 @@ class Record:
         """Points [K, n] and losses [K] of the last complete request."""
         self.complete = 0
         """Evaluations of complete requests."""
+        self.keeps_outputs = True
+        """Whether the outputs of further requests are kept."""
+        self._outputs = [x0.new_empty(0, 0)]
+        """Of the last complete evaluations [k, *out], in batches."""
 
     @property
     def known(self) -> int:
@@ -85,6 +92,7 @@ class Record:
 
     def note(self, points: Tensor, losses: Tensor) -> None:
         """Add points [K, n] and losses [K] to the record, and close the request."""
+        self._outputs = self._with_outputs(len(points))
         self.last = points, losses
         self._batches.append(self.last)
         self.complete += len(points)
@@ -101,6 +109,20 @@ class Record:
         if untouched is None:
             return points, losses
         return points, torch.where((points == x)[:, untouched].all(1), losses, torch.nan)
+
+    def outputs(self, count: int) -> tuple[int, Tensor]:
+        """Return the outputs [k, *out] that are kept of the first `count` evaluations, and the number of the first."""
+        kept = torch.cat(self._outputs)
+        first = self.complete - len(kept)
+        return first, kept[: max(count - first, 0)]
+
+    def _with_outputs(self, count: int) -> list[Tensor]:
+        """Return the kept outputs with those of a request of `count` points; without earlier ones if they are many."""
+        values = self._sorted()
+        if not self.keeps_outputs or values.ndim < 2 or len(values) != count:
+            return [values.new_empty(0, 0)]
+        kept = [one for one in self._outputs if len(one)]
+        return [*kept, values] if sum(map(torch.numel, kept)) + values.numel() <= _HELD else [values]
 
     def mean_at(self, x: Tensor) -> Tensor:
         """Return the mean of the finite losses at a point [n]."""
@@ -122,7 +144,7 @@ class Record:
         """Everything, for `load_state_dict`."""
         points, losses = _joined(self._batches)
         request = None if self.requested is None else (self.requested, list(self._numbers), self._values)
-        return {"points": points, "values": losses, "request": request}
+        return {"points": points, "values": losses, "request": request, "outputs": torch.cat(self._outputs)}
 
     def load_state_dict(self, state: dict[str, Any], like: Tensor) -> None:
         """Go on from a state, on the device of the start `like` [n]. ValueError if it has another start or type."""
@@ -132,6 +154,7 @@ class Record:
         if points.shape[1:] == like.shape and len(points) and not torch.equal(points[0].to(like.device), like):
             raise ValueError(f"x0 must be {short(points[0])} as there, got {short(like)}")
         self._batches, self.complete = [(points.to(like.device), losses.to(like.device))], len(points)
+        self._outputs = [state["outputs"].to(like.device)]
         if state["request"] is not None:
             requested, self._numbers, values = state["request"]
             self.requested, self._values = requested.to(like.device), values.to(like.device)

@@ -167,6 +167,7 @@ class Running:
             self._noted(points, losses)
             return
         self.noise = self.noise or 0.0
+        self.record.keeps_outputs = self.noise > 0.0
         values = self.record.values(points)
         # A search that begins again in noise may get no value at its start, where there was one before.
         lost = self.begun and not search.evaluations and values.ndim == 1 and not bool(torch.isfinite(values[0]))
@@ -220,9 +221,8 @@ class Running:
             return
         self._deciding = before, allowed
         search, believed = self.search, self._believed(before).x
-        told, bounds = self.record.keeping(search.untouched, search.x), search.bounds
         likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
-        found = decide(self._evaluated, *told, likely, bounds, before, allowed, self.noise, trusted=search.averages)
+        found = decide(self._evaluated, self.record, search, likely, before, allowed, self.noise)
         if found is not None:
             self._decided = Decision(*found, self.evaluations)
         self._deciding = None

@@ -52,7 +52,7 @@ class TrustRegion(AskTell[Any]):
         tolerance: length, in units of the first sigma, below which the search has arrived; 0.01 if None, for the
             engine "local" 0.0005.
         noise: standard deviation of repeated losses at one point, if it is known. The engine "local", and descent on
-            the output of more than two parameters, use only whether it is above 0.
+            an output, use only whether it is above 0.
         pool: evaluations kept; a default by the number of parameters if None. Not for the engine "local".
         grid: rows and columns in which the parameters lie, for the engine "local": see `LocalGaussNewton`.
         seed: of the samples; from torch's global generator if None.

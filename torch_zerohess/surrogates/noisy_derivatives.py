@@ -20,13 +20,13 @@ from torch_zerohess.surrogates.gaussian_process import CONSTANT, DEVIATION_DEGRE
 from torch_zerohess.surrogates.inducing import decomposed
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, factored, quadratic_terms, symmetric
 
-_LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
+LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Lengths of the process, in units of the width."""
-_RATIOS = tuple(10.0**exponent for exponent in range(-6, 7))
+RATIOS = tuple(10.0**exponent for exponent in range(-6, 7))
 """Variances of the process, in units of the variance of the noise."""
-_SPARE = 5
+SPARE = 5
 """Values beyond the coefficients of a quadratic, at least."""
-_MOST = 1000
+MOST = 1000
 """Values that are used at a time: at most so many, or twice as many as are needed. Of more every k-th is used."""
 _FEATURES = 150
 """Features of the process, at most."""
@@ -51,7 +51,7 @@ def _root(square: Tensor) -> Tensor:
     return (5.0 * square).sqrt()
 
 
-_KERNELS = (
+KERNELS = (
     _Kernel(
         lambda s: torch.exp(-0.5 * s),
         lambda s: -0.5 * torch.exp(-0.5 * s),
@@ -123,13 +123,13 @@ def noisy_changes(
 def _told(x: Tensor, points: Tensor, values: Tensor, noise: float, others: Tensor) -> _Told | None:
     """Return what values tell around x [n], by the part of them that has the least error of the Hessian."""
     finite = torch.isfinite(values)
-    steps, values, least = points[finite] - x, values[finite], coefficients(len(x)) + _SPARE
-    unit = _width(steps)
+    steps, values, least = points[finite] - x, values[finite], coefficients(len(x)) + SPARE
+    unit = mean_length(steps)
     order = (steps / unit).norm(dim=1).argsort(stable=True)
-    found, count, most = [], len(order), max(_MOST, 2 * least)
+    found, count, most = [], len(order), max(MOST, 2 * least)
     while count >= least:
         near = order[:count][:: math.ceil(count / most)]
-        width = _width(steps[near])
+        width = mean_length(steps[near])
         told = _model(steps[near] / width, values[near], noise, (others - x) / width)
         if told is not None:
             error = float((told[0].curvature_error * (unit / width).square()).norm())
@@ -139,7 +139,7 @@ def _told(x: Tensor, points: Tensor, values: Tensor, noise: float, others: Tenso
     return None if best is None else best[1]
 
 
-def _width(steps: Tensor) -> Tensor:
+def mean_length(steps: Tensor) -> Tensor:
     """Return the mean length [n] of steps [P, n] along every parameter; 1 where there are none."""
     mean = steps.abs().mean(0)
     return torch.where(mean > 0.0, mean, torch.ones_like(mean))
@@ -189,10 +189,10 @@ def _choices(u: Tensor, change: Tensor, noise: float, others: Tensor) -> _Choice
     rest = change - orthonormal @ (orthonormal.mT @ change)
     known = DEVIATION_DEGREES * noise**2
     degrees = len(u) - len(inverse) + DEVIATION_DEGREES
-    ratios = u.new_tensor(_RATIOS)[:, None]
+    ratios = u.new_tensor(RATIOS)[:, None]
     found = []
-    for kernel, length in itertools.product(_KERNELS, _LENGTHS):
-        features, derivatives, missed = _features(u, kernel, length, others)
+    for kernel, length in itertools.product(KERNELS, LENGTHS):
+        features, derivatives, missed = process_features(u, kernel, length, others)
         part = sought @ (orthonormal.mT @ features)
         spread, axes = torch.linalg.eigh((features - orthonormal @ (orthonormal.mT @ features)).mT @ features)
         pulled = axes.mT @ (features.mT @ rest)
@@ -201,7 +201,7 @@ def _choices(u: Tensor, change: Tensor, noise: float, others: Tensor) -> _Choice
         squares = rest.square().sum() - shrunk @ pulled.square() + known
         variances = squares.clamp_min(torch.finfo(u.dtype).tiny * degrees) / degrees
         evidence = -0.5 * (degrees * variances.log() + widened.log().sum(1))
-        evidence += _SHORT * math.log(min(length, 1.0)) - _LARGE * ratios[:, 0].log()
+        evidence += log_prior(length, ratios[:, 0])
         tilt = (derivatives - part) @ axes  # [q, M]
         means = quadratic + (shrunk * pulled) @ tilt.mT
         certain = sought.square().sum(1) + shrunk @ tilt.square().mT + ratios * missed
@@ -209,7 +209,12 @@ def _choices(u: Tensor, change: Tensor, noise: float, others: Tensor) -> _Choice
     return _Choices(*(torch.cat(one) for one in zip(*found, strict=True)))
 
 
-def _features(u: Tensor, kernel: _Kernel, length: float, others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def log_prior(length: float, ratios: Tensor) -> Tensor:
+    """Return the log of the prior of a process with a length and variances [R] in units of the noise."""
+    return _SHORT * math.log(min(length, 1.0)) - _LARGE * ratios.log()
+
+
+def process_features(u: Tensor, kernel: _Kernel, length: float, others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Decompose a process of variance 1 (plus a constant) into features, at most as many as there are points.
 
     Returns:

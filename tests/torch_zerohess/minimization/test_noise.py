@@ -11,6 +11,7 @@ import torch_zerohess as zh
 from torch_zerohess.minimization.belief import believed
 from torch_zerohess.minimization.decision import decide
 from torch_zerohess.minimization.noise import REPEATED, differs, distinct, lowest_mean, reserved
+from torch_zerohess.minimization.record import Record
 from truths import vector
 
 
@@ -455,10 +456,10 @@ def test_two_points_with_low_values_may_be_best_besides_the_likely_ones():
     """The values of a decision are 1 at the lowest point, 0 at the second lowest, -1 at the third and 2 elsewhere."""
     points, losses = torch.arange(5.0).double()[:, None], vector(0.1, 0.2, 0.3, 0.4, 0.5)
     truth = vector(1.0, 0.0, -1.0, 2.0, 2.0)
-    bounds = vector(-math.inf), vector(math.inf)
-    x, value, _ = decide(
-        lambda z: truth[z[:, 0].long()], points, losses, [points[4]], bounds, 5, 12, 0.1, trusted=False
-    )
+    search = zh.optim.TrustRegion([0.0], sigma=1.0, noise=0.1, seed=0)
+    record = Record(None, None, search.x)
+    record.note(points, losses)
+    x, value, _ = decide(lambda z: truth[z[:, 0].long()], record, search, [points[4]], 5, 12, 0.1)
     assert (float(x), value) == (1.0, 0.0)
 
 

@@ -40,8 +40,8 @@ class OutputDescentProgress(Progress):
 class OutputDescent(Relay[OutputDescentProgress]):
     """The method of `Descent` for an output under a loss. In noise, and above 40 parameters, it only follows.
 
-    With one or two parameters it begins with Gauss-Newton: a quadratic of the loss, by which the descent goes on
-    there, predicts no output.
+    With one or two parameters, and no noise, it begins with Gauss-Newton: a quadratic of the loss, by which the descent
+    goes on there, predicts no output.
     """
 
     engine = "descent"

@@ -37,7 +37,8 @@ class Descent(AskTell[Any]):
       minimum of loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises
       for a while. It uses only whether there is `noise`, not how much.
     - Gauss-Newton by interpolation, in a trust region, goes on where a step was predicted well, until its steps fail.
-      With one or two parameters it begins. It takes up to 40 parameters, and no noise.
+      With one or two parameters it begins. It takes up to 40 parameters, and no noise. In noise the search follows the
+      smoothed output with any number of parameters.
 
     "3 fits" are three times as many evaluations as a fit takes. After an arrival, possibly at a local minimum, the
     search starts again, up to `restarts` times: from a random point, or in turn from a random point and around the best

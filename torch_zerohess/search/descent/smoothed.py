@@ -18,7 +18,8 @@ from torch_zerohess.surrogates.pool import Pool
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 _FEW = 2
-"""Parameters up to which a full quadratic of the loss takes so few evaluations that an output is not needed."""
+"""Parameters up to which a full quadratic of the loss takes so few evaluations that an output is not needed. In noise
+each number of the output tells something."""
 _ENOUGH = 4
 """Near evaluations, besides the center, that a model needs at least; n if that is less."""
 _SHARPNESS = 0.1
@@ -54,7 +55,7 @@ class SmoothedQuadratics(Method[DescentProgress]):
         super().__init__(settings)
         self._arrives = arrives
         self._n = n = settings.n
-        self.follows = settings.loss is not None and n > _FEW
+        self.follows = settings.loss is not None and (n > _FEW or settings.noise > 0.0)
         """Whether it models the output, not the loss."""
         self._loss = settings.loss if self.follows else None
         self.capacity = settings.pool or _capacity(n, loss_alone=settings.loss is None)

@@ -393,13 +393,16 @@ def test_a_round_without_finite_values_has_not_arrived(lost, arrives):
     assert (ended.rounds, ended.lost) == (1, 0)
 
 
-@pytest.mark.parametrize(("n", "follows"), [(1, False), (2, False), (3, True)])
-def test_an_output_is_followed_from_three_parameters_on(n, follows, monkeypatch):
-    """Of up to two parameters the quadratic is of the loss."""
+@pytest.mark.parametrize(("n", "noise", "follows"), [(1, 0.0, False), (2, 0.0, False), (3, 0.0, True), (1, 0.1, True)])
+def test_an_output_is_followed_from_three_parameters_on(n, noise, follows, monkeypatch):
+    """Of up to two parameters the quadratic is of the loss, if there is no noise."""
     fitted = []
     for name in ("fit_values", "fit_outputs"):
         fit = getattr(pool_quadratic, name)
         monkeypatch.setattr(pool_quadratic, name, lambda *told, name=name, fit=fit: fitted.append(name) or fit(*told))
-    search = Descent(zeros(n), sigma=1.0, loss=torch.sum, noise=0.1, seed=0)  # in noise it only follows
-    search.tell(search.ask().square())
+    follow = Descent(zeros(n), sigma=1.0, loss=torch.sum, noise=noise, seed=0)._method._follow
+    known, points = follow.first(torch.Generator())
+    outputs = points.square()
+    evaluated = Evaluated(points, outputs.sum(1), outputs, points.shape[1:])
+    follow.next(known, evaluated, torch.Generator())
     assert set(fitted) == {"fit_outputs" if follows else "fit_values"}

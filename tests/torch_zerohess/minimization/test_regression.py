@@ -61,10 +61,12 @@ def test_a_minimum_that_is_no_lower_for_sure_leaves_x():
 
 
 def test_the_minimum_is_within_the_bounds():
+    """u^2 + v^2 + 1.5 u v of u, v = x - 0.3 and u <= -0.2: the minimum has v = -0.75 u."""
     upper = vector(0.1, 2.0)
-    x = modelled_minimum(vector(-0.5, 1.0), around(quadratic, 0.01, 0), (-upper, upper))
+    told = around(lambda z: quadratic(z) + 1.5 * (z[:, 0] - 0.3) * (z[:, 1] - 0.3), 0.01, 0)
+    x = modelled_minimum(vector(-0.5, 1.0), told, (-upper, upper))
     assert float(x[0]) == 0.1
-    assert float(x[1]) == pytest.approx(0.3, abs=0.02)
+    assert float(x[1]) == pytest.approx(0.45, abs=0.02)
 
 
 def test_a_step_is_no_longer_than_the_evaluations_are_wide():

@@ -145,3 +145,12 @@ def test_a_record_keeps_the_latest_outputs(monkeypatch):
     record.keeps_outputs = False
     evaluate(3)
     assert len(record.outputs(12)[1]) == 0
+
+
+def test_a_loss_counts_only_where_untouched_parameters_stay():
+    points, losses = torch.stack([vector(0.0, 0.0), vector(0.0, 1.0)]), vector(3.0, 2.0)
+    record = Record(None, None, points[0])
+    record.note(points, losses)
+    kept = record.keeping(torch.tensor([False, True]), vector(5.0, 0.0))[1]
+    assert kept.isnan().tolist() == [False, True]
+    assert torch.equal(record.keeping(None, points[0])[1], losses)

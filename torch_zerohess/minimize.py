@@ -132,11 +132,11 @@ def minimize(
             be equal by chance; six times where there are only two different losses. If values differ, the search begins
             again at x as one in noise. Give the noise if fn has no noise at x0, as on a plateau. The noise is taken to
             be the same everywhere. In noise, an eighth of `max_evaluations` (4 to 48) is kept for the end: the best
-            candidates are evaluated again. With up to 40 parameters the first candidate is the minimum of a
-            regression on all evaluations, and x unless the mean of another one is lower by three standard errors.
-            Otherwise x is the candidate with the lowest mean. `value` is the mean at x and `value_error` its standard
-            error. No call of fn has a point twice, because noise may be the same for all
-            points of a call: repeated points are evaluated at once only in several processes.
+            candidates are evaluated again. With up to 40 parameters the minimum of a regression on all evaluations is
+            the first candidate. It is x unless the mean at another candidate is lower by three standard errors.
+            Without a regression, x is the candidate with the lowest mean. `value` is the mean at x and `value_error`
+            its standard error. No call of fn has a point twice, because noise may be the same for all points of a call:
+            repeated points are evaluated at once only in several processes.
         memory: keeps every evaluation of this call, the outputs of fn before `loss`, for a later `estimate` or
             `BlackBox` of the same fn, also if the call is interrupted or fails. Evaluations before a checkpoint are not
             in it. The search does not read the memory: the result is the same as without one. The next `estimate`

@@ -1,8 +1,7 @@
 """Derivatives of a loss of noisy outputs at a point, from a regression of the outputs around it.
 
 Every number of the output has a model as in `noisy_derivatives`: a quadratic with a flat prior, plus a Gaussian
-process.
-All numbers share the process, and the likeliest choice of kernel, length and size is the only one used.
+process. Kernel, length and size of the process are the likeliest ones for all numbers together.
 
 The standard errors take errors of the numbers as independent. Outputs that bend in the same way err together, so the
 standard errors may be half of the true ones.

@@ -2,6 +2,7 @@
 
 from torch import Tensor
 
+from torch_zerohess.estimation.advice import add_note
 from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.evaluators.batch import numbers as numbers_of
 from torch_zerohess.evaluators.finished import finished_values
@@ -32,9 +33,8 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
             numbers, values = finished_values(error, given)
             if isinstance(error, Exception):
                 one_by_one = isinstance(call.evaluator, Inline) and not call.vectorized
-                _say_where(
-                    error, [points[k] for k in range(len(points)) if k not in numbers][: 1 if one_by_one else None]
-                )
+                left = [points[k] for k in range(len(points)) if k not in numbers]
+                _say_where(error, left[:1] if one_by_one else left)
         if scalar and numbers and values.shape[1:] not in ((), (1,)):
             raise failure or ValueError(
                 f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
@@ -49,9 +49,7 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
 
 
 def _say_where(error: Exception, points: list[Tensor]) -> None:
-    """Add a note to an error that says at which point [n], or at which of several, fn was; before Python 3.11 none."""
-    if points and hasattr(error, "add_note"):
-        places = ", ".join(f"[{numbers_of(one)}]" for one in points[:_NAMED]) + (
-            ", ..." if len(points) > _NAMED else ""
-        )
-        error.add_note(f"fn was called at the point{'s' if len(points) > 1 else ''} {places}")
+    """Add a note to an error that says at which point [n], or at which of several, fn was."""
+    if points:
+        places = [f"[{numbers_of(one)}]" for one in points[:_NAMED]] + ["..."] * (len(points) > _NAMED)
+        add_note(error, f"fn was called at the point{'s' if len(points) > 1 else ''} {', '.join(places)}")

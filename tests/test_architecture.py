@@ -32,7 +32,7 @@ LAYERS = {
         ),
         *(f"search.{one}" for one in ("protocol", "region", "gauss_newton", "descent", "sparse", "gaussian_process")),
         *("search.descent_and_gaussian_process", "search.sparse_or_dense", "search.trust_region"),
-        *("optim", "minimization", "minimize", "adapters", "doctor"),
+        *("optim", "minimization", "minimize", "adapters", "doctor", "__main__"),
     ],
     "experiments": [
         *("arguments", "problems", "runs", "methods", "ensembles", "reports", "studies"),

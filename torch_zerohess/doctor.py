@@ -46,8 +46,7 @@ class Report:
 def doctor() -> Report:
     """Find out what works here; nothing it tries can abort the process. Takes some seconds where Mitsuba is installed.
 
-    `print(doctor())` prints the report. So does `python -m torch_zerohess.doctor`, after a warning of Python that the
-    package has imported this module already.
+    `print(doctor())` prints the report, and so does `python -m torch_zerohess`.
 
     Example:
         >>> doctor().devices[0]
@@ -88,7 +87,3 @@ def _extras() -> dict[str, list[str]]:
         if name and extra and extra[1] not in _DEVELOPERS and name[0].replace("-", "_") != _NAME:
             found.setdefault(extra[1], []).append(name[0])
     return found
-
-
-if __name__ == "__main__":
-    print(doctor())

@@ -71,11 +71,11 @@ def test_extension_is_built_and_doctor_says_so():
     assert "C++ extension  used" in str(report)
 
 
-def test_the_module_doctor_prints_its_report(capsys, monkeypatch):
+def test_the_package_as_a_program_prints_the_report(capsys, monkeypatch):
     monkeypatch.setattr(
         "torch_zerohess.adapters.mitsuba_variants.probe", lambda *_: mitsuba_variants.Probe(False, "no")
     )
-    runpy.run_path(str(ROOT / "torch_zerohess" / "doctor.py"), run_name="__main__")
+    runpy.run_module("torch_zerohess", run_name="__main__")
     assert capsys.readouterr().out == f"{zh.doctor()}\n"
 
 

@@ -43,7 +43,7 @@ def test_x_is_as_exact_as_all_evaluations_together():
         fit = zh.minimize(f, [1.0, 1.0], sigma=0.5, bounds=(-2, 2), max_evaluations=150, seed=seed)
         ends.append(float(quadratic(fit.x[None])))
         assert abs(fit.value - ends[-1]) < 5 * fit.value_error
-        assert bool((fit.gradient.abs() < 3 * fit.standard_errors["gradient"]).all())
+        assert bool((fit.gradient.abs() < 5 * fit.standard_errors["gradient"]).all())
     assert statistics.median(ends) < 1e-5
 
 

@@ -37,13 +37,13 @@ def test_a_narrow_valley(n, most, seed):
 
 
 def test_errors_of_a_hessian_make_no_valley():
-    """The loss is round at its minimum. Four searches divide it by more than 500 in fewer than 560 evaluations."""
+    """The loss is round at its minimum. Eight searches divide it by more than 500 in fewer than 1 300 evaluations."""
     count = 0
-    for seed in range(4):
+    for seed in range(8):
         start = 1.0 + 4.0 * torch.rand(10, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         search = Descent(start, sigma=2.0, seed=seed, restarts=0)
         count += evaluations_to(search, lambda z: (1.0 + 10.0 * z.square()).sqrt().sum(1) - 10.0, 0.03)
-    assert count < 560
+    assert count < 1300
 
 
 def test_curvatures_that_may_be_errors():

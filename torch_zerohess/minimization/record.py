@@ -11,7 +11,7 @@ from torch_zerohess.estimation.inputs import short
 from torch_zerohess.minimization.doubt import DEEP, is_unbounded
 
 _HELD = 1 << 22
-"""Numbers of outputs that are kept, at most."""
+"""Numbers of outputs that are kept, at most; the last request is kept whole."""
 
 Call = Callable[[Tensor], tuple[list[int], Tensor, BaseException | None]]
 """Evaluate points [K, n]: the numbers of those that have a value, these values [k, *out], and what was raised."""

@@ -11,7 +11,7 @@ alone the standard errors are too small.
 import itertools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,9 +24,9 @@ LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Lengths of the process, in units of the width."""
 RATIOS = tuple(10.0**exponent for exponent in range(-6, 7))
 """Variances of the process, in units of the variance of the noise."""
-SPARE = 5
+_SPARE = 5
 """Values beyond the coefficients of a quadratic, at least."""
-MOST = 1000
+_MOST = 1000
 """Values that are used at a time: at most so many, or twice as many as are needed. Of more every k-th is used."""
 _FEATURES = 150
 """Features of the process, at most."""
@@ -37,6 +37,9 @@ _SHORT = 6.0
 large derivatives."""
 _LARGE = 0.1
 """The prior of a ratio is its power with minus this exponent: a process is small if the values do not tell its size."""
+
+
+T = TypeVar("T")
 
 
 class _Kernel(NamedTuple):
@@ -123,17 +126,32 @@ def noisy_changes(
 def _told(x: Tensor, points: Tensor, values: Tensor, noise: float, others: Tensor) -> _Told | None:
     """Return what values tell around x [n], by the part of them that has the least error of the Hessian."""
     finite = torch.isfinite(values)
-    steps, values, least = points[finite] - x, values[finite], coefficients(len(x)) + SPARE
-    unit = mean_length(steps)
+    steps, values = points[finite] - x, values[finite]
+
+    def fitted(near: Tensor, width: Tensor) -> tuple[LocalModel, _Told] | None:
+        told = _model(steps[near] / width, values[near], noise, (others - x) / width)
+        return None if told is None else (told[0], _Told(told[0], width, *told[1:]))
+
+    return most_certain(steps, fitted)
+
+
+def most_certain(steps: Tensor, fitted: Callable[[Tensor, Tensor], tuple[LocalModel, T] | None]) -> T | None:
+    """Fit to all evaluations, to the nearest half, and so on; return what has the least error of the Hessian.
+
+    Args:
+        steps: to the evaluations [P, n].
+        fitted: numbers of evaluations and their width [n] to a quadratic and what is returned; None if they do not
+            determine a quadratic.
+    """
+    unit, least = mean_length(steps), coefficients(steps.shape[1]) + _SPARE
     order = (steps / unit).norm(dim=1).argsort(stable=True)
-    found, count, most = [], len(order), max(MOST, 2 * least)
+    found, count, most = [], len(order), max(_MOST, 2 * least)
     while count >= least:
         near = order[:count][:: math.ceil(count / most)]
         width = mean_length(steps[near])
-        told = _model(steps[near] / width, values[near], noise, (others - x) / width)
-        if told is not None:
-            error = float((told[0].curvature_error * (unit / width).square()).norm())
-            found.append((error, _Told(told[0], width, *told[1:])))
+        fit = fitted(near, width)
+        if fit is not None:
+            found.append((float((fit[0].curvature_error * (unit / width).square()).norm()), fit[1]))
         count //= 2
     best = min((one for one in found if math.isfinite(one[0])), key=lambda one: one[0], default=None)
     return None if best is None else best[1]
@@ -178,17 +196,14 @@ def _choices(u: Tensor, change: Tensor, noise: float, others: Tensor) -> _Choice
     quadratic takes its part out of features and values (restricted likelihood). The eigenvectors of what is left serve
     all sizes of the process.
     """
-    factors = factored(quadratic_terms(u))
+    factors = sought_terms(u, others)
     if factors is None:
         return None
-    orthonormal, inverse = factors
-    steps = quadratic_terms(others)
-    steps[:, 0] = 0.0
-    sought = torch.cat([inverse, steps @ inverse])
+    orthonormal, sought = factors
     quadratic = sought @ (orthonormal.mT @ change)
     rest = change - orthonormal @ (orthonormal.mT @ change)
     known = DEVIATION_DEGREES * noise**2
-    degrees = len(u) - len(inverse) + DEVIATION_DEGREES
+    degrees = len(u) - orthonormal.shape[1] + DEVIATION_DEGREES
     ratios = u.new_tensor(RATIOS)[:, None]
     found = []
     for kernel, length in itertools.product(KERNELS, LENGTHS):
@@ -207,6 +222,20 @@ def _choices(u: Tensor, change: Tensor, noise: float, others: Tensor) -> _Choice
         certain = sought.square().sum(1) + shrunk @ tilt.square().mT + ratios * missed
         found.append(_Choices(evidence, means, variances[:, None] * certain))
     return _Choices(*(torch.cat(one) for one in zip(*found, strict=True)))
+
+
+def sought_terms(u: Tensor, others: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return Q [P, q] and S [q + C, q] of a quadratic through values y at u [P, n]; None if u does not determine one.
+
+    S Q^T y are the q coefficients of the quadratic at 0, and its changes from there to others [C, n].
+    """
+    factors = factored(quadratic_terms(u))
+    if factors is None:
+        return None
+    orthonormal, inverse = factors
+    steps = quadratic_terms(others)
+    steps[:, 0] = 0.0
+    return orthonormal, torch.cat([inverse, steps @ inverse])
 
 
 def log_prior(length: float, ratios: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torch_zerohess.surrogates import noisy_derivatives as of_losses
 from torch_zerohess.surrogates.loss_curvature import loss_curvature
-from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, factored, quadratic_terms, symmetric
+from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, symmetric
 
 
 @dataclass(frozen=True)
@@ -67,21 +67,16 @@ class OutputRegression:
 
     def _around(self, x: Tensor, others: Tensor) -> tuple[LocalModel, Tensor, _Outputs] | None:
         """Return what the nearest evaluations, or more of them, tell: those with the least error of the Hessian."""
-        steps, least = self.points - x, coefficients(len(x)) + of_losses.SPARE
-        unit = of_losses.mean_length(steps)
-        order = (steps / unit).norm(dim=1).argsort(stable=True)
-        found, count, most = [], len(order), max(of_losses.MOST, 2 * least)
-        while count >= least:
-            near = order[:count][:: math.ceil(count / most)]
-            width = of_losses.mean_length(steps[near])
+        steps = self.points - x
+
+        def fitted(near: Tensor, width: Tensor) -> tuple[LocalModel, tuple[LocalModel, Tensor, _Outputs]] | None:
             outputs = _fitted(steps[near] / width, self.outputs[near], (others - x) / width)
-            if outputs is not None:
-                model = self._quadratic(outputs, len(x))
-                error = float((model.curvature_error * (unit / width).square()).norm())
-                found.append((error, (model, width, outputs)))
-            count //= 2
-        best = min((one for one in found if math.isfinite(one[0])), key=lambda one: one[0], default=None)
-        return None if best is None else best[1]
+            if outputs is None:
+                return None
+            model = self._quadratic(outputs, len(x))
+            return model, (model, width, outputs)
+
+        return of_losses.most_certain(steps, fitted)
 
     def _quadratic(self, known: _Outputs, n: int) -> LocalModel:
         """Return the quadratic of the loss at 0."""
@@ -101,20 +96,17 @@ class OutputRegression:
 
 def _fitted(u: Tensor, outputs: Tensor, others: Tensor) -> _Outputs | None:
     """Fit outputs [P, m] at u [P, n]; None if u does not determine a quadratic. Others [C, n]."""
-    factors = factored(quadratic_terms(u))
+    factors = of_losses.sought_terms(u, others)
     if factors is None:
         return None
-    orthonormal, inverse = factors
-    steps = quadratic_terms(others)
-    steps[:, 0] = 0.0
-    sought = torch.cat([inverse, steps @ inverse])
+    orthonormal, sought = factors
     base = outputs.mean(0)
     change = outputs - base
     size = float(change.abs().max()) or 1.0
     change = change / size
     projected = orthonormal.mT @ change
     rest = change - orthonormal @ projected
-    degrees, (_, m) = len(u) - len(inverse), change.shape
+    degrees, (_, m) = len(u) - orthonormal.shape[1], change.shape
     ratios = u.new_tensor(of_losses.RATIOS)[:, None]
     total, found = rest.square().sum(0), []
     for kernel, length in itertools.product(of_losses.KERNELS, of_losses.LENGTHS):

@@ -179,7 +179,7 @@ def test_many_values_are_thinned_and_cover_the_same_region(monkeypatch, n):
     """Of 3 000 values as many are used as the limit says, from the nearest to the farthest."""
     used, choices = [], module._choices
     monkeypatch.setattr(module, "_choices", lambda u, *rest: used.append(u) or choices(u, *rest))
-    monkeypatch.setattr(module, "MOST", 100)
+    monkeypatch.setattr(module, "_MOST", 100)
     points = torch.linspace(0.1, 1.0, 3000, dtype=torch.float64)[:, None] * normal(3000, n)
     noisy_derivatives(points.new_zeros(n), points, points.square().sum(1) + NOISE * normal(3000, seed=1), NOISE)
     most = max(100, 2 * ((n + 1) * (n + 2) // 2 + 5))

@@ -80,7 +80,7 @@ def test_values_far_away_do_not_count():
 
 
 def test_many_outputs_are_thinned(monkeypatch):
-    monkeypatch.setattr(noisy_derivatives, "MOST", 40)
+    monkeypatch.setattr(noisy_derivatives, "_MOST", 40)
     seen = []
     own = noisy_derivatives.process_features
 

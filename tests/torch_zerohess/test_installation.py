@@ -75,7 +75,7 @@ def test_the_package_as_a_program_prints_the_report(capsys, monkeypatch):
     monkeypatch.setattr(
         "torch_zerohess.adapters.mitsuba_variants.probe", lambda *_: mitsuba_variants.Probe(False, "no")
     )
-    runpy.run_module("torch_zerohess", run_name="__main__")
+    runpy.run_path(str(ROOT / "torch_zerohess" / "__main__.py"), run_name="__main__")
     assert capsys.readouterr().out == f"{zh.doctor()}\n"
 
 

@@ -1,12 +1,14 @@
 """Quadratic of a loss by least change: interpolate the values near a point, and change the Hessian no more than needed.
 
 A full quadratic in n parameters has (n + 1)(n + 2)/2 coefficients, more than a search has evaluations. Many quadratics
-interpolate the values. We take the quadratic with the Hessian nearest to an earlier Hessian in the Frobenius norm. It
-is unique once the points span the space (Powell 2004, "Least Frobenius norm updating of quadratic models").
+interpolate the values. Powell's method takes the quadratic whose Hessian is nearest to an earlier Hessian in the
+Frobenius norm. It is unique once the points span the space (Powell 2004, "Least Frobenius norm updating of quadratic
+models"). It is the mean of a Gaussian process: the entries of the change of the Hessian are independent normal numbers.
 
-It is also the mean of a Gaussian process: the entries of the change of the Hessian are independent normal numbers, and
-a value at u differs from the quadratic by a normal number whose variance grows as |u|^6. How fast it grows depends on
-the function. So the values choose between two rates by their likelihoods (Rasmussen and Williams 2006, section 5.4).
+The process here differs in two ways. A multiple of the identity, with a normal factor, is added to the change: on the
+way to a minimum all curvatures often grow or fall alike. And a value at u differs from the quadratic by a normal number
+whose variance grows as |u|^6. How fast it grows depends on the function. So the values choose between two rates by
+their likelihoods (Rasmussen and Williams 2006, section 5.4).
 """
 
 import math
@@ -20,6 +22,8 @@ _EXACT = 1e-10
 _CUBIC, _ROUGH = 1e-8, 1e-3
 """The same per sixth power of the distance: of a function that is nearly quadratic, and of another one. A smooth
 function leaves a quadratic by third powers."""
+_ALIKE = 1.0
+"""Variance of the multiple of the identity, over the variance of an entry beside the diagonal."""
 _LIKELIER = 20.0
 """`_ROUGH` is taken where it makes the values more than so many times as likely as `_CUBIC` does."""
 _FREE = 1e-12
@@ -47,6 +51,7 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
         fit = rough if rough.likelihood > fit.likelihood + math.log(_LIKELIER) else fit
     alpha = torch.linalg.solve_triangular(fit.factor.mT, fit.left[:, None], upper=True)[:, 0]
     change = (u.mT * alpha) @ u
+    change.diagonal().add_(0.5 * _ALIKE * float(alpha @ u.square().sum(1)))
     return float(fit.coefficients[0]), fit.coefficients[1:], hessian + 0.5 * (change + change.mT)
 
 
@@ -67,7 +72,7 @@ class _Affine:
     def through(cls, u: Tensor, values: Tensor, rest: Tensor, cubic: float) -> "_Affine":
         """Fit values [P] at u [P, n], for the likelihood, and the `rest` of them less the earlier Hessian [P]."""
         P, n = u.shape
-        factor = _factor(u, cubic)
+        factor = _factor(u, cubic, _ALIKE)
         columns = torch.cat([u.new_ones(P, 1), u, rest[:, None], values[:, None]], 1)
         design, targets = torch.linalg.solve_triangular(factor, columns, upper=False).split([n + 1, 2], 1)
         free = (_FREE * float(design.square().sum(0).amax())) ** 0.5
@@ -113,10 +118,11 @@ class LeastNorm:
         return (self.u * alpha).mT @ self.u
 
 
-def _factor(u: Tensor, cubic: float) -> Tensor:
+def _factor(u: Tensor, cubic: float, alike: float = 0.0) -> Tensor:
     """Return the Cholesky factor of the covariance of values at u [P, n] whose slopes and constant are subtracted."""
     inner = u @ u.mT
-    kernel = 0.5 * inner.square()
+    kernel, squares = 0.5 * inner.square(), inner.diagonal()
     unit = float(kernel.diagonal().mean()) or 1.0
-    kernel.diagonal().add_(_EXACT * unit + cubic * inner.diagonal().pow(3))
+    kernel.addr_(squares, squares, alpha=0.25 * alike)
+    kernel.diagonal().add_(_EXACT * unit + cubic * squares.pow(3))
     return torch.linalg.cholesky(kernel)

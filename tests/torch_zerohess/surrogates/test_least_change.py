@@ -46,7 +46,7 @@ def test_few_points_tell_the_slope_along_them():
 
 
 def test_no_smaller_change_interpolates():
-    """The change has no component that leaves all values as they are: it is orthogonal to all such matrices."""
+    """The change is C + a I of least |C|^2 / 2 + a^2: both derivatives vanish along all changes that no value sees."""
     n, P = 3, 7
     _, _, f = quadratic(n, 2)
     u = points(P, n, 2)
@@ -57,12 +57,26 @@ def test_no_smaller_change_interpolates():
     pairs = [(i, j) for i in range(n) for j in range(i + 1)]
     columns = [u.new_ones(P), *u.mT, *(u[:, i] * u[:, j] * (0.5 if i == j else 1.0) for i, j in pairs)]
     design = torch.stack(columns, 1)
+    change = hessian - earlier
+    alike = float(change.trace()) / (2 + n)  # of least |change - a I|^2 / 2 + a^2, given the change
+    own = change - alike * torch.eye(n, dtype=torch.float64)
     _, _, rows = torch.linalg.svd(design)
     for free in rows[P:]:  # changes of the coefficients that no value sees
         matrix = u.new_zeros(n, n)
         for k, (i, j) in enumerate(pairs):
             matrix[i, j] = matrix[j, i] = free[1 + n + k]
-        assert abs(float(((hessian - earlier) * matrix).sum())) < 1e-4
+        assert abs(float((own * matrix).sum())) < 1e-4
+
+
+def test_a_change_of_all_curvatures_is_learned_from_few_values():
+    """Eleven values near the minimum of |u|^2 in ten dimensions, and an earlier Hessian of half of it.
+
+    They have one degree of freedom beyond a slope. Alone it tells the common factor, and one axis of 55.
+    """
+    u = torch.cat([torch.zeros(1, 10), torch.eye(10), -torch.eye(10)[:1]]).double()
+    identity = torch.eye(10, dtype=torch.float64)
+    _, _, hessian = least_change(u, u.square().sum(1), identity)
+    assert float((hessian - 2 * identity).norm()) < 0.85 * float(identity.norm())
 
 
 def test_near_points_count_more():

@@ -37,13 +37,13 @@ _KEPT, _LEAST_KEPT = 3, 200
 """Evaluations kept, over those that are fitted, and at least."""
 _FEW = 2
 """Parameters up to which a step is tried before there are two points along every axis."""
-_RATE, _FIRST_RATE = 0.3, 0.7
-"""Rate at which the metric is learned from a full quadratic, and from the first one."""
+_RATE = 0.3
+"""Rate at which the metric is learned from a full quadratic."""
 _FALLING = 1.5
 """For fewer points the rate is multiplied by (points / coefficients) to this power: much of the Hessian is guessed."""
-_DOUBTED = 100.0
-"""Curvatures below so many times (most negative curvature)^2 / (largest one) may be errors of a Hessian, see
-`_guessed`."""
+_EARLY = 8
+"""In a round with fewer evaluations than coefficients it is also multiplied by (evaluations / coefficients) to this
+power. On the way from the start the Hessian changes: a ball is then better than the metric of a Hessian of before."""
 CURVED = 1e-3
 """Curvature over a region, relative to the slope, below which it says nothing about the metric."""
 _LATEST = 2
@@ -266,24 +266,8 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         return replace(known, size=size, gradient=back.mT @ gradient, hessian=hessian), len(chosen)
 
     def _learned(self, known: MetricProgress, count: int) -> Tensor:
-        if len(known.values) <= 2 * self._n:
-            return known.root
-        rate = _FIRST_RATE if known.phase == "axes" else self._rate(count)
-        floor = max(CURVED * float(known.gradient.norm()) / known.sigma, self._guessed(known.hessian, count))
-        return learned(known.root, known.hessian, rate, floor)
-
-    def _guessed(self, hessian: Tensor, count: int) -> float:
-        """Return the curvature below which a Hessian [n, n] from so many points says nothing about the metric.
-
-        Near a minimum no curvature is negative. A negative curvature is an error there, and the other curvatures have
-        errors of its size: as valleys of the metric they would be wrong. The bound is the square of the most negative
-        curvature, because a negative curvature that is small beside the largest one may be true. The bound falls to
-        zero as the points determine the Hessian.
-        """
-        curvatures = torch.linalg.eigvalsh(hessian)
-        negative, largest = max(0.0, -float(curvatures[0])), float(curvatures.abs().max())
-        unknown = max(0.0, 1.0 - count / self._coefficients) ** 2
-        return min(unknown * _DOUBTED * negative**2 / largest, largest) if negative else 0.0
+        rate = self._rate(count) * min(1.0, len(known.values) / self._coefficients) ** _EARLY
+        return learned(known.root, known.hessian, rate, CURVED * float(known.gradient.norm()) / known.sigma)
 
     def _rate(self, count: int) -> float:
         """Return the rate at which the metric is learned from a quadratic of so many points."""

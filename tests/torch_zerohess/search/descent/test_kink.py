@@ -163,7 +163,7 @@ def test_where_the_slopes_do_not_tell_there_is_no_arrival() -> None:
 def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
     """The evaluations end while slopes are measured."""
     start = torch.zeros(3).double()
-    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=2, restarts=0)
+    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=9, restarts=0)
     while (local := search._state.progress.local) is None or local.slopes is None:
         search.tell(half_space(search.ask(), 1e4))
     search.tell(half_space(search.ask(limit=2), 1e4))
@@ -173,7 +173,7 @@ def test_a_process_whose_quadratics_do_not_tell_has_not_arrived() -> None:
 def test_a_process_waits_until_slopes_are_measured() -> None:
     """It has no patience left, and the slopes that are measured lower nothing."""
     start = torch.zeros(3).double()
-    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=2, restarts=0)
+    search = zh.optim.TrustRegion(start, sigma=0.5, bounds=(-5, 5), engine="gaussian_process", seed=9, restarts=0)
     while (local := search._state.progress.local) is None or local.slopes is None:
         search.tell(half_space(search.ask(), 1e4))
     search._state = replace(search._state, progress=replace(search._state.progress, waited=10**6))

@@ -36,25 +36,20 @@ def test_a_narrow_valley(n, most, seed):
     assert evaluations_to(Descent(zeros(n), sigma=2.0, seed=seed, restarts=0), f, 1e-8) < most
 
 
-def test_errors_of_a_hessian_make_no_valley():
-    """The loss is round at its minimum. Eight searches divide it by more than 500 in fewer than 1 300 evaluations."""
+def test_a_hessian_of_before_makes_no_valley():
+    """The loss is round at its minimum, and flatter far away. Eight searches need 822 evaluations.
+
+    They need 1 161 if the metric is learned as fast from a Hessian of which much is guessed, and 993 if it is learned
+    on the way from the start.
+    """
     count = 0
     for seed in range(8):
-        start = 1.0 + 4.0 * torch.rand(10, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        generator = torch.Generator().manual_seed(seed)
+        axes = torch.linalg.qr(torch.randn(10, 10, generator=generator, dtype=torch.float64))[0]
+        start = 10.0 * torch.rand(10, generator=generator, dtype=torch.float64) - 5.0
         search = Descent(start, sigma=2.0, seed=seed, restarts=0)
-        count += evaluations_to(search, lambda z: (1.0 + 10.0 * z.square()).sqrt().sum(1) - 10.0, 0.03)
-    assert count < 1300
-
-
-def test_curvatures_that_may_be_errors():
-    """With 4 parameters a quadratic has 15 coefficients."""
-    method = method_of(4)
-    hessian = torch.diag(vector(10.0, 4.0, 1.0, -0.1))
-    assert method._guessed(hessian, 0) == pytest.approx(100.0 * 0.1**2 / 10.0)
-    assert method._guessed(hessian, 12) == pytest.approx(0.2**2 * 100.0 * 0.1**2 / 10.0)
-    assert method._guessed(hessian, 15) == 0.0
-    assert method._guessed(hessian.abs(), 0) == 0.0
-    assert method._guessed(-hessian, 0) == 10.0  # at most the largest
+        count += evaluations_to(search, lambda z: (1.0 + 10.0 * (z @ axes).square()).sqrt().sum(1) - 10.0, 0.01)  # noqa: B023
+    assert count < 910
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -263,15 +258,18 @@ def test_where_a_quadratic_is_known_sigma_falls_at_once(seed):
     assert search.value < 1e-12
 
 
-@pytest.mark.parametrize("seed", [4, 28, 53])
-def test_a_wall_near_the_largest_number_is_forgotten(seed):
-    """A curvature of 1e60, in units of the values that remain, is made of their roundings."""
-    search = Descent(torch.full((3,), 2.0, dtype=torch.float64), sigma=0.7, seed=seed, restarts=0)
+def test_a_wall_near_the_largest_number_is_forgotten():
+    """A curvature of 1e60, in units of the values that remain, is made of their roundings.
+
+    Ten runs take 265 evaluations, and 400 with such curvatures.
+    """
 
     def wall_beside_a_bowl(x):
         return (x - 1.0).square().sum(1) + 1e60 * (x[:, 1] - 2.05).clamp(min=0)
 
-    assert evaluations_to(search, wall_beside_a_bowl, 1e-10) < 18
+    start = torch.full((6,), 2.0, dtype=torch.float64)
+    searches = [Descent(start, sigma=0.7, seed=seed, restarts=0) for seed in range(10)]
+    assert sum(evaluations_to(one, wall_beside_a_bowl, 1e-10) for one in searches) < 330
 
 
 @pytest.mark.parametrize("n", [41, 120])

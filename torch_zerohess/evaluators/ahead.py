@@ -3,96 +3,27 @@
 Calls are served in rounds: give points to workers, wait until one of them has news, take it. A call alone is served by
 the thread that made it. The first `submit`, or a call beside another one, starts a thread that serves all calls from
 then on; a call that is under way is handed to it between two rounds. Calls are begun in their order, so the values of
-an early call come early. A call has the same bits as it would have alone.
+an early call come early. A call has the same bits as it would have alone. The thread keeps the evaluator alive only
+while there are calls.
 """
 
 import contextlib
-import itertools
 import threading
+import weakref
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from queue import SimpleQueue
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.batch import MOST, Batch
 from torch_zerohess.evaluators.factory import same
 from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
+from torch_zerohess.evaluators.job import Function, Job
 from torch_zerohess.evaluators.kept import make_room, used
-from torch_zerohess.evaluators.transfer import Part
-
-
-@dataclass(eq=False)
-class Function:
-    """A black box, and what workers get of it."""
-
-    fn: Callable[..., Any]
-    sent: Any
-    known: tuple[torch.dtype, torch.Size] | None = None
-    """Type and shape [*out] of its values, as soon as there are some."""
-    number: int = field(default_factory=itertools.count().__next__)
-
-
-@dataclass(eq=False)
-class Job:
-    """A call: its points, and the values known so far."""
-
-    function: Function
-    tensors: tuple[Tensor, ...]
-    """Points [K, n] and aux [K, ...], on the CPU."""
-    device: torch.device
-    batch: Batch
-    future: Evaluation = field(default_factory=Evaluation)
-    error: BaseException | None = None
-    """Why the call fails, whatever its points do."""
-    _begun: bool = False
-    _cancelled: bool = False
-
-    def __post_init__(self) -> None:
-        self.future.lost = self.batch.lost
-
-    @cached_property
-    def parts(self) -> list[Part]:
-        """The tensors as bytes."""
-        return [Part.of(one) for one in self.tensors]
-
-    @property
-    def waiting(self) -> bool:
-        """Whether a chunk waits for a worker. `begin` comes before the first one is taken."""
-        return bool(self.batch.waiting and not self.over)
-
-    @property
-    def over(self) -> bool:
-        """Whether nothing more is to be done."""
-        gone = self._cancelled if self._begun else self.future.cancelled()
-        hopeless = self.batch.hopeless and self.function.known is None
-        return gone or self.error is not None or self.batch.finished or hopeless
-
-    def settle(self) -> None:
-        """Give the future its values or its error."""
-        if self.begin():
-            self.future.settle(self._values)
-
-    def _values(self) -> Tensor:
-        if self.error is not None:
-            raise self.error
-        if not self.batch.finished:  # it is hopeless
-            raise self.batch.loss()
-        values = self.batch.result(self.function.known)
-        self.function.known = values.dtype, values.shape[1:]
-        return values.to(self.device)
-
-    def begin(self) -> bool:
-        """Mark the future as running. Return False if it was cancelled; whoever waits for it is then told."""
-        if not self._begun:
-            self._begun = True
-            self._cancelled = not self.future.set_running_or_notify_cancel()
-        return not self._cancelled
 
 
 class Ahead(Closing, ABC):
@@ -155,9 +86,9 @@ class Ahead(Closing, ABC):
 
     def close(self) -> None:
         """End all workers, and with them all calls: those under way raise RuntimeError."""
-        with self._news:
+        with self._lock:
             self._closed = True
-            self._news.notify()
+            self._news.put(None)
         self._wake()
         with self._serving, self._taking:  # once the round under way has ended, and no black box is being sent
             self._fail(self._taken())
@@ -195,8 +126,10 @@ class Ahead(Closing, ABC):
         # reentrant, because a callback or a signal handler may close the evaluator
         self._serving, self._taking = threading.RLock(), threading.RLock()
         self._thread: threading.Thread | None = None
-        self._news = threading.Condition()
+        self._lock = threading.RLock()
         self._inbox: deque[Job] = deque()
+        self._news: SimpleQueue[Ahead | None] = SimpleQueue()
+        """For the thread: this evaluator for each call in the inbox, None to end."""
         self._calls = threading.local()
 
     def _job(self, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor]) -> Job:
@@ -214,19 +147,21 @@ class Ahead(Closing, ABC):
 
     def _queue(self, job: Job) -> None:
         """Leave a job to the thread that serves all calls."""
-        with self._news:
+        with self._lock:
             self._check_open()
             if self._thread is None:
-                thread = threading.Thread(target=self._serve, name="torch_zerohess evaluator", daemon=True)
+                having = self._news, self._serving  # not the evaluator, so that it ends when nobody uses it
+                thread = threading.Thread(target=_serve, args=having, name="torch_zerohess evaluator", daemon=True)
                 thread.start()
                 self._thread = thread
+                weakref.finalize(self, self._news.put, None).atexit = False
             self._inbox.append(job)
-            self._news.notify()
+            self._news.put(self)
         self._wake()
 
     def _taken(self) -> list[Job]:
         """Return the jobs of the inbox, which has none from now on."""
-        with self._news:
+        with self._lock:
             jobs = list(self._inbox)
             self._inbox.clear()
         return jobs
@@ -239,7 +174,7 @@ class Ahead(Closing, ABC):
         except BaseException:  # Ctrl-C: nobody waits for what the workers do
             self._give_up([job])
             raise
-        with self._news:
+        with self._lock:
             if not (job.over or self._closed):
                 self._inbox.appendleft(job)  # it was the first
                 return
@@ -258,27 +193,21 @@ class Ahead(Closing, ABC):
             raise
 
     def _serve(self) -> None:
-        """Serve all calls, until the evaluator is closed."""
-        jobs: list[Job] = []
-        with self._serving:  # once the call under way has been handed over
-            while True:
-                with self._news:
-                    while not (self._closed or self._inbox or jobs):
-                        self._news.wait()
-                jobs += self._taken()
-                if self._closed:
-                    break
-                try:
-                    if any(not job.over for job in jobs):
-                        self._round(jobs)
-                except BaseException as error:
-                    for job in jobs:
-                        job.error = error
-                ended = [job for job in jobs if job.over]
-                self._give_up(ended)
-                jobs = [job for job in jobs if job not in ended]
-                _settle(ended)
-            self._fail(jobs)
+        """Serve the calls of the inbox, and those that come meanwhile."""
+        jobs = self._taken()
+        while jobs and not self._closed:
+            try:
+                if any(not job.over for job in jobs):
+                    self._round(jobs)
+            except BaseException as error:
+                for job in jobs:
+                    job.error = error
+            ended = [job for job in jobs if job.over]
+            jobs = [job for job in jobs if job not in ended]
+            self._give_up(ended)
+            _settle(ended)
+            jobs += self._taken()
+        self._fail(jobs)
 
     def _fail(self, jobs: Sequence[Job]) -> None:
         """End jobs, because the evaluator is closed."""
@@ -287,6 +216,14 @@ class Ahead(Closing, ABC):
             job.future.cancel()  # if it has not begun
             job.error = RuntimeError(f"the {type(self).__name__} was closed before the values were there")
         _settle(jobs)
+
+
+def _serve(news: "SimpleQueue[Ahead | None]", serving: "threading.RLock") -> None:
+    """Serve all calls of an evaluator in this thread, until the evaluator is closed, or nobody has it."""
+    with serving:  # once the call under way has been handed over
+        while (evaluator := news.get()) is not None:
+            evaluator._serve()
+            del evaluator
 
 
 def _settle(jobs: Sequence[Job]) -> None:

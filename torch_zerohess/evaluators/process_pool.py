@@ -21,8 +21,9 @@ from typing import Any
 from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer, checked_number
-from torch_zerohess.evaluators.ahead import Ahead, Job
+from torch_zerohess.evaluators.ahead import Ahead
 from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.job import Job
 from torch_zerohess.evaluators.kept import MOST
 from torch_zerohess.evaluators.payload import dumped, loaded_error
 from torch_zerohess.evaluators.worker import ERROR, VALUES

@@ -13,10 +13,11 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.evaluators import transfer
-from torch_zerohess.evaluators.ahead import Ahead, Job
+from torch_zerohess.evaluators.ahead import Ahead
 from torch_zerohess.evaluators.batch import Batch, Chunk
 from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
 from torch_zerohess.evaluators.executor import values_of
+from torch_zerohess.evaluators.job import Job
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from torch_zerohess.evaluators import transfer, worker
-from torch_zerohess.evaluators.ahead import Job
 from torch_zerohess.evaluators.batch import Chunk
 from torch_zerohess.evaluators.default_dtype import default_dtype
+from torch_zerohess.evaluators.job import Job
 from torch_zerohess.evaluators.kept import make_room, used
 from torch_zerohess.evaluators.lifetime import end_group, ending, starting_worker
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages

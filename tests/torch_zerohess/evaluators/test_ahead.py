@@ -1,7 +1,10 @@
 """Who serves calls: the thread of a call, the thread of all calls, and nobody after the end. Without processes."""
 
 import concurrent.futures
+import gc
+import multiprocessing
 import threading
+import weakref
 from types import SimpleNamespace
 
 import black_boxes
@@ -10,8 +13,9 @@ import torch
 from black_boxes import part, points
 
 from torch_zerohess.evaluators import ProcessPool
-from torch_zerohess.evaluators.ahead import Ahead, Function, Job
+from torch_zerohess.evaluators.ahead import Ahead
 from torch_zerohess.evaluators.batch import Batch
+from torch_zerohess.evaluators.job import Function, Job
 
 
 class Stepping(Ahead):
@@ -104,6 +108,43 @@ def test_a_callback_may_close_the_evaluator():
     evaluator.submit(black_boxes.waves, points(9)).add_done_callback(lambda _: (evaluator.close(), done.set()))
     evaluator.steps.release(9)
     assert done.wait(60)
+
+
+def test_the_thread_ends_when_nobody_has_the_evaluator():
+    """The first future is done before the evaluator goes. The second one is not: it still gets its values."""
+    before = set(threading.enumerate())
+    for steps in (3, None):
+        evaluator = Stepping()
+        future, gone = evaluator.submit(black_boxes.waves, points(3)), weakref.ref(evaluator)
+        (thread,) = set(threading.enumerate()) - before
+        release = evaluator.steps.release
+        if steps:
+            release(steps)
+            future.result(60)
+        del evaluator
+        if not steps:
+            release(3)
+        assert torch.equal(future.result(60), black_boxes.waves(points(3)))
+        while gone() is not None:  # the thread lets go of it after the future is done
+            gc.collect()
+        thread.join(60)
+        assert not thread.is_alive()
+
+
+def test_workers_end_when_nobody_has_the_pool():
+    before, threads = set(multiprocessing.active_children()), set(threading.enumerate())
+    pool = ProcessPool(1)
+    assert torch.equal(pool.submit(black_boxes.waves, points(1)).result(60), black_boxes.waves(points(1)))
+    (worker,) = set(multiprocessing.active_children()) - before
+    (thread,) = set(threading.enumerate()) - threads
+    gone = weakref.ref(pool)
+    del pool
+    while gone() is not None:
+        gc.collect()
+    worker.join(60)
+    thread.join(60)
+    assert worker.exitcode == 0
+    assert not thread.is_alive()
 
 
 def job(fn=black_boxes.waves, device="cpu"):

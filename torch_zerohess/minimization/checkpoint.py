@@ -53,6 +53,8 @@ class Checkpoint:
         try:
             with draft.open("wb") as file:
                 torch.save(content, file)
+                file.flush()
+                os.fsync(file.fileno())  # after a power cut, the name may otherwise be that of an empty file
             self._own = (found, _state(draft))
             draft.replace(self._path)
         except BaseException as error:  # Ctrl-C, too

@@ -48,12 +48,5 @@ def evaluate_first_batch(
     if torch.equal(search.ask(max(batch - 1, 1), limit=len(points)), points):
         search.tell(values[: len(points)])
     else:
-        _tell_at(every, values, search)
+        search.tell_at(values, every)
     return noise, search, every, losses
-
-
-def _tell_at(points: Tensor, values: Tensor, search: TrustRegion) -> None:
-    """Tell a search that knows nothing the values at points [K, n] that another one has asked for, the start first."""
-    out = points.to(search.unit) / search.unit
-    search.load_state_dict(search.state_dict() | {"out": out})
-    search.tell(values)

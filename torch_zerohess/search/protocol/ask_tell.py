@@ -1,7 +1,9 @@
 """Ask and tell, the same for every search: the checks, the values told, and the state that is saved.
 
 A search is a `Method` inside an `AskTell`. `tell` makes the whole next `State` and assigns it at the end. So a search
-is as it was if anything raises. `ask` reads the state, and notes which points it has given out.
+is as it was if anything raises. `ask` reads the state, and notes which points it has given out: their number does not
+tell them, because the further points of a batch depend on its size, and a limit cuts it. Points that were given out
+stay valid until values are told, whatever is asked for after them.
 
 To add a search: a subclass of `Progress` with its fields, a subclass of `Method` with its step, and a subclass of
 `AskTell` that makes the method.
@@ -77,7 +79,9 @@ class AskTell(Standing[P]):
         generator = torch.Generator().manual_seed(self.seed)
         self._state = self._after(*self._method.first(generator), generator)
         self._out: Tensor | None = self._state.asked[:0]
-        """Points out for evaluation [K, n], None if `load_state_dict` does not know."""
+        """Points given out last [K, n], None if `load_state_dict` does not know."""
+        self._asked: dict[int, Tensor] = {}
+        """Points that `ask` has returned since the last values were told [K, n], by K."""
         self._early: dict[int, Tensor] = {}
         """Values of some of them, by number, that came before the others."""
         self._drawn: tuple[int, Tensor] | None = None
@@ -115,6 +119,7 @@ class AskTell(Standing[P]):
                 self._drawn = batch, self._points(batch)
             points = self._drawn[1]
         self._out = points[:limit]
+        self._asked[len(self._out)] = self._out
         return self._space.parameters(self._out)
 
     @property
@@ -127,16 +132,19 @@ class AskTell(Standing[P]):
 
         With `which` [k], numbers of points, these are the values of some of them: [k] or [k, *out], in any order. The
         step is taken when the last one is told, and does not depend on the order. Without `which` they are the values
-        of all points that are `missing`. If a batch was asked for after `state_dict`, ask for it again after
-        `load_state_dict` before telling parts of it.
+        of all points that are `missing`. They may also be the values of points that an earlier `ask` has returned, if
+        the last one has returned another number of points. If a batch was asked for after `state_dict`, ask for it
+        again after `load_state_dict` before telling parts of it.
 
         Points whose values are not finite are avoided. Raises ValueError for a wrong shape, or if the start itself has
         no finite value; TypeError or ValueError for a loss that is not a differentiable scalar; and whatever the loss
         raises, see `WhiteBox`. The search is then as before, and the same values can be told again.
         """
         values, points = converted(values, self.unit.device), self._given
+        count = len(values) if values.ndim else 1
+        if which is None and not self._early:
+            points = self._asked.get(count, points)
         if self._out is None and which is None and not self._early:
-            count = len(values) if values.ndim else 1
             points = self._points(count)[:count]
         if not len(points):
             raise RuntimeError("ask for points before telling their values")
@@ -148,13 +156,27 @@ class AskTell(Standing[P]):
                 self._out, self._early = points, early
                 return
             values = torch.stack([early[k] for k in range(len(points))])
+        self._take(values, points)
+
+    def tell_at(self, values: Any, points: Tensor) -> None:
+        """Take values of points of the caller's own [K, n], in the type of x0, the start first; before any `tell`.
+
+        Otherwise as `tell`. RuntimeError if values have been told.
+        """
+        if self.evaluations or self._early:
+            raise RuntimeError("values have been told: points of one's own come before")
+        self._take(converted(values, self.unit.device), self._space.coordinates(points))
+
+    def _take(self, values: Tensor, points: Tensor) -> None:
+        """Take a step with the values [K, *out] of points [K, n], in units of sigma."""
         evaluated = self._evaluated(values, points)
         if not self.evaluations:
             check_start(evaluated)
         generator = torch.Generator()
         generator.set_state(self._state.random)
         self._state = self._after(*self._method.after(self._state.progress, evaluated, generator), generator)
-        self._out, self._early, self._drawn, self.told = points[:0], {}, None, evaluated.usable
+        self._out, self._asked, self._early, self._drawn = points[:0], {}, {}, None
+        self.told = evaluated.usable
         self.reference = reference(self.reference, evaluated)
 
     def losses(self, values: Any) -> Tensor:
@@ -194,7 +216,7 @@ class AskTell(Standing[P]):
         out = None if state["out"] is None else state["out"].to(device)
         self._state = State(progress, state["asked"].to(device), state["random"].cpu())
         self.seed, self.reference, self.told = state["seed"], known, self.told[:0]
-        self._out, self._early, self._drawn = out, early, None
+        self._out, self._asked, self._early, self._drawn = out, {}, early, None
 
     @property
     def _given(self) -> Tensor:

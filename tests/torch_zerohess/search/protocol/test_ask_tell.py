@@ -169,7 +169,7 @@ def test_asking_for_fewer():
     torch.testing.assert_close(every[0], zeros(5))
     assert torch.equal(search.ask(limit=2), every[:2])
     with pytest.raises(ValueError, match=r"values must have shape \[2\]"):
-        search.tell(bowl(every))
+        search.tell(bowl(every[:3]))
     search.tell(bowl(every[:2]))  # the others are given up
     assert search.evaluations == 2
     other.ask(limit=2)
@@ -355,6 +355,32 @@ def test_values_that_cannot_be_taken_change_nothing():
         wrong = None
         assert same(search.state_dict(), before)
         search.tell(values)
+
+
+@every_search
+def test_points_of_an_earlier_question_may_be_told(name):
+    """Whatever was asked for meanwhile, if it had another number of points."""
+    search, other, f = make(name), make(name), black_box(name)
+    for _ in range(4):
+        points = search.ask(9)
+        search.ask(9, limit=2)
+        search.ask()
+        search.tell(f(points))
+        other.tell(f(other.ask(9)))
+        assert search.evaluations == other.evaluations
+        assert torch.equal(search.ask(), other.ask())
+
+
+def test_points_of_ones_own_come_first():
+    """A search is told another search's first points, and then a value that no longer fits."""
+    search = Descent(zeros(2), sigma=0.5, seed=0)
+    points = vector(0.0, 0.0, 1.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0, -1.0).view(5, 2)
+    with pytest.raises(ValueError, match=r"values must have shape \[5\]"):
+        search.tell_at([0.0] * 4, points)
+    search.tell_at((points - 1.0).square().sum(1), points)
+    assert (search.evaluations, search.value) == (5, 1.0)
+    with pytest.raises(RuntimeError, match="values have been told"):
+        search.tell_at([0.0] * 5, points)
 
 
 def test_values_before_points():

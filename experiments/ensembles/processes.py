@@ -1,6 +1,5 @@
 """Processes that run jobs, one thread each; a process that dies takes only its own job with it."""
 
-import multiprocessing
 import signal
 import time
 from collections import deque
@@ -21,7 +20,7 @@ from experiments.problems.task import Preset, Task
 from experiments.runs.attempt import attempt
 from experiments.runs.records import Files, Outcome, Preparation, Record, write_outcome
 from torch_zerohess.evaluators import Factory, ProcessPool
-from torch_zerohess.evaluators.lifetime import end_with_parent, ending, starting_worker
+from torch_zerohess.evaluators.lifetime import end_with_parent, ending, started_worker
 
 _PROGRESS = 0.2
 """Seconds between two messages about a running job."""
@@ -104,12 +103,9 @@ class _Process:
     """A process, the pipe to it, and its job if it has one."""
 
     def __init__(self, daemon: bool) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs,), daemon=daemon)  # which has no children
-        with starting_worker():
-            self.process.start()
-        theirs.close()
+        self.process, self.connection = started_worker(
+            _work, "experiments job", daemon=daemon
+        )  # a daemon has no children
         self.job: Job | None = None
         self._started = False
 

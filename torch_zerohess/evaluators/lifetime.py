@@ -6,20 +6,38 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
+from typing import Any
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+_starting = threading.Lock()
+
+
+def started_worker(
+    target: Callable[["Connection[Any, Any]"], None], name: str, *, daemon: bool
+) -> tuple[SpawnProcess, "Connection[Any, Any]"]:
+    """Start a process that runs `target(connection)`, and return it with the other end of the connection."""
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe()
+    process = context.Process(target=target, args=(theirs,), name=name, daemon=daemon)
+    with _starting, _own_settings():
+        process.start()
+    theirs.close()
+    return process, mine
 
 
 @contextlib.contextmanager
-def starting_worker() -> Iterator[None]:
+def _own_settings() -> Iterator[None]:
     """Let a process that starts inside have one thread, and let Ctrl-C not reach it while it imports.
 
-    Libraries read the variables when they are loaded. A new process blocks the signals that its parent blocks, until it
-    calls `end_with_parent`.
+    Libraries read the variables when they are loaded, which may be before any code of this package runs there. So they
+    are set here: multiprocessing gives a process no environment but that of its parent. A program that another thread
+    starts meanwhile gets them, too. A new process blocks the signals that its parent blocks, until it calls
+    `end_with_parent`.
     """
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
@@ -47,7 +65,7 @@ def end_with_parent() -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see `starting_worker`
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see `_own_settings`
     if hasattr(os, "setpgid"):
         os.setpgid(0, 0)  # a group for this process and the programs that it starts
     parent = multiprocessing.parent_process()

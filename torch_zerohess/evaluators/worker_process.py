@@ -2,7 +2,6 @@
 
 import multiprocessing
 import select
-import threading
 import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection, wait
@@ -14,10 +13,8 @@ from torch_zerohess.evaluators.batch import Chunk
 from torch_zerohess.evaluators.default_dtype import default_dtype
 from torch_zerohess.evaluators.job import Job
 from torch_zerohess.evaluators.kept import make_room, used
-from torch_zerohess.evaluators.lifetime import end_group, ending, starting_worker
+from torch_zerohess.evaluators.lifetime import end_group, ending, started_worker
 from torch_zerohess.evaluators.worker import EVALUATE, FUNCTION, READY, ROOM, Messages
-
-_starting = threading.Lock()
 
 
 class Process:
@@ -29,12 +26,7 @@ class Process:
                 "a ProcessPool cannot start workers in a daemon of multiprocessing, such as a worker of a DataLoader: "
                 "leave evaluator=None there, or call the black box in the main process"
             )
-        context = multiprocessing.get_context("spawn")
-        mine, theirs = context.Pipe()
-        self.process = context.Process(target=worker.main, args=(theirs,), name="torch_zerohess worker", daemon=True)
-        with _starting, starting_worker():
-            self.process.start()
-        theirs.close()
+        self.process, mine = started_worker(worker.main, "torch_zerohess worker", daemon=True)
         self.messages = Messages(mine)
         self.ready = False
         """Whether it waits for a black box or points."""

@@ -51,6 +51,18 @@ def test_a_file_that_cannot_be_written_does_not_take_the_result(pause, tmp_path,
     assert torch.equal(fit.points, whole.points)
 
 
+def test_a_file_gets_its_name_when_its_bytes_are_on_the_disk(tmp_path, monkeypatch):
+    path, sizes = tmp_path / "search.pt", []
+
+    def fsync(descriptor):
+        assert not path.exists()
+        sizes.append(os.fstat(descriptor).st_size)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    Checkpoint(path).write({"values": zeros(1000)})
+    assert sizes == [path.stat().st_size]
+
+
 def test_a_file_that_cannot_be_written_does_not_take_the_place_of_the_own_error(tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()

@@ -130,13 +130,30 @@ def test_a_server_that_prints_is_named_and_started_again():
         assert program._server is None
 
 
-def test_a_program_that_ends_or_hangs_says_why(server):
+WRITES = "open(__import__('os').environ['NOTE'], 'w').write('1')"
+
+
+@pytest.fixture
+def note(tmp_path, monkeypatch):
+    """A file in the environment. No limit of this process is over before a program has written to it."""
+    path, real = tmp_path / "note", time.monotonic
+
+    def clock() -> float:
+        return real() + 1e9 if path.exists() and path.read_text().strip() else 0.0
+
+    monkeypatch.setenv("NOTE", str(path))
+    monkeypatch.setattr(servers, "time", SimpleNamespace(monotonic=clock))
+    monkeypatch.setattr(subprocess, "_time", clock)
+    return path
+
+
+@pytest.mark.parametrize("server", [False, True])
+def test_a_program_that_ends_or_hangs_says_why(server, note):
     wrong = READ + "a = sys.stdin.readline(); print('no licence', file=sys.stderr, flush=True); "
-    for one in (False, True):
-        with pytest.raises(RuntimeError, match=r"ended with code 3 and without an answer(.|\n)*no licence"):
-            python(wrong + "sys.exit(3)", server=one)(Z)
-        with pytest.raises(TimeoutError, match=r"no answer within timeout: 1 s(.|\n)*no licence"):
-            python(wrong + "time.sleep(60)", server=one, timeout=0.5)(Z)
+    with pytest.raises(TimeoutError, match=r"no answer within timeout: 1 s(.|\n)*no licence"):
+        python(wrong + WRITES + "; time.sleep(60)", server=server, timeout=0.5)(Z)
+    with pytest.raises(RuntimeError, match=r"ended with code 3 and without an answer(.|\n)*no licence"):
+        python(wrong + "sys.exit(3)", server=server)(Z)
 
 
 TWICE = ANSWER.replace("print(json", "print(2 * (json").replace("), flush", ") + chr(10)), end='', flush")
@@ -153,11 +170,13 @@ def test_a_line_too_many_that_comes_with_the_answer_is_an_error_of_the_call(line
             assert program(Z).isnan().all()
 
 
-def test_an_answer_too_many_is_not_taken_for_the_next():
-    code = SERVE + ANSWER + "    time.sleep(0.1)\n    " + ANSWER
-    with python(code, server=True) as program:
+def test_an_answer_too_many_is_not_taken_for_the_next(tmp_path):
+    """It comes when the first call has ended, and is there before the second."""
+    wait = f"while not __import__('os').path.exists({str(tmp_path / 'ended')!r}): time.sleep(0.01)\n    "
+    with python(SERVE + ANSWER + "    " + wait + ANSWER, server=True) as program:
         assert torch.equal(program(Z), Z.sum(1))
-        time.sleep(1.0)  # the answer too many arrives
+        (tmp_path / "ended").touch()
+        until(lambda: servers._pending(program._server.process.stdout))
         with pytest.raises(ValueError, match=r"wrote more than one answer to a request(.|\n)*before the next request"):
             program(2 * Z)
         assert torch.equal(program(2 * Z), 2 * Z.sum(1))  # it was started again
@@ -167,11 +186,16 @@ STARTS = ["sh", "-c", 'read line; sleep 60 & echo $! > "$NOTE"; wait']
 """A shell that, at a request, waits for a program, and writes the number of that to a file."""
 
 
-def noted(path) -> int:
-    deadline = time.monotonic() + 30.0
-    while not (path.exists() and path.read_text().strip()):
+def until(happened) -> None:
+    """Wait until something has happened, for at most a minute."""
+    deadline = time.monotonic() + 60.0
+    while not happened():
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+def noted(path) -> int:
+    until(lambda: path.exists() and path.read_text().strip())
     return int(path.read_text())
 
 
@@ -181,11 +205,8 @@ def runs(pid: int) -> bool:
 
 
 def has_ended(pid: int) -> bool:
-    """Whether a process ends within 10 seconds."""
-    deadline = time.monotonic() + 10.0
-    while runs(pid) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return not runs(pid)
+    until(lambda: not runs(pid))
+    return True
 
 
 @pytest.mark.parametrize(
@@ -193,10 +214,9 @@ def has_ended(pid: int) -> bool:
     [(STARTS, {}), (STARTS, {"server": True}), (lambda point: STARTS, {"format": float})],
     ids=["once", "server", "function"],
 )
-def test_programs_that_the_program_started_end_with_it(tmp_path, command, settings):
+def test_programs_that_the_program_started_end_with_it(note, command, settings):
     """They hold the pipes of the program: a call must not wait for them."""
-    note = tmp_path / "note"
-    program = Program(command, timeout=1.0, environment={"NOTE": str(note)}, on_failure="nan", **settings)
+    program = Program(command, timeout=1.0, on_failure="nan", **settings)
     assert program(Z[:1]).isnan().all()
     assert "gave no answer within timeout: 1 s" in program.last_failure
     assert has_ended(noted(note))
@@ -205,7 +225,7 @@ def test_programs_that_the_program_started_end_with_it(tmp_path, command, settin
 
 def test_in_a_worker_too(tmp_path):
     note = tmp_path / "note"
-    program = Program(STARTS, timeout=1.0, environment={"NOTE": str(note)}, on_failure="nan")
+    program = Program(STARTS, timeout=10.0, environment={"NOTE": str(note)}, on_failure="nan")
     with ProcessPool(1) as pool:
         assert pool(program, Z[:1]).isnan().all()
         assert has_ended(noted(note))
@@ -264,7 +284,7 @@ def test_every_wait_is_short(monkeypatch):
     """Python loses a Ctrl-C that comes just before it waits for a lock, until the wait is over."""
     waits = []
     clock = iter(range(100))
-    monkeypatch.setattr(servers.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(servers, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     thread = SimpleNamespace(is_alive=lambda: len(waits) < 3, join=waits.append)
     servers._join(thread, None)
     assert waits == [1.0] * 3
@@ -273,10 +293,9 @@ def test_every_wait_is_short(monkeypatch):
     assert waits == [0.5]
 
 
-def test_a_program_that_left_the_group_is_not_waited_for(tmp_path):
+def test_a_program_that_left_the_group_is_not_waited_for(note):
     """It may hold the pipes for ever."""
-    note = tmp_path / "note"
-    program = Program([sys.executable, "-S", "-c", LEAVES], timeout=1.0, environment={"NOTE": str(note)})
+    program = Program([sys.executable, "-S", "-c", LEAVES], timeout=1.0)
     with pytest.raises(TimeoutError, match=r"timeout: 2 s(.|\n)*started"):
         program(Z)
     other = noted(note)
@@ -296,14 +315,14 @@ LEAVES = (
 SQUARE = "a = json.load(sys.stdin)['x']; print('seen', file=sys.stderr); x = a[0][0]; "
 FAILURES = {
     "exit": ("sys.exit(3) if x > 1 else None; ", "ended with code 3"),
-    "late": ("time.sleep(60) if x > 1 else None; ", "gave no answer within timeout: 1 s"),
+    "late": (f"({WRITES}, time.sleep(60)) if x > 1 else None; ", "gave no answer within timeout: 1 s"),
     "text": ("print('oh' if x > 1 else '', end=''); ", "nothing else to its standard output, got 'oh"),
     "null": ("x = 'null' if x > 1 else x; ", "it printed null where a number was expected"),
 }
 
 
 @pytest.mark.parametrize(("wrong", "message"), FAILURES.values(), ids=FAILURES)
-def test_a_run_that_fails_has_no_value_or_names_its_point(wrong, message):
+def test_a_run_that_fails_has_no_value_or_names_its_point(wrong, message, note):
     """One image [2] per point, for one point: the run fails beyond 1."""
     code = READ + SQUARE + "sys.stderr.flush(); " + wrong + "print(f'[[{x}, 7]]')"
     good, bad = torch.tensor([[0.5, 0.25]]).double(), torch.tensor([[1.5, 0.25]]).double()

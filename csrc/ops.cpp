@@ -25,12 +25,22 @@ namespace {
 const Row* row_data(const Tensor& rows) {
   check(rows, "rows", 2, ScalarType::Long);
   STD_TORCH_CHECK(rows.size(1) == 5, "rows has ", rows.size(1), " columns instead of 5");
-  return reinterpret_cast<const Row*>(rows.const_data_ptr<int64_t>());
+  const Row* row = reinterpret_cast<const Row*>(rows.const_data_ptr<int64_t>());
+  for (int64_t r = 0; r < rows.size(0); ++r)
+    STD_TORCH_CHECK(row[r].kind >= kNormal && row[r].kind <= kBox, "the kind of row ", r, " is ", row[r].kind,
+                    ", but must be from 0 to ", int64_t(kBox));
+  return row;
+}
+
+void check_proposal(int64_t proposal) {
+  STD_TORCH_CHECK(proposal >= kGaussian && proposal <= kSignedLobes, "proposal is ", proposal,
+                  ", but must be from 0 to ", int64_t(kSignedLobes));
 }
 
 Tensor pick_rows(int64_t seed, int64_t first, int64_t count, int64_t n, int64_t proposal) {
   check_size(count, "count", 0);
   check_size(n, "n", 1);
+  check_proposal(proposal);
   Tensor rows = empty({count, 5}, ScalarType::Long);
   Row* out = reinterpret_cast<Row*>(rows.mutable_data_ptr<int64_t>());
   for (int64_t r = 0; r < count; ++r) out[r] = pick(seed, first + r, n, proposal);
@@ -135,6 +145,7 @@ std::tuple<Tensor, Tensor, Tensor> place_all(
   check(u, "u", 2);
   check(x, "x", 2);
   check(sigma, "sigma", 1);
+  check_proposal(proposal);
   const int64_t B = x.size(0), n = x.size(1);
   STD_TORCH_CHECK(B > 0 && u.size(0) % B == 0 && u.size(1) == n && sigma.size(0) == n, "u, x and sigma do not fit");
   const double* source = u.const_data_ptr<double>();

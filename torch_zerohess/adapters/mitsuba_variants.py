@@ -12,6 +12,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -136,6 +137,8 @@ def variants() -> dict[str, Probe]:
 def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleType:
     """Set a variant that is known to work in this process, and return the `mitsuba` module.
 
+    `DRJIT_LIBLLVM_PATH` is set to what `find_llvm` returns, with a warning if it named another library.
+
     Args:
         variant: `"auto"` (`llvm_ad_rgb` where that is safe, else `scalar_rgb`) or the name of a variant.
         threads: render threads of this process, at least 1; None keeps Dr.Jit's own choice (all cores). One thread in
@@ -159,6 +162,14 @@ def select_variant(variant: str = "auto", threads: int | None = None) -> ModuleT
             raise RuntimeError(f"variant {variant!r} does not work here: {outcome.reason}; {_advice(variant)}")
     llvm = find_llvm()
     if llvm is not None:  # read once, when Dr.Jit first needs LLVM
+        asked = os.environ.get("DRJIT_LIBLLVM_PATH")
+        if asked and Path(asked) != llvm:
+            warnings.warn(
+                f"DRJIT_LIBLLVM_PATH must name a file that is LLVM {MINIMUM_LLVM} or newer by its name, got {asked}: "
+                f"{llvm} is used instead",
+                UserWarning,
+                stacklevel=2,
+            )
         os.environ["DRJIT_LIBLLVM_PATH"] = str(llvm)
     import drjit
     import mitsuba

@@ -1,4 +1,7 @@
-"""The compiled extension, where there is one; pure torch, with the same results, where there is not."""
+"""The compiled extension, where there is one; pure torch, with the same draws, where there is not.
+
+Sums over samples agree to rounding: their order of addition is another one.
+"""
 
 import importlib
 import os
@@ -17,7 +20,7 @@ def _load() -> tuple[bool, str]:
     except ImportError as error:
         reason = str(error)
         warnings.warn(
-            f"torch_zerohess runs without its C++ extension, with the same results but slower ({reason}); {HINT}",
+            f"torch_zerohess runs without its C++ extension: slower, with the same draws ({reason}); {HINT}",
             RuntimeWarning,
             stacklevel=2,
         )

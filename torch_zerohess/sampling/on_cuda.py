@@ -1,4 +1,4 @@
-"""What draws on CUDA devices: Triton kernels, or the reference in torch where they fail."""
+"""What draws on CUDA devices: Triton kernels, or the reference in torch where only they fail."""
 
 import functools
 import importlib.util
@@ -45,12 +45,14 @@ def on_cuda(function: Callable[..., Any]) -> None:
             except torch.OutOfMemoryError:
                 raise
             except Exception as error:  # no compiler for its launcher, a device that is too old
+                result = function(*arguments)  # it raises, too, where the arguments are wrong: Triton stays on
                 _refused.add(device)
                 warnings.warn(
                     f"torch_zerohess draws with torch, not Triton, on {device}: the same numbers, slower. {error!r}",
                     RuntimeWarning,
                     stacklevel=2,
                 )
+                return result
         return function(*arguments)
 
     torch.library.impl(f"torch_zerohess::{function.__name__}", "cuda", run)

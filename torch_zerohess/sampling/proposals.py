@@ -49,6 +49,7 @@ def pick_rows(seed: int, first: int, count: int, n: int, proposal: int) -> Tenso
 
 def mixture_rows(seeds: Tensor, index: Tensor, p: Tensor, n: int, proposal: int) -> Tensor:
     """Choose component and dimensions of every row's lobe by uniforms p [R, 3]."""
+    _check(proposal)
     component = (p[:, 0] * (2 if proposal == FIRST_ORDER else 3)).long()
     i, j = (p[:, 1] * n).long(), (p[:, 2] * n).long()
     hessian = torch.where(i == j, DIAGONAL_LOBE, OFF_DIAGONAL_LOBE)
@@ -124,6 +125,7 @@ def weights(u: Tensor, proposal: int) -> Tensor:
 
 def density_ratio(l1: Tensor, l2: Tensor, hole: Tensor, n: int, proposal: int) -> Tensor:
     """Return N(u) / p(u) from sum |u|, sum u^2 and sum |u^2 - 1|."""
+    _check(proposal)
     if proposal in (GAUSSIAN, SIGNED_LOBES):
         return torch.ones_like(l1)
     if proposal == UNIFORM:
@@ -132,6 +134,11 @@ def density_ratio(l1: Tensor, l2: Tensor, hole: Tensor, n: int, proposal: int) -
     if proposal == FIRST_ORDER:
         return 2.0 / (1.0 + gradient)
     return 3.0 / (1.0 + gradient + (_HALF_PI * (l1 * l1 - l2) + _DIAGONAL_LOBE_SCALE * hole) / (n * n))
+
+
+def _check(proposal: int) -> None:
+    if not GAUSSIAN <= proposal <= SIGNED_LOBES:
+        raise ValueError(f"proposal is {proposal}, but must be from {GAUSSIAN} to {SIGNED_LOBES}")
 
 
 def element_rows(seed: int, first: int, samples: int, n: int, order: int) -> Tensor:

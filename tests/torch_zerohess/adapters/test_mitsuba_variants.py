@@ -110,6 +110,22 @@ def test_select_returns_the_module_with_the_variant_set(monkeypatch: pytest.Monk
     assert adapter.select_variant().variant() == expected
 
 
+def test_a_library_that_is_replaced_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adapter, "_FOLDERS", (str(tmp_path),))
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", asked := str(tmp_path / "libLLVM-15.so.1"))
+    for name in ("libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1"):
+        (tmp_path / name).touch()
+    with pytest.warns(
+        UserWarning, match=rf"must name .* LLVM 16 or newer .*, got {asked}: .*libLLVM\.so\.20\.1 is used"
+    ):
+        adapter.select_variant("scalar_rgb")
+    assert os.environ["DRJIT_LIBLLVM_PATH"] == str(tmp_path / "libLLVM.so.20.1")
+    adapter.select_variant("scalar_rgb")  # the same one again
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", asked := str(tmp_path / "libLLVM.so.19.1"))
+    adapter.select_variant("scalar_rgb")  # an own choice that qualifies stays
+    assert os.environ["DRJIT_LIBLLVM_PATH"] == asked
+
+
 def test_auto_falls_back_to_scalar(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adapter, "find_llvm", lambda: None)
     assert adapter.select_variant().variant() == "scalar_rgb"

@@ -384,6 +384,26 @@ WRONG = {
 }
 
 
+@pytest.mark.parametrize("proposal", [-1, 5])
+@pytest.mark.parametrize("module", [ops, proposals])
+def test_numbers_of_no_proposal_are_named(module, proposal: int, capfd: pytest.CaptureFixture[str]) -> None:
+    x, sigma = doubles(2, 3), torch.ones(3, dtype=torch.float64)
+    with pytest.raises((RuntimeError, ValueError), match=f"proposal is {proposal}, but must be from 0 to 4"):
+        module.pick_rows(0, 0, 4, 3, proposal)
+    with pytest.raises((RuntimeError, ValueError), match=f"proposal is {proposal}, but must be from 0 to 4"):
+        module.place(doubles(4, 3), x, sigma, True, False, proposal)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", [-1, 6])
+def test_numbers_of_no_kind_are_named(kind: int, capfd: pytest.CaptureFixture[str]) -> None:
+    rows = torch.zeros(2, 5, dtype=torch.int64)
+    rows[1, 2] = kind
+    with pytest.raises(RuntimeError, match=f"the kind of row 1 is {kind}, but must be from 0 to 5"):
+        ops.draw(rows, 3, False)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.parametrize("call", WRONG.values(), ids=WRONG.keys())
 def test_wrong_shapes_raise(call, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises((RuntimeError, IndexError)):

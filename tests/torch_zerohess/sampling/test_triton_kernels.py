@@ -165,6 +165,32 @@ def test_float32_holds_what_is_compared() -> None:
     assert all(float(torch.tensor(one, dtype=torch.float32)) == one for one in numbers)
 
 
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch):
+    """What draws on a device, here a CPU whose memory Triton could reach."""
+    on_cuda._triton_kernels.cache_clear()
+    registered = {}
+    monkeypatch.setattr(torch.library, "impl", lambda name, device, run: registered.update({name: (device, run)}))
+    for function in (kernels.draw, kernels.uniforms, kernels.sample):
+        on_cuda.on_cuda(function)
+    assert {device for device, _ in registered.values()} == {"cuda"}
+    monkeypatch.setattr(on_cuda, "_TRITON", True)
+    monkeypatch.setattr(on_cuda, "_refused", set())
+    yield registered["torch_zerohess::draw"][1]
+    on_cuda._triton_kernels.cache_clear()
+
+
+def test_wrong_arguments_do_not_switch_triton_off(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference raises for them, too."""
+    rows = proposals.pick_rows(3, 0, 4, 5, proposals.SECOND_ORDER)
+    stand_in = SimpleNamespace(draw=proposals.draw)
+    monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", stand_in)
+    with pytest.raises((RuntimeError, IndexError)):
+        run(rows[:, :3], 5, False)
+    assert on_cuda.by_triton(rows.device)
+    assert torch.equal(run(rows, 5, False), proposals.draw(rows, 5))
+
+
 @pytest.mark.parametrize(
     ("module", "message"),
     [
@@ -173,19 +199,10 @@ def test_float32_holds_what_is_compared() -> None:
     ],
 )
 def test_where_triton_fails_the_reference_draws_and_a_warning_says_so(
-    module: SimpleNamespace | None, message: str, monkeypatch: pytest.MonkeyPatch
+    module: SimpleNamespace | None, message: str, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    on_cuda._triton_kernels.cache_clear()
-    registered = {}
-    monkeypatch.setattr(torch.library, "impl", lambda name, device, run: registered.update({name: (device, run)}))
-    for function in (kernels.draw, kernels.uniforms, kernels.sample):
-        on_cuda.on_cuda(function)
-    assert {device for device, _ in registered.values()} == {"cuda"}
     rows = proposals.pick_rows(3, 0, 4, 5, proposals.SECOND_ORDER)
-    monkeypatch.setattr(on_cuda, "_TRITON", True)
-    monkeypatch.setattr(on_cuda, "_refused", set())
     monkeypatch.setitem(sys.modules, "torch_zerohess.sampling.triton_kernels", module)
-    _, run = registered["torch_zerohess::draw"]
     with pytest.warns(RuntimeWarning, match=f"torch, not Triton, on cpu.*{message}"):
         got = run(rows, 5, False)
     assert torch.equal(got, proposals.draw(rows, 5))

@@ -147,4 +147,4 @@ def _needs(name: str, error: ImportError) -> str:
     if "pip install" in str(error) or error.name is None:
         return str(error)
     package = error.name.partition(".")[0]
-    return f"{name} needs {package}, which is not installed: pip install 'torch_zerohess[experiments,rivals]'"
+    return f"{name} needs {package}, which is not installed: pip install '.[experiments,rivals]'"

@@ -60,7 +60,7 @@ def doctor() -> Report:
     advice = [] if extension.available else [f"for the C++ extension, {extension.HINT}"]
     if "mitsuba" in versions and not probes["llvm_ad_rgb"].works:
         advice.append(f"for fast renders with derivatives, {mitsuba_variants.LLVM}")
-    advice += [f"for {', '.join(names)}: pip install '{_NAME}[{extra}]'" for extra, names in _missing()]
+    advice += [f"for {extra}: pip install {' '.join(names)}" for extra, names in _missing()]
     return Report(extension.available, extension.status, devices, variants, versions, advice)
 
 

@@ -96,7 +96,7 @@ def ssim(target: Any, *, window_size: int = 11, data_range: float = 1.0) -> Imag
         window_size: pixels along a window, odd, at least 3; neither side of the image may be smaller.
         data_range: difference of the largest and the smallest value that a pixel can have.
 
-    Raises ImportError if kornia is not installed (`pip install 'torch_zerohess[losses]'`).
+    Raises ImportError if kornia is not installed (`pip install kornia`).
     """
     target = _checked(target)
     window_size = checked_integer("window_size", window_size)
@@ -107,9 +107,7 @@ def ssim(target: Any, *, window_size: int = 11, data_range: float = 1.0) -> Imag
     try:
         import kornia.metrics  # noqa: F401 - that it is missing should be known before the first evaluation
     except ImportError as error:
-        raise ImportError(
-            f"losses.ssim needs kornia ({error}): pip install 'torch_zerohess[losses]'", name=error.name
-        ) from error
+        raise ImportError(f"losses.ssim needs kornia ({error}): pip install kornia", name=error.name) from error
     return ImageLoss("ssim", target, partial(_dissimilarity, window_size=window_size, data_range=data_range))
 
 

@@ -93,7 +93,7 @@ def _packages_of(name: str) -> Iterator[None]:
         yield
     except ImportError as error:
         raise ImportError(
-            f"task {name} needs {error.name}, which is not installed: pip install 'torch_zerohess[experiments]'",
+            f"task {name} needs {error.name}, which is not installed: pip install '.[experiments]'",
             name=error.name,
         ) from error
 

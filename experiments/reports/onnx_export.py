@@ -24,7 +24,7 @@ def export(encoder: nn.Module, images: Tensor, path: Path) -> float:
     1e-4, ImportError if a package of the extra `onnx` is missing.
     """
     if missing():
-        raise ImportError(f"ONNX export needs {', '.join(missing())}: pip install 'torch_zerohess[onnx]'")
+        raise ImportError(f"ONNX export needs {', '.join(missing())}: pip install '.[onnx]'")
     import onnxruntime
 
     encoder.eval()

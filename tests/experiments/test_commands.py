@@ -92,7 +92,7 @@ def test_a_missing_package_is_named(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     for loaded in ("matplotlib.figure", "experiments.reports.error_curves"):
         monkeypatch.delitem(sys.modules, loaded, raising=False)
-    with pytest.raises(SystemExit, match="plot needs matplotlib, which is not installed: pip install 'torch_zerohess"):
+    with pytest.raises(SystemExit, match=r"plot needs matplotlib, .*: pip install '\.\["):
         main(["plot", "results"])
 
 
@@ -104,7 +104,7 @@ def no_mitsuba(monkeypatch) -> None:
 @pytest.mark.usefixtures("no_mitsuba")
 def test_tasks_that_mitsuba_renders_say_that_it_is_missing() -> None:
     for name in (*catalogue.RENDERED, *catalogue.RENDERED_NETWORKS):
-        with pytest.raises(ImportError, match=rf"task {name} needs mitsuba, .*pip install 'torch_zerohess") as raised:
+        with pytest.raises(ImportError, match=rf"task {name} needs mitsuba, .*pip install '.") as raised:
             catalogue.load(name)
         assert raised.value.name == "mitsuba"
     assert catalogue.load("caustic").name == "caustic"
@@ -115,7 +115,7 @@ def test_tasks_that_mitsuba_renders_say_that_it_is_missing() -> None:
 def test_tasks_that_mujoco_simulates_say_that_it_is_missing(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     for name in catalogue.SIMULATED:
-        with pytest.raises(ImportError, match=rf"task {name} needs mujoco, .*pip install 'torch_zerohess"):
+        with pytest.raises(ImportError, match=rf"task {name} needs mujoco, .*pip install '."):
             catalogue.load(name)
 
 
@@ -135,7 +135,7 @@ def test_tasks_that_mujoco_simulates_say_that_it_is_missing(monkeypatch) -> None
 def test_commands_say_what_to_install(monkeypatch, tmp_path, command) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["experiments", *command])
-    with pytest.raises(SystemExit, match="needs mitsuba, which is not installed: pip install 'torch_zerohess"):
+    with pytest.raises(SystemExit, match=r"needs mitsuba, which is not installed: pip install '\.\["):
         main()
     assert not list(tmp_path.iterdir())  # nothing was run before
 

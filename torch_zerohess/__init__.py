@@ -14,12 +14,12 @@ from torch_zerohess import adapters, evaluators, heads, losses, optim, surrogate
 from torch_zerohess.autograd.blackbox import BlackBox, smooth
 from torch_zerohess.autograd.curvature import CurvatureOperator, hvp
 from torch_zerohess.autograd.sparse_layer import SparseBlackBox
-from torch_zerohess.doctor import doctor
+from torch_zerohess.doctor import Report, doctor
 from torch_zerohess.estimation.estimate import estimate
 from torch_zerohess.estimation.finite_differences import finite_difference_hvp
-from torch_zerohess.estimation.result import Estimate
+from torch_zerohess.estimation.result import ConfidenceInterval, Estimate
 from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
-from torch_zerohess.minimize import Iterate, Minimum, minimize
+from torch_zerohess.minimize import Iterate, Minimum, Observation, minimize
 from torch_zerohess.optim.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory
@@ -27,12 +27,15 @@ from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 
 __all__ = [
     "BlackBox",
+    "ConfidenceInterval",
     "CurvatureOperator",
     "Estimate",
     "Iterate",
     "LinearSigma",
     "Memory",
     "Minimum",
+    "Observation",
+    "Report",
     "Smoothing",
     "SparseBlackBox",
     "SparseJacobian",

@@ -3,14 +3,13 @@
 import difflib
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
 
 from torch_zerohess.arguments import check_bool, check_callable, checked_file, checked_integer
 from torch_zerohess.estimation.call import BlackBoxCall
-from torch_zerohess.estimation.inputs import working
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.evaluators.process_pool import ProcessPool
 from torch_zerohess.minimization.callback import Callback
@@ -21,7 +20,7 @@ from torch_zerohess.minimization.outcome import outcome
 from torch_zerohess.minimization.running import Running
 from torch_zerohess.minimization.separate import separated
 from torch_zerohess.minimization.stopping import Stopping
-from torch_zerohess.search.protocol.space import Bounds, checked_start
+from torch_zerohess.search.protocol.space import Bounds, Vector, checked_start
 from torch_zerohess.search.trust_region import Engine, TrustRegion
 from torch_zerohess.smoothing import random_seed
 from torch_zerohess.surrogates.memory import Memory, check_memory
@@ -46,9 +45,9 @@ _OTHER_NAMES = {
 
 def minimize(
     fn: Callable[[Tensor], Any],
-    x0: Tensor | Sequence[float],
+    x0: Vector,
     *,
-    sigma: float | Tensor | Sequence[float],
+    sigma: float | Vector,
     loss: Callable[[Tensor], Tensor] | None = None,
     bounds: Bounds | None = None,
     max_evaluations: int = 1000,
@@ -167,7 +166,7 @@ def minimize(
     path = None if checkpoint is None else checked_file("checkpoint", checkpoint)
     if evaluator is not None and workers is not None:
         raise ValueError(f"workers={workers!r} makes an evaluator of its own: give workers or evaluator, not both")
-    start = checked_start(working(x0) if isinstance(x0, Tensor) else x0)
+    start = checked_start(x0)
     rounds = max(max_evaluations, 0) if restarts is None else restarts
     given = {**settings, "loss": loss, "engine": engine, "restarts": rounds}
     own_seed = random_seed() if seed is None else seed

@@ -11,7 +11,8 @@ import torch_zerohess
 
 FOUND = [module.name for module in pkgutil.walk_packages(torch_zerohess.__path__, "torch_zerohess.")]
 MODULES = ["torch_zerohess", *sorted(name for name in FOUND if not name.endswith("._C"))]
-RESULTS = {"Estimate", "Iterate", "Minimum"}  # of functions that show them in their own examples
+RESULTS = {"ConfidenceInterval", "Estimate", "Iterate", "Minimum", "Observation", "Report"}
+"""Of functions that show them in their own examples."""
 PUBLIC = {f"zh.{name}": getattr(torch_zerohess, name) for name in torch_zerohess.__all__ if name not in RESULTS}
 PUBLIC |= {f"zh.optim.{name}": getattr(torch_zerohess.optim, name) for name in torch_zerohess.optim.__all__}
 

@@ -71,12 +71,17 @@ class Closing:
 class Inline(Closing):
     """Calls the black box in this process, all points at once, without autograd.
 
+    It holds nothing, so `close()` changes nothing: unlike a pool it can still be called.
+
     Example:
         >>> import torch
         >>> with Inline() as evaluator:
         ...     evaluator(lambda z: z.sum(1), torch.ones(2, 3))
         tensor([3., 3.])
     """
+
+    def __repr__(self) -> str:
+        return "Inline()"
 
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Any:
         with without_graph(), without_autocast(points.device):

@@ -1,6 +1,6 @@
 """The choice of a search by the number of parameters, their bounds, and the evaluations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -11,7 +11,7 @@ from torch_zerohess.search.descent_and_gaussian_process import DescentAndProcess
 from torch_zerohess.search.gaussian_process.search import process_method
 from torch_zerohess.search.protocol.ask_tell import AskTell
 from torch_zerohess.search.protocol.method import Method, Settings
-from torch_zerohess.search.protocol.space import Bounds
+from torch_zerohess.search.protocol.space import Bounds, Vector
 from torch_zerohess.search.sparse.noisy_method import sparse_method
 from torch_zerohess.search.sparse.settings import SPARSE_TOLERANCE, SparseSearchSettings
 from torch_zerohess.search.sparse_or_dense import FEWEST, SparseOrDense, SparseOrDenseProgress
@@ -73,9 +73,9 @@ class TrustRegion(AskTell[Any]):
 
     def __init__(
         self,
-        x0: Tensor | Sequence[float],
+        x0: Vector,
         *,
-        sigma: float | Tensor | Sequence[float],
+        sigma: float | Vector,
         bounds: Bounds | None = None,
         loss: Callable[[Tensor], Tensor] | None = None,
         engine: Engine = "auto",

@@ -63,6 +63,12 @@ def test_two_results_of_a_batch_are_no_points(evaluator, count):
         BlackBoxCall(black_boxes.with_numbers, evaluator=evaluator)(points(count), [])
 
 
+def test_an_evaluator_in_this_process_has_nothing_to_close():
+    with Inline() as evaluator:
+        assert repr(evaluator) == "Inline()"
+    assert torch.equal(evaluator(black_boxes.waves, points(2)), black_boxes.waves(points(2)))
+
+
 def test_an_evaluator_in_this_process_records_nothing():
     recording = []
 

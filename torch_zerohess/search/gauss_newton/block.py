@@ -31,7 +31,7 @@ from torch_zerohess.search.gauss_newton.kinked_steps import LITTLE, Steps, check
 from torch_zerohess.search.protocol.ask_tell import AskTell
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import orthonormal
-from torch_zerohess.search.protocol.space import Bounds
+from torch_zerohess.search.protocol.space import Bounds, Vector
 from torch_zerohess.search.protocol.state import Best, Evaluated
 from torch_zerohess.search.protocol.told import check_range
 from torch_zerohess.surrogates.loss_curvature import alternating, loss_curvature
@@ -196,9 +196,9 @@ class BlockGaussNewton(AskTell[BlockProgress]):
 
     def __init__(
         self,
-        x0: Tensor,
+        x0: Vector,
         *,
-        sigma: float | Tensor,
+        sigma: float | Vector,
         loss: Callable[[Tensor], Tensor],
         bounds: Bounds | None = None,
         radius: float = 0.5,

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch_zerohess.arguments import check_state, checked_integer, checked_number, checked_seed
 from torch_zerohess.search.protocol.method import Method, Settings
 from torch_zerohess.search.protocol.reference import Reference, reference
-from torch_zerohess.search.protocol.space import Bounds, Space, checked_start
+from torch_zerohess.search.protocol.space import Bounds, Space, Vector, checked_start
 from torch_zerohess.search.protocol.standing import Standing
 from torch_zerohess.search.protocol.state import Evaluated, P, State, plain, restored, restored_progress
 from torch_zerohess.search.protocol.told import as_evaluated, check_start, converted, joined
@@ -34,7 +34,8 @@ class AskTell(Standing[P]):
     """A search whose evaluations the caller owns: `ask` for points, evaluate them, `tell` their values.
 
     Args:
-        x0: start [n], within the bounds: a tensor, float32 or float64, a NumPy array, a list or a tuple.
+        x0: start [n], within the bounds: a tensor, a NumPy array, a list or a tuple. float16 and bfloat16 become
+            float32, integers float64.
         sigma: smoothing at the start, in units of the parameters: of the order of the distance to the solution.
             One value, or one per parameter [n] where they have different units; at most the width of its bounds.
         bounds: lower and upper, numbers or [n], None for no bound on a side; or a list of n pairs; or
@@ -53,9 +54,9 @@ class AskTell(Standing[P]):
 
     def __init__(
         self,
-        x0: Tensor | Sequence[float],
+        x0: Vector,
         *,
-        sigma: float | Tensor | Sequence[float],
+        sigma: float | Vector,
         bounds: Bounds | None = None,
         loss: Callable[[Tensor], Tensor] | None = None,
         restarts: int = 10,

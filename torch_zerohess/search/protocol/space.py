@@ -4,12 +4,34 @@ import math
 import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-Bounds = Any
+from torch_zerohess.estimation.inputs import working
+
+
+class Array(Protocol):
+    """An array of NumPy, or what can be made one."""
+
+    def __array__(self, *args: Any, **kwargs: Any) -> Any: ...
+
+
+class BothBounds(Protocol):
+    """`scipy.optimize.Bounds`."""
+
+    @property
+    def lb(self) -> Any: ...
+
+    @property
+    def ub(self) -> Any: ...
+
+
+Vector = Sequence[float] | Tensor | Array
+"""Numbers [n]."""
+Bound = float | Sequence[float | None] | Tensor | Array | None
+Bounds = tuple[Bound, Bound] | Sequence[Sequence[float | None]] | Tensor | Array | BothBounds
 """(lower, upper), numbers or [n] or None; n pairs (lower, upper), a list or [n, 2]; or `scipy.optimize.Bounds`."""
 
 
@@ -26,7 +48,7 @@ class Space:
     upper: Tensor
 
     @classmethod
-    def checked(cls, x0: Tensor, sigma: float | Tensor | Sequence[float], bounds: Bounds | None) -> "Space":
+    def checked(cls, x0: Tensor, sigma: float | Vector, bounds: Bounds | None) -> "Space":
         """Check what a caller gave. ValueError for a wrong shape or type, or a number out of range."""
         lower, upper = _bounds(bounds, x0)
         width, unit = upper.double() - lower.double(), _unit(sigma, x0)
@@ -61,9 +83,10 @@ class Space:
 
 
 def checked_start(x0: Any) -> Tensor:
-    """Return a start as a tensor [n]; ValueError if it is not finite, or neither float32 nor float64.
+    """Return a start as a tensor [n], float32 or float64. ValueError if it is not finite, or no real numbers.
 
-    A NumPy array of floats keeps its type. Lists, tuples and integers of NumPy or torch become float64.
+    float16 and bfloat16 of torch become float32. A NumPy array of float32 or float64 keeps its type. Lists, tuples and
+    integers of NumPy or torch become float64.
     """
     if not isinstance(x0, Tensor):
         kept = str(getattr(x0, "dtype", "")) in ("float32", "complex64", "complex128")
@@ -73,6 +96,7 @@ def checked_start(x0: Any) -> Tensor:
             raise ValueError(f"x0 must be a tensor, an array or a list of n numbers, got {x0!r}") from error
     elif not x0.is_floating_point() and not x0.is_complex():
         x0 = x0.double()
+    x0 = working(x0)
     if x0.dtype not in (torch.float32, torch.float64) or x0.ndim != 1 or not len(x0):
         raise ValueError(f"x0 must be a tensor [n], float32 or float64, got one of shape {[*x0.shape]}, {x0.dtype}")
     if not bool(torch.isfinite(x0).all()):
@@ -85,7 +109,7 @@ def _unshared(given: Any) -> Any:
     return given.copy() if hasattr(given, "strides") else given
 
 
-def _unit(sigma: float | Tensor | Sequence[float], x0: Tensor) -> Tensor:
+def _unit(sigma: float | Vector, x0: Tensor) -> Tensor:
     """Return sigma as float64 [n]."""
     try:
         unit = torch.as_tensor(_unshared(sigma), dtype=torch.float64, device=x0.device).detach()

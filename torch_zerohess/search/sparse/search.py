@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_zerohess.search.protocol.ask_tell import AskTell
 from torch_zerohess.search.protocol.method import Settings
-from torch_zerohess.search.protocol.space import Bounds
+from torch_zerohess.search.protocol.space import Bounds, Vector
 from torch_zerohess.search.sparse.method import SparseMethod
 from torch_zerohess.search.sparse.noisy_method import sparse_method
 from torch_zerohess.search.sparse.progress import SparseProgress
@@ -89,9 +89,9 @@ class LocalGaussNewton(AskTell[SparseProgress]):
 
     def __init__(
         self,
-        x0: Tensor,
+        x0: Vector,
         *,
-        sigma: float | Tensor,
+        sigma: float | Vector,
         loss: Callable[[Tensor], Tensor],
         bounds: Bounds | None = None,
         grid: tuple[int, ...] | None = None,

@@ -14,7 +14,7 @@ import torch_zerohess as zh
 from torch_zerohess.evaluators import Executor, Inline
 from torch_zerohess.evaluators.batch import Batch
 from torch_zerohess.evaluators.factory import Each
-from torch_zerohess.evaluators.finished import finished_values, keep_finished
+from torch_zerohess.evaluators.partial_values import finished_values, keep_finished
 from torch_zerohess.minimization import running
 from torch_zerohess.minimization.noise import reserved
 from torch_zerohess.minimization.running import Running

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from torch_zerohess.evaluators.batch import MOST, Batch
 from torch_zerohess.evaluators.factory import same
-from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
 from torch_zerohess.evaluators.job import Function, Job
 from torch_zerohess.evaluators.kept import make_room, used
+from torch_zerohess.evaluators.partial_values import keep_finished
 
 
 class Ahead(Closing, ABC):

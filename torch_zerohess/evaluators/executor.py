@@ -18,9 +18,9 @@ from torch_zerohess.evaluators import transfer
 from torch_zerohess.evaluators.batch import MOST, Batch, Chunk
 from torch_zerohess.evaluators.default_dtype import default_dtype, take_default_dtype
 from torch_zerohess.evaluators.factory import Each, same
-from torch_zerohess.evaluators.finished import keep_finished
 from torch_zerohess.evaluators.inline import Closing, Evaluation, values_without_points
 from torch_zerohess.evaluators.kept import make_room, used
+from torch_zerohess.evaluators.partial_values import keep_finished
 from torch_zerohess.evaluators.payload import dumped_error, loaded_error
 from torch_zerohess.evaluators.process_identity import become_worker, identity, in_this_process
 from torch_zerohess.evaluators.random_numbers import draw_apart, drawn_apart

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.evaluators.batch import numbers
-from torch_zerohess.evaluators.finished import keep_finished
+from torch_zerohess.evaluators.partial_values import keep_finished
 from torch_zerohess.evaluators.values import as_tensor
 
 

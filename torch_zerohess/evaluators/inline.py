@@ -20,7 +20,7 @@ class Evaluator(Protocol):
     points in the last call, and why. One that calls fn with single points has `single_points`: the largest number of
     points of which it does so. One that can begin further calls before the first has ended has
     `submit(fn, points, *aux)`, which returns a `concurrent.futures.Future` of the values. Where a call fails whose
-    first values are known, its exception carries them, see `evaluators.finished`.
+    first values are known, its exception carries them, see `evaluators.partial_values`.
     """
 
     def __call__(self, fn: Callable[..., Any], points: Tensor, *aux: Tensor) -> Any:

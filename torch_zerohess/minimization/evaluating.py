@@ -5,8 +5,8 @@ from torch import Tensor
 from torch_zerohess.estimation.advice import add_note
 from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.evaluators.batch import numbers as numbers_of
-from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.inline import Inline
+from torch_zerohess.evaluators.partial_values import finished_values
 from torch_zerohess.minimization.record import Call
 from torch_zerohess.surrogates.memory import Memory
 

@@ -2,8 +2,8 @@
 
 import contextlib
 
-from torch_zerohess.minimization.blame import failure
 from torch_zerohess.minimization.callback import Callback
+from torch_zerohess.minimization.failure import failure
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.outcome import outcome
 from torch_zerohess.minimization.running import Running

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.estimation.inputs import short
-from torch_zerohess.minimization.doubt import DEEP, is_unbounded
+from torch_zerohess.minimization.minimality_checks import DEEP, is_unbounded
 
 _HELD = 1 << 22
 """Numbers of outputs that are kept, at most; the last request is kept whole."""

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.arguments import check_state
-from torch_zerohess.minimization.belief import Belief, believed, lowest
 from torch_zerohess.minimization.checkpoint import Checkpoint, check_limits
 from torch_zerohess.minimization.decision import Decision, decide
-from torch_zerohess.minimization.doubt import doubt
 from torch_zerohess.minimization.first_batch import evaluate_first_batch
+from torch_zerohess.minimization.minimality_checks import doubt
 from torch_zerohess.minimization.minimum import Iterate
 from torch_zerohess.minimization.noise import REPEATED, noise_at, opening, reserved
+from torch_zerohess.minimization.noisy_minimum import Lowest, expected_minimum, lowest
 from torch_zerohess.minimization.record import Call, Record
 from torch_zerohess.minimization.wording import budget
 from torch_zerohess.search.trust_region import TrustRegion
@@ -118,18 +118,18 @@ class Running:
         return doubt(*self.record.told, *self.best[:2], self.search.unit)
 
     @property
-    def best(self) -> Belief:
+    def best(self) -> Lowest:
         """The best point, its value and the error of the value; in noise from all evaluations together."""
         if self.decision is not None:
-            return Belief(self.decision.x, self.decision.value, self.decision.error)
+            return Lowest(self.decision.x, self.decision.value, self.decision.error)
         search = self.search
         points, losses = self.record.keeping(search.untouched, search.x)  # with what was not told to the search
         if self.noise and bool(torch.isfinite(losses).any()):
-            return self._believed(self.evaluations)
+            return self._expected_minimum(self.evaluations)
         found = lowest(points, losses, search.x)
         of_search = search.evaluations and self.record.requested is None and not self.record.flat
         # What the search takes for the best may be a prediction, where fn varies as if it was noisy.
-        return Belief(search.x, found.value, 0.0) if of_search and search.value == found.value else found
+        return Lowest(search.x, found.value, 0.0) if of_search and search.value == found.value else found
 
     @property
     def decision(self) -> Decision | None:
@@ -220,8 +220,8 @@ class Running:
         if allowed < 1:
             return
         self._deciding = before, allowed
-        search, believed = self.search, self._believed(before).x
-        likely = [search.x, search.center, believed] if search.averages else [believed, search.center]
+        search, expected = self.search, self._expected_minimum(before).x
+        likely = [search.x, search.center, expected] if search.averages else [expected, search.center]
         found = decide(self._evaluated, self.record, search, likely, before, allowed, self.noise)
         if found is not None:
             self._decided = Decision(*found, self.evaluations)
@@ -263,10 +263,10 @@ class Running:
         search.reference = self.search.reference
         return search
 
-    def _believed(self, count: int) -> Belief:
+    def _expected_minimum(self, count: int) -> Lowest:
         """Return the minimum of a noisy loss from the first `count` evaluations together."""
         points, losses = self.record.keeping(self.search.untouched, self.search.x)
-        return believed(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
+        return expected_minimum(points[:count], losses[:count], self.search.x, self.search.unit, self.noise or 0.0)
 
     def _evaluated(self, points: Tensor) -> Tensor:
         """Return the losses [K] of points [K, n], which are not told to the search."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from torch_zerohess.arguments import checked_number
-from torch_zerohess.minimization.doubt import UNBOUNDED
+from torch_zerohess.minimization.minimality_checks import UNBOUNDED
 from torch_zerohess.minimization.minimum import Status
 from torch_zerohess.minimization.running import Running
 

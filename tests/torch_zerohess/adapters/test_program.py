@@ -20,7 +20,7 @@ import torch_zerohess as zh
 from torch_zerohess.adapters import server as servers
 from torch_zerohess.adapters.process import Program
 from torch_zerohess.evaluators import Executor, ProcessPool
-from torch_zerohess.evaluators.finished import finished_values
+from torch_zerohess.evaluators.partial_values import finished_values
 from truths import vector
 
 READ = "import json, sys, time\n"

@@ -23,8 +23,8 @@ from black_boxes import part, points
 import torch_zerohess as zh
 from torch_zerohess.evaluators import Factory, Inline, LostEvaluationError, ProcessPool
 from torch_zerohess.evaluators.batch import MOST, Batch, cut
-from torch_zerohess.evaluators.finished import finished_values
 from torch_zerohess.evaluators.lifetime import ending
+from torch_zerohess.evaluators.partial_values import finished_values
 from torch_zerohess.evaluators.process_pool import cores
 from truths import Exponential, PlaneWave, deviation, vector
 

@@ -8,9 +8,9 @@ import torch
 from searches import TARGET, bowl, zeros
 
 import torch_zerohess as zh
-from torch_zerohess.minimization.belief import believed
 from torch_zerohess.minimization.decision import decide
 from torch_zerohess.minimization.noise import REPEATED, differs, distinct, lowest_mean, reserved
+from torch_zerohess.minimization.noisy_minimum import expected_minimum
 from torch_zerohess.minimization.record import Record
 from truths import vector
 
@@ -264,7 +264,7 @@ def test_a_belief_is_of_a_point_that_was_evaluated_and_not_of_the_luckiest_draw(
     for _ in range(40):
         points = torch.randn(50, 2, generator=generator, dtype=torch.float64)
         losses = points.square().sum(1) + 0.5 * torch.randn(50, generator=generator, dtype=torch.float64)
-        x, value, error = believed(points, losses, points[int(losses.argmin())], torch.ones(2), 0.5)
+        x, value, error = expected_minimum(points, losses, points[int(losses.argmin())], torch.ones(2), 0.5)
         assert bool((points == x).all(1).any())
         scores.append((value - float(x.square().sum())) / error)
         lowest.append(float(losses.min() - points[int(losses.argmin())].square().sum()))
@@ -277,31 +277,34 @@ def test_a_belief_is_of_the_nearest_hundred_evaluations_whatever_their_distance(
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(100, 2, generator=generator, dtype=torch.float64)
     losses = points.square().sum(1) + 0.5 * torch.randn(100, generator=generator, dtype=torch.float64)
-    x, value, error = believed(points, losses, zeros(2), vector(1.0, 1.0), 0.5)
+    x, value, error = expected_minimum(points, losses, zeros(2), vector(1.0, 1.0), 0.5)
     far = torch.cat([points, 100.0 + points[:50]]), torch.cat([losses, -9.0 * torch.ones(50).double()])
-    again = believed(*far, zeros(2), vector(1.0, 1.0), 0.5)
+    again = expected_minimum(*far, zeros(2), vector(1.0, 1.0), 0.5)
     assert torch.equal(again.x, x)
     assert again[1:] == (value, error)
-    wide = believed(1e3 * points, losses, zeros(2), vector(1.0, 1.0), 0.5)
+    wide = expected_minimum(1e3 * points, losses, zeros(2), vector(1.0, 1.0), 0.5)
     assert torch.equal(wide.x, 1e3 * x)
     assert wide[1:] == pytest.approx((value, error))
     for size in (2.0**-900, 2.0**900):  # losses whose squares vanish or overflow
-        scaled = believed(points, size * losses, zeros(2), vector(1.0, 1.0), size * 0.5)
+        scaled = expected_minimum(points, size * losses, zeros(2), vector(1.0, 1.0), size * 0.5)
         assert scaled.value / size == pytest.approx(value)
         assert scaled.error / size == pytest.approx(error)
     single = points.float()
-    same = believed(single, losses, zeros(2).float(), torch.ones(2), 0.5)
+    same = expected_minimum(single, losses, zeros(2).float(), torch.ones(2), 0.5)
     assert torch.equal(same.x, single[(points == x).all(1)][0])
     assert same[1:] == pytest.approx((value, error), rel=1e-4)
 
 
 def test_what_one_point_or_equal_losses_say_is_their_mean():
     losses = vector(1.0, 3.0, math.nan)
-    x, value, error = believed(TARGET.expand(3, -1), losses, zeros(2), torch.ones(2), 0.4)
+    x, value, error = expected_minimum(TARGET.expand(3, -1), losses, zeros(2), torch.ones(2), 0.4)
     assert (value, error) == (2.0, pytest.approx(0.4 / math.sqrt(2)))
     assert torch.equal(x, TARGET)
     points = torch.stack([TARGET, -TARGET, zeros(2)])
-    assert believed(points, torch.ones(3).double(), zeros(2), torch.ones(2), 0.4)[1:] == (1.0, 0.4 / math.sqrt(3))
+    assert expected_minimum(points, torch.ones(3).double(), zeros(2), torch.ones(2), 0.4)[1:] == (
+        1.0,
+        0.4 / math.sqrt(3),
+    )
 
 
 def test_derivatives_in_noise_and_their_errors():
@@ -468,6 +471,6 @@ def test_losses_may_be_ten_thousand_times_the_noise():
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(40, 2, generator=generator, dtype=torch.float64)
     losses = 1e3 * points.square().sum(1) + 0.1 * torch.randn(40, generator=generator, dtype=torch.float64)
-    x, value, error = believed(points, losses, zeros(2), torch.ones(2), 0.1)
+    x, value, error = expected_minimum(points, losses, zeros(2), torch.ones(2), 0.1)
     assert error < 1.0
     assert value == pytest.approx(1e3 * float(x.square().sum()), abs=3 * error)

@@ -33,7 +33,7 @@ from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.random_points import orthonormal
 from torch_zerohess.search.protocol.space import Bounds, Vector
 from torch_zerohess.search.protocol.state import Best, Evaluated
-from torch_zerohess.search.protocol.told import check_range
+from torch_zerohess.search.protocol.told_values import check_range
 from torch_zerohess.surrogates.loss_curvature import alternating, loss_curvature
 from torch_zerohess.surrogates.surrogate import raised, scaled
 

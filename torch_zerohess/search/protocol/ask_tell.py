@@ -24,7 +24,7 @@ from torch_zerohess.search.protocol.reference import Reference, reference
 from torch_zerohess.search.protocol.space import Bounds, Space, Vector, checked_start
 from torch_zerohess.search.protocol.standing import Standing
 from torch_zerohess.search.protocol.state import Evaluated, P, State, plain, restored, restored_progress
-from torch_zerohess.search.protocol.told import as_evaluated, check_start, converted, joined
+from torch_zerohess.search.protocol.told_values import as_evaluated, check_start, converted, joined
 from torch_zerohess.search.protocol.white_box import checked_loss
 from torch_zerohess.smoothing import random_seed
 from torch_zerohess.version import VERSION

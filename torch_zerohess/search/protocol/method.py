@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_zerohess.search.protocol.random_points import normal, reflect, uniform
 from torch_zerohess.search.protocol.state import Evaluated, P
-from torch_zerohess.search.protocol.told import moderate
+from torch_zerohess.search.protocol.told_values import moderate
 from torch_zerohess.surrogates.quadratic import LocalModel
 
 _AWAY = 2.0

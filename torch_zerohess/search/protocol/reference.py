@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.search.protocol.state import Evaluated
-from torch_zerohess.search.protocol.told import as_evaluated
+from torch_zerohess.search.protocol.told_values import as_evaluated
 
 _ROUNDING = 1e-4
 """Relative difference of two losses that may be rounding: networks in float32 have it on another machine."""

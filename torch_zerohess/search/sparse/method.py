@@ -27,7 +27,7 @@ from torch import Tensor
 from torch_zerohess.search.gauss_newton.kinked_steps import NOTHING
 from torch_zerohess.search.protocol.random_points import normal
 from torch_zerohess.search.protocol.state import Best, Evaluated
-from torch_zerohess.search.protocol.told import in_range
+from torch_zerohess.search.protocol.told_values import in_range
 from torch_zerohess.search.sparse.arrival import MOST, SparseArrivals
 from torch_zerohess.search.sparse.progress import SparseProgress
 from torch_zerohess.search.sparse.steps import derivatives

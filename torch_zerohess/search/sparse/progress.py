@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torch_zerohess.search.gauss_newton.by_samples import JacobianProgress
 from torch_zerohess.search.protocol.state import Best, Evaluated
-from torch_zerohess.search.protocol.told import check_range
+from torch_zerohess.search.protocol.told_values import check_range
 from torch_zerohess.surrogates.determined_jacobian import better_determined
 from torch_zerohess.surrogates.sparse_choices import GridEvidence
 from torch_zerohess.surrogates.sparse_evidence import Evidence

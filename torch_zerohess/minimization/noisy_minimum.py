@@ -14,7 +14,7 @@ _FINE_NOISES = (1e-8, 1e-7, 1e-5, 1e-4, 3e-4, 3e-3, 3e-2, 0.3, 3.0)
 """Further levels of noise: losses far from the minimum may be thousands of times the noise."""
 
 
-class Belief(NamedTuple):
+class Lowest(NamedTuple):
     """A point [n] that was evaluated, the loss without noise that is expected there, and its standard error."""
 
     x: Tensor
@@ -22,7 +22,7 @@ class Belief(NamedTuple):
     error: float
 
 
-def lowest(points: Tensor, losses: Tensor, start: Tensor) -> Belief:
+def lowest(points: Tensor, losses: Tensor, start: Tensor) -> Lowest:
     """Return the evaluation with the lowest finite loss; the first one if none is finite, the start if there is none.
 
     Args:
@@ -31,12 +31,12 @@ def lowest(points: Tensor, losses: Tensor, start: Tensor) -> Belief:
         start: [n], whose value is not known: NaN.
     """
     if not len(losses):
-        return Belief(start, math.nan, 0.0)
+        return Lowest(start, math.nan, 0.0)
     k = int(torch.where(torch.isfinite(losses), losses, torch.inf).argmin())
-    return Belief(points[k].clone(), float(losses[k]), 0.0)
+    return Lowest(points[k].clone(), float(losses[k]), 0.0)
 
 
-def believed(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise: float) -> Belief:
+def expected_minimum(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise: float) -> Lowest:
     """Return the evaluated point with the lowest expected loss, by a Gaussian process of the evaluations.
 
     Every candidate was evaluated, so a value without an evaluation near it is never returned. The expectation uses the
@@ -58,11 +58,11 @@ def believed(points: Tensor, losses: Tensor, around: Tensor, unit: Tensor, noise
     points, values, z = points[near], losses[near].to(unit), z[near]
     reach = float(distance[: len(near)].square().mean().sqrt())
     if bool((z == z[0]).all() or (values == values[0]).all()):  # all are of one point, or none is lower than another
-        return Belief(points[0], float(values.mean()), noise / math.sqrt(len(values)))
+        return Lowest(points[0], float(values.mean()), noise / math.sqrt(len(values)))
     z = z / (reach * math.sqrt(len(unit)))
     size = max(float(values.abs().max()), noise)  # the squares of values / size and noise / size do not overflow
     process = GaussianProcess.fit(z, values[:, None] / size, (*NOISES, *_FINE_NOISES, *HIGH_NOISES), noise / size)
     expected = process.predict(z)[:, 0]
     k = int(expected.argmin())
     error = float(process.uncertainty(process.covariance(z[k : k + 1])).sqrt())
-    return Belief(points[k], size * float(expected[k]), size * error)
+    return Lowest(points[k], size * float(expected[k]), size * error)

@@ -12,7 +12,7 @@ _CHECKS = tuple(
         "minimization.callback",
         "minimization.evaluating",
         "minimization.separate",
-        "search.protocol.told",
+        "search.protocol.told_values",
         "search.sparse.progress",
     )
 )

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torch_zerohess.minimization.doubt import doubt, has_cusp, is_constant, jumps
+from torch_zerohess.minimization.minimality_checks import doubt, has_cusp, is_constant, jumps
 from truths import vector
 
 

@@ -20,8 +20,8 @@ _GROWTH = 1.3
 """The surrogate is fitted again when there are this times as many evaluations as at the last fit."""
 _FEWEST = 8
 """Evaluations at the first fit, and the least capacity: with less there would never be a fit."""
-_EXCESS = 1.05
-"""Evaluations over the capacity at which they are thinned."""
+_KEPT = 0.9
+"""Share of the capacity that thinning leaves: it takes long, and must not follow every call."""
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -69,8 +69,8 @@ class Memory:
             It calls a module in evaluation mode, whatever its mode is, and leaves mode and buffers as they are.
             ValueError at the first call after a fit if outputs at the same points differ, as behind a dropout by
             `torch.nn.functional`, which draws in evaluation mode, too.
-        capacity: evaluations that are kept, at least 8. Beyond it, of points that are close to each other the older are
-            dropped. Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
+        capacity: evaluations that are kept, at least 8: with fewer nothing is fitted. Beyond it a tenth is dropped: of
+            points that are close to each other the older. Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
             Values then have noise, so `optim.NewtonCG` and `optim.Newton` need adapt=False. None: all of them. 0: none;
             the estimate is then the first term alone, and biased towards g. Under `vmap` each element is a batch of its
@@ -186,7 +186,7 @@ class Memory:
             self._points.append(points[finite])
             self._outputs.append(outputs[finite])
         self._size += len(self._points[-1])
-        if self._size > _EXCESS * self.capacity:
+        if self._size > self.capacity:
             self._thin()
 
     @_locked
@@ -228,9 +228,9 @@ class Memory:
         return 1.0 if self.fresh == 0 else self.regression.value
 
     def _thin(self) -> None:
-        """Drop points until the capacity is kept."""
+        """Drop points down to a share of the capacity."""
         first = max(self._size - 2 * self.capacity, 0)  # older ones go first, so that distances are few
-        kept = first + farthest_from_later(self.points[first:], self.capacity)
+        kept = first + farthest_from_later(self.points[first:], max(_FEWEST, int(_KEPT * self.capacity)))
         with outside_inference():
             self._points, self._outputs = [self.points[kept]], [self.outputs[kept]]
         self._size, self._rows = len(kept), int((kept < self._rows).sum())

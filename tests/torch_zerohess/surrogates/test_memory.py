@@ -1,6 +1,7 @@
 """What a memory keeps, when it fits, and what it thinks of its surrogate."""
 
 import copy
+import math
 import threading
 
 import pytest
@@ -11,6 +12,7 @@ import torch_zerohess as zh
 from torch_zerohess.surrogates import memory as module
 from torch_zerohess.surrogates.linear import LinearSurrogate
 from torch_zerohess.surrogates.memory import Memory
+from torch_zerohess.surrogates.thinning import farthest_from_later
 from truths import normal
 
 
@@ -65,30 +67,52 @@ def test_wrong_shapes_raise(points, outputs) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
 def test_thinning_drops_older_points_that_are_crowded(dtype) -> None:
-    memory = Memory(capacity=10)
-    z = torch.arange(11, dtype=dtype)[:, None]
-    z[10] = 2.125  # the newest, next to the third
-    memory.add(z, z)
-    assert len(memory) == 10
-    assert 2.0 not in memory.points
-    assert 2.125 in memory.points
+    """A tenth of the capacity, two points, goes with the point beyond the capacity."""
+    memory = Memory(capacity=20)
+    z = torch.arange(21, dtype=dtype)[:, None]
+    z[18:] = torch.tensor([[2.125], [5.25], [9.125]], dtype=dtype)  # the newest, next to older ones
+    memory.add(z[:20], z[:20])
+    assert len(memory) == 20
+    memory.add(z[20:], z[20:])
+    assert memory.points[:, 0].tolist() == [one for one in z[:, 0].tolist() if one not in (2.0, 5.0, 9.0)]
     assert torch.equal(memory.points, memory.outputs)
+
+
+@pytest.mark.parametrize(("capacity", "least"), [(8, 8), (50, 45)])
+def test_no_more_than_the_capacity_is_kept_after_a_call(capacity, least) -> None:
+    """And the least that a fit takes stays, however few the capacity is."""
+    memory, z = Memory(capacity=capacity), normal(300, 2)
+    sizes = []
+    for part in [*z[:150].split(1), *z[150:].split(7)]:
+        memory.add(part, part)
+        sizes.append(len(memory))
+    assert (min(sizes[capacity:]), max(sizes)) == (least, capacity)
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_points_nearest_to_later_ones_are_found(n) -> None:
+    """In standard deviations of each parameter, with the distances as another formula gives them."""
+    z = (normal(300, n) * torch.logspace(-1, 3, n) + 10.0).float()
+    scaled = (z.double() / z.double().std(0)).tolist()
+    gaps = [min([math.dist(one, other) for other in scaled[k + 1 :]], default=math.inf) for k, one in enumerate(scaled)]
+    expected = sorted(sorted(range(300), key=gaps.__getitem__)[120:])
+    assert farthest_from_later(z, 180).tolist() == expected
 
 
 def test_thinning_compares_few_points_at_once(monkeypatch) -> None:
     """However many are added, distances are computed between a block of points and at most 2 capacity points."""
-    apart, shapes = torch.cdist, []
+    product, shapes = torch.addmm, []
     monkeypatch.setattr(
-        torch, "cdist", lambda a, b, **options: shapes.append((len(a), len(b))) or apart(a, b, **options)
+        torch, "addmm", lambda c, a, b, **options: shapes.append((len(a), b.shape[1])) or product(c, a, b, **options)
     )
     memory, z = Memory(capacity=1500), normal(20_000, 1)
     memory.add(z, z)
-    assert len(memory) == 1500
-    assert max(block for block, _ in shapes) <= 1024
-    assert max(others for _, others in shapes) <= 3000
+    assert len(memory) == 1350
+    assert max(block for block, _ in shapes) <= 64
+    assert max(others for _, others in shapes) == 3000
     latest = z[-3000:]
     gaps = torch.stack([(latest[k + 1 :] - latest[k]).abs().min() for k in range(2999)])
-    dropped = gaps.argsort()[:1500]
+    dropped = gaps.argsort()[:1650]
     assert not torch.isin(latest[dropped], memory.points).any()
 
 
@@ -228,7 +252,7 @@ def test_a_parameter_that_is_constant_does_not_decide_what_is_kept() -> None:
     memory = Memory(capacity=100)
     for part in torch.rand(300, 1, generator=torch.Generator().manual_seed(0)).split(150):
         memory.add(torch.cat([part, torch.full_like(part, 5.0)], 1), part[:, 0])
-    assert len(memory) == 100
+    assert len(memory) == 90
     generator = torch.Generator().manual_seed(0)
     latest = torch.rand(300, 1, generator=generator)[200:, 0]
     assert 0.3 < float(torch.isin(memory.outputs, latest).double().mean()) < 0.9

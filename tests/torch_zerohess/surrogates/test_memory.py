@@ -91,8 +91,12 @@ def test_no_more_than_the_capacity_is_kept_after_a_call(capacity, least) -> None
 
 @pytest.mark.parametrize("n", [1, 5])
 def test_points_nearest_to_later_ones_are_found(n) -> None:
-    """In standard deviations of each parameter, with the distances as another formula gives them."""
-    z = (normal(300, n) * torch.logspace(-1, 3, n) + 10.0).float()
+    """In standard deviations of each parameter, with the distances as another formula gives them.
+
+    One point is far away: the others are close to each other for the deviation.
+    """
+    z = (normal(300, n) * torch.logspace(-1, 3, n)).float()
+    z[0] *= 1e4
     scaled = (z.double() / z.double().std(0)).tolist()
     gaps = [min([math.dist(one, other) for other in scaled[k + 1 :]], default=math.inf) for k, one in enumerate(scaled)]
     expected = sorted(sorted(range(300), key=gaps.__getitem__)[120:])

@@ -20,6 +20,19 @@ _STRIDE = 0x9E3779B97F4A7C15  # between seeds: generators of near seeds begin al
 _SHOWN = 2048  # parameters up to which a repr says what was chosen; beyond the choice stays as it is
 
 
+class _Sigma:
+    """The setting sigma, checked. A reader gets a copy of a tensor, which may be written to."""
+
+    def __get__(self, owner: "Smoothing | None", kind: type) -> Any:
+        if owner is None:
+            raise AttributeError("sigma has no default")
+        sigma = vars(owner)["sigma"]
+        return sigma if isinstance(sigma, float) else sigma.clone()
+
+    def __set__(self, owner: "Smoothing", sigma: Any) -> None:
+        vars(owner)["sigma"] = checked_sigma(sigma)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Smoothing:
     """How a function is convolved with a Gaussian, F(x) = E f(x + sigma u), u ~ N(0, I), and sampled.
@@ -68,7 +81,7 @@ class Smoothing:
         ('orthogonal', 33)
     """
 
-    sigma: float | Tensor
+    sigma: float | Tensor = _Sigma()  # type: ignore[assignment]
     samples: int = 8
     proposal: Proposal = "aggregate"
     antithetic: Signs = True
@@ -79,7 +92,6 @@ class Smoothing:
     scrambles: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sigma", checked_sigma(self.sigma))
         for name, least in (("samples", 1), ("order", 1), ("scrambles", 1)):
             number = getattr(self, name)
             if number is not None or name in ("samples", "order"):  # as integers of Python, for `state_dict`
@@ -241,11 +253,12 @@ class Smoothing:
 
     def sigma_vector(self, n: int, device: torch.device) -> Tensor:
         """Return sigma as float64 [n]; ValueError for a tensor that has not n elements."""
-        if isinstance(self.sigma, float):
-            return torch.full((n,), self.sigma, dtype=torch.float64, device=device)
-        if len(self.sigma) != n:
-            raise ValueError(f"sigma has {len(self.sigma)} elements, but x has {n} parameters: give one number or {n}")
-        return self.sigma.to(device=device, dtype=torch.float64)
+        sigma = vars(self)["sigma"]
+        if isinstance(sigma, float):
+            return torch.full((n,), sigma, dtype=torch.float64, device=device)
+        if len(sigma) != n:
+            raise ValueError(f"sigma has {len(sigma)} elements, but x has {n} parameters: give one number or {n}")
+        return sigma.to(device=device, dtype=torch.float64)
 
 
 def settings_of(smoothing: Smoothing) -> dict[str, Any]:

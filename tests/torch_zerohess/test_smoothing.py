@@ -1,7 +1,9 @@
 """Settings as values: equal, hashable, and made of numbers that any file keeps."""
 
+import copy
 import io
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -17,6 +19,18 @@ def test_equal_settings_are_equal():
     others = [one.replace(samples=5), one.replace(sigma=0.1), one.replace(sigma=[0.1, 0.3]), one.replace(seed=1)]
     assert len({one, *others}) == 5
     assert one != "text"
+
+
+def test_nobody_can_write_to_a_sigma():
+    """Neither to the tensor that was given, nor to the tensor that is read."""
+    given = torch.tensor([1.0, 2.0])
+    settings = zh.Smoothing(sigma=given, seed=0)
+    given[0] = settings.sigma[0] = -1.0
+    assert settings.sigma.tolist() == settings.sigma_vector(2, given.device).tolist() == [1.0, 2.0]
+    for copied in (pickle.loads(pickle.dumps(settings)), copy.deepcopy(settings)):
+        assert copied == settings
+    with pytest.raises(TypeError, match="'sigma'"):
+        zh.Smoothing(samples=4)
 
 
 @pytest.mark.parametrize("number", [np.int64(4), np.uint8(4), torch.tensor(4)])

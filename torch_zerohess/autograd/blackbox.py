@@ -267,7 +267,7 @@ def smooth(
     evaluator: Evaluator | None = None,
     value: ValueMode = "center",
     on_nonfinite: str | float = "raise",
-) -> Callable[..., Tensor]:
+) -> BlackBox:
     """Return fn, convolved with a Gaussian, as a differentiable function of a tensor: a `BlackBox` of fn.
 
     Arguments, shapes and errors: see `BlackBox`.

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torch_zerohess.autograd import transforms
-from torch_zerohess.estimation.control import Control, Prediction
+from torch_zerohess.estimation.control import NOT_FINITE, Control, Prediction
+from torch_zerohess.estimation.inputs import all_finite
 from torch_zerohess.estimation.smoothness import known_smooth
 from torch_zerohess.estimation.surrogate_mean import per_element, smoothed
 from torch_zerohess.estimation.surrogate_term import MOST_STEIN, measure
@@ -55,6 +56,14 @@ def _pathwise(control: Control, center: Tensor, aux: Sequence[Tensor], sigma: Te
             return 2 if known_smooth(control) else 0
     few = center.shape[1] <= MOST_STEIN
     return (0 if few else 2) if memory.pathwise is None else memory.pathwise
+
+
+def _check_finite(result: Tensor) -> None:
+    """Raise ValueError if the surrogate alone, without new evaluations, gave numbers that are not finite."""
+    with transforms.outside():
+        seen = transforms.shown(result)
+        if seen is not None and not all_finite(seen):
+            raise ValueError(NOT_FINITE)
 
 
 def around(
@@ -126,6 +135,8 @@ def around(
 
     def whole(x: Tensor) -> Tensor:
         result, new = expected(x)
+        if rest is None:
+            _check_finite(result)
         if value == "smoothed":
             return result
         start, new = (result, new) if fixed is None else fixed

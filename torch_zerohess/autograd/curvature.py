@@ -9,8 +9,10 @@ The supplement of Wang, Fischer and Ritschel (2025, section E) calls the second 
 term in the curvature of the network, hence "approximately" in the source.
 """
 
+import sys
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import Any, overload
 
 import torch
 from torch import Tensor
@@ -96,8 +98,15 @@ class CurvatureOperator:
     depends: bool
     """Whether the loss is computed from any of the parameters."""
 
-    def __matmul__(self, v: Tensor) -> Tensor:
-        """Return H v for v [N], or H V for V [N, m]."""
+    @overload
+    def __matmul__(self, v: Tensor) -> Tensor: ...
+    @overload
+    def __matmul__(self, v: Any) -> Any: ...
+    def __matmul__(self, v: Any) -> Any:
+        """Return H v for v [N], or H V for V [N, m]: a tensor, or for an array of NumPy an array of its type."""
+        if isinstance(array := v, getattr(sys.modules.get("numpy"), "ndarray", ())):
+            v = torch.as_tensor(array)
+            return (self @ v.to(self.device)).to(v).numpy()
         if not isinstance(v, Tensor):
             raise TypeError(f"v must be a tensor [{self.shape[0]}], all inputs in one, got {type(v).__name__}")
         if v.dim() not in (1, 2) or len(v) != self.shape[0]:

@@ -13,7 +13,7 @@ from torch_zerohess.autograd.marker import Input
 from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.estimation.evaluation import evaluate_center
 from torch_zerohess.estimation.inputs import checked_input, working
-from torch_zerohess.estimation.sparse_jacobian import sparse_jacobian
+from torch_zerohess.estimation.sparse_jacobian import check_output, sparse_jacobian
 from torch_zerohess.evaluators.inline import Evaluator
 from torch_zerohess.precision import without_autocast
 from torch_zerohess.smoothing import Smoothing, settings_of, smoothing_of
@@ -100,6 +100,7 @@ class SparseBlackBox(Layer):
         SparseSettings.checked(n, **self.settings)
         center = working(x).detach().reshape(-1, n).clone()
         values = evaluate_center(self.call, center, ()).to(center.dtype)
+        check_output(values.shape[1:], "BlackBox")
         if transforms.derivative_possible(x):
             self.jacobians = jacobians = self._jacobians(center, values.shape[1:])
             change = Input.apply(working(x)).reshape(-1, n) - center

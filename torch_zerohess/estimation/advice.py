@@ -15,13 +15,19 @@ def add_note(error: Exception, text: str) -> None:
 
 
 def add_advice(
-    error: Exception, fn: Callable[..., Any], points: Tensor, aux: Sequence[Tensor], *, vectorized: bool
+    error: Exception,
+    fn: Callable[..., Any],
+    points: Tensor,
+    aux: Sequence[Tensor],
+    *,
+    vectorized: bool,
+    headed: bool = False,
 ) -> None:
     """Add a note to an error that fn raised when it was called for a batch of points [K, n].
 
     A function of one point gets a note only where it mixes arrays and tensors. A class of black boxes with the
     attribute `takes_batches` gets none: its errors are no sign of a function of one point. Neither does an error that
-    says what fn must return.
+    says what fn must return. With a head (`headed`) fn may have expected the auxiliary inputs that the head gets.
     """
     text = str(error)
     by_construction = getattr(getattr(fn, "__self__", fn), "takes_batches", False)
@@ -31,6 +37,10 @@ def add_advice(
         add_note(
             error, f"fn gets {'points' if vectorized else 'a point'} as a torch.Tensor: np.asarray(x) is the array"
         )
+    missing = isinstance(error, TypeError) and "positional argument" in text
+    if headed and missing and not _takes(fn, 1):
+        add_note(error, "fn gets points alone where there is a head: the head gets the auxiliary inputs")
+        return
     if not vectorized:
         return
     if "does not require grad" in text:
@@ -39,7 +49,7 @@ def add_advice(
         )
         return
     note = f"fn was called with a batch {list(points.shape)}"
-    if isinstance(error, TypeError) and "positional argument" in text:
+    if missing:
         given = [f"points {list(points.shape)}", *(f"aux {list(one.shape)}" for one in aux)]
         note = f"fn was called as fn({', '.join(given)})"
     add_note(error, note + ("; if it takes one point, pass vectorized=False" if _takes(fn, 1 + len(aux)) else ""))

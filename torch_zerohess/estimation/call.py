@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torch_zerohess.arguments import check_bool, check_evaluator, check_head
+from torch_zerohess.arguments import check_bool, check_evaluator, check_head, checked_number
 from torch_zerohess.estimation.advice import add_advice
 from torch_zerohess.estimation.head import Head, apply_head
 from torch_zerohess.estimation.inputs import all_finite, times_changed
@@ -58,9 +58,7 @@ class BlackBoxCall:
             check_head(self.outer.head)
         if self.value not in ("center", "smoothed"):
             raise ValueError(f"value must be 'center' or 'smoothed', got {self.value!r}")
-        rule = self.on_nonfinite
-        if rule not in ("raise", "drop") and not _finite_number(rule):
-            raise ValueError(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
+        object.__setattr__(self, "on_nonfinite", _checked_rule(self.on_nonfinite))
 
     def __call__(self, points: Tensor, aux: Sequence[Tensor]) -> Tensor:
         """Return values [K, *out], a real floating tensor on the device of points [K, n]."""
@@ -72,7 +70,8 @@ class BlackBoxCall:
         except (IndexError, RuntimeError, TypeError, ValueError) as error:
             raised = isinstance(self.evaluator, Inline) or isinstance(error.__cause__, RemoteTraceback)
             if raised and not self.answered:
-                add_advice(error, self.fn, points, aux, vectorized=self.vectorized)
+                headed = self.outer.head is not None
+                add_advice(error, self.fn, points, aux, vectorized=self.vectorized, headed=headed)
             raise
         values = checked_values(result, points, self.vectorized)
         object.__setattr__(self, "answered", True)
@@ -159,8 +158,17 @@ class BlackBoxCall:
         return lambda b, e: lost.get(e if self.joint else b * E + e)
 
 
-def _finite_number(rule: Any) -> bool:
-    return isinstance(rule, (int, float)) and not isinstance(rule, bool) and math.isfinite(rule)
+def _checked_rule(rule: Any) -> str | float:
+    """Return `on_nonfinite`. TypeError if it is neither a text nor a number, ValueError if it is another one."""
+    if isinstance(rule, str) and rule in ("raise", "drop"):
+        return rule
+    error: type[Exception] = ValueError
+    try:
+        if not isinstance(rule, str):
+            return checked_number("on_nonfinite", rule, below=math.inf)
+    except (TypeError, ValueError) as wrong:
+        error = type(wrong)
+    raise error(f"on_nonfinite must be 'raise', 'drop' or a finite number, got {rule!r}")
 
 
 def _copied(tensor: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.parameter import is_lazy
 
+from torch_zerohess.estimation.advice import add_note
 from torch_zerohess.estimation.head import apply_head
 from torch_zerohess.estimation.outer import Outer
 from torch_zerohess.evaluation_mode import evaluation_mode
@@ -31,6 +32,7 @@ _ROUNDING, _DEVIATION = 16.0, 0.01
 """Errors of values that are negligible: in units of their rounding, and of their deviation."""
 
 
+NOT_FINITE = "the surrogate of the memory predicted a value that is not finite"
 _PLAIN = (torch.jit.ScriptModule, nn.DataParallel)
 """Modules whose parameters cannot be exchanged for a call."""
 _changed = threading.RLock()
@@ -107,7 +109,7 @@ class Control:
             with torch.no_grad():  # a module has parameters that require grad
                 predicted = Prediction(self, self.memory.surrogate, aux, encoded)(points).double()
             if self.active and not bool(torch.isfinite(predicted).all()):
-                raise ValueError("the surrogate of the memory predicted a value that is not finite")
+                raise ValueError(NOT_FINITE)
         if self.learning and predicted is not None:
             least = [float(one.square().mean()) for one in added(_negligible(values, outputs.dtype))]
             derivatives = list(zip(added(values), added(predicted), least, strict=True))
@@ -220,6 +222,7 @@ def as_constant(surrogate: Any, z: Tensor) -> Tensor:
     except RuntimeError as error:
         if "data pointer" in str(error):  # NumPy got a tensor of a transform
             raise RuntimeError("the surrogate of the memory is not made of torch: torch.func cannot map it") from error
+        add_note(error, f"the surrogate of the memory, {type(surrogate).__name__}, was called with points {[*z.shape]}")
         raise
 
 

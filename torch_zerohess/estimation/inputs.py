@@ -93,6 +93,14 @@ def named(name: str, tensor: Tensor) -> str:
     return f"{name}={short(tensor)}" if tensor.numel() <= _SHOWN else f"{name} of shape {list(tensor.shape)}"
 
 
+def attribute(owner: object, name: str) -> str:
+    """Return an attribute that is a tensor as `named` does, or that it is not finite where it raises ValueError."""
+    try:
+        return named(name, getattr(owner, name))
+    except ValueError:
+        return f"{name} not finite"
+
+
 def _rounded(numbers: Any) -> Any:
     return [_rounded(one) for one in numbers] if isinstance(numbers, list) else f"{numbers:.4g}"
 

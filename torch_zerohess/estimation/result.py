@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_number
 from torch_zerohess.estimation.call import ValueMode
-from torch_zerohess.estimation.inputs import all_finite, named, short
+from torch_zerohess.estimation.inputs import all_finite, attribute, short
 from torch_zerohess.estimation.skewness import Shape, extension
 from torch_zerohess.estimation.stein import Quantity
 from torch_zerohess.estimation.student import student_factor
@@ -218,7 +218,7 @@ class Estimate:
 
     def __repr__(self) -> str:
         shape = f"x {list(self._x.shape)}, output {[*self._batch, *self._out]}"
-        parts = [shape, named("value", self.value), named("gradient", self.gradient)]
+        parts = [shape, attribute(self, "value"), attribute(self, "gradient")]
         parts += [f"auto: {self._chosen}"] * bool(self._chosen)
         parts += [f"evaluations={self.evaluations}"] + [f"dropped={self.dropped}"] * (self.dropped > 0)
         return f"Estimate({', '.join(parts)})"

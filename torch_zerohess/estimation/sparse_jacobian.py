@@ -109,6 +109,15 @@ def sparse_jacobian(
     return replace(found.times(1.0 / sigma), evaluations=evaluations, total_evaluations=taken + evaluations)
 
 
+def check_output(shape: torch.Size, other: str) -> None:
+    """Raise ValueError for an output [*out] of one number, and name what is made for it."""
+    if shape.numel() < 2:
+        raise ValueError(
+            f"fn must return an output of many numbers, each of few parameters, got shape {list(shape)}: for one "
+            f"number use {other}"
+        )
+
+
 def _resolved(smoothing: Smoothing, n: int) -> Smoothing:
     """Return the settings without "auto"; ValueError for samples that do not tell a sparse Jacobian."""
     if smoothing.sampler == "auto" and smoothing.resolved(n).sampler == "sobol":
@@ -138,11 +147,7 @@ def _sampled(
     points, u, weights = perturbations.points, stein.u[0], stein.weight[0]
     values, _ = call.values(points, [])
     shape = values.shape[2:]
-    if shape.numel() < 2:
-        raise ValueError(
-            f"fn must return an output of many numbers, each of few parameters, got shape {list(shape)}: for one "
-            "number use estimate"
-        )
+    check_output(shape, "estimate")
     why = call.why_lost(points.shape[1])
     values, kept = finite_values(values, values, lambda: points, call.on_nonfinite, len(u), smoothing, stein, why)
     flat = values[0].reshape(len(u), -1).double()

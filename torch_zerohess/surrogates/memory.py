@@ -70,7 +70,8 @@ class Memory:
             ValueError at the first call after a fit if outputs at the same points differ, as behind a dropout by
             `torch.nn.functional`, which draws in evaluation mode, too.
         capacity: evaluations that are kept, at least 8: with fewer nothing is fitted. Beyond it a tenth is dropped: of
-            points that are close to each other the older. Outputs stay in memory as they are: 4 000 images of 64 x 64 x 3 float32 numbers take 200 MB.
+            points that are close to each other the older. Outputs stay in memory as they are: 4 000 images of 64 x 64 x
+            3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
             Values then have noise, so `optim.NewtonCG` and `optim.Newton` need adapt=False. None: all of them. 0: none;
             the estimate is then the first term alone, and biased towards g. Under `vmap` each element is a batch of its
@@ -173,10 +174,8 @@ class Memory:
             )
         for name, new, kept in (("points", points, self._points), ("outputs", outputs, self._outputs)):
             if kept and new.shape[1:] != kept[0].shape[1:]:
-                raise ValueError(
-                    f"{name} must be [K, {', '.join(map(str, kept[0].shape[1:]))}] like the earlier ones, "
-                    f"got {list(new.shape)}"
-                )
+                wanted = ", ".join(map(str, ("K", *kept[0].shape[1:])))
+                raise ValueError(f"{name} must be [{wanted}] like the earlier ones, got {list(new.shape)}")
         points, outputs = floating("points", points), floating("outputs", outputs)
         finite = torch.isfinite(points).all(1) & torch.isfinite(outputs.reshape(len(outputs), -1)).all(1)
         self.evaluations += len(points)

@@ -4,6 +4,7 @@ The samples are many and quasi-random, so that their error is far below the tole
 relative to the largest element; the structure (symmetry, agreement of matrix-free and dense) holds to rounding.
 """
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -170,6 +171,16 @@ def test_a_dense_matrix_beyond_ten_thousand_parameters_is_refused():
     with pytest.raises(ValueError, match="matrix of 10001 squared numbers: use H @ v"):
         operator.to_dense()
     torch.testing.assert_close(operator @ torch.ones(10_001), torch.full((10_001,), 2.0))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_arrays_of_numpy_give_arrays_of_their_type(dtype):
+    x = torch.tensor([1.0, 2.0], requires_grad=True)
+    operator = zh.CurvatureOperator((x**3).sum(), x)
+    v, both = np.array([1.0, -1.0], dtype=dtype), np.eye(2, dtype=dtype)
+    for got, expected in ((operator @ v, [6.0, -12.0]), (operator @ both, [[6.0, 0.0], [0.0, 12.0]])):
+        assert got.dtype == dtype
+        np.testing.assert_allclose(got, expected, rtol=1e-6)
 
 
 def test_a_list_of_vectors_is_refused():

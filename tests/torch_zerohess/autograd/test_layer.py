@@ -2,6 +2,7 @@
 
 import copy
 import io
+import math
 import pickle
 from collections.abc import Callable
 
@@ -17,7 +18,7 @@ from torch_zerohess.autograd import transforms
 from torch_zerohess.estimation import perturbations
 from torch_zerohess.heads import SquaredError
 from torch_zerohess.sampling import kernels, stein_sums
-from truths import normal, spread, vector
+from truths import deviation, normal, spread, vector
 
 
 def test_value_gradient_and_hessian_cost_one_call() -> None:
@@ -47,6 +48,22 @@ def test_value_gradient_and_hessian_cost_one_call() -> None:
     fn, calls = counting(SCALAR.f)
     torch.func.vmap(torch.func.hessian(smooth(fn, AGGREGATE)))(BATCH)
     assert calls == [4 * 13]
+
+
+@pytest.mark.parametrize(("seeds", "unbiased"), [((1, 2), True), ((None, None), True), ((1, 1), False)])
+def test_layers_in_sequence_need_different_perturbations(seeds: tuple[int | None, int | None], unbiased: bool) -> None:
+    """E sin(x + sigma u) = exp(-sigma^2 / 2) sin(x), so the slope behind two layers is the product of two slopes.
+
+    With the same perturbations it is too large by the covariance of the two Jacobians, here a third, which 4 000
+    elements tell.
+    """
+    torch.manual_seed(0)
+    sigma, n = 0.5, 3
+    first, second = (BlackBox(torch.sin, Smoothing(sigma=sigma, seed=seed)) for seed in seeds)
+    x = spread(n, -0.5, 0.5).expand(4000, n).requires_grad_()
+    (slopes,) = torch.autograd.grad(second(first(x)).sum(), x)
+    truth = math.exp(-(sigma**2)) * torch.cos(x[0]) * torch.cos(torch.sin(x[0]))
+    assert (deviation(slopes, truth.detach()) < 5.0) == unbiased
 
 
 def test_only_the_value_where_no_derivative_can_be_asked_for() -> None:

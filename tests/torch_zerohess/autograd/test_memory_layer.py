@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -721,6 +722,28 @@ def test_a_surrogate_that_predicts_no_numbers_is_left_out() -> None:
         plain(other).sum().backward()
         assert torch.equal(leaf.grad, other.grad)
     assert memory.coefficient == 0.0
+
+
+@pytest.mark.parametrize("value", ["center", "smoothed"])
+def test_a_surrogate_that_predicts_no_numbers_is_an_error_without_new_evaluations(value: Any) -> None:
+    """Nothing else is there; some points of the smoothing, or the center alone, may be without a number."""
+    x, r = point()
+    for wrong in (lambda z: render(z) * math.nan, lambda z: render(z).where(z[:, :1].double() < 0.9, math.nan)):
+        box = layer(remembering(Fixed(wrong), fresh=0), value=value)
+        for call in (
+            lambda z, box=box: box(z, r).sum(),
+            lambda z, box=box: torch.func.grad(lambda y: box(y, r).sum())(z),
+        ):
+            with pytest.raises(ValueError, match="surrogate of the memory predicted a value that is not finite"):
+                call(x.clone().requires_grad_())
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+def test_an_error_of_a_surrogate_names_it_and_the_shape_of_its_points() -> None:
+    box = zh.BlackBox(render, zh.Smoothing(sigma=SIGMA, samples=4), memory=zh.Memory(nn.Linear(3, 3).double()))
+    with pytest.raises(RuntimeError, match="mat1 and mat2") as raised:
+        box(point()[0].requires_grad_())
+    assert raised.value.__notes__ == ["the surrogate of the memory, Linear, was called with points [36, 2]"]
 
 
 @pytest.mark.parametrize("n", [2, 10])

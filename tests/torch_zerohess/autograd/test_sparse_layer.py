@@ -248,8 +248,9 @@ def test_sigma_is_annealed_and_saved():
 def test_what_it_refuses():
     x = X.clone().requires_grad_()
     layer = zh.SparseBlackBox(blurred, SMOOTHING)
-    with pytest.raises(ValueError, match="for one number use estimate"):
-        zh.SparseBlackBox(lambda z: z.sum(1), SMOOTHING)(x)
+    for smoothing in (SMOOTHING, SMOOTHING.replace(samples=1)):  # also where there are too few samples
+        with pytest.raises(ValueError, match="for one number use BlackBox"):
+            zh.SparseBlackBox(lambda z: z.sum(1), smoothing)(x)
     with pytest.raises(ValueError, match="sampler must be 'random', 'orthogonal' or 'auto', got 'sobol'"):
         zh.SparseBlackBox(blurred, SMOOTHING.replace(sampler="sobol"))(x)
     with pytest.raises(RuntimeError, match="use BlackBox"):

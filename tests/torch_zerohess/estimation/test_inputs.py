@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torch_zerohess import BlackBox, Smoothing, estimate, smooth
+from torch_zerohess import BlackBox, Smoothing, estimate, heads, smooth
 from torch_zerohess.adapters.mitsuba import MitsubaScene
 from torch_zerohess.adapters.onnx import OnnxFunction
 from torch_zerohess.adapters.process import Program
@@ -207,6 +207,21 @@ def test_an_error_of_arrays_and_tensors_says_how_to_make_an_array(vectorized: bo
     assert raised.value.__notes__[0] == f"fn gets {points} as a torch.Tensor: np.asarray(x) is the array"
 
 
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="exceptions have no notes")
+@pytest.mark.parametrize("vectorized", [True, False])
+def test_the_note_says_that_fn_gets_points_alone_where_there_is_a_head(vectorized: bool) -> None:
+    layer = BlackBox(lambda z, r: z - r, S, head=heads.SquaredError(), vectorized=vectorized)
+    with pytest.raises(TypeError, match="missing 1 required positional argument") as raised:
+        layer(torch.zeros(3, 2), torch.ones(3, 2))
+    assert raised.value.__notes__ == ["fn gets points alone where there is a head: the head gets the auxiliary inputs"]
+
+
+@pytest.mark.parametrize("number", [np.float32(2.5), np.int64(2), torch.tensor(1e6), 3])
+def test_any_number_may_replace_what_is_not_finite(number) -> None:
+    given = BlackBox(lambda z: z.sum(1) * math.nan, S, on_nonfinite=number)
+    assert given(torch.zeros(3, 2)).tolist() == [float(number)] * 3
+
+
 CALLED = "fn was called as fn(points [7, 2]"
 
 
@@ -294,7 +309,9 @@ OTHERS = [
         ValueError,
         "on_nonfinite must be 'raise', 'drop' or a finite number, got",
     ),
-    (lambda: BlackBox(f, S, on_nonfinite=True), ValueError, "on_nonfinite must be .*got True"),
+    (lambda: BlackBox(f, S, on_nonfinite=True), TypeError, "on_nonfinite must be .*got True"),
+    (lambda: BlackBox(f, S, on_nonfinite=None), TypeError, "'raise', 'drop' or a finite number, got None"),
+    (lambda: BlackBox(f, S, on_nonfinite=math.inf), ValueError, "'raise', 'drop' or a finite number, got inf"),
     (lambda: estimate(f, X, S, 1.0), TypeError, r"aux\[0\] must be a tensor \[\*batch, \.\.\.\], got float"),
     (
         lambda: estimate(lambda z, a: f(z), X.expand(3, 2), S, torch.ones(2)),

@@ -411,6 +411,8 @@ def test_an_estimate_says_what_it_is() -> None:
     assert repr(got).endswith("], evaluations=33)")
     large = estimate(lambda z: z.repeat(1, 30), spread(6, 0.0, 1.0).view(3, 2), PLAIN)
     shapes = "value of shape [3, 60], gradient of shape [3, 60, 2]"
+    beyond = estimate(lambda z: 1e300 + z.double().sum(1), torch.zeros(2), Smoothing(sigma=1.0))
+    assert repr(beyond).startswith("Estimate(x [2], output [], value not finite, gradient=[")
     assert repr(large) == f"Estimate(x [3, 2], output [3, 60], {shapes}, evaluations=99)"
 
 

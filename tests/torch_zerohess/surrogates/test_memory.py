@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 import threading
 
 import pytest
@@ -194,6 +195,14 @@ def test_a_module_without_fit_is_ready_and_never_fitted() -> None:
 def test_wrong_settings_raise(options, error) -> None:
     with pytest.raises(error, match=next(iter(options))):
         Memory(**options)
+
+
+@pytest.mark.parametrize(("shape", "text"), [((), "[K]"), ((3, 2), "[K, 3, 2]")])
+def test_the_shape_of_earlier_outputs_is_named(shape, text) -> None:
+    memory = Memory()
+    memory.add(normal(2, 2), normal(2, *shape))
+    with pytest.raises(ValueError, match=re.escape(f"outputs must be {text} like the earlier ones, got [2, 5]")):
+        memory.add(normal(2, 2), normal(2, 5))
 
 
 def test_lists_are_no_tensors() -> None:

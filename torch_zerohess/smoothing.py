@@ -63,7 +63,10 @@ class Smoothing:
             directions (proposals "aggregate" and "gaussian").
         seed: None draws a new seed from torch's default generator at every call. A number below 2^63 freezes the
             perturbations: every call uses the same ones, whatever the number of threads. With a `Memory`, and with an
-            earlier `SparseJacobian`, they also depend on the number of evaluations that it has taken.
+            earlier `SparseJacobian`, they also depend on the number of evaluations that it has taken. Layers in
+            sequence must not share a seed, nor may a layer with a seed get its own output: gradients are biased,
+            because the sampled Jacobians depend on each other. Give each layer another seed, or seed=None after
+            `torch.manual_seed`.
         scrambles: independent scrambles of sampler "sobol", a divisor of samples. Fewer ones have a smaller error, and
             a standard error with fewer degrees of freedom. None: the largest of 1, 2, 4 and 8 that divides samples; 4
             and 8 only with at least 8 points in each scramble, 8 only if no setting is "auto".

@@ -40,10 +40,10 @@ class BlackBox(Layer):
             fn is not registered: its parameters are not trained through this layer.
         head: white box after fn, `head(outputs [K, *out], *aux [K, ...]) -> [K]`, made of differentiable torch
             operations. fn then gets points alone, so that one output serves every aux; aux is not copied per sample,
-            and head must not change it.
-            Parameters and other tensors in it are constants: they must not require grad, except under `torch.no_grad`.
-            A module given as head is not registered. What is trained belongs behind a layer without a head.
-            Second derivatives of a nonlinear loss there are biased by the variance of the sampled Jacobian.
+            and head must not change it. Parameters and other tensors in it are constants: they must not require grad,
+            except under `torch.no_grad`. A module given as head is not registered. What is trained belongs behind a
+            layer without a head. There, derivatives of a nonlinear loss are biased: the second ones always, the first
+            ones with value="smoothed", and with a memory whose `fresh` is less than the batch.
         memory: keeps evaluations and subtracts what its surrogate explains, see `Memory`. fn gets points alone. In
             training mode evaluations are kept and the surrogate is fitted to them; after `eval()` both stay as they
             are, and so does the coefficient: 0 until a call has learned it. Under `torch.no_grad` f(x) alone is
@@ -51,7 +51,7 @@ class BlackBox(Layer):
         smoothing: how to sample. This and `value` may be set between calls: `layer.smoothing = Smoothing(...)`.
         vectorized: False if fn takes one point [n] at a time.
         evaluator: where evaluations run; in this process if None.
-        value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are derivatives of F in both cases.
+        value: "center" returns f(x), "smoothed" the estimate of F(x). Derivatives are of F in both cases, see `head`.
         on_nonfinite: "raise", "drop" (with the other one of its pair), or a number that replaces NaN and infinities.
             "drop" is unbiased only where fn fails at random, not where it fails in a region.
 
@@ -59,8 +59,8 @@ class BlackBox(Layer):
     float16 or bfloat16, as autocast makes them, fn and head get float32. Autocast is off while fn, head and surrogate
     run: its rounding is larger than the differences that derivatives are made of.
 
-    A batch without points, [0, n], gives an empty result, with zero gradients upstream. fn is not called for it.
-    Without a head the shape of one output must be known, from an earlier call or the memory, else ValueError.
+    A batch without points, [0, n], gives an empty result and zero gradients, without a call of fn. Without a head
+    the shape of one output must be known, from an earlier call or the memory, else ValueError.
 
     Under `torch.func.vmap` the noise is independent for each point that is mapped over, as in a batch. So vmap works as
     with randomness="different", and does not raise with its default, "error". With seed=None, "same" raises ValueError,

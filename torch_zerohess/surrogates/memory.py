@@ -49,10 +49,10 @@ class Memory:
         F(x, r) = c E h(g(x + sigma u), r)  +  E[ h(f(x + sigma u), r) - c h(g(x + sigma u), r) ].
 
     The first term takes no evaluations; its derivatives come from h and g. The second term is estimated from the
-    evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g. A bad g costs
-    variance, and c falls to zero. A `Smoothing` with a fixed seed draws other samples at every call that adds
-    evaluations: g would explain the old samples too well. With another number of threads of torch the fit of g differs
-    by rounding, and so does the estimate.
+    evaluations of this call. g and c come from earlier calls, hence the estimate is unbiased for every g, but for
+    `heads.LocalEntropy`. A bad g costs variance, and c falls to zero. A `Smoothing` with a fixed seed draws other
+    samples at every call that adds evaluations: g would explain the old samples too well. With another number of
+    threads of torch the fit of g differs by rounding, and so does the estimate.
 
     Torch differentiates the first term as far as h(g(z), r) is smooth in z, and Stein's identity does the rest: the
     second derivatives where slopes jump (an absolute error, ReLUs), and all of them where values jump (a threshold, a
@@ -73,8 +73,9 @@ class Memory:
             points that are close to each other the older. Outputs stay in memory as they are: 4 000 images of 64 x 64 x
             3 float32 numbers take 200 MB.
         fresh: how many elements of a batch get new evaluations per call, drawn at random and weighted by B / fresh.
-            Values then have noise, so `optim.NewtonCG` and `optim.Newton` need adapt=False. None: all of them. 0: none;
-            the estimate is then the first term alone, and biased towards g. Under `vmap` each element is a batch of its
+            Values then have noise, so `optim.NewtonCG` and `optim.Newton` need adapt=False, and a nonlinear loss behind
+            the layer has biased gradients: give it as `head`. None: all of them. 0: none; the estimate is then the
+            first term alone, and biased towards g. Under `vmap` each element is a batch of its
             own: all of them get new evaluations, unless there are none.
         order: highest derivative that new evaluations enter. 1: second derivatives come from the surrogate alone,
             without noise, and biased towards it; values and gradients stay unbiased.

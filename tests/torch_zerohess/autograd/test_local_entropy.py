@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 import torch
-from layers import in_graphs
+from layers import Fixed, in_graphs
 from torch import Tensor
 
 import torch_zerohess as zh
@@ -57,6 +57,33 @@ def test_value_and_derivatives_of_a_square(memory: bool) -> None:
     torch.testing.assert_close(F.detach(), expected.detach(), rtol=0.03, atol=0.0)
     torch.testing.assert_close(g.detach(), slope.detach(), rtol=0.05, atol=0.0)
     torch.testing.assert_close(h, bend, rtol=0.15, atol=0.0)
+
+
+@pytest.mark.parametrize("shift", [0.1, 0.4])
+def test_with_a_memory_it_is_linear_in_what_the_surrogate_leaves(shift: float) -> None:
+    """-T (log Z_g + r / Z_g) for a surrogate g(z) = z + shift of f(z) = z, with T and Z_g in closed form.
+
+    The bias is T (r / Z_g)^2 / 2 but for the next order, (r / Z_g) / 1.5 of it.
+    """
+    sigma, temperature, at = 0.5, 0.5, 0.8
+    memory = zh.Memory(Fixed(lambda z: z.double() + shift), draws=1 << 14)
+    memory.add(torch.zeros(2, 1), torch.zeros(2, 1))
+    memory.fit()
+    memory.regression.moments = [[1.0, 1.0]]
+    T = temperature * ((at + shift) ** 2 + sigma**2)
+    Z_g, Z = (math.exp(-float(entropy_of_square(torch.tensor(y), sigma, T)) / T) for y in (at + shift, at))
+    rest = Z / Z_g - 1.0
+    box = zh.BlackBox(
+        identity,
+        zh.Smoothing(sigma=sigma, samples=1 << 14, seed=0),
+        head=zh.heads.LocalEntropy(square, temperature),
+        memory=memory,
+        value="smoothed",
+    ).eval()
+    found = float(box(torch.tensor([[at]], dtype=torch.float64, requires_grad=True)).detach())
+    line = -T * (math.log(Z_g) + rest)
+    assert found == pytest.approx(line, abs=0.01 * T)
+    assert -T * math.log(Z) - found == pytest.approx(0.5 * T * rest**2 / (1.0 + rest / 1.5), abs=0.02 * T)
 
 
 def test_a_high_temperature_is_the_mean() -> None:

@@ -74,6 +74,7 @@ COMMANDS = {
     "bench_device": Command(
         "studies.bench_device:bench_device", "the same on a CUDA device, against its memory and torch", long=True
     ),
+    "memory_steps": Command("studies.memory_steps:memory_steps", "time of training steps with a memory", long=True),
     "workers": Command("studies.workers:workers", "cost and gain of worker processes, and faults", long=True),
     "stability": Command("studies.stability:stability", "extreme cases against closed forms", long=True),
     "doctor": Command("commands:doctor", "what this installation can do"),

@@ -105,7 +105,7 @@ class CurvatureOperator:
     def __matmul__(self, v: Any) -> Any:
         """Return H v for v [N], or H V for V [N, m]: a tensor, or for an array of NumPy an array of its type."""
         if isinstance(array := v, getattr(sys.modules.get("numpy"), "ndarray", ())):
-            v = torch.as_tensor(array)
+            v = torch.as_tensor(array, device="cpu")
             return (self @ v.to(self.device)).to(v).numpy()
         if not isinstance(v, Tensor):
             raise TypeError(f"v must be a tensor [{self.shape[0]}], all inputs in one, got {type(v).__name__}")

@@ -123,7 +123,8 @@ def minimize(
             the output and `loss=` where you can. If None, until max_evaluations are used up, or three rounds in a row
             have arrived at the same point, or at points with the same loss. Two are enough where the loss has fallen to
             zero, but for rounding, and no loss was negative. A later round counts as arrived as soon as the quadratic
-            at a known minimum predicts its losses.
+            at a known minimum predicts its losses. With `loss` and the engine "gaussian_process", rounds in between
+            may have arrived at higher minima.
         noise: standard deviation of repeated losses at one point; 0 for none. If None it is measured at x0, by two
             evaluations, and six more if the two differ. For that, a `batch` that takes all evaluations is made shorter;
             the message says so where they are too few to measure it. As there may be no noise at x0, x is evaluated

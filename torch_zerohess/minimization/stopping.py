@@ -61,7 +61,8 @@ class Stopping:
         if self.agrees and not running.noise and _agree(running):
             where = "points with the loss at x: the minimum is not unique" if search.apart else "x"
             status: Status = "stalled" if running.doubt == UNBOUNDED else "solved"
-            return status, f"{search.agreed} rounds in a row have arrived at {where}"
+            higher = f", and {search.higher} at higher minima" if search.higher else ""
+            return status, f"{search.agreed} rounds{'' if higher else ' in a row'} have arrived at {where}{higher}"
         if running.spent:
             return "budget", running.budget
         if self.time_limit is not None and running.seconds > self.time_limit:

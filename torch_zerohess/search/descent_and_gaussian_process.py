@@ -72,7 +72,7 @@ class DescentAndProcess(Relay[TurnsProgress]):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
-        self._descent, self._process = OutputDescent(settings), OutputProcess(settings)
+        self._descent, self._process = OutputDescent(settings), OutputProcess(settings, elsewhere=False)
 
     def first(self, generator: torch.Generator) -> tuple[TurnsProgress, Tensor]:
         descent, points = self._descent.first(generator)

@@ -83,10 +83,6 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Return a round that begins at the best point of another search, with its evaluations [P, n] and [P]."""
         return self._begun(best).holding(points, values, lowest=best, sigma=sigma, phase="geometry")
 
-    def begin(self, center: Tensor, sigma: float, generator: torch.Generator) -> tuple[MetricProgress, Tensor]:
-        """Return a round that begins at a point [n] with this sigma, and its first points."""
-        return self._started(replace(self._begun(Best(center)), sigma=sigma), generator)
-
     def next(
         self, known: MetricProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[MetricProgress, Tensor]:

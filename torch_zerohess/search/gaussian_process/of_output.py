@@ -5,6 +5,11 @@ samples, as for smooth outputs, it begins at once. If its steps do not keep thei
 process goes on alone. Gauss-Newton begins again once its first step promises more than an evaluation of the process has
 gained in the meantime, or once the search would end. On a plateau with ripples each step of the process finds something
 a little better. Where nothing much better comes, the process looks where it knows least.
+
+The process believes most in the minimum that it knows, and may never look where another one is. Once Gauss-Newton has
+arrived, it therefore begins again at random points of the box. Such a round is independent of the evaluations before.
+It ends early where it leads to the best point, or where its model has a minimum that is higher. A round that arrives at
+a higher minimum does not count against the best point.
 """
 
 import math
@@ -15,7 +20,7 @@ from torch import Tensor
 
 from torch_zerohess.search.gauss_newton.by_interpolation import OutputGaussNewton, OutputProgress
 from torch_zerohess.search.gaussian_process.finish import PATIENCE, FinishedProcess, FinishedProgress
-from torch_zerohess.search.gaussian_process.method import ROUND
+from torch_zerohess.search.gaussian_process.method import APART, ROUND
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.state import Best, Evaluated, Progress
 from torch_zerohess.surrogates.pool import Pool
@@ -35,6 +40,11 @@ _ARRIVED, _STRAIGHT = 1e-8, 0.01
 step: its curvature takes away less than the second part of the promise."""
 _WIDEST = 0.3
 """First region of Gauss-Newton, at most."""
+_ELSEWHERE = 2
+"""Rounds of Gauss-Newton from random points in a row, before it is the turn of the process."""
+_HIGHER = 0.01
+"""A round ends where it promises less than this part of its distance from the lowest loss."""
+_ARRIVAL = "steps of Gauss-Newton have arrived"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,19 +67,30 @@ class OutputProcessProgress(FinishedProgress):
     """Evaluations of the process since Gauss-Newton might last have begun."""
     alone_from: float = math.inf
     """Lowest loss before them."""
+    kept: OutputProgress | None = None
+    """What Gauss-Newton knows at the best point, while it works elsewhere; otherwise None."""
+    tries: int = 0
+    """Rounds elsewhere since the turn of the process."""
     failures: int = 0
     """Turns of Gauss-Newton in a row that have ended beside their start; after each the process works twice as long."""
 
 
 class OutputProcess(FinishedProcess[OutputProcessProgress]):
-    """A process of the output and Gauss-Newton in turn."""
+    """A process of the output and Gauss-Newton in turn.
+
+    Args:
+        settings: of the search.
+        elsewhere: whether Gauss-Newton begins at random points, too, once it has arrived.
+    """
 
     progress = OutputProcessProgress
     local: OutputGaussNewton
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, elsewhere: bool = True) -> None:
         super().__init__(settings)
+        self._elsewhere = elsewhere
         self.local = OutputGaussNewton(replace(settings, restarts=0), self.capacity, _PATIENCE)
+        self._afar = OutputGaussNewton(replace(settings, restarts=0), self.capacity)
 
     def taking_over(
         self, other: Progress, evaluated: Evaluated, generator: torch.Generator
@@ -79,8 +100,11 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         return self.points(self.remembered(known, evaluated), generator)
 
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:
-        newton, best = known.local, known.best
-        if newton is not None and torch.equal(newton.best.point, best.point):  # the process has not all of these
+        best = known.best
+        newton = next(
+            (one for one in (known.local, known.kept) if one and torch.equal(one.best.point, best.point)), None
+        )
+        if newton is not None:  # the process has not all of these
             known = replace(known, pool=Pool.of(newton.points, newton.values, newton.outputs, best.point))
         if not known.noisy:  # the nearest evaluations that tell a Jacobian, however the best one was found
             known = replace(known, best=replace(best, sigma=self.settings.tolerance))
@@ -121,13 +145,19 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
                 known = begun if begun.finishing else known
             if known.finishing:
                 return known, points
-        return self._went_on(known), evaluated.points[:0]
+        rounds = known.rounds
+        known = self._went_on(known)
+        if known.rounds > rounds or known.waited >= PATIENCE * (self.settings.n + 1):
+            return self._begun_elsewhere(known, generator)
+        return known, evaluated.points[:0]
 
     def after_local(
         self, known: OutputProcessProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[OutputProcessProgress, Tensor]:
         """Let Gauss-Newton go on, and return to the process where it ends."""
         assert known.local is not None
+        if known.kept is not None:
+            return self._after_elsewhere(known, known.kept, evaluated, generator)
         now, points = self.local.next(known.local, evaluated, generator)
         known = replace(self.told(known, now, evaluated), lost=now.lost)
         if known.early and now.rejected and not now.kept:
@@ -140,7 +170,53 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         known = replace(known, finishing=False, waited=0, finished=best, solved=solved, failures=failures)
         if not known.due and not now.done:
             return known, points
-        return super().arrived(known, known.due or "steps of Gauss-Newton have arrived"), points
+        return self._begun_elsewhere(super().arrived(known, known.due or _ARRIVAL), generator)
+
+    def _begun_elsewhere(
+        self, known: OutputProcessProgress, generator: torch.Generator
+    ) -> tuple[OutputProcessProgress, Tensor]:
+        """Let Gauss-Newton begin at a random point if it has arrived at the best one, unless the process has waited."""
+        nothing = known.center[None][:0]
+        smooth = known.is_solved and known.is_minimum(self.settings.tolerance)
+        if known.done or not smooth or not self._elsewhere:
+            return known, nothing
+        if known.tries >= _ELSEWHERE:
+            return replace(known, tries=0, waited=0), nothing
+        newton, points = self._afar.begin(self.settings.further_start(generator), 1.0, generator)
+        return replace(known, kept=known.local, local=newton, finishing=True, tries=known.tries + 1), points
+
+    def _after_elsewhere(
+        self, known: OutputProcessProgress, kept: OutputProgress, evaluated: Evaluated, generator: torch.Generator
+    ) -> tuple[OutputProcessProgress, Tensor]:
+        """Let Gauss-Newton go on elsewhere; where it ends let it begin again, or the process go on."""
+        assert known.local is not None
+        now, points = self._afar.next(known.local, evaluated, generator)
+        known = replace(self.told(known, now, evaluated), lost=now.lost)
+        best = known.best
+        end = now.lowest if now.done else self._foreseen(now, points, best)
+        if end is None and not now.failed:
+            return known, points
+        if best is now.best:
+            known = replace(known, finished=best.point, solved=best.point if now.done else None)
+        else:
+            known = replace(known, local=kept)
+        known = replace(known, kept=None, finishing=False, waited=0)
+        if end is None:
+            return replace(known, tries=0), points[:0]
+        if known.agreed > 0 and known.arriving_here(self.settings.tolerance, end).agreed == 0:
+            known = known.with_arrivals(higher=known.arrivals.higher + 1).ended_round(_ARRIVAL, self.settings.restarts)
+        else:
+            known = super().arrived(known, _ARRIVAL, end)
+        return self._begun_elsewhere(known, generator)
+
+    def _foreseen(self, now: OutputProgress, points: Tensor, best: Best) -> Best | None:
+        """Return where a round leads, if it is at the best point or at a higher minimum; None if that is not known."""
+        promise = self._afar.promise(now)
+        if not len(points) or now.lowest.loss <= best.loss or promise == math.inf:
+            return None
+        if float((torch.cat([points[:1], now.lowest.point[None]]) - best.point).norm(dim=1).min()) < APART:
+            return best
+        return now.lowest if promise < _HIGHER * (now.lowest.loss - best.loss) else None
 
     def _is_due(self, known: OutputProcessProgress) -> bool:
         """Whether the process has worked alone for long enough, and the best point is not a minimum already."""

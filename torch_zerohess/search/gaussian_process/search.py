@@ -15,7 +15,8 @@ class GaussianProcessSearch(AskTell[Any]):
       evaluations. The next point is the one where the loss of the prediction, with some optimism, is lowest; or where
       the process knows least, if that point is known already. Gauss-Newton finishes in a basin, where its first step
       promises to take away a tenth of the loss, or more than an evaluation of the process gains; before the search ends
-      it begins for less. It begins right after the first samples where it promises three tenths.
+      it begins for less. It begins right after the first samples where it promises three tenths. Once it has arrived,
+      it begins at random points of the box, too, twice for each turn of the process.
     - With the loss alone, the process predicts the loss, and quadratics (`Descent`) finish in each basin it finds.
       Where the process finds nothing better, quadratics begin at a random point of the box. While arrivals disagree,
       quadratics begin beside the best point every other time. Where the loss is a sum of functions of one parameter

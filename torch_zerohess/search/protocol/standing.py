@@ -93,6 +93,11 @@ class Standing(ABC, Generic[P]):
         return self._state.progress.agreed
 
     @property
+    def higher(self) -> int:
+        """Rounds since the first of these that began at random points and arrived at higher minima."""
+        return self._state.progress.arrivals.higher
+
+    @property
     def apart(self) -> bool:
         """Whether these rounds have arrived at several points."""
         return self._state.progress.arrivals.apart

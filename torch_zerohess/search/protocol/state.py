@@ -46,7 +46,9 @@ class Arrivals:
     lowest: Best | None = None
     """The lowest point at which it has arrived."""
     agreed: int = 0
-    """Rounds in a row that have arrived at the best point, or at other points with the same loss."""
+    """Rounds that have arrived at the best point, or at other points with the same loss, and none at a lower one."""
+    higher: int = 0
+    """Rounds since the first of them that began at random points and arrived at higher minima."""
     place: Best | None = None
     """The best point when the first of them arrived."""
     apart: bool = False
@@ -137,7 +139,9 @@ class Progress:
         if not is_best(end):
             return self.with_arrivals(agreed=0)
         if place is None or self.agreed == 0 or not is_best(place):
-            return self.with_arrivals(agreed=1, place=best, apart=not are_same(end.point, best.point, tolerance))
+            return self.with_arrivals(
+                agreed=1, higher=0, place=best, apart=not are_same(end.point, best.point, tolerance)
+            )
         apart = apart or not are_same(end.point, place.point, tolerance)
         return self.with_arrivals(agreed=self.agreed + 1, apart=apart)
 

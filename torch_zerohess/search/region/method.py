@@ -110,6 +110,10 @@ class RegionDescent(Method[R]):
     def first(self, generator: torch.Generator) -> tuple[R, Tensor]:
         return self._started(self._begun(Best(self.settings.start)), generator)
 
+    def begin(self, center: Tensor, sigma: float, generator: torch.Generator) -> tuple[R, Tensor]:
+        """Return a round that begins at a point [n] with this sigma, and its first points."""
+        return self._started(replace(self._begun(Best(center)), sigma=sigma), generator)
+
     def next(self, known: R, evaluated: Evaluated, generator: torch.Generator) -> tuple[R, Tensor]:
         before, told = known.lowest.loss, float(evaluated.losses[0])
         known = known.remembered(evaluated, self._capacity)

@@ -132,7 +132,9 @@ def test_rounds_agree_that_arrive_at_one_point_which_is_the_best_one():
     second = first.agreeing(Best(vector(1.07, 0.0)), 0.05)
     assert (first.agreed, second.agreed, second.arrivals.apart) == (1, 2, False)
     assert second.agreeing(Best(vector(1.08, 0.0)), 0.05).agreed == 0
-    moved = replace(second, best=Best(vector(3.0, 0.0))).agreeing(Best(vector(3.0, 0.0)), 0.05)
+    second = replace(second, best=Best(vector(3.0, 0.0))).with_arrivals(higher=2)
+    moved = second.agreeing(Best(vector(3.0, 0.0)), 0.05)
+    assert (moved.agreed, moved.arrivals.higher) == (1, 0)
     assert (moved.agreed, moved.arrivals.place.point.tolist()) == (1, [3.0, 0.0])
 
 

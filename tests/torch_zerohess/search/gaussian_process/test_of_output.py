@@ -444,7 +444,8 @@ def test_a_round_from_a_random_point_ends_early_where_it_leads_to_a_minimum():
 
 
 def test_what_gauss_newton_knows_at_the_best_point_outlasts_rounds_from_random_points():
-    start, settings = located(1)
+    """Without its evaluations, the process knows the Hessian with an error of 0.14 or more."""
+    start, settings = located(3)
     found = GaussianProcessSearch(start, **settings)
     expected = torch.func.hessian(lambda x: settings["loss"](signals(x[None])[0]))(SOURCE) * torch.outer(
         0.2 * (UPPER - LOWER), 0.2 * (UPPER - LOWER)
@@ -465,4 +466,4 @@ def test_no_round_begins_at_a_random_point_before_gauss_newton_has_arrived():
     found = search(steps, restarts=100)
     while found.evaluations < 150:
         found.tell(steps(found.ask()))
-        assert found._state.progress.kept is None
+        assert len(found.ask()) == 1  # five points would be the start of a round

@@ -98,6 +98,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     """
 
     progress = OutputProgress
+    _least_gain = NOTHING  # in smaller regions, roundings of the outputs promise more
     _singular = 1e-16  # the square of units of outputs that differ by 1e6, and a margin
 
     def __init__(self, settings: Settings, capacity: int, patience: int | None = None) -> None:

@@ -125,6 +125,28 @@ def test_rounded_outputs_do_not_keep_it_from_arriving(monkeypatch):
     assert sum(found(seed).evaluations for seed in range(50, 55)) > 1.5 * taken
 
 
+@pytest.mark.parametrize("bend", [0.0, 1e-6])
+def test_where_outputs_are_linear_it_arrives_soon_after_the_minimum(bend):
+    """Ten parameters: a Jacobian takes 11 evaluations. The squares are least, and not zero, at a known point.
+
+    In regions far below the tolerance roundings of the outputs would promise steps, and all of them would be refused.
+    """
+    generator = torch.Generator().manual_seed(0)
+    A, errors = (torch.randn(21, k, generator=generator, dtype=torch.float64) for k in (10, 1))
+    errors = errors - A @ torch.linalg.lstsq(A, errors).solution  # orthogonal to what parameters change
+    target = 0.3 * A.sum(1) + errors[:, 0]
+
+    def outputs(x):
+        straight = x @ A.mT - target
+        return straight + bend * straight.square()
+
+    for seed in range(4):
+        search = run(Descent(zeros(10), sigma=0.3, loss=squares, seed=seed, restarts=0), outputs, 200)
+        assert search.solved
+        assert search.evaluations < 30
+        assert (search.x - 0.3).abs().max() < 1e-4
+
+
 def test_the_hessian_of_an_output_is_not_damped():
     """J^T J has curvatures of 2 to 8e-4. A thousandth of their mean would double the smallest one, as a step may."""
     scale = vector(1.0, 0.3, 0.1, 0.02)

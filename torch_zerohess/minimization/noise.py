@@ -19,8 +19,9 @@ _BATCHED = 1e-3
 """The same for a value of a call of several points: sums in float32 are rounded in another way there."""
 _SHARE, _MOST, _LEAST = 8, 48, 4
 """The part of all evaluations that the decision at the end gets: one in so many, at most and at least so many."""
-_SIGNIFICANT = 2.0
-"""Standard errors by which a deviation must be below noise."""
+_SIGNIFICANT = 3.0
+"""Standard errors by which a deviation must be below noise. They are errors for Gaussian noise; the deviation of few
+values of skewed noise is that small more often."""
 _CONTRADICTION = 3.0
 """Standard errors by which a mean must be below the mean of a point that is trusted: several points are compared."""
 

@@ -122,6 +122,10 @@ def check_start(start: Evaluated) -> None:
         )
     if bool(start.finite[0]):
         return
+    if start.outputs is not None and not math.isfinite(loss) and bool(torch.isfinite(start.outputs[0]).all()):
+        missing = ": if data are missing, let it leave them out, as (y - data)[torch.isfinite(data)].square().sum()"
+        told = missing if math.isnan(loss) else ""
+        raise ValueError(f"loss is {loss} at the start x0, although the output there is finite{told}")
     if start.outputs is None or not math.isfinite(loss):
         raise ValueError(f"the black box is not finite at the start x0: {loss}")
     count = int((~torch.isfinite(start.outputs[0])).sum())

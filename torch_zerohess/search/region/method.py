@@ -61,8 +61,8 @@ class RegionDescent(Method[R]):
     _singular = SINGULAR
     """Curvature, relative to the largest one, that may as well be zero."""
     _least_gain = -1.0
-    """Promise of a region within the tolerance, over the loss, up to which the round has arrived if the loss at a point of
-    that region was predicted. Below 0: smaller regions follow."""
+    """Promise of a region within the tolerance, over the loss, up to which the round has arrived if the loss at a point
+    of that region was predicted. Below 0: smaller regions follow."""
 
     def __init__(self, settings: Settings, fitted: int, capacity: int) -> None:
         super().__init__(settings)

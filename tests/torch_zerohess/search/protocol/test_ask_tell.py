@@ -507,6 +507,16 @@ def test_a_start_that_is_not_finite_can_be_told_again():
     assert search.evaluations == len(values)
 
 
+@pytest.mark.parametrize(
+    ("output", "message"), [(1.0, "loss is nan at the start x0"), (math.nan, "the black box is not")]
+)
+def test_a_loss_that_is_not_finite_is_not_blamed_on_the_black_box(output, message):
+    data = vector(1.0, math.nan)
+    search = Descent(zeros(3), sigma=1.0, loss=lambda y: (y - data).square().sum(), seed=0)
+    with pytest.raises(ValueError, match=message):
+        search.tell(torch.full((len(search.ask()), 2), output))
+
+
 @pytest.mark.parametrize("written", ["0.0.9", None])
 @pytest.mark.parametrize(("change", "wrong"), [("arrivals", "lacks arrivals"), (None, "has later")])
 def test_a_state_of_another_version_is_named_and_changes_nothing(written, change, wrong):

@@ -131,13 +131,16 @@ class RegionDescent(Method[R]):
             return self._after_start(known, evaluated, generator)
         if known.phase == "trial":
             loss = told if bool(evaluated.finite[0]) else math.inf
-            known = replace(known, iterations=known.iterations + 1, tied=known.tied + 1 if loss == before else 0)
+            ratio = (before - loss) / known.promised
+            cuts = known.cuts.after(finite=loss < math.inf, kept=ratio >= BAD)
+            tied = known.tied + 1 if loss == before else 0
+            known = replace(known, iterations=known.iterations + 1, tied=tied, cuts=cuts)
             if known.tied >= _TIES:
                 if float((evaluated.points[0] - known.lowest.point).norm()) < self.settings.tolerance:
                     return self._arrived(known, f"{_TIES} steps in a row changed nothing", generator)
                 return self._on_plateau(known, generator)
             if loss < math.inf:
-                known, bad = self._judged(known, (before - loss) / known.promised)
+                known, bad = self._judged(known, ratio)
                 if bad is not None:
                     return self._geometry(known, bad, generator)
         return self.plan(known, generator)
@@ -147,6 +150,8 @@ class RegionDescent(Method[R]):
         settings, n = self.settings, self._n
         while known.sigma >= self._finest:
             known, count = self._modelled(self._bordered(known)[0])
+            if known.border is not None:
+                known = known.cut_or_free(self._minimum(known), self._minimum(replace(known, border=None)))
             x = known.lowest.point
             s, promised = self._step(known)
             length = float(torch.linalg.solve(known.root, s).norm()) / known.sigma
@@ -255,7 +260,7 @@ class RegionDescent(Method[R]):
         """Return the progress with the border that is near, if there is one, and whether the border is plane."""
         found = border_between(known.scaled, known.holes) if bool(known.holes.any()) else None
         if found is None:
-            return replace(known, border=None), False
+            return replace(known, border=None, cuts=replace(known.cuts, last="whole")), False
         normal, offset, plane = found
         normal = torch.linalg.solve(known.root, normal) / known.sigma  # B is symmetric
         return replace(known, border=torch.cat([normal, normal.new_tensor([offset])])), plane

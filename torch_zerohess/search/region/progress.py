@@ -1,13 +1,14 @@
 """The progress of a search by quadratics in a trust region, between two evaluations."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, Progress
+from torch_zerohess.search.region.cut_steps import CutSteps
 from torch_zerohess.surrogates.pool import latest
 
 _AT_BORDER = 10 * LOST
@@ -28,6 +29,8 @@ class RegionProgress(Progress):
     """Which of the evaluations [P] have no finite value. Their entry of `values` is the highest one of the round."""
     border: Tensor | None = None
     """a and b [n + 1] of a plane a.s = b, s from the best point. The holes near that point are at a.s > b."""
+    cuts: CutSteps = field(default_factory=CutSteps)
+    """Steps that the border has cut short."""
     root: Tensor
     """B [n, n], symmetric, positive, of determinant 1."""
     hessian: Tensor
@@ -65,6 +68,17 @@ class RegionProgress(Progress):
     def scaled(self) -> Tensor:
         """The evaluations as u [P, n]."""
         return torch.linalg.solve(self.root, (self.points - self.lowest.point).mT).mT / self.sigma
+
+    def cut_or_free(self: R, cut: Tensor, free: Tensor) -> R:
+        """Return the progress without the border if the next step is to ignore it.
+
+        Args:
+            cut: the step with the border [n].
+            free: the step without it [n].
+        """
+        u = torch.linalg.solve(self.root, torch.stack([cut, free], 1)).mT / self.sigma
+        cuts = self.cuts.planned(self.scaled, self.holes, u[0], u[1])
+        return replace(self, cuts=cuts, border=None if cuts.last == "free" else self.border)
 
     def holding(self: R, points: Tensor, values: Tensor, **own: Any) -> R:
         """Return a round with other evaluations [P, n] and finite values [P]."""

@@ -6,6 +6,7 @@ import torch
 
 import torch_zerohess as zh
 from torch_zerohess.search.region.border import border_between
+from torch_zerohess.search.region.cut_steps import CutSteps
 
 
 def test_the_plane_lies_in_the_middle_between_evaluations_and_holes():
@@ -76,3 +77,35 @@ def test_a_minimum_on_a_border_is_found(problem, n, bounds, excess):
         assert fit.value >= least * (1.0 - 1e-9)
         found += fit.value <= near
     assert found >= 3
+
+
+@pytest.mark.parametrize(("n", "most"), [(3, 40), (5, 50)])
+def test_a_region_that_fails_is_passed(n, most):
+    """A ball that fails lies in the way. Once the search is beside it, no step is cut short for long.
+
+    Without the ball the minimum is found after 12 evaluations, with five parameters after 17. A step that halves its
+    distance from the border every time would take 82 and more with three parameters.
+    """
+    start, end = np.eye(n)[0] * -0.7 + np.eye(n)[1] * 0.1, np.eye(n)[0] * 0.6
+
+    def fn(z):
+        return [float((x - end) @ (x - end)) if x @ x >= 0.09 else float("nan") for x in z.numpy()]
+
+    settings = {"sigma": 0.3, "max_evaluations": 200, "target": 1e-3}
+    assert sum(zh.minimize(fn, start, seed=seed, **settings).evaluations < most for seed in range(4)) >= 3
+
+
+def test_a_step_ignores_a_border_after_others_kept_their_promise():
+    """Only if it ends nearer to a value than to a hole; and twice as many are needed after such a step has failed."""
+    u, holes = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 2.0]]).double(), torch.tensor([False, False, True])
+    cut, near, far = torch.tensor([[0.5, 0.1], [0.9, 0.8], [0.5, 1.2]]).double()
+    cuts, asked = CutSteps(), []
+    for _ in range(12):
+        cuts = cuts.planned(u, holes, cut, near)
+        asked.append(cuts.last)
+        cuts = cuts.after(finite=cuts.last == "cut", kept=True)
+    assert asked == ["cut", "cut", "free"] + 4 * ["cut"] + ["free"] + 4 * ["cut"]
+    cuts = CutSteps(kept=100)
+    assert cuts.planned(u, holes, cut, far).last == "cut"
+    assert cuts.planned(u, holes, near, near).last == "whole"
+    assert cuts.planned(u, holes, near, near).after(finite=True, kept=True).kept == 100

@@ -1,8 +1,8 @@
 """Steps that a border cuts short, and when a step may ignore the border.
 
 The border is a plane, but the region that fails may be small, and the search may have passed it. Then steps that the
-border cuts short keep their promise one after the other. A step without the border is tried after two of them. Each
-such step that fails doubles this number: a minimum on a true border costs a logarithm of the steps there.
+border cuts short keep their promise one after the other. A step without the border is tried after three of them. Each
+such step that fails multiplies this number by four: a minimum on a true border costs a logarithm of the steps there.
 """
 
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from typing import Literal
 
 from torch import Tensor
 
-_FIRST, _MORE = 2, 2
+_FIRST, _MORE = 3, 4
 """Cut steps that keep their promise before a step first ignores the border, and the factor after one that fails."""
 _CUT = 0.1
 """Distance between the ends of a step with and without a border, in units of the region, from which the border cuts it

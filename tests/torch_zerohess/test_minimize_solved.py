@@ -174,7 +174,7 @@ def test_the_hessian_in_a_curved_valley_is_that_of_the_nearest_evaluations_that_
     """Steps along the valley say nothing about its walls.
 
     The standard errors do not contain how curvatures change within the evaluations that are fitted: some percents. One
-    of ten runs may miss more.
+    of ten runs may miss more. Where ftol ends a run, few evaluations may be near x: then errors are up to a half.
     """
 
     def banana(z):
@@ -186,7 +186,7 @@ def test_the_hessian_in_a_curved_valley_is_that_of_the_nearest_evaluations_that_
         expected = torch.func.hessian(lambda x: banana(x[None])[0])(fit.x)
         off, errors = (fit.hessian - expected).diagonal().abs(), fit.standard_errors["hessian_diagonal"]
         within += bool((off < torch.maximum(5 * errors, 0.03 * expected.diagonal())).all())
-        assert bool((errors < 0.2 * expected.diagonal()).all())
+        assert bool((errors < (0.2 if "xtol" in settings else 0.6) * expected.diagonal()).all())
     assert within >= 9
 
 

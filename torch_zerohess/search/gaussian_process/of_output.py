@@ -101,9 +101,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
 
     def model_at_best(self, known: OutputProcessProgress) -> tuple[LocalModel, float] | None:
         best = known.best
-        newton = next(
-            (one for one in (known.local, known.kept) if one and torch.equal(one.best.point, best.point)), None
-        )
+        newton = next((one for one in (known.local, known.kept) if one and _knows(one, best.point)), None)
         if newton is not None:  # the process has not all of these
             known = replace(known, pool=Pool.of(newton.points, newton.values, newton.outputs, best.point))
         if not known.noisy:  # the nearest evaluations that tell a Jacobian, however the best one was found
@@ -259,3 +257,8 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         if known.stuck < (_STUCK * (n + 1)) << known.looks:
             return known
         return replace(known, exploring=ROUND * n, stuck=0, looking=True, looks=known.looks + 1)
+
+
+def _knows(newton: OutputProgress, x: Tensor) -> bool:
+    """Whether Gauss-Newton has evaluated a point [n]."""
+    return bool((newton.points == x).all(1).any())

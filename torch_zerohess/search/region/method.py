@@ -62,7 +62,8 @@ class RegionDescent(Method[R]):
     """Curvature, relative to the largest one, that may as well be zero."""
     _least_gain = -1.0
     """Promise of a region within the tolerance, over the loss, up to which the round has arrived if the loss at a point
-    of that region was predicted. Below 0: smaller regions follow."""
+    of that region was predicted, and the model has a Hessian: on a plateau every loss is predicted. Below 0: smaller
+    regions follow."""
 
     def __init__(self, settings: Settings, fitted: int, capacity: int) -> None:
         super().__init__(settings)
@@ -165,7 +166,8 @@ class RegionDescent(Method[R]):
                     direction = torch.nn.functional.normalize(normal(generator, x, n), dim=0)
                 if direction is not None:
                     return self._geometry(known, direction, generator)
-            elif known.sigma < settings.tolerance and promised <= self._least_gain * abs(known.lowest.loss):
+            least = self._least_gain * abs(known.lowest.loss)
+            if known.confirmed and known.sigma < settings.tolerance and promised <= least and known.hessian.any():
                 return self._arrived(known, "a step promises nothing where the last loss was predicted", generator)
             known = replace(known, sigma=(_LEAPING if known.confirmed else _CLOSING) * known.sigma, confirmed=False)
         reason = f"sigma fell below {self._finest:g} of the first one"

@@ -430,17 +430,19 @@ def test_rounds_that_arrive_at_higher_minima_do_not_count_against_the_lowest():
 
 
 def test_a_round_from_a_random_point_ends_early_where_it_leads_to_a_minimum():
-    """A round has four evaluations at its start. To the last digit of a minimum it takes 18 on average, not 12."""
-    start, settings = located(1)
-    found, lengths = GaussianProcessSearch(start, **settings), []
-    while found.evaluations < 250:
-        before, asked = found._state.progress, len(found.ask())
-        found.tell(signals(found.ask()))
-        now = found._state.progress
-        if before.kept is not None and (now.kept is None or now.tries != before.tries):
-            lengths.append(len(before.local.points) + asked)
-    assert len(lengths) > 10
-    assert sum(lengths) / len(lengths) < 11.0
+    """A round has four evaluations at its start. To the last digit of a minimum it takes 20 on average, not 12."""
+    lengths = []
+    for seed in range(1, 5):
+        start, settings = located(seed)
+        found = GaussianProcessSearch(start, **settings)
+        while found.evaluations < 250:
+            before, asked = found._state.progress, len(found.ask())
+            found.tell(signals(found.ask()))
+            now = found._state.progress
+            if before.kept is not None and (now.kept is None or now.tries != before.tries):
+                lengths.append(len(before.local.points) + asked)
+    assert len(lengths) > 40
+    assert sum(lengths) / len(lengths) < 14.0
 
 
 def test_what_gauss_newton_knows_at_the_best_point_outlasts_rounds_from_random_points():

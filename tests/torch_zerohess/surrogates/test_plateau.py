@@ -61,7 +61,8 @@ def test_the_extent_of_a_plateau_is_a_root_mean_square():
 
 def test_equal_values_beyond_the_plateau_say_nothing_of_its_extent():
     """Half of the values are equal out to a distance of 2 along one parameter, and one of many far away."""
-    steps = torch.cat([torch.tensor([[0.1, 0.1], [1.0, 0.0], [2.0, 0.0]]), 9.0 + torch.linspace(0, 1, 80).view(40, 2)]).double()
+    far = 9.0 + torch.linspace(0, 1, 80).view(40, 2)
+    steps = torch.cat([torch.tensor([[0.1, 0.1], [1.0, 0.0], [2.0, 0.0]]), far]).double()
     values = torch.cat([vector(7.1, 7.0, 7.0), 8.0 + torch.zeros(40).double()])
     values[20] = 7.0
     assert not is_plateau(steps, values, 7.0, beyond=0.2)

@@ -103,9 +103,8 @@ class _Process:
     """A process, the pipe to it, and its job if it has one."""
 
     def __init__(self, daemon: bool) -> None:
-        self.process, self.connection = started_worker(
-            _work, "experiments job", daemon=daemon
-        )  # a daemon has no children
+        # a daemon has no children
+        self.process, self.connection = started_worker(_work, "experiments job", daemon=daemon)
         self.job: Job | None = None
         self._started = False
 

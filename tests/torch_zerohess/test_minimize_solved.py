@@ -191,16 +191,16 @@ def test_the_hessian_in_a_curved_valley_is_that_of_the_nearest_evaluations_that_
 
 
 def test_a_region_that_shrank_by_mistake_is_no_evidence():
-    """A valley of condition 4e4 that begins at a bound: a third of the runs shrink the region there, and grow it again.
+    """A kink along a diagonal: models across it are wrong, and rejected steps shrink the region far from the minimum.
 
-    At most four of 20 runs may call the bound a minimum; two are expected.
+    No run of ten calls such a point a minimum, and eight do if the width of the region alone counts.
     """
 
-    def valley(z):
-        return 1e4 * (z.sum(1) - 3.9).square() + (z[:, 0] - z[:, 1] - 0.5).square()
+    def kinked(z):
+        return 100.0 * (z[:, 1] - z[:, 0]).abs() + (1.0 - z[:, 0]).square()
 
-    fits = [zh.minimize(valley, zeros(2) - 1.0, sigma=2.0, bounds=(-5, 5), seed=k, xtol=1e-2) for k in range(20)]
-    assert sum(fit.success and fit.value > 0.1 for fit in fits) <= 4
+    fits = [zh.minimize(kinked, zeros(2) - 1.0, sigma=2.0, seed=k, xtol=0.03, max_evaluations=300) for k in range(10)]
+    assert sum(fit.success and fit.value > 0.1 for fit in fits) <= 2
 
 
 @pytest.mark.parametrize("kind", [zh.optim.LocalGaussNewton, zh.optim.BlockGaussNewton])

@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 import torch
+from layers import Fixed
 from torch.utils.weak import TensorWeakRef
 
 import torch_zerohess as zh
+from truths import deviation
 
 
 def fitted() -> zh.BlackBox:
@@ -162,6 +164,27 @@ def test_a_frozen_function_keeps_no_graph() -> None:
     del x
     assert held() is None
     frozen(torch.ones(1, 1))
+
+
+@pytest.mark.parametrize(("fresh", "factor"), [(None, 1.0), (1, 2.0)])
+def test_gradients_of_a_nonlinear_loss_behind_a_layer_with_fresh_elements(fresh: int | None, factor: float) -> None:
+    """Of y^2 at x = 1 behind f(z) = z with sigma = 0.5: 2. The surrogate is 0 and explains nothing.
+
+    With one of B = 2 elements fresh, y and its slope are both 0, or both twice too large. On average the gradient is B
+    times too large.
+    """
+    torch.manual_seed(0)
+    memory = zh.Memory(Fixed(torch.zeros_like), fresh=fresh)
+    memory.add(torch.zeros(2, 1), torch.zeros(2, 1))
+    memory.fit()
+    memory.regression.moments = [[1.0, 1.0]]  # of a surrogate that explains all, so that it is subtracted as a whole
+    layer = zh.BlackBox(lambda z: z, zh.Smoothing(sigma=0.5, samples=1), memory=memory).eval()
+    slopes = []
+    for _ in range(400):
+        x = torch.ones(2, 1, dtype=torch.float64, requires_grad=True)
+        slopes.append(torch.autograd.grad(layer(x).square().sum(), x)[0].mean())
+    assert deviation(torch.stack(slopes), torch.tensor(2.0 * factor)) < 5.0
+    assert deviation(torch.stack(slopes), torch.tensor(2.0)) > 5.0 or fresh is None
 
 
 def test_parameters_must_be_as_many_as_those_in_memory() -> None:

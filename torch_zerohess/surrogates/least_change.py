@@ -7,8 +7,9 @@ models"). It is the mean of a Gaussian process: the entries of the change of the
 
 The process here differs in two ways. A multiple of the identity, with a normal factor, is added to the change: on the
 way to a minimum all curvatures often grow or fall alike. And a value at u differs from the quadratic by a normal number
-whose variance grows as |u|^6. How fast it grows depends on the function. So the values choose between two rates by
-their likelihoods (Rasmussen and Williams 2006, section 5.4).
+whose variance grows as |u|^6. How fast it grows depends on the function. Many values choose between two rates by their
+likelihoods (Rasmussen and Williams 2006, section 5.4). Few values get the faster rate: quadratics through far points
+fit them nearly always, and the slopes of these quadratics are wrong.
 """
 
 import math
@@ -17,11 +18,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torch_zerohess.surrogates.quadratic import coefficients
+
 _EXACT = 1e-10
 """Variance of a value that is no quadratic, in units of the mean variance of the quadratics at the points."""
-_CUBIC, _ROUGH = 1e-8, 1e-3
+_CUBIC, _ROUGH = 1e-8, 1e-2
 """The same per sixth power of the distance: of a function that is nearly quadratic, and of another one. A smooth
 function leaves a quadratic by third powers."""
+_FEW = 0.75
+"""Values, over the coefficients of a quadratic, below which the rate is `_ROUGH`."""
 _ALIKE = 1.0
 """Variance of the multiple of the identity, over the variance of an entry beside the diagonal."""
 _LIKELIER = 20.0
@@ -41,14 +46,14 @@ def least_change(u: Tensor, values: Tensor, hessian: Tensor) -> tuple[float, Ten
         hessian: the earlier one [n, n].
 
     With fewer than n + 1 points the gradient has the least norm. With more points than a quadratic has coefficients the
-    result is a regression, in which near points count more than far ones. With more than n + 1 points the likelihood of
-    the values says how much more.
+    result is a regression. Near points count more than far ones, and much more where the points are few or where the
+    likelihood of the values says so.
     """
     rest = values - 0.5 * ((u @ hessian) * u).sum(1)
-    fit = _Affine.through(u, values, rest, _CUBIC)
-    if len(u) > u.shape[1] + 1:
-        rough = _Affine.through(u, values, rest, _ROUGH)
-        fit = rough if rough.likelihood > fit.likelihood + math.log(_LIKELIER) else fit
+    fit = _Affine.through(u, values, rest, _ROUGH)
+    if len(u) >= _FEW * coefficients(u.shape[1]):
+        smooth = _Affine.through(u, values, rest, _CUBIC)
+        fit = fit if fit.likelihood > smooth.likelihood + math.log(_LIKELIER) else smooth
     alpha = torch.linalg.solve_triangular(fit.factor.mT, fit.left[:, None], upper=True)[:, 0]
     change = (u.mT * alpha) @ u
     change.diagonal().add_(0.5 * _ALIKE * float(alpha @ u.square().sum(1)))

@@ -47,7 +47,7 @@ def test_few_points_tell_the_slope_along_them():
 
 def test_no_smaller_change_interpolates():
     """The change is C + a I of least |C|^2 / 2 + a^2: both derivatives vanish along all changes that no value sees."""
-    n, P = 3, 7
+    n, P = 3, 8
     _, _, f = quadratic(n, 2)
     u = points(P, n, 2)
     earlier = torch.diag(torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))

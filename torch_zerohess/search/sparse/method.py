@@ -142,7 +142,7 @@ class SparseMethod(SparseArrivals):
             known = self.arrived(known)
             known = replace(known, sigma=self.distance(known.radius))
         if known.phase == "trial" and not known.done:
-            promised = self._solved(known, self.radii(known)).promised
+            promised = self.solved(known, self.radii(known)).promised
             if promised is not None and promised <= NOTHING * abs(known.loss):
                 known = self.at_kink(known)
         if known.done:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
+from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.search.gauss_newton.by_samples import JacobianProgress
 from torch_zerohess.search.protocol.state import Best, Evaluated
 from torch_zerohess.search.protocol.told_values import check_range
@@ -113,7 +114,7 @@ class SparseProgress(JacobianProgress):
     def check_outputs(self, outputs: Tensor) -> None:
         """Raise ValueError for outputs [K, m] of one number, and for first ones whose changes are beyond float32."""
         if len(self.output) == 1:
-            raise ValueError(
+            raise ReturnedValueError(
                 "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
                 "number: use engine='descent'"
             )

@@ -40,6 +40,7 @@ __all__ = [
     "Smoothing",
     "SparseBlackBox",
     "SparseJacobian",
+    "__version__",
     "adapters",
     "doctor",
     "estimate",

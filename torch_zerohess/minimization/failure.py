@@ -2,11 +2,10 @@
 
 import torch
 
-from torch_zerohess import linalg, search, surrogates
 from torch_zerohess.evaluators.returned import ReturnedError
 
 _NUMERICAL = torch.linalg.LinAlgError  # type: ignore[attr-defined]
-_OWN = tuple(f"{folder.__name__}." for folder in (linalg, search, surrogates))
+_OWN = tuple(f"torch_zerohess.{folder}." for folder in ("search", "surrogates", "linalg"))
 """Beginnings of the names of modules with models of a search."""
 
 

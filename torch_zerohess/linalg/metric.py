@@ -44,7 +44,7 @@ def region_step(
     """Return s [n] that minimises gradient.s + s.hessian s/2 within |B^-1 s| <= 1 and lower <= s <= upper.
 
     The constraint that is exceeded most becomes an equation, and the rest of s gets a new step, until none is exceeded.
-    The set of equations is a guess.
+    The set of active constraints may not be optimal.
 
     Args:
         gradient: [n].

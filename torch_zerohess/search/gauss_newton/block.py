@@ -219,7 +219,7 @@ class BlockGaussNewton(AskTell[BlockProgress]):
 def broyden_update(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
     """Return the Jacobian [n, m] nearest to `jacobian` that explains changes [k, m] of the output along steps [k, n].
 
-    Nearest in the Frobenius norm: with one step it is Broyden's update. A step of no length tells nothing.
+    Nearest in the Frobenius norm: with one step it is Broyden's update. A step of no length has no effect.
     """
     long = steps.abs().amax(1) > 0.0
     if not bool(long.any()):

@@ -90,7 +90,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
 
     @property
     def _enough(self) -> int:
-        """Samples that determine a dense Jacobian, and tell whether it predicts; 0 if they would be too many."""
+        """Number of samples that determine a dense Jacobian and test its prediction; 0 if too many."""
         enough = math.ceil(1.25 * self.settings.n) + 4
         return enough if enough <= MOST * self.own.samples else 0
 

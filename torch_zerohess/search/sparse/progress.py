@@ -19,7 +19,7 @@ _PREDICTED = 0.5
 _HIDDEN = 1e-5
 """Share of the first loss that an inexact Jacobian may hide where the search arrives."""
 _PAIRS = 16
-"""Outputs at one point that tell the noise, at most about."""
+"""Outputs at one point that measure the noise, at most about."""
 _ROUNDING = 1e-12
 """A hop leads to something better if it lowers the loss by more than this share of it, and of what the hop added."""
 
@@ -71,7 +71,7 @@ class SparseProgress(JacobianProgress):
     variance: float = 0.0
     """In noise, of a number of the output; 0 before a point was evaluated twice."""
     pairs: int = 0
-    """Of outputs that tell the variance, as far as they count."""
+    """Of outputs that measure the variance, as far as they count."""
     averaging: bool = False
     """In noise, whether no single output is trusted any more."""
     before: Best | None = None
@@ -126,7 +126,7 @@ class SparseProgress(JacobianProgress):
         return ((points - self.center) / self.sigma).float(), ((outputs - self.output) / self.sigma).float()
 
     def telling_noise(self, one: Tensor, other: Tensor) -> "SparseProgress":
-        """Take what two outputs [m] at one point tell about noise: a mean over all pairs, mostly the latest ones."""
+        """Take what two outputs [m] at one point say about noise: a mean over all pairs, mostly the latest ones."""
         own, pairs = 0.5 * float((one - other).square().mean()), min(self.pairs + 1, _PAIRS)
         return replace(self, variance=own if pairs == 1 else self.variance + (own - self.variance) / pairs, pairs=pairs)
 
@@ -153,7 +153,7 @@ class SparseProgress(JacobianProgress):
         return replace(self, jacobian=best.within(evidence.found), evidence=evidence)
 
     def told_aside(self, evaluated: Evaluated, gain: float) -> "SparseProgress":
-        """Take what points tell at which only the parameters that stay have moved.
+        """Take what points show at which only the parameters that stay have moved.
 
         Slopes may be zero although outputs change, as at the maximum of a parabola. Then no parameter stays any more,
         and the center is the lowest point if the loss falls by more than this share of it.

@@ -234,7 +234,7 @@ def wide(x):
 
 
 def test_full_rows_and_a_grid_of_parameters_are_found():
-    """25 entries per row, where 16 are kept at first; neighbours tell them, although nobody says that they are some."""
+    """25 entries per row, where 16 are kept at first. Neighbours show them, although nobody says that they are some."""
     truth, order = normal(196), torch.randperm(196, generator=torch.Generator().manual_seed(0))
     least = 1e-4 * float(wide(truth[None]).square().mean())
     open_, few = (run(search_for(wide, truth, **one), wide, 300, least).evaluations for one in ({}, {"keep": 16}))

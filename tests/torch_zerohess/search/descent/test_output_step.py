@@ -1,4 +1,4 @@
-"""What a descent learns from a step's output, case by case: outputs of a known misfit, and the rule for each of them."""
+"""What a descent learns from a step's output, case by case: outputs of a known misfit, and the rule for each."""
 
 import math
 from dataclasses import replace

@@ -193,9 +193,16 @@ Tensor accumulate_numbers(
   return result;
 }
 
+// Writes u_k . v_m to out [B, M, K], for rows as above and vectors [B, M, n].
 template <class RowsOf>
-Tensor accumulate_with(const RowsOf& rows_of, int64_t n, bool squares, const Tensor& a) {
-  return accumulate_numbers(rows_of, a.size(0), a.size(1), a.size(2), n, squares, a.const_data_ptr<double>());
+void project_numbers(
+    const RowsOf& rows_of, int64_t B, int64_t M, int64_t K, int64_t n, const double* vectors, double* out) {
+  torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      const int64_t b = row / K;
+      project_row(rows_of(b), row % K, K, n, M, vectors + b * M * n, out + b * M * K);
+    }
+  });
 }
 
 auto stored(const Tensor& u) {
@@ -222,14 +229,7 @@ Tensor project(const Tensor& u, const Tensor& t) {
   STD_TORCH_CHECK(u.size(0) == t.size(0) && u.size(2) == t.size(2), "u and t do not fit");
   const int64_t B = t.size(0), M = t.size(1), n = t.size(2), K = u.size(1);
   Tensor result = empty({B, M, K}, ScalarType::Double);
-  const double* vectors = t.const_data_ptr<double>();
-  double* out = result.mutable_data_ptr<double>();
-  torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
-    for (int64_t row = begin; row < end; ++row) {
-      const int64_t b = row / K;
-      project_row(rows_of(b), row % K, K, n, M, vectors + b * M * n, out + b * M * K);
-    }
-  });
+  project_numbers(rows_of, B, M, K, n, t.const_data_ptr<double>(), result.mutable_data_ptr<double>());
   return result;
 }
 
@@ -237,7 +237,8 @@ Tensor accumulate(const Tensor& u, const Tensor& a, bool squares) {
   const auto rows_of = stored(u);
   check(a, "a", 3);
   STD_TORCH_CHECK(u.size(0) == a.size(0) && u.size(1) == a.size(2), "u and a do not fit");
-  return accumulate_with(rows_of, u.size(2), squares, a);
+  return accumulate_numbers(
+      rows_of, a.size(0), a.size(1), a.size(2), u.size(2), squares, a.const_data_ptr<double>());
 }
 
 template <class T>
@@ -325,12 +326,7 @@ Tensor weighted_hvp(
   }
   std::vector<double> totals(size_t(B * M)), along(size_t(B * M * K));
   for (int64_t row = 0; row < B * M; ++row) totals[size_t(row)] = total(numbers.data() + row * K, K);
-  torch::stable::parallel_for(0, B * K, grain(M * n), [&](int64_t begin, int64_t end) {
-    for (int64_t row = begin; row < end; ++row) {
-      const int64_t b = row / K;
-      project_row(rows_of(b), row % K, K, n, M, vectors + b * M * n, along.data() + b * M * K);
-    }
-  });
+  project_numbers(rows_of, B, M, K, n, vectors, along.data());
   for (size_t k = 0; k < numbers.size(); ++k) numbers[k] *= along[k];
   Tensor result = accumulate_numbers(rows_of, B, M, K, n, false, numbers.data());
   double* out = result.mutable_data_ptr<double>();
@@ -366,7 +362,7 @@ Tensor accumulate_drawn(
   check(a, "a", 3);
   const int64_t K = rows.size(0) / x.size(0) * (antithetic ? 2 : 1);
   STD_TORCH_CHECK(x.size(0) == a.size(0) && K == a.size(2), "rows and a do not fit");
-  return accumulate_with(rows_of, x.size(1), squares, a);
+  return accumulate_numbers(rows_of, a.size(0), a.size(1), K, x.size(1), squares, a.const_data_ptr<double>());
 }
 
 Tensor hessian(const Tensor& u, const Tensor& a) {

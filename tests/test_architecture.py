@@ -48,7 +48,7 @@ MAKERS = {
         *("randperm", "scalar_tensor", "tensor", "tril_indices", "triu_indices", "zeros"),
     )
 }
-DEFAULT_DEVICE = {"search.protocol.space": ["torch.as_tensor(_unshared(x0), dtype=None if kept else torch.float64)"]}
+DEFAULT_DEVICE = {"search.protocol.space": ["torch.as_tensor(own_copy(x0), dtype=None if kept else torch.float64)"]}
 MODULES = {tree: sorted((ROOT / tree).rglob("*.py")) for tree in LAYERS}
 CASES = [pytest.param(tree, path, id=str(path.relative_to(ROOT))) for tree in LAYERS for path in MODULES[tree]]
 

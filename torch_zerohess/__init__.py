@@ -24,6 +24,7 @@ from torch_zerohess.optim.schedules import LinearSigma
 from torch_zerohess.smoothing import Smoothing
 from torch_zerohess.surrogates.memory import Memory
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
+from torch_zerohess.version import VERSION as __version__
 
 __all__ = [
     "BlackBox",
@@ -39,6 +40,7 @@ __all__ = [
     "Smoothing",
     "SparseBlackBox",
     "SparseJacobian",
+    "__version__",
     "adapters",
     "doctor",
     "estimate",

@@ -145,6 +145,11 @@ def _numbers(given: Any) -> Tensor:
     return torch.as_tensor(given, dtype=torch.float64, device="cpu") if real else tensor
 
 
+def own_copy(numbers: Any) -> Any:
+    """Return a copy of an array, whose strides torch can take: NumPy has negative ones. Anything else as it is."""
+    return numbers.copy() if hasattr(numbers, "strides") else numbers
+
+
 def checked_sigma(sigma: Any, name: str = "sigma") -> float | Tensor:
     """Return a number, or a copy [n] in float64. TypeError if sigma is neither, ValueError if it is out of range."""
     if isinstance(sigma, Tensor) and sigma.requires_grad:

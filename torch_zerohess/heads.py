@@ -57,18 +57,19 @@ class LocalEntropy:
     scale, and vanishes with the loss. So losses must not be negative, and must be small where the fit is good: with a
     large constant added to a loss T is large, and the local entropy is hardly different from the mean. T is not
     differentiated. For a large temperature the local entropy is the mean.
+
     The estimate is the logarithm of a sample mean, hence biased if the samples are few. With a memory T is a multiple
     of the mean loss of the surrogate g. The estimate is then linear in r = E exp(-loss / T) - Z_g, where Z_g is the
     mean of exp(-loss / T) over g, and too low by about T (r / Z_g)^2 / 2. More samples do not remove this bias, a
     better surrogate does. Baseline "center" subtracts nothing where exp(-loss / T) at x is more than twice its mean
     over the samples, as it is near a minimum.
 
+    It takes all samples of an element, which only the layer has: it must be the `head` of the layer itself, not a part
+    of another function.
+
     Args:
         head: outputs [K, *out], *aux [K, ...] -> losses [K]; no local entropy itself.
         temperature: T over the mean loss.
-
-    It takes all samples of an element, which only the layer has: it must be the `head` of the layer itself, not a part
-    of another function.
     """
 
     head: Callable[..., Tensor]

@@ -78,7 +78,7 @@ def minimize(
         sigma: smoothing at the start, a number or [n]: of the order of the distance to the solution. One that is wider
             than the bounds of a parameter are apart counts as their distance.
         loss: white box after fn, [*out] -> scalar, in torch, called with float64 outputs on the device of x0. Where
-            there is one, give it: each evaluation then tells as many equations as the output has numbers. It may have
+            there is one, give it: each evaluation then gives as many equations as the output has numbers. It may have
             kinks, as a sum of magnitudes or a norm. A point with a number that is not finite in its output has failed,
             also where the loss ignores that number. Leave constants out: "gaussian_process" takes fewer evaluations
             where the loss falls to 0.

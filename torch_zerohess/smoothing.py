@@ -131,7 +131,8 @@ class Smoothing:
 
     def _check_draws(self) -> None:
         """Raise ValueError if all samples are one independent draw: there are no other draws to take the mean of."""
-        choice = self._choice(1)  # more parameters have no more draws
+        # n = 1 has the most draws: a setting that passes here may still be refused by a call with more parameters.
+        choice = self._choice(1)
         sobol = choice["sampler"] == "sobol"
         if (choice["scrambles"] if sobol else choice["samples"]) > 1:
             return

@@ -1,4 +1,4 @@
-"""How exact 100 samples tell the Hessian of NONPSD, whose convolution is known in closed form.
+"""How exactly 100 samples give the Hessian of NONPSD, whose convolution is known in closed form.
 
 The source claims for the negated Gaussian -N(0, s1) smoothed with N(0, s2) that "the mean error of our method across
 the interval (-3, 3)^2 is within 1e-4 for 100 samples", without s1, s2 or what the mean is taken of. Three readings are

@@ -1,4 +1,4 @@
-"""How many samples tell a sparse Jacobian: ours, LASSO and least norm on the same samples of maps that are known.
+"""How many samples determine a sparse Jacobian: ours, LASSO and least norm on the same samples of maps that are known.
 
 Each of m outputs depends on s of n parameters. The samples are as in `zh.sparse_jacobian`, antithetic pairs: a pair
 gives one difference along one direction. The support of s entries among n takes of the order of s log n differences

@@ -28,7 +28,7 @@ HEADERS = ("layer", "renders per call", "call", "error of the gradient", "error 
 
 @dataclass(frozen=True)
 class LayerError:
-    """How well one call of a layer tells the derivatives."""
+    """How well one call of a layer estimates the derivatives."""
 
     layer: str
     evaluations: int
@@ -43,7 +43,7 @@ class LayerError:
 def sparse_layers(
     samples: tuple[int, ...] = (24, 48, 96), calls: int = 4, seed: int = 0, store: str | None = None
 ) -> list[LayerError]:
-    """Print how well layers tell the derivatives of a loss behind a network, POSTER and 1 024 texels.
+    """Print how well layers estimate the derivatives of a loss behind a network, POSTER and 1 024 texels.
 
     Args:
         samples: antithetic pairs per texture.

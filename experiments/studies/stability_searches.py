@@ -3,7 +3,7 @@
 Every case is a function of two or ten parameters in units of sigma, with a start of value 1 and a minimum of value 0.
 A run succeeds if the noiseless value at its result is at most `aim`. A run is wrong if `Minimum.success` is true and
 it did not succeed. Under noise such claims are counted and not judged: 200 values whose noise is as large as the signal
-do not tell the minimum. On a plateau without an end the message has to say that all values are equal.
+do not determine the minimum. On a plateau without an end the message has to say that all values are equal.
 """
 
 import statistics

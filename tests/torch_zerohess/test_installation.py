@@ -191,3 +191,7 @@ def test_a_source_distribution_has_the_extension_and_no_tests(tmp_path):
     }
     assert needed <= names
     assert not any(name.startswith("tests") for name in names)
+
+
+def test_the_package_says_its_version():
+    assert zh.__version__ == importlib.metadata.version("torch_zerohess")

@@ -10,6 +10,8 @@ import torch
 from searches import TARGET, raising, tilted, zeros
 
 import torch_zerohess as zh
+from torch_zerohess.evaluators.returned import ReturnedError
+from torch_zerohess.minimization.failure import failure
 from truths import vector
 
 
@@ -244,6 +246,27 @@ def test_what_is_wrong_with_a_value_is_said_once_and_not_as_an_error_of_fn(value
     with pytest.raises(ValueError, match="fn must return one number per point") as caught:
         zh.minimize(lambda x: next(values), zeros(2), sigma=1.0, vectorized=False)
     assert caught.value.minimum.message == str(caught.value)
+
+
+WRONG = {
+    "callback": (tilted, {"callback": lambda one: torch.zeros(2, dtype=torch.bool)}),
+    "loss must return a tensor": (lambda z: z, {"loss": lambda y: float(y.sum())}),
+    "loss must return a scalar": (lambda z: z, {"loss": lambda y: y}),
+    "loss must not change": (lambda z: z, {"loss": lambda y: y.mul_(2.0).sum()}),
+    "fn must return a tensor": (lambda z: None, {}),
+    "fn must return one value per point": (lambda z: z[:1, 0], {}),
+    "fn must return real numbers": (lambda z: z[:, 0] + 1j, {}),
+    "fn must return values of one shape": (lambda z: z.new_zeros(len(z), len(z)), {"loss": torch.sum}),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_every_check_of_what_a_function_returned_speaks_for_itself(message):
+    fn, settings = WRONG[message]
+    with pytest.raises((TypeError, ValueError), match=message) as caught:
+        zh.minimize(fn, zeros(2), sigma=2.0, seed=0, max_evaluations=40, **settings)
+    assert isinstance(caught.value, ReturnedError)
+    assert failure(caught.value, "fn") == str(caught.value)
 
 
 @pytest.mark.parametrize("bounds", [None, (-5.0, 5.0)])

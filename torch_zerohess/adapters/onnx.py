@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_zerohess.adapters.mixed_points import MixedPoints
 from torch_zerohess.adapters.onnx_session import fed, got, started
-from torch_zerohess.arguments import check_tensors
+from torch_zerohess.arguments import check_tensors, own_copy
 
 _TYPES = {
     "tensor(float)": torch.float32,
@@ -99,7 +99,7 @@ class OnnxFunction:
         self._batched = all(_free(self._inputs[name].shape[:1]) for name in (*self.parameters, *self.aux))
         self._mixing = MixedPoints()
         self._constants = {
-            name: self._converted("constants", name, torch.as_tensor(_compact(one), device="cpu")).clone()
+            name: self._converted("constants", name, torch.as_tensor(own_copy(one), device="cpu")).clone()
             for name, one in fixed.items()
         }
 
@@ -258,11 +258,6 @@ class OnnxFunction:
         if "string" in kinds[name] or kinds[name].startswith(("seq(", "map(")):
             raise ValueError(f"output {name!r} must be a tensor of numbers, got {kinds[name]}")
         return name
-
-
-def _compact(numbers: Any) -> Any:
-    """Return a copy of an array of NumPy, whose strides may be negative; anything else as it is."""
-    return numbers.copy() if hasattr(numbers, "strides") else numbers
 
 
 def _again(*arguments: Any) -> OnnxFunction:

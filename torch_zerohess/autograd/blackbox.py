@@ -212,7 +212,7 @@ class BlackBox(Layer):
             self.control = None
 
     def _estimated(self, center: Tensor, aux: list[Tensor], zero: bool) -> tuple[Callable[[Tensor], Tensor], Tensor]:
-        """Return the expectation that new evaluations tell, as `_around` does, and its constants."""
+        """Return the expectation that new evaluations estimate, as `_around` does, and its constants."""
         expansion = self._evaluate(center, aux)
         active = self.control is not None and self.control.active
         if active and self.memory is not None and self.memory.order == 1:

@@ -126,7 +126,7 @@ def around(
         return control.coefficient * (inner if excess is None else inner + excess)
 
     def expected(x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """F at x, and what the new evaluations tell about its fresh elements."""
+        """F at x, and what the new evaluations show about its fresh elements."""
         term = smoothed(values, x, center, sigma, u, pathwise=pathwise, plain=not transforms.transform_active())
         new = None if rest is None else rest[0](x.index_select(0, part))
         return outer.corrected(term, None if new is None else spread(new), scales), new

@@ -73,7 +73,7 @@ def estimate(
             without this region, and standard errors do not tell: look at `Estimate.dropped`.
         joint: whether one evaluation takes a point of every batch element, for x [B, n]: fn is [K, B, n],
             *aux [K, B, ...] -> [K, B, *out], or [B, n] -> [B, *out] where not `vectorized`. Use it where each of B
-            parts of a scene changes a loss of its own, such as the pixels near it: K evaluations then tell the
+            parts of a scene changes a loss of its own, such as the pixels near it: K evaluations then give the
             derivatives of B small functions. Each function is smoothed over the perturbations of the other parts, too.
             These have the density of the samples, which is the Gaussian with proposal "gaussian".
         tolerance: relative error at which to stop; None for one batch.

@@ -217,8 +217,9 @@ def check_repeats(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> None:
 
 
 def jumps(surrogate: Callable[[Tensor], Tensor], z: Tensor) -> bool | None:
-    """Whether outputs at points z [Q, n] differ where their derivative says that they are constant; None if they do not
-    differ.
+    """Whether outputs differ where their derivative is zero; None if all outputs are equal.
+
+    z: the points [Q, n] of the outputs.
     """
     with torch.inference_mode(False), torch.enable_grad():
         at = z.clone().requires_grad_()

@@ -119,7 +119,7 @@ def check_output(shape: torch.Size, other: str) -> None:
 
 
 def _resolved(smoothing: Smoothing, n: int) -> Smoothing:
-    """Return the settings without "auto"; ValueError for samples that do not tell a sparse Jacobian."""
+    """Return the settings without "auto"; ValueError for samples that do not determine a sparse Jacobian."""
     if smoothing.sampler == "auto" and smoothing.resolved(n).sampler == "sobol":
         smoothing = smoothing.replace(sampler="orthogonal")
     smoothing = smoothing.resolved(n)

@@ -29,7 +29,7 @@ _FEW = 32
 """Parameters that are few."""
 _PAIRS = 2
 """Pairs of points per element with many parameters, of which the surrogate is affine. Derivatives of a loss that is
-quadratic in an affine map are exact from one pair, and two pairs tell an error."""
+quadratic in an affine map are exact from one pair, and two pairs measure an error."""
 _EDGE = 1e-9
 """Probability at which the normal quantile is cut off."""
 

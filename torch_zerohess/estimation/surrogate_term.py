@@ -31,7 +31,7 @@ _SUMS = 4
 """Sums of all outputs with random signs, on which both derivatives are compared. The variance of such a sum has the sum
 of the variances of the outputs as its mean."""
 _REPEATS = 8
-"""Means over other points, which tell the variance of one."""
+"""Means over other points, which measure the variance of one."""
 _SHORTER = 4
 """Points of the term per point at which a surrogate is looked at for jumps and kinks once more, at least."""
 _LOOKED = 512

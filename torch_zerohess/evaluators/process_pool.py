@@ -102,7 +102,7 @@ class ProcessPool(Ahead):
         recycle = None if recycle is None else checked_integer("recycle", recycle, 1)
         memory_limit = None if memory_limit is None else int(checked_number("memory_limit", memory_limit, above=0.0))
         if memory_limit is not None and sys.platform != "linux":
-            raise ValueError(f"memory_limit needs Linux, which tells the memory of a process, got {sys.platform}")
+            raise ValueError(f"memory_limit needs Linux, which says how much memory a process has, got {sys.platform}")
         self.timeout = None if timeout is None else checked_number("timeout", timeout, above=0.0)
         self.retries, self.recycle, self.memory_limit = retries, recycle, memory_limit
         self._most = MOST if memory_limit is None else 1  # a limit is for one

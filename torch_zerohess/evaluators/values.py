@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.returned import ReturnedTypeError, ReturnedValueError
+
 
 def stacked(rows: Any) -> Any:
     """Return a list of tensors, or of arrays of NumPy, as one of them, and anything else as it is.
@@ -24,7 +26,9 @@ def stacked(rows: Any) -> Any:
         return rows
     for k, one in enumerate(parts):
         if one.shape != parts[0].shape:
-            raise ValueError(f"rows must have one shape, got {[*one.shape]} for row {k} and {[*parts[0].shape]} before")
+            raise ReturnedValueError(
+                f"rows must have one shape, got {[*one.shape]} for row {k} and {[*parts[0].shape]} before"
+            )
     return _known(numpy.asarray([_unmasked(one) for one in parts])) if arrays else torch.stack(parts)
 
 
@@ -75,7 +79,7 @@ def as_tensor(result: Any) -> Tensor:
         exact = not (tensor.is_floating_point() or tensor.is_complex())
         return torch.as_tensor(result, dtype=torch.float64, device=device) if exact else tensor
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise TypeError(
+        raise ReturnedTypeError(
             f"fn must return a tensor or a NumPy array of numbers, got {type(result).__name__}: {error}"
         ) from error
 
@@ -86,17 +90,19 @@ def checked_values(result: Any, points: Tensor, vectorized: bool = True) -> Tens
     A batch whose values are a tuple of tensors is several results, as `(image, info)`, and no list of points.
     """
     if vectorized and isinstance(result, tuple) and any(getattr(one, "ndim", 0) > 0 for one in result):
-        raise TypeError(
+        raise ReturnedTypeError(
             f"fn must return one tensor [K, *out], got a tuple of {len(result)}: return one of them, or join them "
             "along dimension 1"
         )
     values = as_tensor(result)
     if values.requires_grad:
-        raise ValueError("fn returned a tensor that requires grad; a black box has no graph: return it detached")
+        raise ReturnedValueError(
+            "fn returned a tensor that requires grad; a black box has no graph: return it detached"
+        )
     if not values.is_floating_point():
-        raise TypeError(f"fn must return real numbers, got {values.dtype}: return .real, .abs() or both parts")
+        raise ReturnedTypeError(f"fn must return real numbers, got {values.dtype}: return .real, .abs() or both parts")
     if values.dim() == 0 or values.shape[0] != points.shape[0]:
-        raise ValueError(
+        raise ReturnedValueError(
             f"fn must return one value per point, [{len(points)}, *out] for points "
             f"{list(points.shape)}, got {list(values.shape)}"
             + ("" if vectorized else " from single points")

@@ -27,7 +27,7 @@ def steihaug(
     step.
 
     Where g and H are means of R independent estimates, gradient [R, N] and product(v) [R, N] may give all of them.
-    Their spread tells the error of the residual g + H s and of the curvature d.Hd along a direction, and iterations
+    Their spread measures the error of the residual g + H s and of the curvature d.Hd along a direction, and iterations
     stop ("noise") when the residual, or the curvature, is of the size that errors alone would have (see `noise_level`):
     what follows would be fitted to the noise, and grows without limit in flat directions. If the curvature of the very
     first direction is that uncertain, it is taken at the upper end of its error.

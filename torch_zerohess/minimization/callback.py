@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+from torch_zerohess.evaluators.returned import ReturnedTypeError
 from torch_zerohess.minimization.minimum import Iterate
 
 
@@ -31,7 +32,7 @@ def _is_true(answer: object) -> bool:
         return False
     shape = [*getattr(answer, "shape", ())]
     if math.prod(shape) != 1:
-        raise TypeError(
+        raise ReturnedTypeError(
             f"callback must return True to end the search, one truth value, got values of shape {shape}: use .any() or "
             ".all()"
         )

@@ -52,25 +52,25 @@ def decide(
     """
     points, losses = record.keeping(search.untouched, search.x)
     lowest = torch.where(torch.isfinite(losses), losses, torch.inf)[:before].argsort()[:_OTHERS]
-    told, trusted = regression(record, search, before, noise), search.averages
-    minimum = None if told is None else modelled_minimum(likely[0], told, search.bounds)
+    fitted, trusted = regression(record, search, before, noise), search.averages
+    minimum = None if fitted is None else modelled_minimum(likely[0], fitted, search.bounds)
     if minimum is not None:
         likely, trusted = [minimum, *likely], True
     candidates = distinct([*likely, *points[lowest]])
     unused = list(range(before, len(points)))
 
     def again(asked: Tensor) -> Tensor:
-        told, missing = losses.new_empty(len(asked)), list[int]()
+        values, missing = losses.new_empty(len(asked)), list[int]()
         for k, one in enumerate(asked):
             known = next((j for j in unused if torch.equal(points[j], one)), None)
             if known is None:
                 missing.append(k)
             else:  # in any order: evaluations that ran at once may have left gaps
                 unused.remove(known)
-                told[k] = losses[known]
+                values[k] = losses[known]
         if missing:
-            told[missing] = evaluate(asked[missing])
-        return told
+            values[missing] = evaluate(asked[missing])
+        return values
 
     found = lowest_mean(again, candidates, most, noise, trusted=trusted)
     return None if found is None else (candidates[found[0]], *found[1:])

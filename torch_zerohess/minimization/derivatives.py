@@ -61,7 +61,7 @@ def is_flat(found: Derivatives, unit: Tensor) -> bool:
 def _model(
     x: Tensor, search: TrustRegion, points: Tensor, losses: Tensor, noise: float
 ) -> tuple[LocalModel, float | Tensor] | None:
-    """Return the search's quadratic model around x and its sigma; or what all evaluations tell, if that is better.
+    """Return the search's quadratic model around x and its sigma; or that of all evaluations, if it is better.
 
     It is also better where the model of a loss alone has infinite errors.
     In noise it is better if there are enough of them: its standard errors contain what is not quadratic.
@@ -80,5 +80,5 @@ def _model(
 
 
 def _is_determined(model: LocalModel, search: TrustRegion) -> bool:
-    """Whether evaluations determine the curvatures of a model. Models of outputs do not tell their errors."""
+    """Whether evaluations determine the curvatures of a model. Models of outputs have no errors of them."""
     return search.loss is not None or bool(model.full_errors()[1].isfinite().all())

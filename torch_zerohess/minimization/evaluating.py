@@ -7,6 +7,7 @@ from torch_zerohess.estimation.call import BlackBoxCall
 from torch_zerohess.evaluators.batch import numbers as numbers_of
 from torch_zerohess.evaluators.inline import Inline
 from torch_zerohess.evaluators.partial_values import finished_values
+from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.minimization.record import Call
 from torch_zerohess.surrogates.memory import Memory
 
@@ -36,7 +37,7 @@ def evaluating(call: BlackBoxCall, memory: Memory | None, *, scalar: bool) -> Ca
                 left = [points[k] for k in range(len(points)) if k not in numbers]
                 _say_where(error, left[:1] if one_by_one else left)
         if scalar and numbers and values.shape[1:] not in ((), (1,)):
-            raise failure or ValueError(
+            raise failure or ReturnedValueError(
                 f"fn must return one number per point if there is no loss=, got shape {list(values.shape)} for "
                 f"{len(points)} points"
             )

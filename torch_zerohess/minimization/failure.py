@@ -2,36 +2,25 @@
 
 import torch
 
+from torch_zerohess.evaluators.returned import ReturnedError
+
 _NUMERICAL = torch.linalg.LinAlgError  # type: ignore[attr-defined]
 _OWN = tuple(f"torch_zerohess.{folder}." for folder in ("search", "surrogates", "linalg"))
 """Beginnings of the names of modules with models of a search."""
-_CHECKS = tuple(
-    f"torch_zerohess.{module}"
-    for module in (
-        "evaluators.values",
-        "minimization.callback",
-        "minimization.evaluating",
-        "minimization.separate",
-        "search.protocol.told_values",
-        "search.sparse.progress",
-    )
-)
-"""Modules that check what functions of a caller return."""
 
 
 def failure(error: BaseException, caller: str) -> str:
     """Return who raised an error: "the search" for a numerical failure of its own models, or a function of the caller.
 
-    What a check raises of a value that such a function returned speaks for itself.
+    The message of a check of what such a function returned is returned as it is.
 
     Args:
         error: with its traceback.
         caller: name of the function.
     """
-    module = _raising(error)
-    if module in _CHECKS and isinstance(error, TypeError | ValueError):
+    if isinstance(error, ReturnedError):
         return str(error)
-    own = isinstance(error, _NUMERICAL) and module.startswith(_OWN)
+    own = isinstance(error, _NUMERICAL) and _raising(error).startswith(_OWN)
     return f"{'the search' if own else caller} raised {error!r}"
 
 

@@ -10,7 +10,7 @@ from torch_zerohess.surrogates.plateau import is_plateau
 _NEXT = ((1e-5, 1e-3), (2e-2, 0.2))
 """Distances in units of sigma, and differences to the value at x over the range of all values: more is a jump."""
 _EDGE, _LEAST, _SIDE = 1e-4, 1e-6, 3
-"""Points within this distance of x, in units of sigma, tell an edge. Beyond it values are higher than at x by more than
+"""Points within this distance of x, in units of sigma, show an edge. Beyond it values are higher than at x by more than
 this part of the range of all values. At least so many points lie on each side."""
 _ALIKE, _TENFOLD = 0.05, 10.0
 """Values beyond an edge are higher by the same amount, but for this part of it. The ratio of their distances is at
@@ -27,7 +27,7 @@ _BESIDE, _APART, _STEEPER = 1e-3, 0.1, 8.0
 """Distances in units of sigma up to which an evaluation is beside x, and from which it is apart; how many times as
 steep the loss is beside x at a cusp: a square root is ten times as steep at 1e-3 as at 0.1."""
 _TOLD = 1e-3
-"""Difference, over the range of all values, from which it tells a cusp: less may be roughness."""
+"""Difference, over the range of all values, from which it shows a cusp: less may be roughness."""
 
 DEEP, _DEEPER = 1e100, 1e12
 """Magnitude of a negative loss, and its ratio to the first loss: lower ones are no minimum of anything measured."""
@@ -97,8 +97,8 @@ def has_cusp(points: Tensor, losses: Tensor, x: Tensor, unit: Tensor) -> bool:
     if not bool(same.any()):
         return False
     rise, range_ = losses - losses[same].min(), losses[finite].max() - losses[finite].min()
-    told = finite & (distance > 0.0) & (rise > _TOLD * range_)
-    near, far = (told & (distance <= _BESIDE)), (finite & (distance >= _APART))
+    informative = finite & (distance > 0.0) & (rise > _TOLD * range_)
+    near, far = (informative & (distance <= _BESIDE)), (finite & (distance >= _APART))
     slopes = rise / distance
     return bool(near.any() and far.any()) and bool(slopes[near].max() > _STEEPER * slopes[far].max())
 

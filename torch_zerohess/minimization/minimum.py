@@ -52,13 +52,13 @@ class Minimum:
             output and the Hessian H of the loss: second derivatives of the output are left out.
         standard_errors: of these by the names "gradient" [n] and "hessian_diagonal" [n]; None likewise. They are
             infinite where the evaluations do not determine the derivative. Without noise they are an estimate, often
-            too small: they tell neither third derivatives nor what J^T H J leaves out. At an active bound few
+            too small: they include neither third derivatives nor what J^T H J leaves out. At an active bound few
             evaluations lie beside x, and the Hessian may be wrong by far more than its error. In noise, and up to 40
             parameters, about 95 % of derivatives are within twice the error. Of the Hessian it is 60 to 85 % where the
             minimum is a sharp tip that few evaluations resolve. With more parameters, or with fewer than (n + 1)(n +
             2)/2 + 5 evaluations, the errors are of the search's own model, and often too small.
         sigma: [n], width of the quadratic along every parameter; in noise, the mean distance from x of the evaluations
-            that tell the derivatives.
+            that the derivatives were fitted to.
         evaluations: how many there were.
         points: [evaluations, n], where, in order.
         values: [evaluations], float64, the losses there; NaN where an output is not finite.
@@ -69,7 +69,7 @@ class Minimum:
         status: target: the value is at most the target. solved: the search has ended at a minimum, possibly a local
             one. stalled: it has ended without one, or where a small region is no evidence of one: in noise, and, unless
             several rounds agree, where fn jumps, fails, is constant or has a cusp at x, or a kink whose slopes do not
-            tell; or the loss falls without end. budget, time: evaluations or seconds are used up. callback,
+            decide; or the loss falls without end. budget, time: evaluations or seconds are used up. callback,
             interrupted: the caller has ended it. failed: the black box, the loss, the callback or the search has
             raised.
         message: why the search ended, in words.

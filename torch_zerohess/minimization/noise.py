@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 REPEATED = 8
-"""Values at one point that tell the standard deviation of noise."""
+"""Values at one point that measure the standard deviation of noise."""
 _AGAIN = 2
 """Further evaluations of x where losses are counts: one would be equal to the first too often."""
 _TWO = 6
@@ -34,7 +34,7 @@ def differs(one: Tensor, other: Tensor, rounding: float = _ROUNDING) -> bool:
 def is_rounding(values: Tensor) -> bool:
     """Whether values [K, *out] of one point have no noise: only the first one, of a call of several points, differs.
 
-    False for fewer than three values, which tell nothing.
+    False for fewer than three values, which show nothing.
     """
     if len(values) < 3:
         return False
@@ -148,21 +148,21 @@ def lowest_mean(
     for k in range(rounds):
         each = choosing // ((rounds - k) * len(left))
         if each:
-            told = evaluate(points[left].repeat(each, 1)).reshape(each, -1).mT.cpu()
-            choosing, evaluations = choosing - told.numel(), evaluations - told.numel()
-            losses = torch.cat([losses, torch.where(torch.isfinite(told), told, torch.inf)], 1)
+            repeated = evaluate(points[left].repeat(each, 1)).reshape(each, -1).mT.cpu()
+            choosing, evaluations = choosing - repeated.numel(), evaluations - repeated.numel()
+            losses = torch.cat([losses, torch.where(torch.isfinite(repeated), repeated, torch.inf)], 1)
             means = losses.mean(1)
             if trusted:
                 means[left == 0] -= _CONTRADICTION * noise * math.sqrt(2.0 / losses.shape[1])
             better = means.argsort()[: math.ceil(len(left) / 2)]
             left, losses = left[better], losses[better]
-    told = evaluate(points[left[:1]].repeat(evaluations, 1))
-    told, earlier = (one[torch.isfinite(one)] for one in (told, losses[0]))
-    if not len(told):
-        told, earlier = earlier, told
-    if not len(told):
+    repeated = evaluate(points[left[:1]].repeat(evaluations, 1))
+    repeated, earlier = (one[torch.isfinite(one)] for one in (repeated, losses[0]))
+    if not len(repeated):
+        repeated, earlier = earlier, repeated
+    if not len(repeated):
         return None
-    return int(left[0]), float(told.mean()), _spread([told, earlier], noise) / math.sqrt(len(told))
+    return int(left[0]), float(repeated.mean()), _spread([repeated, earlier], noise) / math.sqrt(len(repeated))
 
 
 def _spread(groups: Sequence[Tensor], noise: float) -> float:

@@ -62,24 +62,24 @@ def regression(
 
 
 def modelled_minimum(
-    x: Tensor, told: LossRegression | OutputRegression, bounds: tuple[Tensor, Tensor]
+    x: Tensor, regression: LossRegression | OutputRegression, bounds: tuple[Tensor, Tensor]
 ) -> Tensor | None:
     """Return the minimum [n] of a regression near x; x itself if the regression is not sure of a lower loss there.
 
-    None if the evaluations do not determine a quadratic. Each Newton step is at most as long as the evaluations that
-    tell the quadratic are wide. The decrease from x must be more than its standard error: beside a kink the regression
-    takes losses for equal that are not.
+    None if the evaluations do not determine a quadratic. The width of the evaluations that determine it bounds each
+    Newton step. The decrease from x must be more than its standard error: beside a kink the regression takes losses for
+    equal that are not.
 
     Args:
         x: where to begin [n].
-        told: what evaluations tell.
+        regression: of the evaluations.
         bounds: lower and upper [n].
     """
     at = start = x.double()
     lower, upper = (one.double() for one in bounds)
     radius = math.sqrt(len(x))
     for _ in range(_STEPS):
-        found = told.derivatives(at)
+        found = regression.derivatives(at)
         if found is None:
             return None
         model, width = found
@@ -87,5 +87,5 @@ def modelled_minimum(
         at = (at + width * step).clamp(lower, upper)
         if float(step.norm()) < _SHORT * radius:
             break
-    change = told.change(at, start)
+    change = regression.change(at, start)
     return at.to(x) if change is not None and change[0] > change[1] else x

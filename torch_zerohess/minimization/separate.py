@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.minimization.record import Call
 
 
@@ -23,15 +24,15 @@ def separated(call: Call, alone: Callable[[int], bool]) -> Call:
             return call(points)
         numbers, values, first = list[int](), list[Tensor](), 0
         for part in points.split(lengths(points)):
-            found, told, error = call(part)
-            if found and values and told.shape[1:] != values[0].shape[1:]:
-                shapes = f"{list(values[0].shape[1:])} and {list(told.shape[1:])}"
-                found, error = [], ValueError(f"fn must return values of one shape in every call, got {shapes}")
+            found, returned, error = call(part)
+            if found and values and returned.shape[1:] != values[0].shape[1:]:
+                shapes = f"{list(values[0].shape[1:])} and {list(returned.shape[1:])}"
+                found, error = [], ReturnedValueError(f"fn must return values of one shape in every call, got {shapes}")
             if found:
                 numbers += [first + k for k in found]
-                values.append(told)
+                values.append(returned)
             if error is not None:
-                return numbers, torch.cat(values) if values else told, error
+                return numbers, torch.cat(values) if values else returned, error
             first += len(part)
         return numbers, torch.cat(values), None
 

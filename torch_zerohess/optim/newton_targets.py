@@ -12,16 +12,13 @@ from torch_zerohess.autograd.graph import check_twice
 from torch_zerohess.autograd.tracing import never_compiled
 from torch_zerohess.linalg.magnitudes import magnitudes
 from torch_zerohess.linalg.saddle_free import saddle_free_steps
+from torch_zerohess.optim.elements import check_elements
 from torch_zerohess.version import VERSION
 
 _DENSE = 16
 """Outputs up to which the Hessian of every element is formed and solved."""
 _TOLERANCE = 1e-2
 """Residual of the system, relative to the gradient."""
-_COUPLED = 1e-3
-"""Relative error of a derivative at which losses depend on other elements."""
-_REPEATED = 8.0
-"""The same in differences between two backward passes, which on a GPU may add in another order."""
 _PATIENCE = 100
 """Calls without a new preconditioner, after one with which its own call did not converge."""
 
@@ -44,6 +41,10 @@ class NewtonTargets:
     one H, and of about this length where their Hessians differ. Negative curvature that `iterations` do not find can
     make a step longer: `output_radius` is its bound. h is v^T |H| v / n with random signs v (Hutchinson 1989), where
     |H| is taken in the space of v and H v.
+
+    Where H is 0 up to rounding, as for a loss that is linear in y, the step is g. H counts as rounding where
+    h <= sqrt(eps) |g| / max |y| and h <= sqrt(eps) |g|^2 / max |l|. The maxima are over the batch, and eps is that of
+    the type of y.
 
     The preconditioner is one matrix: column i is from the Hessian over h of element i modulo B. Later calls keep it.
     Where `iterations` do not reach a residual of 1 %, the call makes another one. If the residual stays above 1 % with
@@ -152,7 +153,7 @@ class NewtonTargets:
             (cg,) = torch.autograd.grad(values, at, c.to(values), retain_graph=True)
             return cg
 
-        _check_elements(slopes, gradient)
+        check_elements(slopes, gradient)
 
         def product(v: Tensor) -> Tensor:
             if not g.requires_grad:  # a loss that is linear in y
@@ -160,38 +161,47 @@ class NewtonTargets:
             (hv,) = torch.autograd.grad(g, at, v, retain_graph=True, materialize_grads=True)
             return hv
 
-        step = self._dense(product, gradient) if y.shape[1] <= _DENSE else self._iterate(product, gradient)
+        solve = self._dense if y.shape[1] <= _DENSE else self._iterate
+        step = solve(product, gradient, _least(gradient, y.detach(), self.losses))
         _check(step)
         if self.output_radius < math.inf:
             length = step.double().norm(dim=1, keepdim=True)
             step = step * (self.output_radius / length.clamp_min(self.output_radius)).to(step.dtype)
         return y.detach() - step
 
-    def _dense(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
+    def _dense(self, product: Callable[[Tensor], Tensor], gradient: Tensor, least: Tensor) -> Tensor:
         n = gradient.shape[1]
         units = torch.eye(n, dtype=gradient.dtype, device=gradient.device)
         columns = torch.stack([product(unit.expand_as(gradient)) for unit in units], 2)
         v = torch.rand(
             gradient.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu"
         ).to(gradient)
-        _check_elements(lambda c: product(c[:, None] * v), torch.einsum("bij,bj->bi", columns, v))
+        check_elements(lambda c: product(c[:, None] * v), torch.einsum("bij,bj->bi", columns, v))
         h = _magnitudes(columns.double())
-        shift = self._shift(h.diagonal(dim1=1, dim2=2).abs().mean(1))
-        h = h + shift[:, None, None] * torch.eye(n, dtype=h.dtype, device=h.device)
+        size = h.diagonal(dim1=1, dim2=2).abs().mean(1, keepdim=True)
+        curved = size > least
+        shift = self._shift(curved * size)
+        h = curved[:, :, None] * h + shift[:, :, None] * torch.eye(n, dtype=h.dtype, device=h.device)
         return torch.linalg.solve(h, gradient.double()).to(gradient.dtype)
 
     def _shift(self, size: Tensor) -> Tensor:
         """Return the damping for h; 1 for a Hessian of zeros."""
         return torch.where(size > 0, self.relative_damping * size, 1.0)
 
-    def _iterate(self, product: Callable[[Tensor], Tensor], gradient: Tensor) -> Tensor:
+    def _iterate(self, every: Callable[[Tensor], Tensor], gradient: Tensor, least: Tensor) -> Tensor:
         n = gradient.shape[1]
         coins = torch.rand(n, generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu")
         signs = torch.where(coins < 0.5, -1.0, 1.0).to(gradient)
-        image = product(signs.expand_as(gradient))
+        image = every(signs.expand_as(gradient))
         _check(image)
-        size = _size(product, signs, image)
-        _check_elements(lambda c: product(c[:, None] * signs), image)
+        size = _size(every, signs, image)
+        curved = size > least
+        size = curved * size
+
+        def product(v: Tensor) -> Tensor:
+            return curved * every(v)
+
+        check_elements(lambda c: every(c[:, None] * signs), image)
         if self._factor is not None and self._factor.shape[0] == n:
             self._factor = self._factor.to(gradient.device)  # a loaded one may be elsewhere
             step, converged = self._solve(product, gradient, size)
@@ -236,6 +246,17 @@ class NewtonTargets:
         return s.to(gradient.dtype), converged
 
 
+def _least(gradient: Tensor, y: Tensor, losses: Tensor) -> Tensor:
+    """Return the h of every element, [B, 1], up to which H is rounding.
+
+    With this h, the step g/h has the length max |y| / sqrt(eps) or more, and |g|^2/h is max |l| / sqrt(eps) or more.
+    One of the maxima may be zero: it then decides nothing.
+    """
+    slope = gradient.double().norm(dim=1, keepdim=True)
+    least = torch.minimum(slope / y.double().abs().max(), slope * (slope / losses.double().abs().max()))
+    return math.sqrt(torch.finfo(y.dtype).eps) * least.nan_to_num(0.0, posinf=0.0)
+
+
 def _size(product: Callable[[Tensor], Tensor], signs: Tensor, image: Tensor) -> Tensor:
     """Return v^T |H| v / n of every element, [B, 1], for v = signs [n] and image = H v [B, n].
 
@@ -256,36 +277,6 @@ def _magnitudes(h: Tensor) -> Tensor:
     """Return Hessians [..., n, n], symmetric and with the magnitudes of their eigenvalues."""
     _check(h)
     return magnitudes(0.5 * (h + h.mT))
-
-
-def _check_elements(derivative: Callable[[Tensor], Tensor], image: Tensor) -> None:
-    """Raise ValueError if a loss depends on another element.
-
-    The derivative of element b, of the losses times factors c [B], is then not c_b times the one without factors. The
-    factors are powers of two, which do not change the rounding. Those of up to 8 elements differ.
-
-    Args:
-        derivative: factors [B] -> gradient or product of the Hessians [B, n].
-        image: the derivative without factors, [B, n].
-    """
-    B = len(image)
-    if B == 1:
-        return
-    c = (0.5 ** (torch.randperm(B, generator=torch.Generator().manual_seed(1), device="cpu") % 8)).to(image)
-    scaled, ones = derivative(c) / c[:, None], torch.ones_like(c)
-    least = torch.finfo(image.dtype).tiny * math.sqrt(image.numel())  # half precision: factors lose what is below it
-
-    def norm(x: Tensor) -> float:
-        return float(x.double().norm())
-
-    if norm(scaled - image) <= max(least, _COUPLED * norm(image)):
-        return
-    image, again = derivative(ones), derivative(ones)  # rounding that differs from pass to pass, and of the image
-    if norm(scaled - image) > max(least, _COUPLED * norm(image), _REPEATED * norm(again - image)):
-        raise ValueError(
-            "losses(y) must be each of its own element of the batch, but one depends on the outputs of another: leave "
-            "out what couples them, such as a mean over the batch"
-        )
 
 
 def _check(x: Tensor) -> None:

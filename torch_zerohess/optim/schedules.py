@@ -60,7 +60,8 @@ class LinearSigma:
 
     def state_dict(self) -> dict[str, Any]:
         """Return where the schedule is, without the layers."""
-        return {name: getattr(self, name) for name in ("start", "end", "steps", "hold", "count")}
+        state = {name: getattr(self, name) for name in ("start", "end", "steps", "hold", "count")}
+        return {name: one.clone() if isinstance(one, Tensor) else one for name, one in state.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume and set the sigma of the layers. Raises as `LinearSigma` for numbers out of their range."""

@@ -80,7 +80,7 @@ class SparseOrDense(Relay[SparseOrDenseProgress]):
         known = SparseOrDenseProgress(
             best=descent.best,
             center=descent.center,
-            reason="the first samples are to tell whether outputs depend on few parameters each",
+            reason="the first samples are to show whether outputs depend on few parameters each",
             rest=points[count:],
             points=points[:0],
             losses=none,

@@ -33,7 +33,7 @@ class TrustRegion(AskTell[Any]):
       process in turn. Descent begins, and stays where its Gauss-Newton makes good steps. Elsewhere the process has its
       turn when n + 1 evaluations of the descent take away less than a fifth of the loss. The descent has its turn again
       when 8 (n + 1) evaluations of the process take away less than a tenth.
-    - 20 parameters or more, an output of many numbers and a `loss`: the evaluations tell whether these numbers depend
+    - 20 parameters or more, an output of many numbers and a `loss`: the evaluations show whether these numbers depend
       on few parameters each. If they do: Gauss-Newton on a sparse Jacobian. The search asks this after its first batch
       and, where the answer is not clear, each time that its evaluations have doubled.
     - Otherwise: descent by quadratic models in a trust region tied to sigma.

@@ -1,6 +1,6 @@
 """Which derivatives evaluations determine.
 
-Evaluations on a bound, for instance, do not tell how the function changes across it: a fit with a prior returns zero.
+Evaluations on a bound, for instance, do not show how the function changes across it: a fit with a prior returns zero.
 """
 
 from dataclasses import replace
@@ -11,7 +11,8 @@ from torch import Tensor
 from torch_zerohess.surrogates.quadratic import LocalModel, coefficients, quadratic_terms
 
 _EXTENT = 1e-2
-"""Least singular value of the weighted terms, in units of sigma: what is less is lost in the prior."""
+"""Least singular value of the weighted terms, in units of sigma: smaller ones are dominated by the
+prior."""
 _SHARE = 1e-6
 """Least part of a derivative in a direction that is not determined with which its error is infinite."""
 

@@ -15,7 +15,7 @@ _SPARE = 2
 _HELD = 1 << 25
 """Entries of a Jacobian, at most."""
 _LEVERAGE = 1e-6
-"""Least share of a sample that others tell: a sample that nothing else tells about does not count."""
+"""Least share of a sample that the others do not determine: a sample without such a share does not count."""
 
 
 def is_determined(n: int, samples: int, outputs: int) -> bool:

@@ -2,7 +2,7 @@
 
 A joint kernel is a function of the distance of two points. An additive kernel is the mean over parameters of a function
 of the distance along one parameter, or the mean over pairs of parameters of the product of two such functions. With it
-an output is a sum of functions of one parameter each, or of two each. Then an evaluation tells about a parameter
+an output is a sum of functions of one parameter each, or of two each. Then an evaluation informs about a parameter
 whatever the others are: ten parameters are ten lines, or 45 squares, not a box of ten dimensions. An image of several
 objects that move by themselves is nearly such a sum.
 
@@ -72,5 +72,6 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
     middle = b.detach().sum(0) / max(len(b), 1)  # without points, too
     a, b = a - middle, b - middle
     squares = a.square().sum(1)[:, None] + b.square().sum(1) - 2.0 * a @ b.mT
-    rounding = squares.detach().clamp(max=0.0)  # to be positive without a derivative of its own
+    # Rounding can make a square negative. The correction is a constant for autograd.
+    rounding = squares.detach().clamp(max=0.0)
     return (squares - rounding + _ZERO).sqrt()

@@ -14,7 +14,7 @@ _UNIT = 6
 _ROUNDING = 16
 """Units of rounding by which the mean of equal numbers differs from them, at most."""
 _ALONE = 1e-6
-"""Part of the output of a point that the others tell, below which they tell nothing."""
+"""Part of the output of a point that the others predict, below which they predict nothing."""
 
 
 class LinearSurrogate:

@@ -129,7 +129,7 @@ class Memory:
         self._known = 0
         """How many evaluations the last fit knew."""
         self.regression = Coefficient()
-        """What earlier calls tell about the surrogate."""
+        """What earlier calls show about the surrogate."""
 
     def __len__(self) -> int:
         """Evaluations that are kept."""

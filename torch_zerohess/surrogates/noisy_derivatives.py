@@ -36,7 +36,8 @@ _SHORT = 6.0
 """The prior of a length below 1 is its power with this exponent. A short process below the noise is never seen, but has
 large derivatives."""
 _LARGE = 0.1
-"""The prior of a ratio is its power with minus this exponent: a process is small if the values do not tell its size."""
+"""The prior of a ratio is its power with minus this exponent: a process is small if the values do not determine its
+size."""
 
 
 T = TypeVar("T")
@@ -93,7 +94,7 @@ class _Told(NamedTuple):
 
 
 def noisy_derivatives(x: Tensor, points: Tensor, values: Tensor, noise: float) -> tuple[LocalModel, Tensor] | None:
-    """Return value, gradient and Hessian at x with their standard errors, and the width of the points that tell them.
+    """Return value, gradient and Hessian at x with their standard errors, and the width of the points behind them.
 
     Args:
         x: [n].

@@ -34,7 +34,7 @@ class _Outputs:
 
 @dataclass(frozen=True)
 class OutputRegression:
-    """A loss of noisy outputs at points, which a regression tells at any other point.
+    """A loss of noisy outputs at points, which a regression predicts at any other point.
 
     Args:
         points: evaluations [P, n], float64.

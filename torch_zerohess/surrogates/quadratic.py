@@ -26,7 +26,8 @@ _ROUNDING = 1e-15
 _INTERCEPT = 1e-9
 """Prior precision of the constant term of an output, in evaluations."""
 _RANK = 1e-9
-"""Smallest pivot of the terms of a quadratic, relative to the largest, with which points tell all its coefficients."""
+"""Smallest pivot of the terms of a quadratic, relative to the largest, with which points determine all its
+coefficients."""
 _JITTER = 1e-13
 """Added to a kernel matrix, in units of its mean diagonal element, so that rounding leaves it definite."""
 
@@ -109,7 +110,7 @@ def quadratic_terms(u: Tensor) -> Tensor:
 
 
 def factored(terms: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return Q [P, q] and R^-1 [q, q] of terms = Q R [P, q]; None if the points do not tell every coefficient."""
+    """Return Q [P, q] and R^-1 [q, q] of terms = Q R [P, q]; None if the points do not determine every coefficient."""
     q, r = torch.linalg.qr(terms)
     pivots = r.diagonal().abs()
     if float(pivots.min()) < _RANK * float(pivots.max()):
@@ -131,7 +132,7 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
 
     Kernel ridge regression with the kernel 10 + u.u'/n + (u.u')^2/2n^2 + (|u|^2-n)(|u'|^2-n)/4n^2. This is a Gaussian
     prior over slopes, over all entries of the Hessian and over its trace: a few evaluations in many dimensions still
-    tell the mean curvature. P numbers describe the Hessian, whatever n. Where P is large it is a full one, otherwise
+    give the mean curvature. P numbers describe the Hessian, whatever n. Where P is large it is a full one, otherwise
     one of low rank plus a multiple of the identity. The evidence (marginal likelihood) chooses the variance of the
     part that is not quadratic, from exact interpolation to noise.
     """
@@ -152,10 +153,10 @@ def fit_values(u: Tensor, values: Tensor, weights: Tensor) -> LocalModel:
     gradient = s.mT @ alpha / n
     identity = torch.eye(s.shape[1], dtype=s.dtype, device=s.device)
     hessian = ((s.mT * alpha) @ s + 0.5 * (alpha @ trace) * identity) / n**2
-    # Posterior variances: the prior one less what the evaluations tell.
+    # Posterior variances: the prior one less what the evaluations determine.
     known = best.whiten(root[:, None] * s / n).square().sum(0)
     bent = best.whiten(root[:, None] * (s.square() + 0.5 * trace[:, None]) / n**2).square().sum(0)
-    # The prior knows one size of curvature for all parameters. Fewer evaluations than coefficients tell no more.
+    # The prior knows one size of curvature for all parameters. Fewer evaluations than coefficients determine no more.
     told = len(u) >= coefficients(n)
     unknown = torch.full_like(bent, math.inf)
     at_zero = _CONSTANT * alpha.sum() - 0.25 * (alpha @ trace) / n

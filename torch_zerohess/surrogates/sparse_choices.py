@@ -5,7 +5,7 @@ the image, and neighbouring parameters share evidence, see `sparse_selection`. W
 share it predicts held-out samples no better. So the first fits are made twice.
 
 Entries of a row are significant, whatever their number: the limit saves memory. If most rows have reached it, the next
-fit has twice the limit. Held-out samples do not tell this. The entries that are missing bend every step in the same
+fit has twice the limit. Held-out samples do not show this. The entries that are missing bend every step in the same
 way, and are a percent of the change.
 """
 
@@ -41,7 +41,7 @@ _GAIN = 0.005
 
 @dataclass(frozen=True)
 class GridEvidence:
-    """What the fits so far tell about the grid."""
+    """What the fits so far show about the grid."""
 
     gain: float = 0.0
     """Share of the held-out change that the grid has added, summed over the comparisons."""

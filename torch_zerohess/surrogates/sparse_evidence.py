@@ -31,7 +31,7 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the batches so far tell about every parameter."""
+    """What the batches so far show about every parameter."""
 
     found: Tensor
     """Whether some output was found to depend on it, bools [n]."""

@@ -15,8 +15,8 @@ from torch_zerohess.surrogates.surrogate import checked, fitted, scaled
 class SparseSurrogate:
     """Affine map from parameters [n] to outputs [*out] with a `SparseJacobian`, a `Surrogate`.
 
-    Where each element of the output depends on k of n parameters, some k log n points tell the map. With fewer than 8
-    points it is their mean.
+    Where each element of the output depends on k of n parameters, some k log n points determine the map. With fewer
+    than 8 points it is their mean.
 
     Args:
         keep: parameters that an element depends on, at most.

@@ -194,6 +194,41 @@ def test_an_element_on_a_plateau_stays_while_others_move() -> None:
     assert float(losses(targets)[1:].max()) < 0.1 * float(losses(y)[1:].min())
 
 
+@pytest.mark.parametrize("n", [1, 3, 20])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1.0, 1e20])
+def test_where_the_hessian_is_rounding_the_step_is_the_gradient(n: int, dtype: torch.dtype, scale: float) -> None:
+    """An element whose loss is linear, but for curvature of the size of rounding; the other one is a quadratic."""
+    generator = torch.Generator().manual_seed(0)
+    slope, y = (torch.randn(2, n, generator=generator, dtype=torch.float64).to(dtype) for _ in range(2))
+    rounding = torch.finfo(dtype).eps
+
+    def losses(y):
+        bent = torch.stack([rounding * y[0].square().sum(), 50.0 * (y[1] - 3.0).square().sum()])
+        return scale * ((slope * (y + 0.3)).sum(1) * torch.tensor([1.0, 0.0]).to(y) + bent)
+
+    step = y - NewtonTargets(relative_damping=1e-9)(losses, y)
+    torch.testing.assert_close(step[0] / scale, slope[0], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(y[1] - step[1], torch.full((n,), 3.0, dtype=dtype), atol=1e-4, rtol=0.0)
+
+
+def test_the_targets_of_a_linear_black_box_are_gradient_steps() -> None:
+    """Its sampled Hessian is about 1e-16."""
+    layer = zh.BlackBox(lambda z: (z - 0.3).sum(1), zh.Smoothing(sigma=0.3, samples=2, seed=5))
+    y = torch.randn(4, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    (slope,) = torch.autograd.grad(layer(y.requires_grad_()).sum(), y)
+    torch.testing.assert_close(NewtonTargets()(layer, y), y.detach() - slope)
+
+
+@pytest.mark.parametrize("n", [3, 20])
+@pytest.mark.parametrize("least", [0.0, -3.999999])
+def test_a_hessian_of_outputs_or_losses_near_zero_is_no_rounding(n: int, least: float) -> None:
+    """Outputs of 1e-10 are far from a minimum at 3; at outputs of 1, the other loss is n 1e-6."""
+    y = torch.full((2, n), 1e-10 if least == 0.0 else 1.0)
+    found = NewtonTargets(relative_damping=1e-6)(lambda y: (y - 3.0).square().sum(1) + n * least, y)
+    torch.testing.assert_close(found, torch.full_like(y, 3.0), rtol=1e-4, atol=0.0)
+
+
 COUPLED = {
     "all": lambda y: (y - y.mean(0)).square().sum(1),
     "two": lambda y: y.square().sum(1) + torch.stack([y[2, 0] * y[0, 0], *(0.0 * y[1:, 0])]),

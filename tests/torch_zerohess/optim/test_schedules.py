@@ -122,3 +122,12 @@ def test_layers_inside_of_modules():
     assert [layer.smoothing.sigma for layer in layers] == [0.75, 0.75, 9.0]
     zh.LinearSigma([network, layers[2], layers[2]], 2.0, 1.0, 1)
     assert [layer.smoothing.sigma for layer in layers] == [2.0, 2.0, 2.0]
+
+
+def test_a_state_is_a_copy() -> None:
+    layer = zh.BlackBox(lambda z: z.sum(1), zh.Smoothing(sigma=torch.ones(2)))
+    schedule = zh.LinearSigma(layer, torch.ones(2), 0.5, steps=4)
+    state = schedule.state_dict()
+    state["start"].fill_(9.0)
+    schedule.step()
+    torch.testing.assert_close(schedule.sigma, torch.full((2,), 0.875, dtype=torch.float64))

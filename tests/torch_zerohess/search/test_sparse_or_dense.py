@@ -105,7 +105,7 @@ def engines(search, f, value, evaluations):
 
 
 def test_a_dense_part_beside_a_sparse_one_is_noticed():
-    """The first samples tell the one parameter of each output, and little else."""
+    """The first samples determine the one parameter of each output, and little else."""
     n = 100
     A = mixed(n)
     search = door(n, square(A @ normal(n)))

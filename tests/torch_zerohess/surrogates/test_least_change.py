@@ -39,7 +39,7 @@ def test_the_true_hessian_stays_and_few_points_are_enough_for_the_slope():
 
 
 def test_few_points_tell_the_slope_along_them():
-    """Two values tell a slope or a curvature: nearly all of their difference is a slope."""
+    """Two values determine a slope or a curvature: nearly all of their difference is a slope."""
     u = vector(0.0, 1.0)[:, None] * vector(3.0, 4.0, 0.0) / 5
     _, gradient, _ = least_change(u, vector(0.0, 2.0), u.new_zeros(3, 3))
     torch.testing.assert_close(gradient, 2.0 * vector(0.6, 0.8, 0.0), rtol=0, atol=0.05)
@@ -71,8 +71,9 @@ def test_no_smaller_change_interpolates():
 def test_a_change_of_all_curvatures_is_learned_from_few_values():
     """Twelve values of |u|^2 in ten dimensions; the earlier Hessian is half of the true one.
 
-    Eleven values tell the constant and the slope. The twelfth is about the curvature along one axis. The change of this
-    curvature counts for all axes: the error of the Hessian falls to 0.61, and to 0.94 if it counts for this axis alone.
+    Eleven values determine the constant and the slope. The twelfth is about the curvature along one axis. The change of
+    this curvature counts for all axes: the error of the Hessian falls to 0.61, and to 0.94 if it counts for this axis
+    alone.
     """
     u = torch.cat([torch.zeros(1, 10), torch.eye(10), -torch.eye(10)[:1]]).double()
     identity = torch.eye(10, dtype=torch.float64)

@@ -61,7 +61,7 @@ def test_what_no_quadratic_explains_is_a_misfit(cubic, misfit):
 
 
 def test_with_few_values_the_hessian_is_the_expected_one():
-    """Three values tell the slopes, and nothing of the curvature that was expected."""
+    """Three values determine the slopes, and nothing of the curvature that was expected."""
     u = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
     fit = fit_noisy(u, quadratic(u), torch.ones(3, dtype=torch.float64), 1e-6, HESSIAN)
     torch.testing.assert_close(fit.hessian, HESSIAN, atol=0.02, rtol=0.0)

@@ -201,7 +201,7 @@ def test_held_out_samples_are_not_used():
 
 
 def test_an_old_jacobian_is_support_and_prior():
-    """8 new samples tell little of a new map; with the old one, which is 10 % off, they tell it all."""
+    """8 new samples say little of a new map; with the old one, which is 10 % off, they determine it."""
     A, u = sparse_map(200, 300, 3), normal(40, 300, seed=1)
     settings = SparseSettings(6)
     old = fit_sparse(normal(100, 300, seed=4), normal(100, 300, seed=4) @ A.mT, torch.Size([200]), settings)

@@ -1,7 +1,7 @@
 """A search along the axes, for losses that are sums of functions of one parameter each.
 
 Such a loss may have as many minima as the product of the minima along its axes, and quadratics find one at a time.
-Two evaluations tell a sum: where c and d are two points a and b with some coordinates exchanged,
+Two evaluations show whether the loss is a sum: where c and d are two points a and b with some coordinates exchanged,
 f(a) + f(b) = f(c) + f(d). Then every parameter is searched alone, all of them in one batch. The interval that needs the
 least curvature to contain a lower value is halved (STEP: Langerman, Seront and Bersini 1994). The lowest places of all
 axes together are the lowest point, and quadratics begin there.
@@ -20,7 +20,7 @@ from torch_zerohess.search.protocol.state import Best, Evaluated
 _SUM = 1e-5
 """Largest difference of the two sums, over the smallest change of the loss between the points."""
 _CHORD = 5
-"""Points on the line through two points, from which a loss of one minimum is told."""
+"""Points on the line through two points, from which a loss of one minimum is known."""
 _PLACES = 40
 """Places that are evaluated on every axis before quadratics begin at the lowest ones."""
 _LOWER, _AS_LOW = 1e-4, 1e-6

@@ -13,7 +13,7 @@ from torch_zerohess.search.descent.metric_progress import MetricProgress
 _FLAT = 1e-4
 """Share of the largest curvature below which a curvature is next to nothing."""
 _APART = 0.03
-"""Least distance from the best point, over the first sigma, of evaluations that tell the largest curvature."""
+"""Least distance from the best point, over the first sigma, of evaluations that measure the largest curvature."""
 ASIDE = 0.1
 """Distance of the two points from the best point, over the first sigma."""
 _GAIN = 1e-6

@@ -33,9 +33,11 @@ _BENT = 30.0
 At a kink the first is at most 30 times as steep as the second, and at least a thirtieth. A smooth loss rises 100 times
 as steeply to the corner, and a loss that jumps a hundredth."""
 _ENOUGH = 8
-"""Evaluations beside the best point, and apart from it, from which their medians tell a kink."""
+"""Evaluations beside the best point, and apart from it, that are needed before their medians decide whether there is a
+kink."""
 _STRADDLED = 0.1
-"""Error of a slope over its length, at most, unless the slope is gentle. Differences across a kink tell no slope."""
+"""Error of a slope over its length, at most, unless the slope is gentle. Differences across a kink do not
+estimate a slope."""
 _ROUNDING = 1e4 * torch.finfo(torch.float64).eps
 """Rise, relative to the loss, up to which it may be rounding."""
 _AROUND, _CLOSE = 1e-2, 1e-2
@@ -51,7 +53,8 @@ _ROOM = 3.0
 """No slopes are measured if a bound is nearer than this, over the same distance."""
 
 Verdict = Literal["open", "end", "unknown"]
-"""Whether more points are asked for around a kink; the slopes there tell no descent; or they tell nothing."""
+"""Whether more points are asked for around a kink, whether no slope there leads down, or whether the slopes do not
+decide."""
 
 
 class KinkCheck:
@@ -113,8 +116,8 @@ class KinkCheck:
     def _is_straight(self, known: MetricProgress, simplex: Evaluated) -> bool:
         """Whether the loss rises as steeply to the first corner as next to the best point, in the same direction.
 
-        Or whether most of the evaluations beside it tell a rise as steep as most of those apart from it, if there are
-        enough, and none tells a jump. The corner is then on the steep side of a kink.
+        Or whether most of the evaluations beside it show a rise as steep as most of those apart from it, if there are
+        enough, and no evaluation shows a jump. The corner is then on the steep side of a kink.
         """
         rise = float(simplex.losses[0]) - known.lowest.loss
         steepness = rise / float((simplex.points[0] - known.lowest.point).norm())

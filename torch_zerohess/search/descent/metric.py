@@ -164,7 +164,7 @@ class MetricQuadratics(RegionDescent[MetricProgress]):
         """Return gradient [n] and Hessian [n, n] at the best point of a round that has arrived.
 
         The last quadratic of the round is made of differences near rounding. A fit to more evaluations is better, if
-        they tell a quadratic.
+        they determine a quadratic.
         """
         around = quadratic_around(known.lowest.point, known.points[~known.holes], known.values[~known.holes])
         if around is None or around[2] > _SURE:

@@ -4,7 +4,7 @@ An iteration evaluates a few random points of the region center + sigma B u, |u|
 evaluations near by (`fit_noisy`). The center moves to the minimum of the quadratic within the region. The metric B
 moves towards |H|^(-1/2), as far as the curvature is known (`learned`).
 
-The next quadratic tells what a step has achieved, and sigma follows as in any trust region. In a region where noise
+The next quadratic shows what a step has achieved, and sigma follows as in any trust region. In a region where noise
 hides the slope, sigma shrinks only if the residuals say that no quadratic fits. Evaluations in the region are kept, so
 the standard error of the center falls with their number. A batch that is higher than the lowest one throughout, or has
 no value, sends the center back to where the lowest one was.
@@ -81,7 +81,7 @@ class NoisyProgress(Progress):
     length: float = 1.0
     """Of the last step, in units of the region."""
     still: int = 0
-    """Iterations in a row that told nothing new."""
+    """Iterations in a row that showed nothing new."""
 
 
 class NoisyQuadratics(Method[NoisyProgress]):

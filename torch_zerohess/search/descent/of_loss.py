@@ -17,7 +17,7 @@ from torch_zerohess.search.descent.two_sided import TwoSidedQuadratics
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.protocol.state import Evaluated
 
-_UNKNOWN = "the slopes around a kink do not tell whether it is a minimum"
+_UNKNOWN = "the slopes around a kink do not show whether it is a minimum"
 
 
 class LossQuadratics(TwoSidedQuadratics):

@@ -17,7 +17,7 @@ _TOLERABLE = 5.0
 """Misfit up to which a step that lowers the loss is itself what the model needs to know."""
 _GAIN = 0.02
 """Part of the loss that a step with a misfit up to `_TOLERABLE` must take away."""
-_MISLED = 2.0
+_BAD_MODEL = 2.0
 """Misfit beyond which the next step needs more samples than the last one."""
 _NARROW, _BY_LENGTH, _WIDER = 0.85, 0.3, 1.05
 """Factor for sigma after a step of no length, its growth with the length, and the largest one."""
@@ -31,7 +31,7 @@ _SHORTER, _RETRY = 0.4, 0.9
 """Length of a shorter step in units of the step before, and its factor for sigma."""
 _STALLED = 8
 """Latest steps, in which the smoothed loss must have fallen."""
-_FALL, _HURRY = 0.95, 0.8
+_FALL, _FAST_SHRINK = 0.95, 0.8
 """Compare the lowest smoothed loss of the latest steps with the lowest one of the steps before. Where it is above the
 first number times that one, sigma is also multiplied by the second number."""
 _FLAT = 0.03
@@ -59,12 +59,12 @@ def after_output(known: DescentProgress, point: Tensor, loss: float, output: Ten
         known = replace(known, faithful=True, misled=0, sigma=sigma)
         unknown = known.n - model.rank
         return known.sampling(unknown, paired=False) if misfit < _FAITHFUL and unknown else known.trying()
-    misled = 0 if misfit < _FAITHFUL else known.misled + (misfit > _MISLED)
+    misled = 0 if misfit < _FAITHFUL else known.misled + (misfit > _BAD_MODEL)
     known = replace(known, faithful=misfit < _FAITHFUL and gain > 0.0, misled=misled)
     known = _followed(known, model.value)
     narrow = _narrowing(length)
     if min(known.recent) > _FALL * known.earlier:
-        narrow *= _HURRY
+        narrow *= _FAST_SHRINK
     if abs(gain) < _FLAT * abs(before) and misfit > _FAITHFUL and known.patience < _PATIENCE:
         known = replace(known, patience=known.patience + 1)
         if known.lowest.loss < _BETTER * before:
@@ -73,7 +73,7 @@ def after_output(known: DescentProgress, point: Tensor, loss: float, output: Ten
             narrow = max(narrow, min(_PLATEAU, WIDEST / known.sigma))
     known = replace(known, sigma=narrow * known.sigma)
     some, most = 2 * math.ceil(known.n / _FEWER), 2 * math.ceil(known.n / 2)
-    return known.sampling(min(2**known.misled, most) if misfit > _MISLED else some)
+    return known.sampling(min(2**known.misled, most) if misfit > _BAD_MODEL else some)
 
 
 def _followed(known: DescentProgress, smoothed: float) -> DescentProgress:

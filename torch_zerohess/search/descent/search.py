@@ -32,7 +32,8 @@ class Descent(AskTell[Any]):
       the center of the region, and `value` is what the quadratic says there. The search has also arrived where three
       steps in a row are within their errors and the quadratic takes no more evaluations.
     - With the smoothed loss, decreases below twice the `noise` do not count. New samples around x are asked for where
-      the model has predicted badly. With more than 200 parameters nothing tells whether x is a minimum.
+      the model has predicted badly. With more than 200 parameters there is no test of whether x is a
+      minimum.
     - With an output [K, *out] and a white-box `loss`, every evaluation is many equations. The search follows the
       minimum of loss(E f), the loss of the smoothed output, while sigma goes to zero, also where the loss itself rises
       for a while. It uses only whether there is `noise`, not how much.
@@ -48,14 +49,14 @@ class Descent(AskTell[Any]):
     search follows the border of the region that fails. Up to 100 steps in a row may fail there.
 
     Beside a kink of a loss alone, with up to 10 parameters, the model is the larger of two quadratics where it has
-    predicted the latest losses better than one quadratic. Slopes at up to 6 (n + 1) points around a kink tell whether
-    it is a minimum: up to 6 (n + 1)(n + 8) evaluations, if no bound is near. If they do not tell, the search has not
+    predicted the latest losses better than one quadratic. Slopes at up to 6 (n + 1) points around a kink show whether
+    it is a minimum: up to 6 (n + 1)(n + 8) evaluations, if no bound is near. If they do not show it, the search has not
     arrived.
 
     Where a loss alone is flat along some direction at the end of a round, as at the inflection of x^3, two points along
     it are evaluated, a tenth of sigma to both sides. The search goes on from there if one of them is lower.
 
-    After a round two evaluations tell whether a loss alone is a sum of functions of one parameter each (in a box, for
+    After a round two evaluations show whether a loss alone is a sum of functions of one parameter each (in a box, for
     2 to 200 parameters). If such a sum has several minima, its lowest one is sought along all axes at once, and the
     next round begins there: some 40 n evaluations, and 7 if it is convex.
 

@@ -19,7 +19,7 @@ from torch_zerohess.surrogates.quadratic import LocalModel
 
 _FEW = 2
 """Parameters up to which a full quadratic of the loss takes so few evaluations that an output is not needed. In noise
-each number of the output tells something."""
+each number of the output counts."""
 _ENOUGH = 4
 """Near evaluations, besides the center, that a model needs at least; n if that is less."""
 _SHARPNESS = 0.1

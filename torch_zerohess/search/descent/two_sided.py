@@ -67,7 +67,10 @@ class TwoSidedQuadratics(MetricQuadratics):
         return (replace(known, sides=self._sides(known)) if wanted and self._n <= _MOST else known), count
 
     def _sides(self, known: MetricProgress) -> TwoSides | None:
-        """Fit two quadratics to the nearest evaluations; None if these tell none, or no kink between them."""
+        """Fit two quadratics to the nearest evaluations.
+
+        None if they do not determine two quadratics, or if there is no kink between these.
+        """
         n, u = self._n, known.scaled
         distance = u.norm(dim=1)
         order = distance.argsort()

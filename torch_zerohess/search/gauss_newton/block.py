@@ -103,11 +103,8 @@ class BlockMethod(GaussNewton[BlockProgress]):
         phase: Literal["sample", "trial"] = "sample" if wanted > 0 else "trial"
         return replace(known, jacobian=jacobian, unused=known.unused[count:], wanted=wanted, phase=phase)
 
-    def steps(self, known: BlockProgress, radii: Tensor) -> Tensor:
+    def solved(self, known: BlockProgress, radii: Tensor) -> Steps:
         """Solve the model for the parameters that no bound holds, see `damped_steps` and `checked_steps`."""
-        return self._solved(known, radii).steps
-
-    def _solved(self, known: BlockProgress, radii: Tensor) -> Steps:
         x, jacobian, (gradient, hessian) = known.center, known.jacobian, self._derivatives(known)
         lower, upper = self.settings.lower - x, self.settings.upper - x
         free = are_free(torch.zeros_like(x), gradient, lower, upper) > 0.0
@@ -137,7 +134,7 @@ class BlockMethod(GaussNewton[BlockProgress]):
     def arrived(self, known: BlockProgress) -> BlockProgress:
         """Begin again or end; it has arrived only where outputs change, and their linear model promises nothing."""
         longest = known.center.new_tensor([LENGTHS[-1] * self.radius * math.sqrt(self.settings.n)])
-        promised = self._solved(known, longest).promised
+        promised = self.solved(known, longest).promised
         if bool(known.jacobian.any()) and (promised is None or promised <= LITTLE * abs(known.loss)):
             known = known.arriving(known.here)
         return super().arrived(replace(known, wanted=self.settings.n))
@@ -222,7 +219,7 @@ class BlockGaussNewton(AskTell[BlockProgress]):
 def broyden_update(jacobian: Tensor, steps: Tensor, changes: Tensor) -> Tensor:
     """Return the Jacobian [n, m] nearest to `jacobian` that explains changes [k, m] of the output along steps [k, n].
 
-    Nearest in the Frobenius norm: with one step it is Broyden's update. A step of no length tells nothing.
+    Nearest in the Frobenius norm: with one step it is Broyden's update. A step of no length has no effect.
     """
     long = steps.abs().amax(1) > 0.0
     if not bool(long.any()):

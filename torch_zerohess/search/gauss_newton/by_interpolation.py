@@ -49,7 +49,7 @@ _AGAIN, _ASIDE = ((1000, 1e-6), (1000, 1e-6)), 0.01
 """Iterations and least gains of further tries where it finds next to nothing and the slope is known, and the distance
 of their starts from x, over the radius."""
 _LEVEL = 1e-3
-"""Distance from a bound, over the distance of the farthest evaluation near by, that tells nothing about the slope."""
+"""Distance from a bound, over the distance of the farthest evaluation near by, that does not determine the slope."""
 _HOLES = 3
 """Values in a row that are not finite, after which it has failed."""
 
@@ -133,7 +133,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
     def _after_start(
         self, known: OutputProgress, evaluated: Evaluated, generator: torch.Generator
     ) -> tuple[OutputProgress, Tensor]:
-        """Try a step at once: n + 1 outputs tell a Jacobian."""
+        """Try a step at once: n + 1 outputs determine a Jacobian."""
         if len(known.values) <= self._n or bool((known.values == known.values[0]).all()):
             return self._on_plateau(known, generator)
         return self.plan(known, generator)
@@ -168,7 +168,7 @@ class OutputGaussNewton(RegionDescent[OutputProgress]):
         return torch.nn.functional.one_hot(unseen.nonzero()[0, 0], self._n).to(x)
 
     def _is_known(self, known: OutputProgress) -> bool:
-        """Whether evaluations near the best point tell its slope in every direction."""
+        """Whether evaluations near the best point determine its slope in every direction."""
         near = int((known.scaled.norm(dim=1) <= NEAR).sum())
         return known.confirmed or (near > self._n and self._unseen(known) is None)
 

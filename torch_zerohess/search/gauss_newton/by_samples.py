@@ -13,6 +13,7 @@ from typing import Literal, TypeVar
 import torch
 from torch import Tensor
 
+from torch_zerohess.search.gauss_newton.kinked_steps import Steps
 from torch_zerohess.search.protocol.method import Method
 from torch_zerohess.search.protocol.state import LOST, Best, Evaluated, Progress
 from torch_zerohess.surrogates.quadratic import LocalModel
@@ -21,6 +22,9 @@ LENGTHS = (0.15, 0.3, 0.6, 1.0, 1.6, 2.5)
 """Of the steps that are tried, in units of the radius."""
 SHRINKING = 0.4
 """Factor of the radius where no step lowers the loss."""
+INSIDE = 0.5
+"""Length of the step to the minimum of the loss of linear outputs, over the longest step, up to which the region
+hardly shortened it."""
 _INNER = 0.99
 """Length of a step, over the radius, below which the radius did not shorten it."""
 _AROUND = 2.0
@@ -34,8 +38,9 @@ class JacobianProgress(Progress):
     """The output at the center, and the kind of points asked for next. A subclass adds the Jacobian."""
 
     phase: Literal["sample", "trial", "aside"] = "sample"
-    """What is asked for: samples, the first ones after the start; the ends of steps; or points at which only the
-    parameters move that stayed so far, see `SparseMethod`."""
+    """What is asked for next. sample: points around the center for the Jacobian; at first with the start. trial: the
+    ends of steps. aside: points at which only parameters that no output was found to depend on have moved
+    (`SparseMethod`)."""
     radius: float
     """Root mean square over the parameters."""
     output: Tensor
@@ -67,7 +72,7 @@ class GaussNewton(Method[Q]):
     """A search that samples the Jacobian of an output and tries steps, in units of its sigma."""
 
     radius: float
-    """The first one."""
+    """Radius of the first region, in units of sigma."""
 
     @abstractmethod
     def begun(self) -> Q:
@@ -82,8 +87,8 @@ class GaussNewton(Method[Q]):
         """Renew the Jacobian by samples with finite values, and say in `phase` what follows."""
 
     @abstractmethod
-    def steps(self, known: Q, radii: Tensor) -> Tensor:
-        """Return a step [k, n] within each of the radii [k]."""
+    def solved(self, known: Q, radii: Tensor) -> Steps:
+        """Return a step [n] within each of the radii [k], in rising order."""
 
     @abstractmethod
     def gradient(self, known: Q) -> Tensor:
@@ -135,7 +140,7 @@ class GaussNewton(Method[Q]):
 
     def trials(self, known: Q) -> Tensor:
         """Return the ends of steps of all lengths [k, n]."""
-        points = known.center + self.steps(known, self.radii(known))
+        points = known.center + self.solved(known, self.radii(known)).steps
         return points.clamp(self.settings.lower, self.settings.upper)
 
     def taken(self, known: Q, evaluated: Evaluated) -> Q:
@@ -168,12 +173,15 @@ class GaussNewton(Method[Q]):
 
         It is infinite if the minimum is farther than the longest step, or if no step is next.
         """
-        longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
         if known.phase != "trial":
             return math.inf
-        (step,) = self.steps(known, known.center.new_tensor([longest]))
+        radii = self.radii(known)
+        found, longest = self.solved(known, radii), float(radii[-1])
+        length = float(found.steps[-1].norm())
+        if found.promised is not None:
+            return found.promised if length <= INSIDE * longest else math.inf
         # At the minimum of a quadratic the decrease is half of what the gradient promises.
-        return -0.5 * float(self.gradient(known) @ step) if float(step.norm()) < _INNER * longest else math.inf
+        return -0.5 * float(self.gradient(known) @ found.steps[-1]) if length < _INNER * longest else math.inf
 
     def width(self, known: Q) -> Tensor:
         """Return the radius for every parameter; infinity before a step, and where the minimum is farther away."""

@@ -89,7 +89,7 @@ def checked_steps(
         if holds(before, after, promised):
             return False
         rounding = abs(outputs.loss(outputs.output * _ROUNDED_UP)[0] - before)
-        return abs(before - after - promised) > rounding  # NaN tells nothing
+        return abs(before - after - promised) > rounding  # False for NaN
 
     if not any(is_wrong(s, float(one)) for s, one in zip(steps, -(down + 0.5 * bent), strict=True)):
         straight = float(bent[-1]) <= -_ROUNDED * float(down[-1])

@@ -1,4 +1,4 @@
-"""A Gaussian process that a local search finishes: whose turn it is, and what one tells the other.
+"""A Gaussian process that a local search finishes: whose turn it is, and what one passes to the other.
 
 The process crosses plateaus and leaves local minima (`ProcessMethod`). It leaves a millionth of a smooth function
 unexplained, where models of the nearest evaluations leave next to nothing. A subclass says which local search it is

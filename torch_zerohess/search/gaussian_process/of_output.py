@@ -104,7 +104,7 @@ class OutputProcess(FinishedProcess[OutputProcessProgress]):
         newton = next((one for one in (known.local, known.kept) if one and _knows(one, best.point)), None)
         if newton is not None:  # the process has not all of these
             known = replace(known, pool=Pool.of(newton.points, newton.values, newton.outputs, best.point))
-        if not known.noisy:  # the nearest evaluations that tell a Jacobian, however the best one was found
+        if not known.noisy:  # the nearest evaluations that determine a Jacobian, however the best one was found
             known = replace(known, best=replace(best, sigma=self.settings.tolerance))
         return super().model_at_best(known)
 

@@ -103,7 +103,7 @@ class AskTell(Standing[P]):
 
         Args:
             batch: how many evaluations run at once. If the search itself has fewer points to ask for, others are
-                added that tell most besides them. They save rounds, not evaluations. `LocalGaussNewton` and
+                added that are most informative beside them. They save rounds, not evaluations. `LocalGaussNewton` and
                 `BlockGaussNewton` add none.
             limit: how many points there may be at most.
 

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from torch_zerohess.arguments import own_copy
 from torch_zerohess.estimation.inputs import working
 
 
@@ -91,7 +92,7 @@ def checked_start(x0: Any) -> Tensor:
     if not isinstance(x0, Tensor):
         kept = str(getattr(x0, "dtype", "")) in ("float32", "complex64", "complex128")
         try:
-            x0 = torch.as_tensor(_unshared(x0), dtype=None if kept else torch.float64)
+            x0 = torch.as_tensor(own_copy(x0), dtype=None if kept else torch.float64)
         except (TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"x0 must be a tensor, an array or a list of n numbers, got {x0!r}") from error
     elif not x0.is_floating_point() and not x0.is_complex():
@@ -104,15 +105,10 @@ def checked_start(x0: Any) -> Tensor:
     return x0
 
 
-def _unshared(given: Any) -> Any:
-    """Return a copy of an array, whose strides torch can take; anything else as it is."""
-    return given.copy() if hasattr(given, "strides") else given
-
-
 def _unit(sigma: float | Vector, x0: Tensor) -> Tensor:
     """Return sigma as float64 [n]."""
     try:
-        unit = torch.as_tensor(_unshared(sigma), dtype=torch.float64, device=x0.device).detach()
+        unit = torch.as_tensor(own_copy(sigma), dtype=torch.float64, device=x0.device).detach()
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"sigma must be a number, or one per parameter [{len(x0)}], got {sigma!r}") from error
     if unit.shape not in ((), x0.shape) or not bool((torch.isfinite(unit) & (unit > 0)).all()):
@@ -196,6 +192,6 @@ def _side(one: Any, none: float, device: torch.device) -> Tensor:
     try:
         if isinstance(one, (tuple, list)):
             one = [none if each is None else float(each) for each in one]
-        return torch.as_tensor(none if one is None else _unshared(one), dtype=torch.float64, device=device)
+        return torch.as_tensor(none if one is None else own_copy(one), dtype=torch.float64, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"bounds must be numbers, tensors [n] or None, got {one!r}") from error

@@ -121,8 +121,9 @@ class Progress:
     def agreeing(self: "P", end: Best, tolerance: float, losses: Tensor | None = None) -> "P":
         """Count a round that has arrived.
 
-        It agrees with the rounds before it if it ends at the best point, and if they arrived at the same point; or if
-        its loss, and theirs, is the best one.
+        It agrees with earlier rounds in either case:
+        (a) it ends at the best point, and they did too;
+        (b) its loss and theirs equal the best loss, up to `losses`.
 
         Args:
             end: the lowest point of the round.

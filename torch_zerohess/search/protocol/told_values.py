@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_zerohess.arguments import checked_integer
 from torch_zerohess.estimation.inputs import times_changed
+from torch_zerohess.evaluators.returned import ReturnedTypeError, ReturnedValueError
 from torch_zerohess.evaluators.values import as_tensor
 from torch_zerohess.search.protocol.state import Evaluated
 
@@ -28,7 +29,9 @@ def converted(values: Any, device: torch.device) -> Tensor:
             raise TypeError("they are complex")
         values = torch.as_tensor(values, dtype=torch.float64, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}: {error}") from error
+        raise ReturnedTypeError(
+            f"values must be a tensor, an array or numbers, got {reprlib.repr(values)}: {error}"
+        ) from error
     found: Tensor = values.detach()
     return found
 
@@ -47,16 +50,16 @@ def as_evaluated(
         values = values[:, 0]
     if values.ndim < 1 or len(values) != len(points) or (loss is None and values.ndim != 1):
         wanted = f"[{len(points)}]" if loss is None else f"[{len(points)}, *out]"
-        raise ValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
+        raise ReturnedValueError(f"values must have shape {wanted}, one per point asked for, got {list(values.shape)}")
     if loss is None:
         return Evaluated(points, values)
     if shape and values.shape[1:] != shape:
-        raise ValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
+        raise ReturnedValueError(f"values must have outputs {list(shape)} as before, got {list(values.shape[1:])}")
     before = times_changed(values)
     with torch.no_grad():
         losses = [loss(one) for one in values]
     if times_changed(values) != before:
-        raise ValueError("loss must not change the output that it is given, which is kept: use a copy of it")
+        raise ReturnedValueError("loss must not change the output that it is given, which is kept: use a copy of it")
     for one in losses:
         _check_loss(one, list(values.shape[1:]))
     return Evaluated(
@@ -70,14 +73,16 @@ def as_evaluated(
 def _check_loss(loss: Any, shape: list[int]) -> None:
     """Raise TypeError or ValueError for what is no loss of an output of this shape."""
     if not isinstance(loss, Tensor):
-        raise TypeError(
+        raise ReturnedTypeError(
             f"loss must return a tensor, which torch differentiates, got {type(loss).__name__} for one output of shape "
             f"{shape}"
         )
     if loss.numel() != 1:
-        raise ValueError(f"loss must return a scalar, got shape {list(loss.shape)} for one output of shape {shape}")
+        raise ReturnedValueError(
+            f"loss must return a scalar, got shape {list(loss.shape)} for one output of shape {shape}"
+        )
     if loss.is_complex():
-        raise TypeError(f"loss must return a real number, got {loss.dtype}: return .real or .abs()")
+        raise ReturnedTypeError(f"loss must return a real number, got {loss.dtype}: return .real or .abs()")
 
 
 def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count: int) -> dict[int, Tensor]:
@@ -94,10 +99,14 @@ def joined(early: dict[int, Tensor], values: Tensor, which: Sequence[int], count
             missing = [other for other in range(count) if other not in early]
             raise ValueError(f"which must be some of the points whose values are missing, {missing}, got {numbers}")
     if values.ndim < 1 or len(values) != len(numbers):
-        raise ValueError(f"values must have one per point in which, [{len(numbers)}, *out], got {list(values.shape)}")
+        raise ReturnedValueError(
+            f"values must have one per point in which, [{len(numbers)}, *out], got {list(values.shape)}"
+        )
     for other in early.values():
         if other.shape != values.shape[1:]:
-            raise ValueError(f"values must have outputs {list(other.shape)} as before, got {list(values.shape[1:])}")
+            raise ReturnedValueError(
+                f"values must have outputs {list(other.shape)} as before, got {list(values.shape[1:])}"
+            )
     return early | {one: value.clone() for one, value in zip(numbers, values, strict=True)}
 
 
@@ -115,9 +124,9 @@ def check_start(start: Evaluated) -> None:
     """Raise ValueError if the first point, which is the start, has no value that models can take."""
     loss, start = float(start.losses[0]), moderate(start)
     if -math.inf < loss < -_LARGEST:
-        raise ValueError(f"the loss at the start x0 is {loss}, below {-_LARGEST}: scale the loss")
+        raise ReturnedValueError(f"the loss at the start x0 is {loss}, below {-_LARGEST}: scale the loss")
     if _LARGEST < loss < math.inf:
-        raise ValueError(
+        raise ReturnedValueError(
             f"the loss at the start x0 is {loss}, above {_LARGEST}: scale the loss, or start where it is no penalty"
         )
     if bool(start.finite[0]):
@@ -125,11 +134,11 @@ def check_start(start: Evaluated) -> None:
     if start.outputs is not None and not math.isfinite(loss) and bool(torch.isfinite(start.outputs[0]).all()):
         missing = ": if data are missing, let it leave them out, as (y - data)[torch.isfinite(data)].square().sum()"
         told = missing if math.isnan(loss) else ""
-        raise ValueError(f"loss is {loss} at the start x0, although the output there is finite{told}")
+        raise ReturnedValueError(f"loss is {loss} at the start x0, although the output there is finite{told}")
     if start.outputs is None or not math.isfinite(loss):
-        raise ValueError(f"the black box is not finite at the start x0: {loss}")
+        raise ReturnedValueError(f"the black box is not finite at the start x0: {loss}")
     count = int((~torch.isfinite(start.outputs[0])).sum())
-    raise ValueError(
+    raise ReturnedValueError(
         f"{count} of {start.outputs.shape[1]} numbers of the output at the start x0 are not finite, or beyond "
         f"{_LARGEST_OUTPUT}: the search models every number, also those that the loss ignores; return moderate ones"
     )
@@ -138,7 +147,7 @@ def check_start(start: Evaluated) -> None:
 def check_range(search: str, changes: Tensor) -> None:
     """Raise ValueError for changes of outputs over sigma that float32 cannot hold; `search` says who computes in it."""
     if not in_range(changes):
-        raise ValueError(
+        raise ReturnedValueError(
             f"{search} computes in float32, got outputs whose largest change over sigma is "
             f"{float(changes.abs().max()):g}: return them in other units, so that it is near 1"
         )

@@ -189,7 +189,7 @@ class RegionDescent(Method[R]):
             return None
         distance = (known.points - best.point).norm(dim=1)
         sigma = self.settings.tolerance
-        while True:  # so wide that evaluations at this distance tell a quadratic
+        while True:  # so wide that evaluations at this distance determine a quadratic
             near = distance <= NEAR * sigma
             if bool(near.all()) or int((near & (distance > _TOLD * sigma)).sum()) >= self._coefficients:
                 break

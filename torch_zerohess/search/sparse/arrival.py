@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torch_zerohess.search.gauss_newton.by_samples import LENGTHS, SHRINKING, GaussNewton
+from torch_zerohess.search.gauss_newton.by_samples import INSIDE, LENGTHS, SHRINKING, GaussNewton
 from torch_zerohess.search.gauss_newton.kinked_steps import LITTLE, Steps
 from torch_zerohess.search.protocol.method import Settings
 from torch_zerohess.search.sparse.progress import SparseProgress
@@ -23,10 +23,6 @@ MOST = 2
 """Samples of a batch, over the first number of samples, at most."""
 _SAME = 0.01
 """A hop confirms a minimum if its end is above the minimum by less than this share of the loss that the hop added."""
-_INSIDE = 0.5
-"""Length of the step to the minimum of the loss of linear outputs, over the longest step, up to which the region
-contains the minimum."""
-
 _SHARED = (
     *("best", "evaluations", "iterations", "arrivals", "lost", "evidence", "grid"),
     *("points", "outputs", "variance", "pairs"),
@@ -42,11 +38,8 @@ class SparseArrivals(GaussNewton[SparseProgress]):
         self.own, self.radius = own, own.radius
         self._last: tuple[SparseProgress, Tensor, Steps] | None = None  # progress, lengths and steps
 
-    def steps(self, known: SparseProgress, radii: Tensor) -> Tensor:
+    def solved(self, known: SparseProgress, radii: Tensor) -> Steps:
         """Solve the model, see `sparse_steps`."""
-        return self._solved(known, radii).steps
-
-    def _solved(self, known: SparseProgress, radii: Tensor) -> Steps:
         last, settings = self._last, self.settings
         if last is not None and last[0] is known and torch.equal(last[1], radii):
             return last[2]
@@ -97,7 +90,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
 
     @property
     def _enough(self) -> int:
-        """Samples that determine a dense Jacobian, and tell whether it predicts; 0 if they would be too many."""
+        """Number of samples that determine a dense Jacobian and test its prediction; 0 if too many."""
         enough = math.ceil(1.25 * self.settings.n) + 4
         return enough if enough <= MOST * self.own.samples else 0
 
@@ -107,7 +100,7 @@ class SparseArrivals(GaussNewton[SparseProgress]):
         found = self._thorough(known, self.radius * root, torch.zeros_like(known.center))
         assert found.promised is not None
         little = found.promised <= LITTLE * abs(known.loss)
-        short = float(found.steps.norm()) <= _INSIDE * LENGTHS[-1] * self.settings.tolerance * root
+        short = float(found.steps.norm()) <= INSIDE * LENGTHS[-1] * self.settings.tolerance * root
         return None if little or short else found.steps[0]
 
     def _doubting(self, known: SparseProgress, step: Tensor) -> SparseProgress:
@@ -166,8 +159,4 @@ class SparseArrivals(GaussNewton[SparseProgress]):
         """Return the promise of a step; it is infinite while a hop has led to nothing better."""
         if not known.predicts or known.failed or known.phase != "trial":
             return math.inf
-        found = self._solved(known, self.radii(known))
-        if found.promised is None:
-            return super().promise(known)
-        longest = LENGTHS[-1] * known.radius * math.sqrt(self.settings.n)
-        return found.promised if float(found.steps[-1].norm()) <= _INSIDE * longest else math.inf
+        return super().promise(known)

@@ -1,9 +1,9 @@
-"""Averaging in noise: a regression on all evaluations nearby tells the sparse Jacobian and the output at the center.
+"""Averaging in noise: a regression on all evaluations nearby determines the sparse Jacobian and the output there.
 
 No single output is trusted. An iteration evaluates the center twice, and samples around it. The sparse regression on
 all kept evaluations nearby has a constant, the output at the center. Its noise falls as evaluations are added, and so
-do the errors of the slopes. A step by `step_in_noise` follows. The next regression tells what it has achieved, and the
-radius follows.
+do the errors of the slopes. A step by `step_in_noise` follows. The next regression shows what it has achieved, and
+the radius follows.
 
 What the regression leaves beyond noise is curvature. Then samples come nearer, as long as the change that the slopes
 predict exceeds the noise. Below that, and where there is no curvature, they go apart. Curvature also moves the

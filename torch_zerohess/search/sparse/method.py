@@ -1,7 +1,7 @@
-"""Gauss-Newton on a sparse Jacobian that samples tell, and hops out of local minima: the method of `LocalGaussNewton`.
+"""Gauss-Newton on a sparse Jacobian from samples, and hops out of local minima: the method of `LocalGaussNewton`.
 
-The start and a few dozen samples of all parameters at once tell a sparse Jacobian of the smoothed output, row by row
-(`surrogates.sparse_fit`). It takes about s log n samples for s parameters per row, where a dense Jacobian takes n.
+The start and a few dozen samples of all parameters at once determine a sparse Jacobian of the smoothed output, row by
+row (`surrogates.sparse_fit`). It takes about s log n samples for s parameters per row, where a dense Jacobian takes n.
 
 An iteration fits the Jacobian J to new samples, with the old J as the prior. Steps of several lengths follow, see
 `steps` and `gauss_newton.by_samples`. Steps and hops move only the parameters that some output was found to depend
@@ -142,7 +142,7 @@ class SparseMethod(SparseArrivals):
             known = self.arrived(known)
             known = replace(known, sigma=self.distance(known.radius))
         if known.phase == "trial" and not known.done:
-            promised = self._solved(known, self.radii(known)).promised
+            promised = self.solved(known, self.radii(known)).promised
             if promised is not None and promised <= NOTHING * abs(known.loss):
                 known = self.at_kink(known)
         if known.done:

@@ -1,8 +1,8 @@
-"""Gauss-Newton on a sparse Jacobian in noise: all evaluations nearby tell the Jacobian and the output at the center.
+"""Gauss-Newton on a sparse Jacobian in noise: all evaluations nearby determine it and the output at the center.
 
 It begins as `SparseMethod` does, and takes each output for true. Samples come with the center again: two outputs at one
-point tell the noise. Where the best step changes the loss by no more than noise may, `Averaging` begins. From then on
-no single output is trusted, and the search neither hops nor ends by itself: with further evaluations it becomes more
+point measure the noise. Where the best step changes the loss by no more than noise may, `Averaging` begins. From then
+on no single output is trusted, and the search neither hops nor ends by itself: with further evaluations it becomes more
 exact.
 """
 
@@ -65,7 +65,7 @@ class NoisySparseMethod(SparseMethod):
         return self.samples(known, generator) if known.averaging else super().asked(known, generator)
 
     def sampled(self, known: SparseProgress, evaluated: Evaluated) -> SparseProgress:
-        """Keep the evaluations; the first ones, at the center, tell the noise of the outputs."""
+        """Keep the evaluations; the first ones, at the center, measure the noise of the outputs."""
         known, outputs, finite = self._keeping(known, evaluated), evaluated.outputs, evaluated.finite
         assert outputs is not None
         if known.averaging:

@@ -45,7 +45,7 @@ def step_in_noise(known: SparseProgress, settings: Settings) -> Tensor:
 def uncertain(expanded: LossCurvature, jacobian: SparseJacobian, output: Tensor) -> Tensor:
     """Return the curvatures of the expected loss [n] by the errors of slopes.
 
-    They take the diagonal of the Hessian of the loss: products with signs tell it up to the other elements.
+    They take the diagonal of the Hessian of the loss: products with signs give it up to the other elements.
     """
     signs = alternating(output)
     bent = (expanded.product(signs) * signs).flatten().clamp_min(0.0)

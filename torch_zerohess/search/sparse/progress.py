@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
+from torch_zerohess.evaluators.returned import ReturnedValueError
 from torch_zerohess.search.gauss_newton.by_samples import JacobianProgress
 from torch_zerohess.search.protocol.state import Best, Evaluated
 from torch_zerohess.search.protocol.told_values import check_range
@@ -18,7 +19,7 @@ _PREDICTED = 0.5
 _HIDDEN = 1e-5
 """Share of the first loss that an inexact Jacobian may hide where the search arrives."""
 _PAIRS = 16
-"""Outputs at one point that tell the noise, at most about."""
+"""Outputs at one point that measure the noise, at most about."""
 _ROUNDING = 1e-12
 """A hop leads to something better if it lowers the loss by more than this share of it, and of what the hop added."""
 
@@ -70,7 +71,7 @@ class SparseProgress(JacobianProgress):
     variance: float = 0.0
     """In noise, of a number of the output; 0 before a point was evaluated twice."""
     pairs: int = 0
-    """Of outputs that tell the variance, as far as they count."""
+    """Of outputs that measure the variance, as far as they count."""
     averaging: bool = False
     """In noise, whether no single output is trusted any more."""
     before: Best | None = None
@@ -113,7 +114,7 @@ class SparseProgress(JacobianProgress):
     def check_outputs(self, outputs: Tensor) -> None:
         """Raise ValueError for outputs [K, m] of one number, and for first ones whose changes are beyond float32."""
         if len(self.output) == 1:
-            raise ValueError(
+            raise ReturnedValueError(
                 "the engine 'local' needs an output of many numbers, each of few parameters, got an output of one "
                 "number: use engine='descent'"
             )
@@ -125,7 +126,7 @@ class SparseProgress(JacobianProgress):
         return ((points - self.center) / self.sigma).float(), ((outputs - self.output) / self.sigma).float()
 
     def telling_noise(self, one: Tensor, other: Tensor) -> "SparseProgress":
-        """Take what two outputs [m] at one point tell about noise: a mean over all pairs, mostly the latest ones."""
+        """Take what two outputs [m] at one point say about noise: a mean over all pairs, mostly the latest ones."""
         own, pairs = 0.5 * float((one - other).square().mean()), min(self.pairs + 1, _PAIRS)
         return replace(self, variance=own if pairs == 1 else self.variance + (own - self.variance) / pairs, pairs=pairs)
 
@@ -152,7 +153,7 @@ class SparseProgress(JacobianProgress):
         return replace(self, jacobian=best.within(evidence.found), evidence=evidence)
 
     def told_aside(self, evaluated: Evaluated, gain: float) -> "SparseProgress":
-        """Take what points tell at which only the parameters that stay have moved.
+        """Take what points show at which only the parameters that stay have moved.
 
         Slopes may be zero although outputs change, as at the maximum of a parabola. Then no parameter stays any more,
         and the center is the lowest point if the loss falls by more than this share of it.

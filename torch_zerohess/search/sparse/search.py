@@ -23,18 +23,19 @@ class LocalGaussNewton(AskTell[SparseProgress]):
     """Gauss-Newton for a black box [n] -> [*out] whose outputs depend on few of thousands of parameters each.
 
     Textures, height fields, vertices and voxels are such parameters, pixels such outputs. Which pixel depends on which
-    parameter need not be known: samples of all parameters at once tell it. It evaluates the start and `samples` points
-    before its first step, and `samples` and six steps per iteration. It needs no derivative of the black box. Where
-    every output depends on every parameter it finds no support and does not move: use `TrustRegion`, which notices.
+    parameter need not be known: samples of all parameters at once determine it. It evaluates the start and `samples`
+    points before its first step, and `samples` and six steps per iteration. It needs no derivative of the black box.
+    Where every output depends on every parameter it finds no support and does not move: use `TrustRegion`, which
+    notices.
 
     Where its steps hardly lower the loss, it hops to a random point close by, at 0.3 sigma per parameter, and goes on
     from there. It stays with what it finds if the loss is lower, and returns otherwise.
 
     In noise, as `noise` says, it begins to average where the best step changes the loss by no more than noise may, or
-    where three rounds have arrived at the best point. All evaluations nearby then tell the Jacobian and the output at
-    the center, so both become more exact as evaluations are added. It evaluates the center twice and samples around it
-    per iteration. From then on it does not hop, and does not end by itself. `value` is the loss of the output that the
-    regression tells, and `averages` says whether it is.
+    where three rounds have arrived at the best point. All evaluations nearby then determine the Jacobian and the output
+    at the center, so both become more exact as evaluations are added. It evaluates the center twice and samples around
+    it per iteration. From then on it does not hop, and does not end by itself. `value` is then the loss of the output
+    of the regression. `averages` says whether the search averages.
 
     Only parameters that some output was found to depend on are moved. The others stay where they are, and `untouched`
     names them. Of the parameters found in a batch, at most 0.5 % have no effect, by expectation. A parameter with a
@@ -68,7 +69,7 @@ class LocalGaussNewton(AskTell[SparseProgress]):
             less than half of the held-out change, it begins again with the first radius instead.
         tolerance: radius, in units of sigma, at which the search has arrived.
         noise: standard deviation of repeated losses at one point, if they differ. The search uses only whether it is
-            above 0: repeated outputs tell how large the noise is.
+            above 0: repeated outputs show how large the noise is.
         seed: of the samples; from torch's global generator if None.
 
     Outputs of two dimensions or more are images, whose neighbouring pixels share evidence: see `sparse_jacobian`.

@@ -1,4 +1,4 @@
-"""What a step tells a descent by its loss, case by case: models of a known promise, and the rule for each outcome."""
+"""What a descent learns from a step's loss, case by case: models of a known promise, and the rule for each outcome."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What a step tells a descent by its output, case by case: outputs of a known misfit, and the rule for each outcome."""
+"""What a descent learns from a step's output, case by case: outputs of a known misfit, and the rule for each."""
 
 import math
 from dataclasses import replace

@@ -129,6 +129,19 @@ def test_the_decrease_to_a_minimum_within_reach_is_promised_and_no_other():
     assert reached >= 3
 
 
+def test_the_promise_at_kinks_is_the_decrease_of_the_loss_of_linear_outputs():
+    """The outputs are linear, so the decrease is that of the black box."""
+    fn = Linear(10, 0, "mean", side=100.0)
+    search, promised = zh.optim.BlockGaussNewton(zeros(10), sigma=1.0, loss=fn.loss, seed=0), 0
+    while search.evaluations < 30:
+        promise, before = search.promise, search.value
+        search.tell(fn(search.ask()))
+        if promise < math.inf:
+            assert promise == pytest.approx(before - search.value, rel=1e-3)
+            promised += 1
+    assert promised == 2
+
+
 def test_where_a_long_step_overshoots_a_short_one_of_the_same_batch_is_taken():
     """Newton's step for atan(5 x) from 1 ends at -6.1; all steps from 2 upward raise the loss."""
     search = zh.optim.BlockGaussNewton(

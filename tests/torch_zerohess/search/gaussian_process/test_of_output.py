@@ -39,7 +39,7 @@ def finishing(found):
 def test_at_kinks_gauss_newton_goes_on_from_where_the_process_arrives(n, seed, kind):
     """By itself the process arrives 1e-3 or more of the loss at the start above the minimum, in the first round.
 
-    With two parameters its last evaluations are all on a side of the box, and tell no slope across it.
+    With two parameters its last evaluations are all on a side of the box, and determine no slope across it.
     """
     fn = Linear(n, seed, kind)
     found = GaussianProcessSearch(zeros(n), sigma=1.0, bounds=(-1, 1), loss=fn.loss, seed=seed, restarts=99)
@@ -70,7 +70,7 @@ def test_the_process_alone_does_not(monkeypatch):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_it_begins_right_after_the_first_samples_where_it_promises_much(seed):
-    """Four evaluations tell an affine output; the region of the first step is a quarter of the way to the minimum."""
+    """Four evaluations determine an affine output; the region of the first step is a quarter of the way to the end."""
     matrix, solution = normal(3, 12, seed=seed), vector(1.25, 0.8, 1.2)
     found = search(lambda x: x @ matrix, solution, seed=seed)
     while not found.done and found.value > 1e-20:

@@ -12,6 +12,8 @@ import torch_zerohess as zh
 from torch_zerohess.optim import LocalGaussNewton
 from torch_zerohess.search.gauss_newton.by_samples import LENGTHS
 from torch_zerohess.search.protocol.state import Arrivals, Evaluated
+from torch_zerohess.search.sparse import arrival
+from torch_zerohess.search.sparse.steps import sparse_steps
 from torch_zerohess.surrogates.sparse_jacobian import SparseJacobian
 from truths import normal, vector
 
@@ -232,7 +234,7 @@ def wide(x):
 
 
 def test_full_rows_and_a_grid_of_parameters_are_found():
-    """25 entries per row, where 16 are kept at first; neighbours tell them, although nobody says that they are some."""
+    """25 entries per row, where 16 are kept at first. Neighbours show them, although nobody says that they are some."""
     truth, order = normal(196), torch.randperm(196, generator=torch.Generator().manual_seed(0))
     least = 1e-4 * float(wide(truth[None]).square().mean())
     open_, few = (run(search_for(wide, truth, **one), wide, 300, least).evaluations for one in ({}, {"keep": 16}))
@@ -543,3 +545,14 @@ def test_the_promise_at_a_kink_is_the_decrease_of_the_loss_of_linear_outputs():
     assert method.promise(known) == math.inf
     known = replace(known, radius=0.1)
     assert method.promise(known) == pytest.approx(known.loss - LEAST, rel=0.02)
+
+
+def test_a_promise_takes_no_more_solutions_than_the_steps_do(monkeypatch):
+    """A callback or a tolerance of the loss reads the promise of every batch of steps."""
+    solved = []
+    monkeypatch.setattr(arrival, "sparse_steps", lambda *args: solved.append(args) or sparse_steps(*args))
+    search = search_for(image, normal(N))
+    search.tell(image(search.ask()))
+    assert search.promise < math.inf
+    assert len(search.ask()) == len(LENGTHS)
+    assert len(solved) == 1
